@@ -1,0 +1,21 @@
+"""What can go wrong, in three kinds that map onto the exit status of the commands."""
+
+from __future__ import annotations
+
+
+class IscatError(Exception):
+    """Base of every error raised on purpose; its text is one line a user can act on."""
+
+    exit_status = 1
+
+
+class DataError(IscatError):
+    """The data cannot be analysed: says which file, what is wrong and what to do (status 1)."""
+
+    exit_status = 1
+
+
+class ConfigError(IscatError):
+    """The configuration or an argument is wrong: names the key, the value, the remedy (status 2)."""
+
+    exit_status = 2

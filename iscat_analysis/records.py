@@ -1,0 +1,383 @@
+"""What the stages hand to one another: frozen dataclasses, axes (t, y, x), units in the names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Protocol
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+PARAMETERS = ("x_nm", "y_nm", "z_nm", "mass_kda")
+"""The particle's parameters, in the order every matrix and vector uses."""
+
+FREE_PARAMETERS: Mapping[str, tuple[str, ...]] = {
+    "mass": ("x_nm", "y_nm", "mass_kda"),
+    "localize": ("x_nm", "y_nm", "z_nm"),
+    "joint": PARAMETERS,
+    "track": PARAMETERS,
+}
+"""What each mode fits."""
+
+EVENT_COLUMNS = (
+    "event", "frame", "n_before", "n_after", "x_px", "y_px", "x_nm", "y_nm", "z_nm", "mass_kda",
+    "contrast", "sigma_x_nm", "sigma_y_nm", "sigma_z_nm", "sigma_mass_kda",
+    "crb_x_nm", "crb_y_nm", "crb_z_nm", "crb_mass_kda",
+    "qcrb_x_nm", "qcrb_y_nm", "qcrb_z_nm", "qcrb_mass_kda",
+    "n_scattered", "snr", "chi2_reduced", "p_value", "status", "flags",
+)  # fmt: skip
+"""The columns of ``fits.csv``, in order."""
+
+
+class Progress(Protocol):
+    """Told how far a stage has come; the command line turns it into a bar on stderr."""
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Report that `done` of `total` steps of `stage` are finished."""
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Ignore progress."""
+
+
+class Status(StrEnum):
+    """The verdict on one fit; `advice` says what each asks of the user."""
+
+    OK = "ok"
+    NOT_CONVERGED = "not_converged"
+    AT_BOUND = "at_bound"
+    AMBIGUOUS_Z = "ambiguous_z"
+    POOR_FIT = "poor_fit"
+    TOO_CLOSE = "too_close"
+    SATURATED = "saturated"
+
+    @property
+    def advice(self) -> str:
+        """What the status means and what to try."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Status.OK: "The fit converged, inside its bounds, and agrees with the data.",
+    Status.NOT_CONVERGED: "The fit did not settle: check the optics, or enlarge fit.roi_nm.",
+    Status.AT_BOUND: "A parameter lies on its bound: widen fit.z_range_nm, or leave the event out.",
+    Status.AMBIGUOUS_Z: "Another height explains the data almost as well: use more frames, "
+    "another focus, or a narrower fit.z_range_nm.",
+    Status.POOR_FIT: "The model does not describe the data: check focus, NA, gain and neighbours.",
+    Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
+    "treat the mass as shared between them.",
+    Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
+}
+
+
+@dataclass(frozen=True)
+class StackMetadata:
+    """What a movie file says of itself; None where it is silent.
+
+    Attributes
+    ----------
+    pixel_size_nm : float or None
+        In the sample plane [nm].
+    exposure_ms : float or None
+        Exposure of one frame [ms].
+    frame_rate_hz : float or None
+        Frames per second [Hz].
+    source : str
+        Which metadata spoke: ``"ome"``, ``"imagej"``, ``"micromanager"``, ``"tiff"``, ``"none"``…
+    """
+
+    pixel_size_nm: float | None = None
+    exposure_ms: float | None = None
+    frame_rate_hz: float | None = None
+    source: str = "none"
+
+
+class FrameSource(Protocol):
+    """A movie that is read a few frames at a time."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Frames ``[start, stop)`` as stored, shape (stop − start, y, x) [counts]."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Photoelectrons summed before and after the particles bound.
+
+    The raw counts are summed, never rescaled frames, so that both sums stay Poisson; laser power
+    enters through `power_ratio` alone (physics.md, section 4).
+
+    Attributes
+    ----------
+    before_e, after_e : ndarray, shape (y, x)
+        Summed photoelectrons [e].  With a known background `before_e` is its expectation for
+        `n_before` = 1 frame.
+    n_before, n_after : int
+        Frames in each sum; `n_before` = 0 where the background is known.
+    power_ratio : float
+        ρ, total power after over total power before.
+    read_variance_before_e2, read_variance_after_e2 : ndarray, shape (y, x)
+        Read-noise variance of each sum [e²].
+    masked : ndarray of bool, shape (y, x)
+        Pixels that must not be used: dead, hot or saturated.
+    saturated : ndarray of bool, shape (y, x)
+        The saturated ones among them.
+    frames_before, frames_after : (int, int)
+        The half-open frame ranges.
+    power : ndarray, shape (t,)
+        Power of every frame in both ranges over the mean power before; before first.
+    """
+
+    before_e: FloatArray
+    after_e: FloatArray
+    n_before: int
+    n_after: int
+    power_ratio: float
+    read_variance_before_e2: FloatArray
+    read_variance_after_e2: FloatArray
+    masked: BoolArray
+    saturated: BoolArray
+    frames_before: tuple[int, int]
+    frames_after: tuple[int, int]
+    power: FloatArray
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A place where something seems to have landed.
+
+    Attributes
+    ----------
+    x_px, y_px : float
+        Sub-pixel position; integer = pixel centre, y down the rows.
+    z_nm : float
+        Height of the template that matched best [nm].
+    mass_kda : float
+        Linear estimate of the mass [kDa]; negative where the contrast has the other sign.
+    snr : float
+        Matched-filter signal over its noise.
+    """
+
+    x_px: float
+    y_px: float
+    z_nm: float
+    mass_kda: float
+    snr: float
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another height that a fit converged to.
+
+    Attributes
+    ----------
+    z_nm : float
+        The height [nm].
+    log_likelihood_gap : float
+        Log-likelihood of the best height minus that of this one, ≥ 0.
+    """
+
+    z_nm: float
+    log_likelihood_gap: float
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """One maximum-likelihood fit.
+
+    Attributes
+    ----------
+    x_nm, y_nm, z_nm, mass_kda : float
+        Estimate in the full frame [nm, kDa]; a parameter that was not free holds its fixed value.
+    free : tuple of str
+        Names of the free parameters, a subset of `PARAMETERS` in that order.
+    sigma : ndarray, shape (4,)
+        Standard deviations from the observed information, in the order of `PARAMETERS`;
+        NaN where not free.
+    covariance : ndarray, shape (n_free, n_free)
+        Inverse observed information.
+    contrast : float
+        Signed peak contrast of the fitted model over the plane.
+    log_likelihood : float
+        At the estimate, without terms that do not depend on the parameters.
+    iterations : int
+        Scoring steps taken by the best start.
+    chi2_reduced, p_value : float
+        Goodness of fit of the fitted pixels.
+    status : Status
+        The verdict.
+    flags : tuple of str
+        Every condition that was noticed, the status among them unless it is ok.
+    alternatives : tuple of Alternative
+        Other heights, best first.
+    """
+
+    x_nm: float
+    y_nm: float
+    z_nm: float
+    mass_kda: float
+    free: tuple[str, ...]
+    sigma: FloatArray
+    covariance: FloatArray
+    contrast: float
+    log_likelihood: float
+    iterations: int
+    chi2_reduced: float
+    p_value: float
+    status: Status
+    flags: tuple[str, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
+
+
+@dataclass(frozen=True)
+class PosteriorResult:
+    """An ensemble of posterior samples and the verdict on it.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Parameter names with units, as in `PARAMETERS`.
+    samples : ndarray, shape (chain, draw, parameter)
+        Draws after burn-in, one chain per walker.
+    log_likelihood : ndarray, shape (chain, draw)
+        At each draw.
+    tau : ndarray, shape (parameter,)
+        Integrated autocorrelation time [steps].
+    r_hat : ndarray, shape (parameter,)
+        Split R̂.
+    ess_bulk, ess_tail : ndarray, shape (parameter,)
+        Effective sample sizes.
+    acceptance : float
+        Mean acceptance fraction.
+    converged : bool
+        Whether every criterion holds; if not, the samples must not be reported as a posterior.
+    message : str
+        Which criterion failed, or that all hold.
+    """
+
+    names: tuple[str, ...]
+    samples: FloatArray
+    log_likelihood: FloatArray
+    tau: FloatArray
+    r_hat: FloatArray
+    ess_bulk: FloatArray
+    ess_tail: FloatArray
+    acceptance: float
+    converged: bool
+    message: str
+
+
+@dataclass(frozen=True)
+class EventView:
+    """What a report shows of one fitted event.
+
+    Attributes
+    ----------
+    event : int
+        Number in the table.
+    row_px, column_px : int
+        Full-frame index of the first pixel of the images.
+    contrast : ndarray, shape (y, x)
+        Measured contrast, after over before minus 1 (dark field: photoelectrons above background).
+    model : ndarray, shape (y, x)
+        Fitted model, in the same unit.
+    residual : ndarray, shape (y, x)
+        (data − model) in standard deviations.
+    posterior : PosteriorResult or None
+        The chain, where sampled.
+    """
+
+    event: int
+    row_px: int
+    column_px: int
+    contrast: FloatArray
+    model: FloatArray
+    residual: FloatArray
+    posterior: PosteriorResult | None = None
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a result came from.
+
+    Attributes
+    ----------
+    command : str
+        The command line, or the library call.
+    input_path : str
+        The movie.
+    input_sha256 : str
+        Hash of the movie's bytes.
+    versions : mapping of str to str
+        iscat-analysis, Python and each numerical dependency.
+    seed : int or None
+        Of the posterior sampler.
+    started : str
+        ISO 8601, UTC.
+    """
+
+    command: str
+    input_path: str
+    input_sha256: str
+    versions: Mapping[str, str]
+    seed: int | None
+    started: str
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """Everything one run of the main job found; what the report is made of.
+
+    Attributes
+    ----------
+    config_toml : str
+        The resolved configuration.
+    mode : str
+        ``"mass"``, ``"localize"``, ``"joint"`` or ``"track"``.
+    scheme : str
+        ``"iscat"``, ``"cobri"`` or ``"darkfield"``.
+    pixel_size_nm : float
+        In the sample plane [nm].
+    table : pandas.DataFrame
+        One row per event, columns `EVENT_COLUMNS`.
+    views : tuple of EventView
+        One per event, in the same order.
+    ratio_image : ndarray, shape (y, x)
+        Contrast of the whole field.
+    power : ndarray, shape (t,)
+        Laser power of each frame used, relative.
+    power_frames : ndarray of int, shape (t,)
+        The frames' numbers.
+    summary : mapping
+        What ``summary.json`` holds.
+    provenance : Provenance
+        Versions, hash, command.
+    warnings : tuple of str
+        One line each.
+    """
+
+    config_toml: str
+    mode: str
+    scheme: str
+    pixel_size_nm: float
+    table: pd.DataFrame
+    views: tuple[EventView, ...]
+    ratio_image: FloatArray
+    power: FloatArray
+    power_frames: NDArray[np.int64]
+    summary: Mapping[str, Any]
+    provenance: Provenance
+    warnings: tuple[str, ...] = field(default=())

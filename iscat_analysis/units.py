@@ -1,0 +1,50 @@
+"""Unit conversions used at the borders of the kernels, each defined once."""
+
+from __future__ import annotations
+
+import math
+
+NM = 1e-9
+"""One nanometre in metres."""
+
+DALTON_KG = 1.66053906892e-27
+"""One dalton in kilograms (CODATA 2022)."""
+
+KILODALTON_KG = 1e3 * DALTON_KG
+"""One kilodalton in kilograms."""
+
+
+def sphere_mass_kda(diameter_nm: float, density_kg_m3: float) -> float:
+    """Mass of a sphere.
+
+    Parameters
+    ----------
+    diameter_nm : float
+        Diameter [nm].
+    density_kg_m3 : float
+        Density [kg/m³].
+
+    Returns
+    -------
+    float
+        Mass [kDa].
+    """
+    return density_kg_m3 * math.pi / 6 * (diameter_nm * NM) ** 3 / KILODALTON_KG
+
+
+def sphere_diameter_nm(mass_kda: float, density_kg_m3: float) -> float:
+    """Diameter of the sphere that has a given mass; the inverse of `sphere_mass_kda`.
+
+    Parameters
+    ----------
+    mass_kda : float
+        Mass [kDa].
+    density_kg_m3 : float
+        Density [kg/m³].
+
+    Returns
+    -------
+    float
+        Diameter [nm].
+    """
+    return (mass_kda * KILODALTON_KG / density_kg_m3 * 6 / math.pi) ** (1 / 3) / NM
