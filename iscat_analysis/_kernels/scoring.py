@@ -1,0 +1,365 @@
+"""Log-likelihood, score and Fisher matrix in one pass over the pixels, and the fit built on it.
+
+Parameters are θ = (x, y, z, a, g): position [nm], amplitude, and the logarithm of a common level
+that multiplies the expected counts.  Two likelihoods, by `kind` and the last axis of `data`:
+
+CONDITIONAL  (d, n, ρ, κ): d of the n = b + d counts fell after landing, p = q/(1+q) with
+             q = ρ e^g (1+s); the unknown background has dropped out (physics.md, section 4).
+             ℓ = κ [d ln q − n ln(1+q)], κ ≤ 1 the share of the variance that is not read noise.
+POISSON      (d, α, β, v): λ = e^g (α + β s) + v, ℓ = d ln λ − λ; v is read-noise variance, added to
+             the counts d as well (Huang et al., Nat. Methods 10, 653, 2013).
+
+Terms that do not depend on θ are left out of ℓ.  A masked pixel has all four entries zero.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.image import FAST, point_gradient, point_signal
+from iscat_analysis._kernels.radial import radial_profile
+
+FloatArray = NDArray[np.float64]
+
+CONDITIONAL, POISSON = 0, 1
+
+CONVERGED, STALLED, EXHAUSTED = 0, 1, 2
+"""How a fit ended: step below tolerance; no step improves; iterations used up."""
+
+
+@njit(inline="always")
+def _log1p(x):
+    """ln(1+x): 2 artanh(x/(2+x)) by its series where |x| < 0.2 (error below 1e-16)."""
+    if -0.2 < x < 0.2:
+        w = x / (2.0 + x)
+        w2 = w * w
+        tail = 1 / 3 + w2 * (1 / 5 + w2 * (1 / 7 + w2 * (1 / 9 + w2 * (1 / 11 + w2 / 13))))
+        return 2.0 * w * (1.0 + w2 * tail)
+    return np.log1p(x)
+
+
+@njit(inline="always")
+def _pixel_value(kind, c0, c1, c2, c3, level, s):
+    """Log-likelihood of one pixel; −inf where the expected count is not positive."""
+    if kind == CONDITIONAL:
+        if s <= -1.0:
+            return -np.inf if c3 > 0 else 0.0
+        change = level * (1.0 + s) - 1.0
+        return c3 * (c0 * _log1p(change) - c1 * _log1p(change * c2 / (1.0 + c2)))
+    base = c1 + c3
+    if base <= 0.0:
+        rate = level * c2 * s
+        if rate > 0.0:
+            return c0 * np.log(rate) - rate
+        return -np.inf if c0 > 0 else 0.0
+    rate = level * (c1 + c2 * s) + c3
+    if rate <= 0.0:
+        return -np.inf
+    return c0 * _log1p((rate - base) / base) - rate
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def score_pass(
+    profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, theta, val, der,
+    score, fisher,
+):  # fmt: skip
+    """Fill score (5) and Fisher matrix (5, 5) at θ and return the log-likelihood."""
+    with_z = profile.shape[2] >= 8
+    q = offsets.size
+    x_p, y_p, amplitude, level = theta[0], theta[1], theta[3], np.exp(theta[4])
+    total = 0.0
+    b0 = b1 = b2 = b3 = b4 = 0.0
+    f00 = f01 = f02 = f03 = f04 = 0.0
+    f11 = f12 = f13 = f14 = 0.0
+    f22 = f23 = f24 = 0.0
+    f33 = f34 = f44 = 0.0
+    for row in range(y.size):
+        for column in range(x.size):
+            s = g0 = g1 = g2 = g3 = 0.0
+            for i in range(q):
+                dy = y[row] + offsets[i] - y_p
+                for j in range(q):
+                    dx = x[column] + offsets[j] - x_p
+                    w = weights[i] * weights[j]
+                    t0, t1, t2, t3, t4 = point_gradient(
+                        profile, inv_step, rho, cos_psi * dx + sin_psi * dy,
+                        cos_psi * dy - sin_psi * dx, amplitude, with_z, val, der,
+                    )  # fmt: skip
+                    s += w * t0
+                    g0 -= w * (cos_psi * t1 - sin_psi * t2)
+                    g1 -= w * (sin_psi * t1 + cos_psi * t2)
+                    g2 += w * t3
+                    g3 += w * t4
+            c0, c1, c2, c3 = (
+                data[row, column, 0], data[row, column, 1],
+                data[row, column, 2], data[row, column, 3],
+            )  # fmt: skip
+            total += _pixel_value(kind, c0, c1, c2, c3, level, s)
+            # pull = ∂ℓ/∂s, bend = information about s; those of g are `stretch` times as large
+            if kind == CONDITIONAL:
+                stretch = 1.0 + s
+                part = 1.0 / (1.0 + c2 * level * stretch)
+                p = 1.0 - part
+                per = 1.0 / stretch
+                pull = c3 * (c0 - c1 * p) * per
+                bend = c3 * c1 * p * part * per * per
+                g4 = stretch
+            else:
+                rate = level * (c1 + c2 * s) + c3
+                gain = level * c2
+                if rate <= 0.0 or gain <= 0.0:
+                    continue
+                per = 1.0 / rate
+                pull = gain * (c0 * per - 1.0)
+                bend = gain * gain * per
+                g4 = (rate - c3) / gain
+            b0 += pull * g0
+            b1 += pull * g1
+            b2 += pull * g2
+            b3 += pull * g3
+            b4 += pull * g4
+            h0, h1, h2, h3, h4 = bend * g0, bend * g1, bend * g2, bend * g3, bend * g4
+            f00 += h0 * g0
+            f01 += h0 * g1
+            f02 += h0 * g2
+            f03 += h0 * g3
+            f04 += h0 * g4
+            f11 += h1 * g1
+            f12 += h1 * g2
+            f13 += h1 * g3
+            f14 += h1 * g4
+            f22 += h2 * g2
+            f23 += h2 * g3
+            f24 += h2 * g4
+            f33 += h3 * g3
+            f34 += h3 * g4
+            f44 += h4 * g4
+    score[0], score[1], score[2], score[3], score[4] = b0, b1, b2, b3, b4
+    fisher[0, 0], fisher[1, 1], fisher[2, 2], fisher[3, 3], fisher[4, 4] = f00, f11, f22, f33, f44
+    fisher[0, 1], fisher[0, 2], fisher[0, 3], fisher[0, 4] = f01, f02, f03, f04
+    fisher[1, 2], fisher[1, 3], fisher[1, 4] = f12, f13, f14
+    fisher[2, 3], fisher[2, 4], fisher[3, 4] = f23, f24, f34
+    for i in range(5):
+        for j in range(i):
+            fisher[i, j] = fisher[j, i]
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def value_pass(
+    profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, theta, val
+):
+    """Log-likelihood at θ, without derivatives."""
+    q = offsets.size
+    x_p, y_p, amplitude, level = theta[0], theta[1], theta[3], np.exp(theta[4])
+    total = 0.0
+    for row in range(y.size):
+        for column in range(x.size):
+            s = 0.0
+            for i in range(q):
+                dy = y[row] + offsets[i] - y_p
+                for j in range(q):
+                    dx = x[column] + offsets[j] - x_p
+                    s += weights[i] * weights[j] * point_signal(
+                        profile, inv_step, rho, cos_psi * dx + sin_psi * dy,
+                        cos_psi * dy - sin_psi * dx, amplitude, val,
+                    )  # fmt: skip
+            total += _pixel_value(
+                kind, data[row, column, 0], data[row, column, 1], data[row, column, 2],
+                data[row, column, 3], level, s,
+            )  # fmt: skip
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def value_batch(
+    table, source, axial, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
+    thetas, out,
+):  # fmt: skip
+    """Log-likelihood at many θ, shape (n, 5); the profile is remade only where z changes."""
+    points = table.shape[3]
+    nodes = np.empty((4, 3 * points))
+    profile = np.empty((points - 1, 6, 4))
+    val = np.empty(8)
+    z = np.nan
+    for k in range(thetas.shape[0]):
+        if thetas[k, 2] != z:
+            z = thetas[k, 2]
+            radial_profile(table, source, axial, z, 1, nodes, profile)
+        out[k] = value_pass(
+            profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
+            thetas[k], val,
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scoring_step(score, fisher, active, damping, step):
+    """Solve (F + damping·diag F) step = score on the active parameters; False if singular."""
+    n = 0
+    index = np.empty(5, dtype=np.int64)
+    for i in range(5):
+        step[i] = 0.0
+        if active[i]:
+            if not fisher[i, i] > 0.0:
+                return False
+            index[n] = i
+            n += 1
+    scale = np.empty(n)
+    for i in range(n):
+        scale[i] = 1.0 / np.sqrt(fisher[index[i], index[i]])
+    lower = np.empty((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            total = fisher[index[i], index[j]] * scale[i] * scale[j]
+            if i == j:
+                total += damping
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            if i == j:
+                if not total > 1e-13:
+                    return False
+                lower[i, i] = np.sqrt(total)
+            else:
+                lower[i, j] = total / lower[j, j]
+    z = np.empty(n)
+    for i in range(n):
+        total = score[index[i]] * scale[i]
+        for k in range(i):
+            total -= lower[i, k] * z[k]
+        z[i] = total / lower[i, i]
+    for i in range(n - 1, -1, -1):
+        total = z[i]
+        for k in range(i + 1, n):
+            total -= lower[k, i] * z[k]
+        z[i] = total / lower[i, i]
+    for i in range(n):
+        step[index[i]] = z[i] * scale[i]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def maximize(
+    table, source, axial, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
+    free, lower, upper, max_step, tolerance, iterations, theta, score, fisher,
+):  # fmt: skip
+    """Damped Fisher scoring inside a box, from θ, which is overwritten with the estimate.
+
+    Parameters
+    ----------
+    table, source, axial, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights
+        The model; see `radial_profile` and `signal_gradient`.
+    kind : int
+        CONDITIONAL or POISSON.
+    data : ndarray, shape (ny, nx, 4)
+        See the module's docstring.
+    free : ndarray of bool, shape (5,)
+        Which parameters move.
+    lower, upper, max_step : ndarray, shape (5,)
+        Box, and largest change of each parameter in one step.
+    tolerance : float
+        Stop when the expected gain in log-likelihood, half the squared step in standard
+        deviations, falls below it.
+    iterations : int
+        Passes over the data at most.
+    theta : ndarray, shape (5,)
+        Start; overwritten.
+    score, fisher : ndarray, shape (5,), (5, 5)
+        Filled with those at the estimate.
+
+    Returns
+    -------
+    value : float
+        Log-likelihood at the estimate.
+    passes : int
+        Passes over the data.
+    outcome : int
+        CONVERGED, STALLED or EXHAUSTED.
+    """
+    points = table.shape[3]
+    orders = 2 if free[2] else 1
+    nodes = np.empty((4 * orders, 3 * points))
+    profile = np.empty((points - 1, 6, 4 * orders))
+    val, der = np.empty(8), np.empty(4)
+    step, trial = np.empty(5), np.empty(5)
+    trial_score, trial_fisher = np.empty(5), np.empty((5, 5))
+    active = np.empty(5, dtype=np.bool_)
+    damping = 0.0
+    radial_profile(table, source, axial, theta[2], orders, nodes, profile)
+    value = score_pass(
+        profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, theta,
+        val, der, score, fisher,
+    )  # fmt: skip
+    passes = 1
+    while passes < iterations:
+        for i in range(5):
+            blocked = (theta[i] <= lower[i] and score[i] < 0) or (
+                theta[i] >= upper[i] and score[i] > 0
+            )
+            active[i] = free[i] and not blocked
+        if not _scoring_step(score, fisher, active, damping, step):
+            if damping > 1e6:
+                return value, passes, STALLED
+            damping = max(10 * damping, 1e-3)
+            continue
+        shrink = 1.0
+        for i in range(5):
+            if active[i] and abs(step[i]) * shrink > max_step[i]:
+                shrink = max_step[i] / abs(step[i])
+        gain = 0.0
+        for i in range(5):
+            trial[i] = min(max(theta[i] + shrink * step[i], lower[i]), upper[i])
+            gain += 0.5 * score[i] * (trial[i] - theta[i])
+        if damping == 0.0 and gain < tolerance:
+            return value, passes, CONVERGED
+        if trial[2] != theta[2]:
+            radial_profile(table, source, axial, trial[2], orders, nodes, profile)
+        trial_value = score_pass(
+            profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, trial,
+            val, der, trial_score, trial_fisher,
+        )  # fmt: skip
+        passes += 1
+        if trial_value >= value - 1e-3 * tolerance - 1e-13 * abs(value):
+            value = trial_value
+            theta[:], score[:], fisher[:] = trial, trial_score, trial_fisher
+            damping = 0.0 if damping < 1e-2 else 0.1 * damping
+        else:
+            if damping > 1e6:
+                return value, passes, STALLED
+            damping = max(10 * damping, 1e-3)
+    return value, passes, EXHAUSTED
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def scan_heights(
+    table, source, axial, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
+    heights, free_amplitude, lower_amplitude, upper_amplitude, theta, values, amplitudes,
+):  # fmt: skip
+    """Profile log-likelihood along z at fixed (x, y): the amplitude takes two scoring steps.
+
+    Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the rest and the start.
+    """
+    points = table.shape[3]
+    nodes = np.empty((4, 3 * points))
+    profile = np.empty((points - 1, 6, 4))
+    val, der = np.empty(8), np.empty(4)
+    score, fisher = np.empty(5), np.empty((5, 5))
+    here = theta.copy()
+    for k in range(heights.size):
+        here[2] = heights[k]
+        here[3] = theta[3]
+        radial_profile(table, source, axial, here[2], 1, nodes, profile)
+        if free_amplitude:
+            for _ in range(2):
+                score_pass(
+                    profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
+                    here, val, der, score, fisher,
+                )  # fmt: skip
+                if fisher[3, 3] > 0:
+                    moved = here[3] + score[3] / fisher[3, 3]
+                    here[3] = min(max(moved, lower_amplitude), upper_amplitude)
+        values[k] = value_pass(
+            profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, here, val
+        )
+        amplitudes[k] = here[3]

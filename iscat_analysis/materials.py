@@ -1,0 +1,145 @@
+"""Refractive indices and densities of the particles, with their sources.
+
+Gold: P. B. Johnson and R. W. Christy, Phys. Rev. B 6, 4370 (1972), n and k against photon energy,
+interpolated linearly in vacuum wavelength.  Silica: I. H. Malitson, J. Opt. Soc. Am. 55, 1205
+(1965).  Polystyrene: N. Sultanova, S. Kasarova and I. Nikolov, Acta Phys. Pol. A 116, 585 (2009).
+Protein: index 1.46 and 1350 kg/m³, the values mass photometry works with.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from iscat_analysis.config import Particle
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.units import sphere_mass_kda
+
+_GOLD = np.array([
+    [0.64, 0.92, 13.78], [0.77, 0.56, 11.21], [0.89, 0.43, 9.519], [1.02, 0.35, 8.145],
+    [1.14, 0.27, 7.150], [1.26, 0.22, 6.350], [1.39, 0.17, 5.663], [1.51, 0.16, 5.083],
+    [1.64, 0.14, 4.542], [1.76, 0.13, 4.103], [1.88, 0.14, 3.697], [2.01, 0.21, 3.272],
+    [2.14, 0.29, 2.863], [2.26, 0.43, 2.455], [2.38, 0.62, 2.081], [2.50, 1.04, 1.833],
+    [2.63, 1.31, 1.849], [2.75, 1.38, 1.914], [2.88, 1.45, 1.948], [3.00, 1.46, 1.958],
+    [3.12, 1.47, 1.952], [3.25, 1.46, 1.933], [3.37, 1.48, 1.895], [3.50, 1.50, 1.866],
+    [3.62, 1.48, 1.871], [3.74, 1.48, 1.883], [3.87, 1.54, 1.898], [3.99, 1.53, 1.893],
+    [4.12, 1.53, 1.889], [4.24, 1.49, 1.878], [4.36, 1.47, 1.869], [4.49, 1.43, 1.847],
+    [4.61, 1.38, 1.803], [4.74, 1.35, 1.749], [4.86, 1.33, 1.688], [4.98, 1.33, 1.631],
+    [5.11, 1.32, 1.577], [5.23, 1.32, 1.536], [5.36, 1.30, 1.497], [5.48, 1.31, 1.460],
+    [5.60, 1.30, 1.427], [5.73, 1.30, 1.387], [5.85, 1.30, 1.350], [5.98, 1.30, 1.304],
+    [6.10, 1.33, 1.277], [6.22, 1.33, 1.251], [6.35, 1.34, 1.226], [6.47, 1.32, 1.203],
+    [6.60, 1.28, 1.188],
+])  # fmt: skip
+"""Photon energy [eV], n, k."""
+
+_EV_NM = 1239.841984
+
+
+def _gold(wavelength_nm: float) -> complex:
+    table = _GOLD[::-1]
+    wavelengths = _EV_NM / table[:, 0]
+    _inside("gold", wavelength_nm, wavelengths[0], wavelengths[-1])
+    n = np.interp(wavelength_nm, wavelengths, table[:, 1])
+    k = np.interp(wavelength_nm, wavelengths, table[:, 2])
+    return complex(n, k)
+
+
+def _silica(wavelength_nm: float) -> complex:
+    _inside("silica", wavelength_nm, 210, 3700)
+    l2 = (wavelength_nm / 1000) ** 2
+    terms = ((0.6961663, 0.0684043), (0.4079426, 0.1162414), (0.8974794, 9.896161))
+    return complex(math.sqrt(1 + sum(b * l2 / (l2 - c**2) for b, c in terms)))
+
+
+def _polystyrene(wavelength_nm: float) -> complex:
+    _inside("polystyrene", wavelength_nm, 350, 1100)
+    l2 = (wavelength_nm / 1000) ** 2
+    return complex(math.sqrt(1 + 1.4435 * l2 / (l2 - 0.020216)))
+
+
+def _protein(wavelength_nm: float) -> complex:
+    return 1.46 + 0j
+
+
+def _inside(kind: str, wavelength_nm: float, low: float, high: float) -> None:
+    if not low <= wavelength_nm <= high:
+        raise ConfigError(
+            f"optics.wavelength_nm = {wavelength_nm:g} lies outside the {kind} table "
+            f"({low:.0f}–{high:.0f} nm): give particle.permittivity"
+        )
+
+
+@dataclass(frozen=True)
+class _Kind:
+    index: Callable[[float], complex]
+    density_kg_m3: float
+    default_mass_kda: float
+
+
+_KINDS = {
+    "gold": _Kind(_gold, 19300.0, sphere_mass_kda(30.0, 19300.0)),
+    "silica": _Kind(_silica, 2200.0, sphere_mass_kda(30.0, 2200.0)),
+    "polystyrene": _Kind(_polystyrene, 1050.0, sphere_mass_kda(30.0, 1050.0)),
+    "protein": _Kind(_protein, 1350.0, 150.0),
+}
+
+
+@dataclass(frozen=True)
+class Material:
+    """What the scattering of a particle depends on.
+
+    Attributes
+    ----------
+    permittivity : complex
+        Relative permittivity at the wavelength.
+    density_kg_m3 : float
+        Mass density [kg/m³].
+    mass_kda : float
+        Nominal mass: start value of fits, truth of simulations [kDa].
+    """
+
+    permittivity: complex
+    density_kg_m3: float
+    mass_kda: float
+
+
+def material(particle: Particle, wavelength_nm: float) -> Material:
+    """Resolve a particle of the configuration at a wavelength.
+
+    Parameters
+    ----------
+    particle : Particle
+        The ``[particle]`` section.
+    wavelength_nm : float
+        Vacuum wavelength [nm].
+
+    Returns
+    -------
+    Material
+        Permittivity, density and nominal mass.
+
+    Raises
+    ------
+    ConfigError
+        The wavelength lies outside the table of the material.
+    """
+    kind = _KINDS.get(particle.kind)
+    if particle.permittivity is not None:
+        permittivity = complex(*particle.permittivity)
+    elif particle.index is not None:
+        permittivity = complex(particle.index**2)
+    elif kind is not None:
+        permittivity = kind.index(wavelength_nm) ** 2
+    else:
+        raise ConfigError('particle.kind = "custom" needs permittivity or index')
+    density = particle.density_kg_m3 or (kind.density_kg_m3 if kind else 1000.0)
+    if particle.mass_kda is not None:
+        mass = particle.mass_kda
+    elif particle.diameter_nm is not None:
+        mass = sphere_mass_kda(particle.diameter_nm, density)
+    else:
+        mass = kind.default_mass_kda if kind else sphere_mass_kda(30.0, density)
+    return Material(permittivity, density, mass)
