@@ -1,0 +1,121 @@
+"""The two programs: `iscat`, the umbrella, and `iscat-fit`, its main job."""
+
+from __future__ import annotations
+
+import io
+import shlex
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Annotated
+
+import typer
+
+from iscat_cli.bounds import EXAMPLE as BOUNDS_EXAMPLE
+from iscat_cli.bounds import bounds
+from iscat_cli.config import EXAMPLE as CONFIG_EXAMPLE
+from iscat_cli.config import config
+from iscat_cli.console import INTERRUPTED, Messages
+from iscat_cli.fit import EXAMPLE as FIT_EXAMPLE
+from iscat_cli.fit import fit
+from iscat_cli.simulate import EXAMPLE as SIMULATE_EXAMPLE
+from iscat_cli.simulate import simulate
+
+# To add a command: its own file with a function and an EXAMPLE, and one line here.
+COMMANDS = (
+    (fit, FIT_EXAMPLE),
+    (simulate, SIMULATE_EXAMPLE),
+    (bounds, BOUNDS_EXAMPLE),
+    (config, CONFIG_EXAMPLE),
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `iscat`.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Without the program's name; default those of the process.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    return _run(_umbrella(), "iscat", given or ["--help"])
+
+
+def main_fit(arguments: Sequence[str] | None = None) -> int:
+    """Run `iscat-fit`, which is ``iscat fit``.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Without the program's name; default those of the process.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
+    app = _empty()
+    app.command(epilog=FIT_EXAMPLE.replace("iscat fit", "iscat-fit"))(fit)
+    return _run(app, "iscat-fit", list(sys.argv[1:] if arguments is None else arguments))
+
+
+def _umbrella() -> typer.Typer:
+    app = _empty()
+    app.callback()(_iscat)
+    for command, example in COMMANDS:
+        app.command(epilog=example)(command)
+    return app
+
+
+def _empty() -> typer.Typer:
+    return typer.Typer(
+        context_settings={"help_option_names": ["-h", "--help"]},
+        pretty_exceptions_enable=False,
+        rich_markup_mode="markdown",
+    )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"iscat-analysis {version('iscat-analysis')}")
+        raise typer.Exit
+
+
+def _iscat(
+    *,
+    show_version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print it."),
+    ] = False,
+) -> None:
+    """Position and mass of single particles from interferometric scattering movies."""
+
+
+def _run(app: typer.Typer, program: str, arguments: list[str]) -> int:
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    command = typer.main.get_command(app)
+    try:
+        status = command.main(
+            args=arguments,
+            prog_name=program,
+            standalone_mode=False,
+            obj=shlex.join([program, *arguments]),
+        )
+    except typer.TyperException as error:
+        context = getattr(error, "ctx", None)
+        name = context.command_path if context is not None else program
+        text = error.format_message().rstrip(".")
+        Messages(name).error(f"{text}; see {name} --help")
+        return error.exit_code
+    except (typer.Abort, KeyboardInterrupt):
+        Messages(program).error("interrupted")
+        return INTERRUPTED
+    return status or 0

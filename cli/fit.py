@@ -1,0 +1,224 @@
+"""`iscat fit`, the main job."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from iscat_cli.console import Messages, failures, print_json, print_result
+from iscat_cli.options import (
+    ConfigOption,
+    DebugOption,
+    JsonOption,
+    Mode,
+    ModeOption,
+    OverwriteOption,
+    QuietOption,
+    SetOption,
+    frame_range,
+)
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from iscat_analysis.records import Analysis
+
+FLAGGED = 3
+ROWS_SHOWN = 20
+
+EXAMPLE = """Example: 200 frames before the particles bound, the rest after.
+
+    iscat fit movie.tif --mode mass --config setup.toml --background 0:200
+"""
+
+
+def fit(
+    context: typer.Context,
+    stack: Annotated[
+        Path,
+        typer.Argument(
+            metavar="STACK", help="The movie: TIFF, OME-TIFF, ImageJ TIFF or Refeyn .mp."
+        ),
+    ],
+    *,
+    mode: ModeOption = None,
+    config: ConfigOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Output folder; default the movie's name with .iscat.",
+            show_default=False,
+        ),
+    ] = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(metavar="A:B", help="Frames to fit, half-open.", show_default=False),
+    ] = None,
+    background: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A:B", help="Frames before the particles bound, half-open.", show_default=False
+        ),
+    ] = None,
+    settings: SetOption = None,
+    posterior: Annotated[
+        bool | None,
+        typer.Option(
+            "--posterior/--no-posterior",
+            help="Sample the posterior; default as configured.",
+            show_default=False,
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Threads.", show_default=False)
+    ] = None,
+    overwrite: OverwriteOption = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Exit with status 3 if any result is flagged.")
+    ] = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Fit the particles of a movie and set each spread beside its Cramér–Rao bounds.
+
+    Writes fits.csv, fits.parquet, summary.json, config.toml, report.html and figures to the
+    output folder.
+    """
+    messages = Messages(context.command_path, quiet=quiet)
+    with failures(messages, debug=debug):
+        from iscat_analysis.config import load_config
+
+        changes = _changes(settings, mode, frames, background, posterior, workers)
+        resolved = load_config(config, changes)
+        folder = stack.with_suffix(".iscat") if out is None else out
+
+        from iscat_analysis.pipeline import fit_stack
+
+        with messages.progress() as progress:
+            analysis = fit_stack(
+                stack,
+                resolved,
+                out=folder,
+                overwrite=overwrite,
+                progress=progress,
+                notify=messages.notify,
+                command=context.obj,
+            )
+        rows: list[dict[str, Any]] = analysis.table.to_dict("records")
+        if as_json:
+            print_json({**analysis.summary, "events": rows, "out": str(folder)})
+        else:
+            _print_table(analysis, rows, folder)
+        flagged = [row for row in rows if _is_flagged(row)]
+        if flagged:
+            _advise(messages, flagged)
+            if strict:
+                raise typer.Exit(FLAGGED)
+
+
+def _changes(
+    settings: Sequence[str] | None,
+    mode: Mode | None,
+    frames: str | None,
+    background: str | None,
+    posterior: bool | None,
+    workers: int | None,
+) -> list[str]:
+    """Write the options as configuration keys; they come last, so they win over --set."""
+    changes = list(settings or ())
+    if mode is not None:
+        changes.append(f'fit.mode="{mode.value}"')
+    if frames is not None:
+        changes.append(f"fit.frames={list(frame_range('--frames', frames))}")
+    if background is not None:
+        changes.append(f"background.frames={list(frame_range('--background', background))}")
+    if posterior is not None:
+        changes.append(f"posterior.enabled={str(posterior).lower()}")
+    if workers is not None:
+        changes.append(f"compute.workers={workers}")
+    return changes
+
+
+def _is_flagged(row: Mapping[str, Any]) -> bool:
+    flags = row["flags"]
+    return row["status"] != "ok" or (isinstance(flags, str) and bool(flags))
+
+
+def _advise(messages: Messages, flagged: Sequence[Mapping[str, Any]]) -> None:
+    from iscat_analysis.records import Status
+
+    for status, count in Counter(str(row["status"]) for row in flagged).most_common():
+        if status != Status.OK:
+            messages.notify(f"{count} {status}: {Status(status).advice}")
+
+
+def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
+    from iscat_analysis.records import FREE_PARAMETERS
+
+    if rows:
+        print_result(events_table(rows[:ROWS_SHOWN], FREE_PARAMETERS[analysis.mode]))
+    if len(rows) > ROWS_SHOWN:
+        print_result(f"… and {len(rows) - ROWS_SHOWN} more")
+    counts = Counter(str(row["status"]) for row in rows)
+    verdict = ", ".join(f"{count} {status}" for status, count in counts.most_common())
+    kind = "rows" if analysis.mode == "track" else "events"
+    print_result(f"{len(rows)} {kind}{': ' if verdict else ''}{verdict}; results in {folder}")
+
+
+def events_table(rows: Sequence[Mapping[str, Any]], free: Sequence[str]) -> Table:
+    """Tabulate fitted events: every parameter ± σ, and the bounds of z and mass where free.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        Rows of ``fits.csv``.
+    free : sequence of str
+        Names of the free parameters.
+
+    Returns
+    -------
+    rich.table.Table
+        One row per event.
+    """
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    bounded = [name for name in ("z_nm", "mass_kda") if name in free]
+    table = Table(box=box.SIMPLE_HEAD if Console().is_terminal else None, pad_edge=False)
+    for heading in ("event", "frame", "x ± σ [nm]", "y ± σ [nm]", "z ± σ [nm]", "mass ± σ [kDa]"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name in bounded:
+        symbol, unit = {"z_nm": ("z", "nm"), "mass_kda": ("mass", "kDa")}[name]
+        table.add_column(f"CRB {symbol} [{unit}]", justify="right", no_wrap=True)
+        table.add_column(f"QCRB {symbol} [{unit}]", justify="right", no_wrap=True)
+    table.add_column("status", no_wrap=True)
+    for row in rows:
+        cells = [str(row["event"]), str(row["frame"])]
+        cells += [
+            _with_spread(row[name], row[f"sigma_{name}"])
+            for name in ("x_nm", "y_nm", "z_nm", "mass_kda")
+        ]
+        for name in bounded:
+            cells += [_short(row[f"crb_{name}"]), _short(row[f"qcrb_{name}"])]
+        table.add_row(*cells, str(row["status"]))
+    return table
+
+
+def _with_spread(value: float, sigma: float | None) -> str:
+    """Write a value to the second significant digit of its standard deviation."""
+    if sigma is None or not math.isfinite(sigma) or sigma <= 0:
+        return _short(value)
+    digits = max(0, 1 - math.floor(math.log10(sigma)))
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
+
+
+def _short(value: float | None) -> str:
+    return "–" if value is None or not math.isfinite(value) else f"{value:.3g}"

@@ -1,0 +1,92 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class Mode(StrEnum):
+    """What is fitted; the same names as `iscat_analysis.config.Mode`."""
+
+    MASS = "mass"
+    LOCALIZE = "localize"
+    JOINT = "joint"
+    TRACK = "track"
+
+
+ModeOption = Annotated[
+    Mode | None,
+    typer.Option(
+        "--mode",
+        metavar="MODE",
+        help="Free parameters: mass (x, y, mass), localize (x, y, z), joint (all four), "
+        "track (joint in every frame, linked).",
+        show_default=False,
+    ),
+]
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        metavar="C.toml",
+        help="Configuration; `iscat config` prints one.",
+        show_default=False,
+    ),
+]
+
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="section.key=value",
+        help="Change one key of the configuration; may be repeated.",
+        show_default=False,
+    ),
+]
+
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace earlier output.")]
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+QuietOption = Annotated[
+    bool, typer.Option("--quiet", help="No progress and no messages; errors are still shown.")
+]
+
+DebugOption = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+
+
+def frame_range(option: str, text: str) -> tuple[int, int]:
+    """Read a half-open range of frames.
+
+    Parameters
+    ----------
+    option : str
+        The option's name, for the message.
+    text : str
+        ``"A:B"``.
+
+    Returns
+    -------
+    start, stop : int
+        ``[start, stop)``.
+
+    Raises
+    ------
+    ConfigError
+        It is not written as ``A:B`` with A < B.
+    """
+    from iscat_analysis.errors import ConfigError
+
+    match = re.fullmatch(r"\s*(\d+)\s*:\s*(\d+)\s*", text, flags=re.ASCII)
+    if match is None or int(match[1]) >= int(match[2]):
+        raise ConfigError(
+            f"{option} {text}: write it as A:B, the first frame and the one after the last, "
+            f"as in {option} 0:200"
+        )
+    return int(match[1]), int(match[2])
