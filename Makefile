@@ -1,0 +1,60 @@
+# `make demo` and `make test` work from a fresh checkout; everything is installed into .venv.
+
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+DOCS_STAMP := $(VENV)/.installed-docs
+
+DEMO_CONFIG := sample_configs/mass.toml
+DEMO        := demo
+
+.PHONY: help install demo test lint bench docs clean
+
+help:
+	@echo "make demo    simulate a movie, fit it, say where the report is"
+	@echo "make test    style, types, architecture, docstrings, tests with coverage"
+	@echo "make lint    the same without the tests"
+	@echo "make bench   speed and efficiency, against peers"
+	@echo "make docs    the manual, in docs/_build/html"
+	@echo "make clean   remove what these made, the environment included"
+
+install: $(STAMP)
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(STAMP): pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable ".[test,lint]"
+	@touch $@
+
+$(DOCS_STAMP): pyproject.toml $(STAMP)
+	$(BIN)/python -m pip install --quiet --editable ".[docs]"
+	@touch $@
+
+demo: $(STAMP)
+	@mkdir -p $(DEMO)
+	$(BIN)/iscat simulate --config $(DEMO_CONFIG) --out $(DEMO)/movie.tif --overwrite
+	$(BIN)/iscat-fit $(DEMO)/movie.tif --config $(DEMO_CONFIG) --out $(DEMO)/movie.iscat --overwrite
+	@echo "The report: $(DEMO)/movie.iscat/report.html"
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/numpydoc lint $$(find iscat_analysis -name '*.py' -not -path '*/_*')
+
+test: lint
+	$(BIN)/pytest --cov --cov-fail-under=90
+
+bench: $(STAMP)
+	$(BIN)/python benchmarks/run.py
+
+docs: $(DOCS_STAMP)
+	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
+	@echo "The manual: docs/_build/html/index.html"
+
+clean:
+	rm -rf $(VENV) $(DEMO) build dist docs/_build docs/reference/api *.egg-info .coverage* \
+	    .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
