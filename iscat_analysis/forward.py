@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.hessian import signal_hessian
-from iscat_analysis._kernels.image import signal_gradient
+from iscat_analysis._kernels.image import signal_gradient, signal_image
 from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil, rectangle
 from iscat_analysis._kernels.radial import STEP, bessel_table, radial_profile
 from iscat_analysis.config import Calibration, Config, Optics
@@ -228,7 +228,10 @@ class ForwardModel:
         ndarray, shape (ny, nx)
             Contrast C, or |E_sca|² in dark field.
         """
-        return self._evaluate(grid, x_nm, y_nm, z_nm, self.scale.amplitude(mass_kda), 1)[0]
+        out = np.empty(grid.shape)
+        amplitude = self.scale.amplitude(mass_kda)
+        signal_image(self.profile(z_nm, 1), *self._geometry(grid, x_nm, y_nm, amplitude), out)
+        return out
 
     def gradient(
         self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
@@ -252,8 +255,10 @@ class ForwardModel:
             Derivatives with respect to x, y, z [1/nm] and mass [1/kDa].
         """
         amplitude = self.scale.amplitude(mass_kda)
-        out = self._evaluate(grid, x_nm, y_nm, z_nm, amplitude, 2)
-        out[4] /= self.scale.slope(amplitude)
+        rows = np.empty((grid.shape[0], 5, grid.shape[1]))
+        signal_gradient(self.profile(z_nm, 2), *self._geometry(grid, x_nm, y_nm, amplitude), rows)
+        rows[:, 4] /= self.scale.slope(amplitude)
+        out = np.moveaxis(rows, 1, 0)
         return out[0], out[1:]
 
     def amplitude_hessian(
@@ -279,15 +284,10 @@ class ForwardModel:
         hessian : ndarray, shape (4, 4, ny, nx)
             Second derivatives.
         """
-        self._check_reach(grid, x_nm, y_nm)
-        profile = self.profile(z_nm, 3)
-        offsets, weights = self.samples
         first = np.empty((5, *grid.shape))
         second = np.empty((4, 4, *grid.shape))
-        signal_hessian(
-            profile, 1 / self.step_nm, self.rho, grid.x_nm, grid.y_nm, x_nm, y_nm, amplitude,
-            *self.rotation, offsets * grid.pixel_nm, weights, first, second,
-        )  # fmt: skip
+        geometry = self._geometry(grid, x_nm, y_nm, amplitude)
+        signal_hessian(self.profile(z_nm, 3), *geometry, first, second)
         return first[0], first[1:], second
 
     def field(
@@ -411,19 +411,12 @@ class ForwardModel:
         linear, quadratic = parts(np.array([r_peak]))
         return float(linear[axis, 0]), float(quadratic[axis, 0]), float(r_peak)
 
-    def _evaluate(
-        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float, orders: int
-    ) -> FloatArray:
-        self._check_reach(grid, x_nm, y_nm)
-        offsets, weights = self.samples
-        out = np.empty((5, *grid.shape))
-        signal_gradient(
-            self.profile(z_nm, orders), 1 / self.step_nm, self.rho, grid.x_nm, grid.y_nm,
-            x_nm, y_nm, amplitude, *self.rotation, offsets * grid.pixel_nm, weights, out,
-        )  # fmt: skip
-        return out
-
-    def _check_reach(self, grid: PixelGrid, x_nm: float, y_nm: float) -> None:
+    def _geometry(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, amplitude: float
+    ) -> tuple[
+        float, float, FloatArray, FloatArray, float, float, float, float, float, FloatArray, FloatArray
+    ]:
+        """Arguments every image kernel takes after the profile."""
         half = grid.pixel_nm / 2
         far_x = max(abs(grid.x_nm[0] - x_nm), abs(grid.x_nm[-1] - x_nm)) + half
         far_y = max(abs(grid.y_nm[0] - y_nm), abs(grid.y_nm[-1] - y_nm)) + half
@@ -432,6 +425,11 @@ class ForwardModel:
                 f"the grid extends {math.hypot(far_x, far_y):.0f} nm from the particle, the model "
                 f"was built for {self.reach_nm:.0f} nm: give forward_model a larger reach_nm"
             )
+        offsets, weights = self.samples
+        return (
+            1 / self.step_nm, self.rho, grid.x_nm, grid.y_nm, x_nm, y_nm, amplitude,
+            *self.rotation, offsets * grid.pixel_nm, weights,
+        )  # fmt: skip
 
 
 def forward_model(
@@ -478,17 +476,19 @@ def forward_model(
     if paper:
         theta, weight = rectangle(alpha, nodes or DONG2021_FIELD_NODES)
     else:
-        turns = k * optics.na * reach_nm + 2 * k * ns * z_max_nm + k * ni * abs(oil_nm)
+        rise = 1 - math.cos(alpha)
+        turns = k * (optics.na * reach_nm + ns * z_max_nm + ni * abs(oil_nm) * rise)
         beyond = (alpha - critical) / alpha if critical else 0.0
         theta, weight = gauss_legendre(
             alpha,
             critical,
-            nodes or 24 + math.ceil(0.55 * turns),
-            nodes or 20 + math.ceil(0.55 * turns * beyond),
+            nodes or 16 + math.ceil(0.45 * turns),
+            nodes or 14 + math.ceil(0.45 * turns * beyond),
         )
+    padding = -theta.size % 4  # the radial kernel takes the nodes in fours
     pupil = make_pupil(
-        theta,
-        weight,
+        np.pad(theta, (0, padding), mode="edge"),
+        np.pad(weight, (0, padding)),
         wavenumber=k,
         n_immersion=ni,
         n_glass=ng,

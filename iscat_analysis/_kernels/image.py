@@ -1,4 +1,4 @@
-"""From a radial profile to the image of a particle, its gradient and its Hessian.
+"""From a radial profile to the image of a particle and its gradient, a row of pixels at a time.
 
 The *signal* is the detected intensity above the reference's, over the reference's (contrast), or in
 dark field, where `rho` = 0 instead of 1, the intensity itself:
@@ -8,6 +8,9 @@ dark field, where `rho` = 0 instead of 1, the intensity itself:
 with a the amplitude and e the field per unit amplitude.  Positions are nm; (x, y) camera axes,
 (u, v) the frame of the polarisation, rotated by ψ.  Derivatives are with respect to the particle's
 (x, y, z, a).
+
+A row is done in two loops: the first evaluates the quintics, whose interval differs from pixel to
+pixel and so runs scalar (76 multiply-adds); the second combines them and runs in vector registers.
 """
 
 from __future__ import annotations
@@ -20,76 +23,166 @@ FloatArray = NDArray[np.float64]
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
-
-@njit(inline="always")
-def point_gradient(profile, inv_step, rho, u, v, amplitude, with_z, val, der):
-    """Signal at (u, v) from the particle and its derivatives (s, ∂s/∂u, ∂s/∂v, ∂s/∂z, ∂s/∂a).
-
-    ∂/∂u and ∂/∂v are with respect to the camera point; `val` (8) and `der` (4) are scratch.
-    """
-    r2 = u * u + v * v
-    r = np.sqrt(r2)
-    t = r * inv_step
-    i = int(t)
-    t -= i
-    channels = 8 if with_z else 4
-    c = profile[i]
-    for k in range(channels):
-        val[k] = ((((c[5, k] * t + c[4, k]) * t + c[3, k]) * t + c[2, k]) * t + c[1, k]) * t + c[0, k]
-    for k in range(4):
-        der[k] = (
-            (((5 * c[5, k] * t + 4 * c[4, k]) * t + 3 * c[3, k]) * t + 2 * c[2, k]) * t + c[1, k]
-        )
-    per_r = inv_step / (r + 1e-30)
-    c2 = u * u - v * v
-    s2 = 2 * u * v
-    eu_r, eu_i = val[0] + val[2] * c2, val[1] + val[3] * c2
-    ev_r, ev_i = val[2] * s2, val[3] * s2
-    # (1/r) d/dr of the fields at fixed (u² − v²), (2uv); then the explicit dependence on u and v
-    p_r, p_i = (der[0] + der[2] * c2) * per_r, (der[1] + der[3] * c2) * per_r
-    q_r, q_i = der[2] * s2 * per_r, der[3] * s2 * per_r
-    # ∂u e_u = p u + 2u F2,  ∂v e_u = p v − 2v F2,  ∂u e_v = q u + 2v F2,  ∂v e_v = q v + 2u F2
-    f_r, f_i = 2 * val[2], 2 * val[3]
-    a = amplitude
-    g_r = 2 * a * rho + 2 * a * a * eu_r
-    g_i = 2 * a * a * eu_i
-    h_r, h_i = 2 * a * a * ev_r, 2 * a * a * ev_i
-    power = eu_r * eu_r + eu_i * eu_i + ev_r * ev_r + ev_i * ev_i
-    along_p = g_r * p_r + g_i * p_i + h_r * q_r + h_i * q_i
-    along_eu = g_r * f_r + g_i * f_i
-    along_ev = h_r * f_r + h_i * f_i
-    s = 2 * rho * a * eu_r + a * a * power
-    s_u = along_p * u + along_eu * u + along_ev * v
-    s_v = along_p * v - along_eu * v + along_ev * u
-    s_a = 2 * rho * eu_r + 2 * a * power
-    s_z = 0.0
-    if with_z:
-        s_z = (
-            g_r * (val[4] + val[6] * c2)
-            + g_i * (val[5] + val[7] * c2)
-            + (h_r * val[6] + h_i * val[7]) * s2
-        )
-    return s, s_u, s_v, s_z, s_a
-
-
-@njit(inline="always")
-def point_signal(profile, inv_step, rho, u, v, amplitude, val):
-    """Signal alone at (u, v) from the particle; `val` (4 or more) is scratch."""
-    t = np.sqrt(u * u + v * v) * inv_step
-    i = int(t)
-    t -= i
-    c = profile[i]
-    for k in range(4):
-        val[k] = ((((c[5, k] * t + c[4, k]) * t + c[3, k]) * t + c[2, k]) * t + c[1, k]) * t + c[0, k]
-    c2 = u * u - v * v
-    s2 = 2 * u * v
-    eu_r, eu_i = val[0] + val[2] * c2, val[1] + val[3] * c2
-    ev_r, ev_i = val[2] * s2, val[3] * s2
-    power = eu_r * eu_r + eu_i * eu_i + ev_r * ev_r + ev_i * ev_i
-    return amplitude * (2 * rho * eu_r + amplitude * power)
+SCRATCH = 13
+"""Rows of scratch a row of pixels needs: 8 fields, 4 slopes, the distance in steps."""
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _row_fields(profile, inv_step, x, x_p, dy, with_gradient, f):
+    """Fill f with the profile's channels, and the slopes d/dt of the first four."""
+    for j in range(x.size):
+        dx = x[j] - x_p
+        f[12, j] = np.sqrt(dx * dx + dy * dy) * inv_step
+    if with_gradient:
+        for j in range(x.size):
+            t = f[12, j]
+            i = np.uintp(t)
+            t -= i
+            for k in range(4):
+                v = profile[i, 5, k]
+                d = 5 * v
+                v = v * t + profile[i, 4, k]
+                d = d * t + 4 * profile[i, 4, k]
+                v = v * t + profile[i, 3, k]
+                d = d * t + 3 * profile[i, 3, k]
+                v = v * t + profile[i, 2, k]
+                d = d * t + 2 * profile[i, 2, k]
+                v = v * t + profile[i, 1, k]
+                f[8 + k, j] = d * t + profile[i, 1, k]
+                f[k, j] = v * t + profile[i, 0, k]
+            for k in range(4, 8):
+                v = profile[i, 5, k]
+                v = v * t + profile[i, 4, k]
+                v = v * t + profile[i, 3, k]
+                v = v * t + profile[i, 2, k]
+                v = v * t + profile[i, 1, k]
+                f[k, j] = v * t + profile[i, 0, k]
+    else:
+        for j in range(x.size):
+            t = f[12, j]
+            i = np.uintp(t)
+            t -= i
+            for k in range(4):
+                v = profile[i, 5, k]
+                v = v * t + profile[i, 4, k]
+                v = v * t + profile[i, 3, k]
+                v = v * t + profile[i, 2, k]
+                v = v * t + profile[i, 1, k]
+                f[k, j] = v * t + profile[i, 0, k]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def row_gradient(profile, inv_step, rho, x, x_p, dy, amplitude, cos_psi, sin_psi, weight, f, out):
+    """Add weight × (s, ∂s/∂x_p, ∂s/∂y_p, ∂s/∂z, ∂s/∂a) of one row to `out`, shape (5, nx).
+
+    `dy` is the row's y minus the particle's; the profile has 8 channels or more.
+    """
+    _row_fields(profile, inv_step, x, x_p, dy, True, f)
+    a = amplitude
+    for j in range(x.size):
+        dx = x[j] - x_p
+        u, v = cos_psi * dx + sin_psi * dy, cos_psi * dy - sin_psi * dx
+        per_r = inv_step * inv_step / (f[12, j] + 1e-30)
+        c2, s2 = u * u - v * v, 2 * u * v
+        eu_r, eu_i = f[0, j] + f[2, j] * c2, f[1, j] + f[3, j] * c2
+        ev_r, ev_i = f[2, j] * s2, f[3, j] * s2
+        # (1/r) d/dr of the fields at fixed u² − v² and 2uv
+        p_r, p_i = (f[8, j] + f[10, j] * c2) * per_r, (f[9, j] + f[11, j] * c2) * per_r
+        q_r, q_i = f[10, j] * s2 * per_r, f[11, j] * s2 * per_r
+        # ∂s = Re(g* ∂e_u + h* ∂e_v), with ∂u e_u = p u + 2u F2, ∂v e_u = p v − 2v F2,
+        # ∂u e_v = q u + 2v F2, ∂v e_v = q v + 2u F2
+        g_r, g_i = 2 * a * rho + 2 * a * a * eu_r, 2 * a * a * eu_i
+        h_r, h_i = 2 * a * a * ev_r, 2 * a * a * ev_i
+        along_r = g_r * p_r + g_i * p_i + h_r * q_r + h_i * q_i
+        along_u = 2 * (g_r * f[2, j] + g_i * f[3, j])
+        along_v = 2 * (h_r * f[2, j] + h_i * f[3, j])
+        s_u = along_r * u + along_u * u + along_v * v
+        s_v = along_r * v - along_u * v + along_v * u
+        power = eu_r * eu_r + eu_i * eu_i + ev_r * ev_r + ev_i * ev_i
+        out[0, j] += weight * (2 * rho * a * eu_r + a * a * power)
+        out[1, j] -= weight * (cos_psi * s_u - sin_psi * s_v)
+        out[2, j] -= weight * (sin_psi * s_u + cos_psi * s_v)
+        out[3, j] += weight * (
+            g_r * (f[4, j] + f[6, j] * c2)
+            + g_i * (f[5, j] + f[7, j] * c2)
+            + (h_r * f[6, j] + h_i * f[7, j]) * s2
+        )
+        out[4, j] += weight * (2 * rho * eu_r + 2 * a * power)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def row_signal(profile, inv_step, rho, x, x_p, dy, amplitude, cos_psi, sin_psi, weight, f, out):
+    """Add weight × s of one row to `out`, shape (nx,); the profile has 4 channels or more."""
+    _row_fields(profile, inv_step, x, x_p, dy, False, f)
+    a = amplitude
+    for j in range(x.size):
+        dx = x[j] - x_p
+        u, v = cos_psi * dx + sin_psi * dy, cos_psi * dy - sin_psi * dx
+        c2, s2 = u * u - v * v, 2 * u * v
+        eu_r, eu_i = f[0, j] + f[2, j] * c2, f[1, j] + f[3, j] * c2
+        ev_r, ev_i = f[2, j] * s2, f[3, j] * s2
+        power = eu_r * eu_r + eu_i * eu_i + ev_r * ev_r + ev_i * ev_i
+        out[j] += weight * a * (2 * rho * eu_r + a * power)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sampled_row(
+    profile, inv_step, rho, x, y_row, x_p, y_p, amplitude, cos_psi, sin_psi, offsets, weights,
+    f, out,
+):  # fmt: skip
+    """Signal and gradient of one row, averaged over q × q samples per pixel; `out` (5, nx)."""
+    out[:] = 0.0
+    for i in range(offsets.size):
+        dy = y_row + offsets[i] - y_p
+        for j in range(offsets.size):
+            row_gradient(
+                profile, inv_step, rho, x, x_p - offsets[j], dy, amplitude, cos_psi, sin_psi,
+                weights[i] * weights[j], f, out,
+            )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sampled_signal(
+    profile, inv_step, rho, x, y_row, x_p, y_p, amplitude, cos_psi, sin_psi, offsets, weights,
+    f, out,
+):  # fmt: skip
+    """Signal of one row, averaged over q × q samples per pixel; `out` (nx,)."""
+    out[:] = 0.0
+    for i in range(offsets.size):
+        dy = y_row + offsets[i] - y_p
+        for j in range(offsets.size):
+            row_signal(
+                profile, inv_step, rho, x, x_p - offsets[j], dy, amplitude, cos_psi, sin_psi,
+                weights[i] * weights[j], f, out,
+            )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def signal_image(
+    profile: FloatArray,
+    inv_step: float,
+    rho: float,
+    x: FloatArray,
+    y: FloatArray,
+    x_p: float,
+    y_p: float,
+    amplitude: float,
+    cos_psi: float,
+    sin_psi: float,
+    offsets: FloatArray,
+    weights: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Signal on a pixel grid; `out` has shape (ny, nx), the rest as in `signal_gradient`."""
+    f = np.empty((SCRATCH, x.size))
+    for row in range(y.size):
+        sampled_signal(
+            profile, inv_step, rho, x, y[row], x_p, y_p, amplitude, cos_psi, sin_psi, offsets,
+            weights, f, out[row],
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def signal_gradient(
     profile: FloatArray,
     inv_step: float,
@@ -109,8 +202,8 @@ def signal_gradient(
 
     Parameters
     ----------
-    profile : ndarray, shape (intervals, 6, 4 or more)
-        From `radial_profile`; with 4 channels ∂/∂z is left zero.
+    profile : ndarray, shape (intervals, 6, 8 or more)
+        From `radial_profile`.
     inv_step : float
         One over the radial step [1/nm].
     rho : float
@@ -125,31 +218,12 @@ def signal_gradient(
         Polarisation angle.
     offsets, weights : ndarray, shape (q,)
         Samples inside a pixel [nm] and their weights, summing to 1.
-    out : ndarray, shape (5, ny, nx)
+    out : ndarray, shape (ny, 5, nx)
         Filled with s, ∂s/∂x_p, ∂s/∂y_p, ∂s/∂z, ∂s/∂a.
     """
-    val, der = np.empty(8), np.empty(4)
-    with_z = profile.shape[2] >= 8
-    q = offsets.size
+    f = np.empty((SCRATCH, x.size))
     for row in range(y.size):
-        for column in range(x.size):
-            t0 = t1 = t2 = t3 = t4 = 0.0
-            for i in range(q):
-                dy = y[row] + offsets[i] - y_p
-                for j in range(q):
-                    dx = x[column] + offsets[j] - x_p
-                    w = weights[i] * weights[j]
-                    s, s_u, s_v, s_z, s_a = point_gradient(
-                        profile, inv_step, rho, cos_psi * dx + sin_psi * dy,
-                        cos_psi * dy - sin_psi * dx, amplitude, with_z, val, der,
-                    )  # fmt: skip
-                    t0 += w * s
-                    t1 -= w * (cos_psi * s_u - sin_psi * s_v)
-                    t2 -= w * (sin_psi * s_u + cos_psi * s_v)
-                    t3 += w * s_z
-                    t4 += w * s_a
-            out[0, row, column] = t0
-            out[1, row, column] = t1
-            out[2, row, column] = t2
-            out[3, row, column] = t3
-            out[4, row, column] = t4
+        sampled_row(
+            profile, inv_step, rho, x, y[row], x_p, y_p, amplitude, cos_psi, sin_psi, offsets,
+            weights, f, out[row],
+        )  # fmt: skip

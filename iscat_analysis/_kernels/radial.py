@@ -98,6 +98,14 @@ def bessel_table(transverse: FloatArray, step_nm: float, intervals: int) -> Floa
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+def _add_four(w, a, b, c, d, n0, n1):
+    """Add four rows of the Bessel matrix, with the complex weights w (2, 4), to two channels."""
+    for j in range(a.size):
+        n0[j] += w[0, 0] * a[j] + w[0, 1] * b[j] + w[0, 2] * c[j] + w[0, 3] * d[j]
+        n1[j] += w[1, 0] * a[j] + w[1, 1] * b[j] + w[1, 2] * c[j] + w[1, 3] * d[j]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
 def radial_profile(
     table: FloatArray,
     source: NDArray[np.complex128],
@@ -112,7 +120,7 @@ def radial_profile(
     Parameters
     ----------
     table : ndarray, shape (2, n, 3, intervals + 1)
-        From `bessel_table`.
+        From `bessel_table`; n a multiple of 4.
     source : complex ndarray, shape (2, n)
         Pupil weights of F0 and F2 at z = 0.
     axial : complex ndarray, shape (n,)
@@ -129,26 +137,29 @@ def radial_profile(
     n = axial.size
     points = table.shape[3]
     width = 3 * points
-    nodes[:] = 0.0
+    rows = table.reshape(2, n, width)
+    weight = np.empty((2, orders, 2, n))
     for i in range(n):
         turn = np.exp(1j * axial[i] * z_nm)
-        rate = 1j * axial[i]
         for which in range(2):
             value = source[which, i] * turn
-            row = table[which, i].reshape(width)
             for order in range(orders):
-                re, im = value.real, value.imag
+                weight[which, order, 0, i] = value.real
+                weight[which, order, 1, i] = value.imag
+                value = value * 1j * axial[i]
+    nodes[:] = 0.0
+    for which in range(2):
+        for i in range(0, n, 4):
+            for order in range(orders):
                 channel = 4 * order + 2 * which
-                for j in range(width):
-                    nodes[channel, j] += re * row[j]
-                    nodes[channel + 1, j] += im * row[j]
-                value = value * rate
+                _add_four(
+                    weight[which, order, :, i : i + 4], rows[which, i], rows[which, i + 1],
+                    rows[which, i + 2], rows[which, i + 3], nodes[channel], nodes[channel + 1],
+                )  # fmt: skip
     for channel in range(4 * orders):
-        f, d, s = (
-            nodes[channel, :points],
-            nodes[channel, points : 2 * points],
-            nodes[channel, 2 * points :],
-        )
+        f = nodes[channel, :points]
+        d = nodes[channel, points : 2 * points]
+        s = nodes[channel, 2 * points :]
         for k in range(points - 1):
             rise = f[k + 1] - f[k]
             profile[k, 0, channel] = f[k]
@@ -158,4 +169,6 @@ def radial_profile(
                 10 * rise - 6 * d[k] - 4 * d[k + 1] - 1.5 * s[k] + 0.5 * s[k + 1]
             )
             profile[k, 4, channel] = -15 * rise + 8 * d[k] + 7 * d[k + 1] + 1.5 * s[k] - s[k + 1]
-            profile[k, 5, channel] = 6 * rise - 3 * d[k] - 3 * d[k + 1] - 0.5 * s[k] + 0.5 * s[k + 1]
+            profile[k, 5, channel] = (
+                6 * rise - 3 * d[k] - 3 * d[k + 1] - 0.5 * s[k] + 0.5 * s[k + 1]
+            )

@@ -1,7 +1,7 @@
 """Log-likelihood, score and Fisher matrix in one pass over the pixels, and the fit built on it.
 
 Parameters are θ = (x, y, z, a, g): position [nm], amplitude, and the logarithm of a common level
-that multiplies the expected counts.  Two likelihoods, by `kind` and the last axis of `data`:
+that multiplies the expected counts.  Two likelihoods, by `kind` and the first axis of `data`:
 
 CONDITIONAL  (d, n, ρ, κ): d of the n = b + d counts fell after landing, p = q/(1+q) with
              q = ρ e^g (1+s); the unknown background has dropped out (physics.md, section 4).
@@ -9,7 +9,8 @@ CONDITIONAL  (d, n, ρ, κ): d of the n = b + d counts fell after landing, p = q
 POISSON      (d, α, β, v): λ = e^g (α + β s) + v, ℓ = d ln λ − λ; v is read-noise variance, added to
              the counts d as well (Huang et al., Nat. Methods 10, 653, 2013).
 
-Terms that do not depend on θ are left out of ℓ.  A masked pixel has all four entries zero.
+ℓ is relative to its value without a particle.  `data` has shape (4, ny, nx); a masked pixel has all
+four entries zero.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.image import FAST, point_gradient, point_signal
+from iscat_analysis._kernels.image import FAST, SCRATCH, sampled_row, sampled_signal
 from iscat_analysis._kernels.radial import radial_profile
 
 FloatArray = NDArray[np.float64]
@@ -28,148 +29,175 @@ CONDITIONAL, POISSON = 0, 1
 CONVERGED, STALLED, EXHAUSTED = 0, 1, 2
 """How a fit ended: step below tolerance; no step improves; iterations used up."""
 
+SERIES = 0.2
+"""Largest |x| at which ln(1+x) is taken from its series."""
+
+FLOOR = 1e-300
+"""Least expected count or intensity: keeps quotients finite where a dark fringe is exactly zero."""
+
 
 @njit(inline="always")
 def _log1p(x):
-    """ln(1+x): 2 artanh(x/(2+x)) by its series where |x| < 0.2 (error below 1e-16)."""
-    if -0.2 < x < 0.2:
-        w = x / (2.0 + x)
-        w2 = w * w
-        tail = 1 / 3 + w2 * (1 / 5 + w2 * (1 / 7 + w2 * (1 / 9 + w2 * (1 / 11 + w2 / 13))))
-        return 2.0 * w * (1.0 + w2 * tail)
-    return np.log1p(x)
-
-
-@njit(inline="always")
-def _pixel_value(kind, c0, c1, c2, c3, level, s):
-    """Log-likelihood of one pixel; −inf where the expected count is not positive."""
-    if kind == CONDITIONAL:
-        if s <= -1.0:
-            return -np.inf if c3 > 0 else 0.0
-        change = level * (1.0 + s) - 1.0
-        return c3 * (c0 * _log1p(change) - c1 * _log1p(change * c2 / (1.0 + c2)))
-    base = c1 + c3
-    if base <= 0.0:
-        rate = level * c2 * s
-        if rate > 0.0:
-            return c0 * np.log(rate) - rate
-        return -np.inf if c0 > 0 else 0.0
-    rate = level * (c1 + c2 * s) + c3
-    if rate <= 0.0:
-        return -np.inf
-    return c0 * _log1p((rate - base) / base) - rate
+    """ln(1+x) = 2 artanh(x/(2+x)) by its series, error below 1e-16 for |x| < SERIES."""
+    w = x / (2.0 + x)
+    w2 = w * w
+    tail = 1 / 3 + w2 * (1 / 5 + w2 * (1 / 7 + w2 * (1 / 9 + w2 * (1 / 11 + w2 / 13))))
+    return 2.0 * w * (1.0 + w2 * tail)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def score_pass(
-    profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, theta, val, der,
-    score, fisher,
-):  # fmt: skip
-    """Fill score (5) and Fisher matrix (5, 5) at θ and return the log-likelihood."""
-    with_z = profile.shape[2] >= 8
-    q = offsets.size
-    x_p, y_p, amplitude, level = theta[0], theta[1], theta[3], np.exp(theta[4])
+def _row_value(kind, data, row, level, s):
+    """Log-likelihood of one row of signals s, relative to the same row without a particle."""
+    c0, c1, c2, c3 = data[0, row], data[1, row], data[2, row], data[3, row]
     total = 0.0
+    largest = 0.0
+    if kind == CONDITIONAL:
+        for j in range(s.size):
+            largest = max(largest, abs(level * (1.0 + s[j]) - 1.0))
+        if largest < SERIES:
+            for j in range(s.size):
+                change = level * (1.0 + s[j]) - 1.0
+                total += c3[j] * (
+                    c0[j] * _log1p(change) - c1[j] * _log1p(change * c2[j] / (1.0 + c2[j]))
+                )
+        else:
+            for j in range(s.size):
+                stretch = max(level * (1.0 + s[j]), FLOOR)
+                total += c3[j] * (
+                    c0[j] * np.log(stretch)
+                    - c1[j] * np.log1p((stretch - 1.0) * c2[j] / (1.0 + c2[j]))
+                )
+        return total
+    for j in range(s.size):
+        base = c1[j] + c3[j]
+        rate = level * (c1[j] + c2[j] * s[j]) + c3[j]
+        largest = max(largest, abs(rate - base) / max(base, FLOOR))
+    if largest < SERIES:
+        for j in range(s.size):
+            base = max(c1[j] + c3[j], FLOOR)
+            change = level * (c1[j] + c2[j] * s[j]) + c3[j] - base
+            total += c0[j] * _log1p(change / base) - change
+    else:
+        for j in range(s.size):
+            base = max(c1[j] + c3[j], FLOOR)
+            rate = level * (c1[j] + c2[j] * s[j]) + c3[j]
+            if c0[j] > 0:
+                total += c0[j] * np.log(max(rate, FLOOR) / base)
+            total -= rate - base
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _row_score(kind, data, row, level, g, sums):
+    """Add one row to the 5 scores and 15 Fisher entries in `sums`; g holds s and its gradient."""
+    c0, c1, c2, c3 = data[0, row], data[1, row], data[2, row], data[3, row]
     b0 = b1 = b2 = b3 = b4 = 0.0
     f00 = f01 = f02 = f03 = f04 = 0.0
     f11 = f12 = f13 = f14 = 0.0
     f22 = f23 = f24 = 0.0
     f33 = f34 = f44 = 0.0
+    for j in range(c0.size):
+        # pull = ∂ℓ/∂s, bend = information about s; ∂s/∂g in effect g4
+        if kind == CONDITIONAL:
+            g4 = max(1.0 + g[0, j], FLOOR)
+            part = 1.0 / (1.0 + c2[j] * level * g4)
+            p = 1.0 - part
+            per = 1.0 / g4
+            pull = c3[j] * (c0[j] - c1[j] * p) * per
+            bend = c3[j] * c1[j] * p * part * per * per
+        else:
+            gain = level * c2[j]
+            expected = level * (c1[j] + c2[j] * g[0, j])
+            per = 1.0 / max(expected + c3[j], FLOOR)
+            pull = gain * (c0[j] * per - 1.0)
+            bend = gain * gain * per
+            g4 = expected / max(gain, FLOOR)
+        g0, g1, g2, g3 = g[1, j], g[2, j], g[3, j], g[4, j]
+        b0 += pull * g0
+        b1 += pull * g1
+        b2 += pull * g2
+        b3 += pull * g3
+        b4 += pull * g4
+        h0, h1, h2, h3, h4 = bend * g0, bend * g1, bend * g2, bend * g3, bend * g4
+        f00 += h0 * g0
+        f01 += h0 * g1
+        f02 += h0 * g2
+        f03 += h0 * g3
+        f04 += h0 * g4
+        f11 += h1 * g1
+        f12 += h1 * g2
+        f13 += h1 * g3
+        f14 += h1 * g4
+        f22 += h2 * g2
+        f23 += h2 * g3
+        f24 += h2 * g4
+        f33 += h3 * g3
+        f34 += h3 * g4
+        f44 += h4 * g4
+    sums[0] += b0
+    sums[1] += b1
+    sums[2] += b2
+    sums[3] += b3
+    sums[4] += b4
+    sums[5] += f00
+    sums[6] += f01
+    sums[7] += f02
+    sums[8] += f03
+    sums[9] += f04
+    sums[10] += f11
+    sums[11] += f12
+    sums[12] += f13
+    sums[13] += f14
+    sums[14] += f22
+    sums[15] += f23
+    sums[16] += f24
+    sums[17] += f33
+    sums[18] += f34
+    sums[19] += f44
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def score_pass(
+    profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, theta,
+    score, fisher,
+):  # fmt: skip
+    """Fill score (5) and Fisher matrix (5, 5) at θ and return the log-likelihood."""
+    level = np.exp(theta[4])
+    f = np.empty((SCRATCH, x.size))
+    g = np.empty((5, x.size))
+    sums = np.zeros(20)
+    total = 0.0
     for row in range(y.size):
-        for column in range(x.size):
-            s = g0 = g1 = g2 = g3 = 0.0
-            for i in range(q):
-                dy = y[row] + offsets[i] - y_p
-                for j in range(q):
-                    dx = x[column] + offsets[j] - x_p
-                    w = weights[i] * weights[j]
-                    t0, t1, t2, t3, t4 = point_gradient(
-                        profile, inv_step, rho, cos_psi * dx + sin_psi * dy,
-                        cos_psi * dy - sin_psi * dx, amplitude, with_z, val, der,
-                    )  # fmt: skip
-                    s += w * t0
-                    g0 -= w * (cos_psi * t1 - sin_psi * t2)
-                    g1 -= w * (sin_psi * t1 + cos_psi * t2)
-                    g2 += w * t3
-                    g3 += w * t4
-            c0, c1, c2, c3 = (
-                data[row, column, 0], data[row, column, 1],
-                data[row, column, 2], data[row, column, 3],
-            )  # fmt: skip
-            total += _pixel_value(kind, c0, c1, c2, c3, level, s)
-            # pull = ∂ℓ/∂s, bend = information about s; those of g are `stretch` times as large
-            if kind == CONDITIONAL:
-                stretch = 1.0 + s
-                part = 1.0 / (1.0 + c2 * level * stretch)
-                p = 1.0 - part
-                per = 1.0 / stretch
-                pull = c3 * (c0 - c1 * p) * per
-                bend = c3 * c1 * p * part * per * per
-                g4 = stretch
-            else:
-                rate = level * (c1 + c2 * s) + c3
-                gain = level * c2
-                if rate <= 0.0 or gain <= 0.0:
-                    continue
-                per = 1.0 / rate
-                pull = gain * (c0 * per - 1.0)
-                bend = gain * gain * per
-                g4 = (rate - c3) / gain
-            b0 += pull * g0
-            b1 += pull * g1
-            b2 += pull * g2
-            b3 += pull * g3
-            b4 += pull * g4
-            h0, h1, h2, h3, h4 = bend * g0, bend * g1, bend * g2, bend * g3, bend * g4
-            f00 += h0 * g0
-            f01 += h0 * g1
-            f02 += h0 * g2
-            f03 += h0 * g3
-            f04 += h0 * g4
-            f11 += h1 * g1
-            f12 += h1 * g2
-            f13 += h1 * g3
-            f14 += h1 * g4
-            f22 += h2 * g2
-            f23 += h2 * g3
-            f24 += h2 * g4
-            f33 += h3 * g3
-            f34 += h3 * g4
-            f44 += h4 * g4
-    score[0], score[1], score[2], score[3], score[4] = b0, b1, b2, b3, b4
-    fisher[0, 0], fisher[1, 1], fisher[2, 2], fisher[3, 3], fisher[4, 4] = f00, f11, f22, f33, f44
-    fisher[0, 1], fisher[0, 2], fisher[0, 3], fisher[0, 4] = f01, f02, f03, f04
-    fisher[1, 2], fisher[1, 3], fisher[1, 4] = f12, f13, f14
-    fisher[2, 3], fisher[2, 4], fisher[3, 4] = f23, f24, f34
+        sampled_row(
+            profile, inv_step, rho, x, y[row], theta[0], theta[1], theta[3], cos_psi, sin_psi,
+            offsets, weights, f, g,
+        )  # fmt: skip
+        total += _row_value(kind, data, row, level, g[0])
+        _row_score(kind, data, row, level, g, sums)
+    k = 5
     for i in range(5):
-        for j in range(i):
-            fisher[i, j] = fisher[j, i]
+        score[i] = sums[i]
+        for j in range(i, 5):
+            fisher[i, j] = fisher[j, i] = sums[k]
+            k += 1
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def value_pass(
-    profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, theta, val
-):
+    profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, theta
+):  # fmt: skip
     """Log-likelihood at θ, without derivatives."""
-    q = offsets.size
-    x_p, y_p, amplitude, level = theta[0], theta[1], theta[3], np.exp(theta[4])
+    level = np.exp(theta[4])
+    f = np.empty((SCRATCH, x.size))
+    s = np.empty(x.size)
     total = 0.0
     for row in range(y.size):
-        for column in range(x.size):
-            s = 0.0
-            for i in range(q):
-                dy = y[row] + offsets[i] - y_p
-                for j in range(q):
-                    dx = x[column] + offsets[j] - x_p
-                    s += weights[i] * weights[j] * point_signal(
-                        profile, inv_step, rho, cos_psi * dx + sin_psi * dy,
-                        cos_psi * dy - sin_psi * dx, amplitude, val,
-                    )  # fmt: skip
-            total += _pixel_value(
-                kind, data[row, column, 0], data[row, column, 1], data[row, column, 2],
-                data[row, column, 3], level, s,
-            )  # fmt: skip
+        sampled_signal(
+            profile, inv_step, rho, x, y[row], theta[0], theta[1], theta[3], cos_psi, sin_psi,
+            offsets, weights, f, s,
+        )  # fmt: skip
+        total += _row_value(kind, data, row, level, s)
     return total
 
 
@@ -182,7 +210,6 @@ def value_batch(
     points = table.shape[3]
     nodes = np.empty((4, 3 * points))
     profile = np.empty((points - 1, 6, 4))
-    val = np.empty(8)
     z = np.nan
     for k in range(thetas.shape[0]):
         if thetas[k, 2] != z:
@@ -190,7 +217,7 @@ def value_batch(
             radial_profile(table, source, axial, z, 1, nodes, profile)
         out[k] = value_pass(
             profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
-            thetas[k], val,
+            thetas[k],
         )  # fmt: skip
 
 
@@ -252,7 +279,7 @@ def maximize(
         The model; see `radial_profile` and `signal_gradient`.
     kind : int
         CONDITIONAL or POISSON.
-    data : ndarray, shape (ny, nx, 4)
+    data : ndarray, shape (4, ny, nx)
         See the module's docstring.
     free : ndarray of bool, shape (5,)
         Which parameters move.
@@ -278,18 +305,16 @@ def maximize(
         CONVERGED, STALLED or EXHAUSTED.
     """
     points = table.shape[3]
-    orders = 2 if free[2] else 1
-    nodes = np.empty((4 * orders, 3 * points))
-    profile = np.empty((points - 1, 6, 4 * orders))
-    val, der = np.empty(8), np.empty(4)
+    nodes = np.empty((8, 3 * points))
+    profile = np.empty((points - 1, 6, 8))
     step, trial = np.empty(5), np.empty(5)
     trial_score, trial_fisher = np.empty(5), np.empty((5, 5))
     active = np.empty(5, dtype=np.bool_)
     damping = 0.0
-    radial_profile(table, source, axial, theta[2], orders, nodes, profile)
+    radial_profile(table, source, axial, theta[2], 2, nodes, profile)
     value = score_pass(
         profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, theta,
-        val, der, score, fisher,
+        score, fisher,
     )  # fmt: skip
     passes = 1
     while passes < iterations:
@@ -314,10 +339,10 @@ def maximize(
         if damping == 0.0 and gain < tolerance:
             return value, passes, CONVERGED
         if trial[2] != theta[2]:
-            radial_profile(table, source, axial, trial[2], orders, nodes, profile)
+            radial_profile(table, source, axial, trial[2], 2, nodes, profile)
         trial_value = score_pass(
             profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, trial,
-            val, der, trial_score, trial_fisher,
+            trial_score, trial_fisher,
         )  # fmt: skip
         passes += 1
         if trial_value >= value - 1e-3 * tolerance - 1e-13 * abs(value):
@@ -341,25 +366,24 @@ def scan_heights(
     Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the rest and the start.
     """
     points = table.shape[3]
-    nodes = np.empty((4, 3 * points))
-    profile = np.empty((points - 1, 6, 4))
-    val, der = np.empty(8), np.empty(4)
+    nodes = np.empty((8, 3 * points))
+    profile = np.empty((points - 1, 6, 8))
     score, fisher = np.empty(5), np.empty((5, 5))
     here = theta.copy()
     for k in range(heights.size):
         here[2] = heights[k]
         here[3] = theta[3]
-        radial_profile(table, source, axial, here[2], 1, nodes, profile)
+        radial_profile(table, source, axial, here[2], 2, nodes, profile)
         if free_amplitude:
             for _ in range(2):
                 score_pass(
                     profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
-                    here, val, der, score, fisher,
+                    here, score, fisher,
                 )  # fmt: skip
                 if fisher[3, 3] > 0:
                     moved = here[3] + score[3] / fisher[3, 3]
                     here[3] = min(max(moved, lower_amplitude), upper_amplitude)
         values[k] = value_pass(
-            profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, here, val
+            profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, here
         )
         amplitudes[k] = here[3]
