@@ -22,8 +22,8 @@ def time_axis(sizes: Mapping[str, int], path: Path) -> str | None:
     """Name the axis along which the frames lie.
 
     T, Z, Q and I may be time: a stack with Z only is what many camera programs write.  So may C
-    beyond the seven channels of an ImageJ composite: tifffile calls the frames of ImageJ and OME stacks
-    channels when it is not told otherwise.
+    beyond the seven channels of an ImageJ composite: tifffile calls the frames of ImageJ and OME
+    stacks channels when it is not told otherwise.
 
     Parameters
     ----------
