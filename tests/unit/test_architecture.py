@@ -1,0 +1,145 @@
+"""The house rules that a linter does not know, checked on the syntax tree."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = sorted([*(ROOT / "iscat_analysis").rglob("*.py"), *(ROOT / "cli").rglob("*.py")])
+TREES = {path: ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in SOURCES}
+
+# The generator interface of numpy.random is its only part without hidden state.
+STATELESS = {"default_rng", "Generator", "SeedSequence", "BitGenerator", "PCG64", "Philox"}
+
+
+def _where(path: Path, node: ast.AST) -> str:
+    return f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 0)}"
+
+
+def _nodes(*kinds: type[ast.AST]) -> Iterator[tuple[Path, ast.AST]]:
+    for path, tree in TREES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, kinds):
+                yield path, node
+
+
+def _public_functions() -> Iterator[tuple[Path, ast.FunctionDef]]:
+    """Functions of modules and methods of classes whose whole path is public."""
+
+    def inside(body: list[ast.stmt]) -> Iterator[ast.FunctionDef]:
+        for node in body:
+            if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+                yield node
+            elif isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                yield from inside(node.body)
+
+    for path, tree in TREES.items():
+        for function in inside(tree.body):
+            yield path, function
+
+
+def _dotted(node: ast.AST) -> str:
+    if isinstance(node, ast.Attribute):
+        return f"{_dotted(node.value)}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def test_no_assert_guards_the_user() -> None:
+    assert [_where(*found) for found in _nodes(ast.Assert)] == []
+
+
+def test_no_bare_except() -> None:
+    handlers = _nodes(ast.ExceptHandler)
+    assert [_where(p, n) for p, n in handlers if getattr(n, "type", None) is None] == []
+
+
+def test_no_catch_all_keywords() -> None:
+    assert [_where(p, f) for p, f in _public_functions() if f.args.kwarg is not None] == []
+
+
+def test_no_global_random_state() -> None:
+    offenders = [
+        _where(path, node)
+        for path, node in _nodes(ast.Attribute)
+        if (match := re.fullmatch(r"(?:np|numpy)\.random\.(\w+)", _dotted(node)))
+        and match[1] not in STATELESS
+    ]
+    offenders += [
+        _where(path, node)
+        for path, node in _nodes(ast.Import)
+        if any(name.name == "random" for name in getattr(node, "names", []))
+    ]
+    assert offenders == []
+
+
+def test_every_public_function_says_what_it_does() -> None:
+    assert [_where(p, f) for p, f in _public_functions() if not ast.get_docstring(f)] == []
+
+
+def test_no_print_in_the_library() -> None:
+    offenders = [
+        _where(path, node)
+        for path, node in _nodes(ast.Call)
+        if _dotted(getattr(node, "func", node)) == "print" and path.is_relative_to(ROOT)
+    ]
+    assert offenders == []
+
+
+def test_every_module_has_a_place_in_the_layers() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    layers = " ".join(project["tool"]["importlinter"]["contracts"][0]["layers"])
+    placed = set(re.findall(r"iscat_analysis\.(\w+)", layers))
+    present = {
+        path.stem if path.is_file() else path.name
+        for path in (ROOT / "iscat_analysis").iterdir()
+        if (path.suffix == ".py" and path.stem != "__init__") or (path / "__init__.py").is_file()
+    }
+    assert present - placed == set()
+
+
+def _tracked_text() -> Iterator[tuple[Path, str]]:
+    listing = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT, capture_output=True, check=False,
+    )  # fmt: skip
+    if listing.returncode:
+        pytest.skip("not a git checkout: there is no list of the files that belong to it")
+    for name in listing.stdout.decode().split("\0"):
+        path = ROOT / name
+        if name and path.is_file() and path.stat().st_size < 1_000_000:
+            try:
+                yield path, path.read_text(encoding="utf-8")
+            except UnicodeDecodeError:
+                continue
+
+
+def test_no_file_names_a_machine_or_a_registry() -> None:
+    # Written in pieces, so that this file does not match itself.
+    homes = "|".join(("work", "root", "farm", "home", "Users"))
+    hosts = "|".join(
+        ("py" + r"pi\.org", "python" + "hosted", "npm" + r"js\.org", "deb" + r"ian\.org")
+    )
+    forbidden = re.compile(
+        rf"(?:^|[^A-Za-z0-9_.])/(?:{homes})/[a-z]|{hosts}|index" + "-url|/sim" + "ple/", re.M
+    )
+    offenders = [
+        f"{path.relative_to(ROOT)}: {match[0].strip()}"
+        for path, text in _tracked_text()
+        if (match := forbidden.search(text))
+    ]
+    assert offenders == []
+
+
+def test_golden_copies_are_the_originals(shared_dir: Path, golden_dir: Path) -> None:
+    originals = shared_dir / "golden"
+    if not originals.is_dir():
+        pytest.skip(f"no golden data beside the checkout: {originals} is absent")
+    for copy in golden_dir.glob("*.json"):
+        assert copy.read_bytes() == (originals / copy.name).read_bytes(), copy.name
