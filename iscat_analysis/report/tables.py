@@ -1,0 +1,188 @@
+"""The machine-readable half of the output folder: tables, summary, configuration, posterior."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Mapping
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.records import EVENT_COLUMNS, Analysis, EventView
+
+CSV_DIGITS = 9
+"""Significant digits in ``fits.csv``: 0.1 pm in a field of 100 µm, with no digits of pure noise."""
+
+
+def event_table(analysis: Analysis) -> pd.DataFrame:
+    """Put the table of an analysis into the shape it is published in.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        Its `table` may be empty and may hold flags as tuples.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns `EVENT_COLUMNS` in that order; flags joined by ``;``, status as text.
+
+    Raises
+    ------
+    ValueError
+        The table lacks one of the columns.
+    """
+    missing = [name for name in EVENT_COLUMNS if name not in analysis.table.columns]
+    if missing and len(analysis.table):
+        raise ValueError(f"analysis.table lacks the columns {', '.join(missing)}")
+    table = analysis.table.reindex(columns=list(EVENT_COLUMNS)).reset_index(drop=True)
+    for name in ("event", "frame", "n_before", "n_after"):
+        table[name] = table[name].astype("int64")
+    for name in EVENT_COLUMNS[4:-2]:
+        table[name] = table[name].astype("float64")
+    table["status"] = [_text(value) for value in table["status"]]
+    table["flags"] = [_text(value) for value in table["flags"]]
+    return table.astype({"status": "object", "flags": "object"})
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Enum):
+        return str(value.value)
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (tuple, list)):
+        return ";".join(_text(item) for item in value)
+    return ""
+
+
+def write_tables(analysis: Analysis, folder: Path) -> None:
+    """Write ``fits.csv``, ``fits.parquet``, ``summary.json`` and ``config.toml``.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What to write.
+    folder : Path
+        An existing folder.
+    """
+    table = event_table(analysis)
+    table.to_csv(
+        folder / "fits.csv", index=False, float_format=f"%.{CSV_DIGITS}g", lineterminator="\n"
+    )
+    table.to_parquet(folder / "fits.parquet", index=False)
+    summary = json.dumps(jsonable(analysis.summary), indent=2, ensure_ascii=False, allow_nan=False)
+    (folder / "summary.json").write_text(summary + "\n", encoding="utf-8")
+    (folder / "config.toml").write_text(analysis.config_toml, encoding="utf-8")
+
+
+def jsonable(value: Any) -> Any:
+    """Turn a value into what strict JSON can hold.
+
+    Parameters
+    ----------
+    value : Any
+        Numbers, arrays, mappings, sequences, paths, enumerations, at any depth.
+
+    Returns
+    -------
+    Any
+        The same with NaN and ±∞ as None, arrays as lists and everything unknown as text.
+    """
+    if value is None or isinstance(value, (bool, np.bool_)):
+        return None if value is None else bool(value)
+    if isinstance(value, Enum):
+        return jsonable(value.value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {_text(key) or str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return jsonable(value.tolist())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [jsonable(item) for item in value]
+    return str(value)
+
+
+def write_posterior(analysis: Analysis, path: Path) -> bool:
+    """Write the converged posteriors as one ArviZ InferenceData file.
+
+    The events are a dimension, so that ``az.from_netcdf(path).posterior["mass_kda"].sel(event=7)``
+    is one event's chain.  Chains of different length are cut to the last draws that all have.
+    Events whose chains did not converge are left out and named in the attributes.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        Its views may carry posteriors.
+    path : Path
+        The file to write.
+
+    Returns
+    -------
+    bool
+        Whether there was a converged posterior to write.
+    """
+    sampled = [view for view in analysis.views if view.posterior is not None]
+    usable = [view for view in sampled if view.posterior is not None and view.posterior.converged]
+    if not usable:
+        return False
+    with warnings.catch_warnings():
+        # ArviZ announces its next major version on import, once a day.
+        warnings.simplefilter("ignore", FutureWarning)
+        import arviz
+        import xarray
+
+    posteriors = [view.posterior for view in usable if view.posterior is not None]
+    names = posteriors[0].names
+    n_chain = min(p.samples.shape[0] for p in posteriors)
+    n_draw = min(p.samples.shape[1] for p in posteriors)
+    samples = np.stack([p.samples[:n_chain, -n_draw:] for p in posteriors], axis=2)
+    log_likelihood = np.stack([p.log_likelihood[:n_chain, -n_draw:] for p in posteriors], axis=2)
+    chain, event = ("chain", "draw", "event"), [int(view.event) for view in usable]
+    coords = {"chain": np.arange(n_chain), "draw": np.arange(n_draw), "event": event}
+    diagnostics = {
+        name: (("event", "parameter"), np.stack([getattr(p, name) for p in posteriors]))
+        for name in ("tau", "r_hat", "ess_bulk", "ess_tail")
+    }
+    refused = [v for v in sampled if v.posterior is not None and not v.posterior.converged]
+    attributes = {
+        "sampling_library": "emcee",
+        "input_path": analysis.provenance.input_path,
+        "input_sha256": analysis.provenance.input_sha256,
+        "events_not_converged": json.dumps([int(view.event) for view in refused]),
+        "reasons_not_converged": json.dumps([_reason(view) for view in refused]),
+        "draws_before_cutting": json.dumps([int(p.samples.shape[1]) for p in posteriors]),
+    }
+    data = arviz.InferenceData(
+        posterior=xarray.Dataset(
+            {name: (chain, samples[..., i], _unit(name)) for i, name in enumerate(names)},
+            coords=coords,
+            attrs=attributes,
+        ),
+        sample_stats=xarray.Dataset(
+            {
+                "log_likelihood": (chain, log_likelihood),
+                "acceptance": (("event",), [p.acceptance for p in posteriors]),
+                **diagnostics,
+            },
+            coords={**coords, "parameter": list(names)},
+            attrs=attributes,
+        ),
+    )
+    data.to_netcdf(str(path), engine="h5netcdf")
+    return True
+
+
+def _unit(name: str) -> dict[str, str]:
+    return {"units": "kDa" if name.endswith("kda") else "nm"}
+
+
+def _reason(view: EventView) -> str:
+    return view.posterior.message if view.posterior is not None else ""
