@@ -112,7 +112,7 @@ def _run(app: typer.Typer, program: str, arguments: list[str]) -> int:
     except typer.TyperException as error:
         context = getattr(error, "ctx", None)
         name = context.command_path if context is not None else program
-        text = error.format_message().rstrip(".")
+        text = error.format_message().replace("Value error, ", "").rstrip(".")
         Messages(name).error(f"{text}; see {name} --help")
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):

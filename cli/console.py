@@ -164,22 +164,19 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
         except Exception as error:
             if debug:
                 _write(sys.stderr, traceback.format_exc())
-            messages.error(_explain(error))
-            raise typer.Exit(_status(error)) from error
+            line, status = _verdict(error, debug=debug)
+            messages.error(line)
+            raise typer.Exit(status) from error
 
 
-def _status(error: Exception) -> int:
-    from iscat_analysis.errors import IscatError
-
-    return error.exit_status if isinstance(error, IscatError) else UNEXPECTED
-
-
-def _explain(error: Exception) -> str:
+def _verdict(error: Exception, *, debug: bool) -> tuple[str, int]:
     from iscat_analysis.errors import IscatError
 
     if isinstance(error, IscatError):
-        return str(error)
-    return f"unexpected {type(error).__name__}: {error}; run again with --debug for the traceback"
+        return str(error), error.exit_status
+    said = f": {error}" if str(error) else ""
+    hint = "" if debug else "; run again with --debug for the traceback"
+    return f"unexpected {type(error).__name__}{said}{hint}", UNEXPECTED
 
 
 def print_result(result: RenderableType) -> None:

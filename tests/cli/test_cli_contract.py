@@ -1,0 +1,463 @@
+"""What the commands promise whatever the library does: exit statuses, streams, one-line errors.
+
+The library is replaced by a stand-in here; test_cli_end_to_end.py runs the real one.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import pty
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, get_args
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from iscat_analysis.config import Mode as ConfigMode
+from iscat_analysis.config import load_config
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.records import EVENT_COLUMNS
+from iscat_cli import main, main_fit
+from iscat_cli.options import Mode
+
+Library = Callable[..., Any]
+
+
+def _row(event: int, status: str = "ok", flags: str = "") -> dict[str, Any]:
+    row: dict[str, Any] = dict.fromkeys(EVENT_COLUMNS, 1.0)
+    row |= {"event": event, "frame": 200, "x_nm": 3456.789, "sigma_x_nm": 1.234, "mass_kda": 480.4}
+    row |= {"sigma_mass_kda": 11.8, "crb_mass_kda": 11.5, "qcrb_mass_kda": 5.1, "z_nm": 5.0}
+    row |= {"sigma_z_nm": np.nan, "crb_z_nm": np.nan, "status": status, "flags": flags}
+    return row
+
+
+def _analysis(*rows: dict[str, Any], mode: str = "mass") -> SimpleNamespace:
+    table = pd.DataFrame(list(rows), columns=list(EVENT_COLUMNS))
+    return SimpleNamespace(table=table, mode=mode, summary={"count": np.int64(len(rows))})
+
+
+@pytest.fixture
+def library(monkeypatch: pytest.MonkeyPatch) -> Callable[[Library], None]:
+    """Put a function in the place of `fit_stack`."""
+
+    def install(fit_stack: Library) -> None:
+        stand_in = SimpleNamespace(fit_stack=fit_stack)
+        monkeypatch.setitem(sys.modules, "iscat_analysis.pipeline", stand_in)
+
+    return install
+
+
+def _returning(analysis: SimpleNamespace, calls: list[dict[str, Any]] | None = None) -> Library:
+    def fit_stack(stack: Path, config: Any, **options: Any) -> SimpleNamespace:
+        if calls is not None:
+            calls.append({"stack": stack, "config": config, **options})
+        options["notify"]("reading")
+        options["progress"]("fit", 8, 8)
+        return analysis
+
+    return fit_stack
+
+
+def _raising(error: BaseException) -> Library:
+    def fit_stack(*_: Any, **__: Any) -> Any:
+        raise error
+
+    return fit_stack
+
+
+# ---- the call --------------------------------------------------------------------------------
+
+
+def test_options_reach_the_library_resolved(library, capsys, tmp_path) -> None:
+    calls: list[dict[str, Any]] = []
+    library(_returning(_analysis(_row(0)), calls))
+    setup = tmp_path / "setup.toml"
+    setup.write_text('[fit]\nmode = "joint"\n[compute]\nworkers = 7\n')
+    options = "--mode mass --frames 200:400 --background 0:150 --workers 3 --no-posterior"
+    options += f" --config {setup} --set optics.na=1.3 --set fit.mode=track --overwrite"
+    assert main_fit(["data/movie.tif", *options.split()]) == 0
+    (call,) = calls
+    config = call["config"]
+    assert call["stack"] == Path("data/movie.tif")
+    assert call["out"] == Path("data/movie.iscat")
+    assert call["overwrite"] is True
+    assert call["command"] == f"iscat-fit data/movie.tif {options}"
+    assert config.fit.mode == "mass"
+    assert config.fit.frames == (200, 400)
+    assert config.background.frames == (0, 150)
+    assert config.compute.workers == 3
+    assert config.posterior.enabled is False
+    assert config.optics.na == 1.3
+    assert capsys.readouterr().err.splitlines() == ["iscat-fit: reading", "iscat-fit: fit: 8 of 8"]
+
+
+def test_without_options_the_configuration_decides(library) -> None:
+    calls: list[dict[str, Any]] = []
+    library(_returning(_analysis(), calls))
+    assert main(["fit", "movie.mp", "--out", "elsewhere"]) == 0
+    assert calls[0]["config"] == load_config()
+    assert calls[0]["out"] == Path("elsewhere")
+    assert calls[0]["overwrite"] is False
+    assert calls[0]["command"] == "iscat fit movie.mp --out elsewhere"
+
+
+def test_modes_are_those_of_the_configuration() -> None:
+    assert [mode.value for mode in Mode] == list(get_args(ConfigMode))
+
+
+# ---- results ---------------------------------------------------------------------------------
+
+
+def test_the_table_is_short_and_plain(library, capsys) -> None:
+    library(_returning(_analysis(_row(0), _row(1, "at_bound", "at_bound"))))
+    assert main_fit(["movie.tif"]) == 0
+    captured = capsys.readouterr()
+    heading, first, second, last = captured.out.splitlines()
+    assert "\x1b" not in captured.out
+    assert all(word in heading for word in ("event", "x ± σ", "CRB mass", "QCRB mass", "status"))
+    for cell in ("3456.8 ± 1.2", "480 ± 12", "11.5", "5.1", "ok"):
+        assert cell in first
+    assert "at_bound" in second
+    assert last == "2 events: 1 ok, 1 at_bound; results in movie.iscat"
+    assert "1 at_bound: A parameter lies on its bound" in captured.err
+
+
+def test_joint_shows_the_bounds_of_height_too(library, capsys) -> None:
+    library(_returning(_analysis(_row(0), mode="joint")))
+    main_fit(["movie.tif"])
+    assert "CRB z [nm]  QCRB z [nm]  CRB mass [kDa]" in capsys.readouterr().out
+
+
+def test_a_long_table_is_cut(library, capsys) -> None:
+    library(_returning(_analysis(*(_row(n) for n in range(300)))))
+    main_fit(["movie.tif"])
+    out = capsys.readouterr().out.splitlines()
+    assert len(out) == 23
+    assert out[-2] == "… and 280 more"
+
+
+def test_no_events_is_a_result(library, capsys) -> None:
+    library(_returning(_analysis()))
+    assert main_fit(["movie.tif", "--strict"]) == 0
+    assert capsys.readouterr().out == "0 events; results in movie.iscat\n"
+
+
+def test_json_is_one_object_without_nan(library, capsys) -> None:
+    library(_returning(_analysis(_row(0), _row(1))))
+    assert main_fit(["movie.tif", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert result["count"] == 2
+    assert result["out"] == "movie.iscat"
+    assert list(result["events"][0]) == list(EVENT_COLUMNS)
+    assert result["events"][0]["sigma_z_nm"] is None
+    assert result["events"][1]["event"] == 1
+
+
+def test_quiet_leaves_stderr_empty(library, capsys) -> None:
+    library(_returning(_analysis(_row(0, "poor_fit", "poor_fit"))))
+    assert main_fit(["movie.tif", "--quiet"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert "poor_fit" in captured.out
+
+
+# ---- exit statuses ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("rows", "status"),
+    [
+        ([_row(0)], 0),
+        ([_row(0), _row(1, "not_converged", "not_converged")], 3),
+        ([_row(0, "ok", "masked_pixels")], 3),
+        ([_row(0) | {"flags": np.nan}], 0),
+    ],
+)
+def test_strict_exits_with_3_where_something_is_flagged(library, rows, status) -> None:
+    library(_returning(_analysis(*rows)))
+    assert main_fit(["movie.tif", "--strict"]) == status
+    assert main_fit(["movie.tif"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (DataError("m.tif: is empty: give a movie"), 1, "m.tif: is empty: give a movie"),
+        (DataError("two\n  lines"), 1, "two; lines"),
+        (ConfigError("fit.frames: outside"), 2, "fit.frames: outside"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (KeyboardInterrupt("3 events are in x"), 130, "interrupted: 3 events are in x"),
+        (
+            ZeroDivisionError("oh"),
+            1,
+            "unexpected ZeroDivisionError: oh; run again with --debug for the traceback",
+        ),
+        (
+            MemoryError(),
+            1,
+            "unexpected MemoryError; run again with --debug for the traceback",
+        ),
+    ],
+)
+def test_errors_are_one_line_and_a_status(library, capsys, error, status, line) -> None:
+    library(_raising(error))
+    assert main_fit(["movie.tif"]) == status
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == f"iscat-fit: error: {line}\n"
+
+
+@pytest.mark.parametrize("error", [DataError("bad"), ZeroDivisionError("oh")])
+def test_debug_shows_the_traceback(library, capsys, error) -> None:
+    library(_raising(error))
+    assert main_fit(["movie.tif", "--debug"]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith("Traceback")
+    assert "--debug" not in err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["fit"], "Missing argument 'STACK'"),
+        (["fit", "m.tif", "--mdoe", "mass"], "--mode"),
+        (["fit", "m.tif", "--overwite"], "--overwrite"),
+        (["fit", "m.tif", "--mode", "mas"], "'mass', 'localize', 'joint', 'track'"),
+        (["fit", "m.tif", "--workers", "0"], "--workers"),
+        (["fit", "m.tif", "--workers", "two"], "--workers"),
+        (["fit", "m.tif", "--frames", "5"], "--frames 5: write it as A:B"),
+        (["fit", "m.tif", "--frames", "9:3"], "--frames 9:3: write it as A:B"),
+        (["fit", "m.tif", "--frames", "-3:9"], "--frames -3:9: write it as A:B"),
+        (["fit", "m.tif", "--background", "0-200"], "as in --background 0:200"),
+        (["fit", "m.tif", "--set", "optics.na"], "section.key=value, as in optics.na=1.42"),
+        (["fit", "m.tif", "--set", "optics.wavelength=525"], "did you mean wavelength_nm?"),
+        (["fit", "m.tif", "--set", "optics.wavelength_nm=525nm"], "optics.wavelength_nm"),
+        (["fit", "m.tif", "--config", "absent.toml"], "absent.toml: cannot be read"),
+        (["fti", "m.tif"], "'fit'"),
+        (["simulate", "--out", "m.tif"], "Missing option '--config'"),
+        (["simulate", "--config", "c.toml"], "Missing option '--out'"),
+        (["config", "--mode", "all"], "'mass'"),
+        (["config", "extra"], "extra"),
+    ],
+)
+def test_usage_errors_are_one_line_and_status_2(library, capsys, arguments, expected) -> None:
+    library(_raising(RuntimeError("must not be reached")))
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = captured.err.splitlines()
+    assert line.startswith("iscat")
+    assert ": error: " in line
+    assert expected in line
+
+
+def test_warnings_are_notes_and_quiet_drops_them(library, capsys) -> None:
+    analysis = _analysis(_row(0))
+
+    def fit_stack(*_: Any, **__: Any) -> SimpleNamespace:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            warnings.warn("doubtful", RuntimeWarning, stacklevel=1)
+        return analysis
+
+    library(fit_stack)
+    assert main_fit(["movie.tif"]) == 0
+    assert capsys.readouterr().err == "iscat-fit: warning: doubtful\n"
+    main_fit(["movie.tif", "--quiet"])
+    assert capsys.readouterr().err == ""
+
+
+# ---- the other commands ----------------------------------------------------------------------
+
+
+def test_simulate_makes_one_call(monkeypatch, capsys, tmp_path) -> None:
+    calls: list[Any] = []
+
+    def write_stack(config: Any, path: Path, **options: Any) -> pd.DataFrame:
+        calls.append((config, path, options))
+        return pd.DataFrame({"x_px": [1.5, np.nan]})
+
+    stand_in = SimpleNamespace(write_stack=write_stack)
+    monkeypatch.setitem(sys.modules, "iscat_analysis.simulate", stand_in)
+    setup = tmp_path / "setup.toml"
+    setup.write_text("[simulation]\nframes = 10\n")
+    arguments = ["simulate", "--config", str(setup), "--out", "m.tif", "--seed", "5", "--quiet"]
+    assert main([*arguments, "--set", "simulation.frames=12"]) == 0
+    (config, path, options) = calls[0]
+    assert config.simulation.frames == 12
+    assert path == Path("m.tif")
+    assert options["seed"] == 5
+    assert options["overwrite"] is False
+    assert "2 particles in m.tif, their truth in m.truth.csv" in capsys.readouterr().out
+    main([*arguments, "--json"])
+    assert json.loads(capsys.readouterr().out)["events"] == [{"x_px": 1.5}, {"x_px": None}]
+
+
+REPORT = {
+    "at": {},
+    "n_scattered": {"camera": 1234.5, "collected": 2000.0},
+    "per_photon": {
+        "crb_single": {"x_nm": 75.6, "z_nm": 17.82, "mass_rel": 0.5},
+        "crb_joint": {"x_nm": 75.7, "z_nm": float("nan")},
+        "qcrb": {"x_nm": 71.0, "z_nm": 17.0, "mass_rel": 0.5, "z_nm_phase_free": 40.0},
+    },
+    "actual": {"crb_single": {"x_nm": 1.0, "mass_kda": 5.0}},
+    "fisher": np.eye(2),
+}
+
+
+def test_bounds_prints_tables_or_json(monkeypatch, capsys) -> None:
+    seen: list[Any] = []
+
+    def bounds_report(config: Any) -> dict[str, Any]:
+        seen.append(config)
+        return REPORT
+
+    stand_in = SimpleNamespace(bounds_report=bounds_report)
+    monkeypatch.setitem(sys.modules, "iscat_analysis.bounds", stand_in)
+    assert main(["bounds", "--mode", "joint", "--set", "particle.mass_kda=1000"]) == 0
+    assert seen[0].fit.mode == "joint"
+    assert seen[0].particle.mass_kda == 1000
+    out = capsys.readouterr().out
+    assert "1234" in out
+    rows = {line.split()[0]: line.split()[1:] for line in out.splitlines() if line.strip()}
+    assert rows["z_nm"] == ["17.82", "–", "17"]
+    assert rows["z_nm_phase_free"] == ["–", "–", "40"]
+    assert main(["bounds", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert result["fisher"] == [[1.0, 0.0], [0.0, 1.0]]
+    assert result["per_photon"]["crb_joint"]["z_nm"] is None
+
+
+def test_config_prints_a_file_that_reads_back(capsys, tmp_path) -> None:
+    assert main(["config", "--mode", "joint"]) == 0
+    path = tmp_path / "setup.toml"
+    path.write_text(capsys.readouterr().out)
+    assert load_config(path) == load_config(None, ["fit.mode=joint"])
+
+
+# ---- help ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["fit", "simulate", "bounds", "config"])
+def test_help_ends_with_a_worked_example(command: str, capsys) -> None:
+    assert main([command, "--help"]) == 0
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if line.strip()]
+    assert lines[-1].startswith(f"iscat {command} ")
+    assert "Example" in lines[-2]
+
+
+def test_iscat_fit_calls_itself_by_its_name(capsys) -> None:
+    assert main_fit(["--help"]) == 0
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if line.strip()]
+    assert lines[-1].startswith("iscat-fit movie.tif")
+
+
+def test_without_a_command_there_is_help(capsys) -> None:
+    assert main([]) == 0
+    out = capsys.readouterr().out
+    assert all(command in out for command in ("fit", "simulate", "bounds", "config"))
+    assert "--install-completion" in out
+
+
+def test_version(capsys) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("iscat-analysis ")
+
+
+def test_help_imports_nothing_of_the_library() -> None:
+    code = (
+        "import sys; from iscat_cli import main; main(['fit', '--help']); "
+        "print([m for m in sys.modules if m.split('.')[0] in "
+        "('iscat_analysis', 'numpy', 'pandas', 'numba')], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ast.literal_eval(done.stderr) == []
+
+
+# ---- pipes and terminals ---------------------------------------------------------------------
+
+
+def _python(code: str, **options: Any) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", code], **options)
+
+
+def test_a_reader_that_leaves_is_no_error() -> None:
+    code = "import sys, iscat_cli; sys.exit(iscat_cli.main(['config']))"
+    reading, writing = os.pipe()
+    os.close(reading)
+    process = _python(code, stdout=writing, stderr=subprocess.PIPE)
+    os.close(writing)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert err == b""
+
+
+def test_a_terminal_that_knows_only_ascii_is_served() -> None:
+    code = "import sys, iscat_cli; sys.exit(iscat_cli.main(['bounds', '--help']))"
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    process = _python(code, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, b"")
+
+
+PROGRESS = """
+import sys
+from types import SimpleNamespace
+import pandas as pd
+from iscat_analysis.records import EVENT_COLUMNS
+from iscat_cli import main_fit
+def fit_stack(stack, config, *, progress, notify, **_):
+    for done in range(4):
+        progress("fitting", done, 3)
+    notify("half way")
+    table = pd.DataFrame([], columns=list(EVENT_COLUMNS))
+    return SimpleNamespace(table=table, mode="mass", summary={})
+sys.modules["iscat_analysis.pipeline"] = SimpleNamespace(fit_stack=fit_stack)
+sys.exit(main_fit(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_bars_are_drawn_on_a_terminal_only(quiet: bool) -> None:
+    arguments = [sys.executable, "-c", PROGRESS, "movie.tif", *(["--quiet"] if quiet else [])]
+    environment = os.environ | {"TERM": "xterm"}
+    master, terminal = pty.openpty()
+    with subprocess.Popen(
+        arguments, stdout=subprocess.PIPE, stderr=terminal, env=environment
+    ) as process:
+        os.close(terminal)
+        drawn = b""
+        while True:
+            try:
+                piece = os.read(master, 4096)
+            except OSError:  # Linux's way of saying that the other end is closed
+                break
+            if not piece:
+                break
+            drawn += piece
+        assert process.stdout is not None
+        out = process.stdout.read()
+    os.close(master)
+    assert process.returncode == 0
+    assert out == b"0 events; results in movie.iscat\n"
+    assert (b"fitting" in drawn and b"half way" in drawn) is not quiet
+    assert (b"\x1b[" in drawn) is not quiet
+
+    plain = subprocess.run(arguments, capture_output=True, check=True)
+    expected = b"" if quiet else b"iscat-fit: fitting: 3 of 3\niscat-fit: half way\n"
+    assert plain.stderr == expected
+
+
+def test_no_command_leaves_a_traceback_when_interrupted(library, capsys) -> None:
+    library(_raising(KeyboardInterrupt()))
+    assert main(["fit", "movie.tif"]) == 130
+    assert "Traceback" not in capsys.readouterr().err
