@@ -67,7 +67,7 @@ def read_ome(text: str, n_images: int, path: Path) -> OmeMovie:
         or fewer frames than the file holds, or more than one axis besides y and x.
     """
     root = _parse(text, path)
-    if any(_children(root, "BinaryOnly")):
+    if next(_children(root, "BinaryOnly"), None) is not None:
         raise DataError(
             f"{path}: is one part of an OME set of several files; "
             "save the whole set as one TIFF file and open that"

@@ -1,0 +1,472 @@
+"""Every kind of TIFF movie is read whole, frame for frame, or refused."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+import tifffile
+from tiff_files import ASCII, LONG, RATIONAL, SHORT, movie, pages_of, write_tiff
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.load import open_stack
+from iscat_analysis.load.directory import DirectoryReader
+from iscat_analysis.records import FrameSource
+
+
+def assert_whole(path: Path, expected: np.ndarray) -> None:
+    with open_stack(path) as stack:
+        assert stack.shape == expected.shape
+        assert stack.dtype == expected.dtype
+        block = stack.read(0, len(expected))
+        assert block.dtype == expected.dtype
+        assert block.dtype.isnative
+        np.testing.assert_array_equal(block, expected)
+        np.testing.assert_array_equal(stack.read(2, 4), expected[2:4])
+        assert block.flags.owndata
+        assert block.flags.writeable
+
+
+LAYOUTS = {
+    "contiguous": {},
+    "bigtiff": {"bigtiff": True},
+    "big-endian": {"byteorder": ">"},
+    "big-endian bigtiff": {"bigtiff": True, "byteorder": ">"},
+    "strips": {"rowsperstrip": 3},
+    "tiles": {"tile": (16, 16)},
+    "lzw": {"compression": "lzw"},
+    "deflate": {"compression": "zlib"},
+    "deflate strips": {"compression": "zlib", "rowsperstrip": 3},
+    "zstd tiles": {"compression": "zstd", "tile": (16, 16)},
+    "big-endian lzw": {"compression": "lzw", "byteorder": ">"},
+    "no description": {"metadata": None},
+    "one directory": {"truncate": True},
+}
+
+
+@pytest.mark.parametrize("options", LAYOUTS.values(), ids=LAYOUTS.keys())
+@pytest.mark.parametrize("dtype", ["u1", "u2", "u4", "i2", "f4"])
+def test_reads_every_layout_and_type(tmp_path: Path, dtype: str, options: dict) -> None:
+    expected = movie(6, 19, 21, dtype)
+    path = tmp_path / "movie.tif"
+    tifffile.imwrite(path, expected, **options)
+    assert_whole(path, expected)
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2"])
+def test_undoes_the_predictor(tmp_path: Path, dtype: str) -> None:
+    expected = movie(dtype=dtype)
+    tifffile.imwrite(tmp_path / "m.tif", expected, compression="zlib", predictor=True)
+    assert_whole(tmp_path / "m.tif", expected)
+
+
+@pytest.mark.parametrize("axes", ["TYX", "ZYX", "TZCYX", "QYX"])
+@pytest.mark.parametrize("kind", ["shaped", "ome", "imagej"])
+def test_finds_the_time_axis(tmp_path: Path, kind: str, axes: str) -> None:
+    if kind == "imagej" and axes == "QYX":
+        pytest.skip("ImageJ has no such axis")
+    expected = movie()
+    data = expected.reshape(6, *([1] * (len(axes) - 3)), 10, 14)
+    options = {"shaped": {}, "ome": {"ome": True}, "imagej": {"imagej": True}}[kind]
+    tifffile.imwrite(tmp_path / "m.tif", data, metadata={"axes": axes}, **options)
+    assert_whole(tmp_path / "m.tif", expected)
+
+
+@pytest.mark.parametrize("options", [{"imagej": True}, {"ome": True}], ids=["imagej", "ome"])
+def test_takes_many_unnamed_channels_as_time(tmp_path: Path, options: dict) -> None:
+    expected = movie(frames=9)  # tifffile writes C = 9 when it is given no axes
+    tifffile.imwrite(tmp_path / "m.tif", expected, **options)
+    assert_whole(tmp_path / "m.tif", expected)
+
+
+@pytest.mark.parametrize("kind", ["shaped", "ome", "imagej"])
+def test_refuses_two_axes_by_name(tmp_path: Path, kind: str) -> None:
+    data = movie(10).reshape(5, 2, 10, 14)
+    options = {"shaped": {}, "ome": {"ome": True}, "imagej": {"imagej": True}}[kind]
+    tifffile.imwrite(tmp_path / "m.tif", data, metadata={"axes": "TCYX"}, **options)
+    with pytest.raises(DataError, match=r"C \(channel\) of length 2") as e:
+        open_stack(tmp_path / "m.tif")
+    assert "\n" not in str(e.value)
+    assert str(tmp_path / "m.tif") in str(e.value)
+
+
+def test_refuses_two_axes_without_names(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "m.tif", movie(6).reshape(3, 2, 10, 14))
+    with pytest.raises(DataError, match=r"of length 3 and number 2 of length 2"):
+        open_stack(tmp_path / "m.tif")
+
+
+def test_refuses_a_few_channels(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "m.tif", movie(3), imagej=True, metadata={"axes": "CYX"})
+    with pytest.raises(DataError, match=r"C \(channel\) of length 3, which is not time"):
+        open_stack(tmp_path / "m.tif")
+
+
+@pytest.mark.parametrize("planar", ["contig", "separate"])
+def test_refuses_colour(tmp_path: Path, planar: str) -> None:
+    shape = (4, 10, 14, 3) if planar == "contig" else (4, 3, 10, 14)
+    data = np.zeros(shape, "u1")
+    tifffile.imwrite(tmp_path / "m.tif", data, photometric="rgb", planarconfig=planar)
+    with pytest.raises(DataError, match="colour"):
+        open_stack(tmp_path / "m.tif")
+
+
+@pytest.mark.parametrize("options", [{}, {"imagej": True}, {"ome": True}])
+def test_refuses_a_single_frame(tmp_path: Path, options: dict) -> None:
+    tifffile.imwrite(tmp_path / "m.tif", movie(1)[0], **options)
+    with pytest.raises(DataError, match="single frame"):
+        open_stack(tmp_path / "m.tif")
+
+
+def test_refuses_lossy_compression(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "m.tif", movie(5, 16, 16, "u1"), compression="jpeg")
+    with pytest.raises(DataError, match="JPEG"):
+        open_stack(tmp_path / "m.tif")
+
+
+def test_refuses_complex_numbers(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "m.tif", movie(5).astype("c8"))
+    with pytest.raises(DataError, match="sample format 6"):
+        open_stack(tmp_path / "m.tif")
+
+
+# --- movies written frame by frame -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [{}, {"ome": True}], ids=["default", "ome"])
+def test_reads_a_movie_written_frame_by_frame(tmp_path: Path, options: dict) -> None:
+    expected = movie(25)
+    with tifffile.TiffWriter(tmp_path / "m.tif", **options) as writer:
+        for frame in expected:
+            writer.write(frame)
+    assert tifffile.imread(tmp_path / "m.tif").ndim == 2  # the trap is set
+    assert_whole(tmp_path / "m.tif", expected)
+
+
+def test_reads_a_movie_written_in_blocks(tmp_path: Path) -> None:
+    expected = movie(15)
+    with tifffile.TiffWriter(tmp_path / "m.tif") as writer:
+        for start in range(0, 15, 5):
+            writer.write(expected[start : start + 5])
+    assert_whole(tmp_path / "m.tif", expected)
+
+
+def _written_frame_by_frame(path: Path, frames: int) -> np.ndarray:
+    expected = np.arange(frames * 4, dtype="u2").reshape(frames, 2, 2)
+    with tifffile.TiffWriter(path) as writer:
+        for frame in expected:
+            writer.write(frame)
+    return expected
+
+
+def test_two_thousand_frames_are_read_whole_with_work_in_proportion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pages: list[int] = []
+    walk = DirectoryReader.read_directory
+    monkeypatch.setattr(
+        DirectoryReader,
+        "read_directory",
+        lambda self, position, index: (pages.append(index), walk(self, position, index))[1],
+    )
+    parse = tifffile.TiffPage.__init__
+    parsed: list[int] = []
+
+    def counted(self: object, *args: object, **kwargs: object) -> None:
+        parsed.append(1)
+        parse(self, *args, **kwargs)
+
+    monkeypatch.setattr(tifffile.TiffPage, "__init__", counted)
+    calls = {}
+    for frames in (500, 2000):
+        path = tmp_path / f"{frames}.tif"
+        expected = _written_frame_by_frame(path, frames)
+        pages.clear()
+        parsed.clear()
+        calls[frames] = _count_calls(lambda path=path: open_stack(path).close())
+        assert pages == list(range(frames))
+        assert len(parsed) <= 1
+        assert_whole(path, expected)
+    assert calls[2000] < 4.2 * calls[500]  # 4 is proportional, 16 would be quadratic
+
+
+def _count_calls(work: Callable[[], object]) -> int:
+    count = 0
+
+    def profile(_frame: object, event: str, _argument: object) -> None:
+        nonlocal count
+        count += event in ("call", "c_call")
+
+    previous = sys.getprofile()
+    sys.setprofile(profile)
+    try:
+        work()
+    finally:
+        sys.setprofile(previous)
+    return count
+
+
+# --- files that are not what they say ----------------------------------------------------------
+
+
+def test_refuses_what_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        open_stack(tmp_path / "absent.tif")
+    with pytest.raises(DataError, match="is a folder"):
+        open_stack(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "empty"),
+        (b"hello, I am text", "needs to be a TIFF file"),
+        (b"\x89HDF\r\n\x1a\n", "an HDF5 file"),
+        (b"\x93NUMPY\x01\x00", "a NumPy array"),
+        (b"II\x2a\x00", "truncated"),
+        (b"II\x2b\x00\x08\x00\x00\x00", "truncated"),
+        (b"II\x2a\x00\x00\x00\x00\x00", "holds no image"),
+        (b"II\x2a\x00\xff\xff\x00\x00", "breaks off after 0"),
+        (b"II\x2a\x00\x08\x00\x00\x00\x00\x00\x00\x00\x00\x00", "damaged"),
+    ],
+)
+def test_refuses_other_files(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "m.tif"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=message) as error:
+        open_stack(path)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("options", LAYOUTS.values(), ids=LAYOUTS.keys())
+def test_finds_truncation_at_every_length(tmp_path: Path, options: dict) -> None:
+    tifffile.imwrite(tmp_path / "whole.tif", movie(5, 16, 16), **options)
+    whole = (tmp_path / "whole.tif").read_bytes()
+    cut = tmp_path / "cut.tif"
+    with open_stack(tmp_path / "whole.tif") as stack:
+        expected = stack.read(0, 5)
+    refused = 0
+    for length in range(1, len(whole), max(1, len(whole) // 60)):
+        cut.write_bytes(whole[:length])
+        try:
+            stack = open_stack(cut)
+        except DataError:
+            refused += 1
+            continue
+        with stack:  # only padding was lost, so nothing that matters
+            np.testing.assert_array_equal(stack.read(0, 5), expected)
+    assert refused > 50
+
+
+def test_names_the_frame_where_a_truncated_file_ends(tmp_path: Path) -> None:
+    data = movie(5)
+    path = write_tiff(tmp_path / "m.tif", pages_of(data), data.shape[1:])
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(DataError, match=r"truncated \(the pixels of image 4"):
+        open_stack(path)
+
+
+def test_finds_truncation_without_reading_pixels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tifffile.imwrite(tmp_path / "m.tif", movie(5), compression="zlib")
+    monkeypatch.setattr(imagecodecs, "zlib_decode", None)
+    monkeypatch.setattr(imagecodecs, "deflate_decode", None)
+    open_stack(tmp_path / "m.tif").close()
+
+
+def test_refuses_a_circle_of_directories(tmp_path: Path) -> None:
+    data = movie(3)
+    path = write_tiff(tmp_path / "m.tif", pages_of(data), data.shape[1:], loop=True)
+    with pytest.raises(DataError, match="circle after 3"):
+        open_stack(path)
+
+
+@pytest.mark.parametrize(
+    "description", ["ImageJ=1.53t\nimages=9\nframes=9\n", '{"shape": [9, 10, 14]}']
+)
+def test_refuses_fewer_frames_than_described(tmp_path: Path, description: str) -> None:
+    data = movie(3)
+    path = write_tiff(
+        tmp_path / "m.tif",
+        pages_of(data),
+        data.shape[1:],
+        page_tags={0: {270: (ASCII, description)}},
+    )
+    with pytest.raises(DataError, match="describes 9 frames but holds 3"):
+        open_stack(path)
+
+
+def test_reads_the_imagej_convention_for_large_files(tmp_path: Path) -> None:
+    data = movie(7)
+    description = "ImageJ=1.53t\nimages=7\nframes=7\n"
+    path = write_tiff(
+        tmp_path / "m.tif",
+        [data.astype(">u2").tobytes()],
+        data.shape[1:],
+        order=">",
+        tags={270: (ASCII, description), 279: (LONG, [280])},
+    )
+    assert_whole(path, data)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(DataError, match=r"truncated \(its 7 frames"):
+        open_stack(path)
+
+
+def test_an_absurd_count_costs_no_memory(tmp_path: Path) -> None:
+    data = movie(1)
+    path = write_tiff(
+        tmp_path / "m.tif",
+        pages_of(data),
+        data.shape[1:],
+        tags={270: (ASCII, f"ImageJ=1.53t\nimages={10**15}\n")},
+    )
+    with pytest.raises(DataError, match="truncated"):
+        open_stack(path)
+
+
+def test_refuses_frames_that_differ(tmp_path: Path) -> None:
+    with tifffile.TiffWriter(tmp_path / "m.tif") as writer:
+        writer.write(np.zeros((10, 14), "u2"))
+        writer.write(np.zeros((10, 12), "u2"))
+    with pytest.raises(
+        DataError, match="image 1 is 10 x 12 pixels of uint16 but the first is 10 x 14"
+    ):
+        open_stack(tmp_path / "m.tif")
+
+
+def test_leaves_out_thumbnails(tmp_path: Path) -> None:
+    expected = movie(5)
+    with tifffile.TiffWriter(tmp_path / "m.tif") as writer:
+        for frame in expected:
+            writer.write(frame, metadata=None)
+        writer.write(expected[0, ::2, ::2], subfiletype=1, metadata=None)
+    assert_whole(tmp_path / "m.tif", expected)
+
+
+def test_reads_frames_at_uneven_places(tmp_path: Path) -> None:
+    data = movie(5)
+    path = write_tiff(
+        tmp_path / "m.tif",
+        pages_of(data),
+        data.shape[1:],
+        page_tags={2: {305: (ASCII, "a text that is longer than the others")}},
+        gap=3,
+    )
+    assert_whole(path, data)
+
+
+def test_refuses_missing_pixels(tmp_path: Path) -> None:
+    data = movie(3)
+    tags = {1: {279: (LONG, [0])}}
+    path = write_tiff(tmp_path / "m.tif", pages_of(data), data.shape[1:], page_tags=tags)
+    with pytest.raises(DataError, match="image 1 has no pixel data"):
+        open_stack(path)
+    tags = {1: {279: (LONG, [100])}}
+    path = write_tiff(tmp_path / "m.tif", pages_of(data), data.shape[1:], page_tags=tags)
+    with pytest.raises(DataError, match=r"image 1 declares .* but stores 100 bytes"):
+        open_stack(path)
+
+
+@pytest.mark.parametrize("size", [10_000, 2**31])
+def test_refuses_decompression_bombs(tmp_path: Path, size: int) -> None:
+    path = write_tiff(
+        tmp_path / "m.tif",
+        [b"x" * 100] * 3,
+        (size, size),
+        tags={259: (SHORT, [8]), 278: (LONG, [size])},
+    )
+    with pytest.raises(DataError, match="damaged"):
+        open_stack(path)
+
+
+def test_says_which_frame_cannot_be_decompressed(tmp_path: Path) -> None:
+    expected = movie(5, 32, 32)
+    path = tmp_path / "m.tif"
+    tifffile.imwrite(path, expected, compression="zlib")
+    with tifffile.TiffFile(path) as file:
+        offset = file.pages[2].dataoffsets[0]
+    raw = bytearray(path.read_bytes())
+    raw[offset : offset + 8] = b"\xff" * 8
+    path.write_bytes(raw)
+    with open_stack(path) as stack:
+        np.testing.assert_array_equal(stack.read(0, 2), expected[:2])
+        with pytest.raises(DataError, match="frame 2 cannot be decompressed"):
+            stack.read(1, 3)
+
+
+def test_unpacks_twelve_bits(tmp_path: Path) -> None:
+    expected = movie(5, 10, 14) * 16
+    pages = [_pack_twelve(frame) for frame in expected]
+    path = write_tiff(tmp_path / "m.tif", pages, (10, 14), bits=12)
+    assert_whole(path, expected)
+
+
+def _pack_twelve(frame: np.ndarray) -> bytes:
+    pairs = frame.reshape(-1, 2).astype(int)
+    return b"".join(struct.pack(">I", int(a) << 20 | int(b) << 8)[:3] for a, b in pairs)
+
+
+# --- the stack ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    tifffile.imwrite(tmp_path / "movie.tif", movie(10))
+    return tmp_path / "movie.tif"
+
+
+def test_stack_is_a_frame_source(path: Path) -> None:
+    with open_stack(path) as stack:
+        source: FrameSource = stack
+        assert source.name == "movie.tif"
+        assert repr(stack) == "<Stack movie.tif: 10 frames of 10 x 14 pixels, uint16>"
+        assert stack.sha256() == hashlib.sha256(path.read_bytes()).hexdigest()
+        assert stack.path == path
+        assert stack.read(3, 3).shape == (0, 10, 14)
+    assert "closed" in repr(stack)
+    stack.close()
+    with pytest.raises(ValueError, match="closed"):
+        stack.read(0, 1)
+
+
+@pytest.mark.parametrize("bounds", [(0, 11), (-1, 3), (5, 4), (11, 12)])
+def test_refuses_frames_outside_the_movie(path: Path, bounds: tuple[int, int]) -> None:
+    with open_stack(path) as stack, pytest.raises(DataError, match=r"it holds \[0, 10\)"):
+        stack.read(*bounds)
+
+
+@pytest.mark.parametrize("frames_per_block", [0.5, 1, 3, 10, 99])
+def test_chunks_cover_the_range_once(path: Path, frames_per_block: float) -> None:
+    megabytes = frames_per_block * 10 * 14 * 2 / 1e6
+    with open_stack(path) as stack:
+        blocks = list(stack.chunks(1, 9, memory_mb=megabytes))
+        assert [first for first, _ in blocks] == list(range(1, 9, max(1, int(frames_per_block))))
+        assert all(len(block) <= max(1, frames_per_block) for _, block in blocks)
+        np.testing.assert_array_equal(np.concatenate([b for _, b in blocks]), movie(10)[1:9])
+        assert sum(len(block) for _, block in stack.chunks()) == 10
+        with pytest.raises(ValueError, match="memory_mb"):
+            next(stack.chunks(memory_mb=0))
+
+
+def test_refuses_a_file_that_shrinks_while_open(path: Path) -> None:
+    with open_stack(path) as stack:
+        path.write_bytes(path.read_bytes()[:100])
+        with pytest.raises(DataError, match="shrank"):
+            stack.read(0, 10)
+
+
+def test_resolution_tags_of_a_printer_are_ignored(tmp_path: Path) -> None:
+    data = movie(3)
+    tags = {282: (RATIONAL, [300, 1]), 283: (RATIONAL, [300, 1]), 296: (SHORT, [2])}
+    path = write_tiff(tmp_path / "m.tif", pages_of(data), data.shape[1:], tags=tags)
+    with open_stack(path) as stack:
+        assert stack.metadata.pixel_size_nm is None
+        assert stack.metadata.source == "none"

@@ -1,0 +1,288 @@
+"""Pixel size, exposure and frame rate are read from every kind of metadata, or left unknown."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from tiff_files import ASCII, RATIONAL, SHORT, movie, pages_of, write_micro_manager, write_tiff
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.load import open_stack
+from iscat_analysis.records import StackMetadata
+
+FRAMES = 5
+OME = (
+    '<?xml version="1.0" encoding="UTF-8"?>'
+    '<OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06">'
+    '<Image ID="Image:0"><Pixels ID="Pixels:0" DimensionOrder="XYZCT" Type="uint16" SizeX="14" '
+    'SizeY="10" SizeZ="1" SizeC="1" SizeT="5" {pixels}>{body}</Pixels></Image>{more}</OME>'
+)
+
+
+def described(
+    path: Path, text: str, *, frames: int = FRAMES, resolution: tuple | None = None
+) -> Path:
+    data = movie(frames)
+    tags: dict = {270: (ASCII, text)} if text else {}
+    if resolution is not None:
+        (x, y), unit = resolution
+        tags |= {282: (RATIONAL, x), 283: (RATIONAL, y), 296: (SHORT, [unit])}
+    return write_tiff(path, pages_of(data), data.shape[1:], page_tags={0: tags})
+
+
+def ome(path: Path, pixels: str = "", body: str = "", more: str = "") -> Path:
+    return described(path, OME.format(pixels=pixels, body=body, more=more))
+
+
+def metadata(path: Path) -> StackMetadata:
+    with open_stack(path) as stack:
+        return stack.metadata
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "m.tif"
+
+
+# --- OME ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("size", "unit"),
+    [
+        ("0.0844", ""),
+        ("0.0844", "µm"),
+        ("0.0844", "μm"),
+        ("84.4", "nm"),
+        ("8.44e-5", "mm"),
+        ("844", "Å"),
+    ],
+)
+def test_ome_pixel_size(path: Path, size: str, unit: str) -> None:
+    units = f'PhysicalSizeXUnit="{unit}" PhysicalSizeYUnit="{unit}"' if unit else ""
+    found = metadata(ome(path, f'PhysicalSizeX="{size}" PhysicalSizeY="{size}" {units}'))
+    assert found.pixel_size_nm == pytest.approx(84.4, rel=1e-12)
+    assert found.source == "ome"
+
+
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        'PhysicalSizeX="0"',
+        'PhysicalSizeX="-1"',
+        'PhysicalSizeX="nan"',
+        'PhysicalSizeX="inf"',
+        'PhysicalSizeX="large"',
+        'PhysicalSizeX="84" PhysicalSizeXUnit="pixel"',
+        'TimeIncrement="0"',
+        'TimeIncrement="-5"',
+        'TimeIncrement="5" TimeIncrementUnit="fortnight"',
+    ],
+)
+def test_ome_nonsense_is_ignored(path: Path, attributes: str) -> None:
+    assert metadata(ome(path, attributes)) == StackMetadata()
+
+
+def test_ome_timing(path: Path) -> None:
+    body = "".join(
+        f'<Plane TheT="{t}" TheZ="0" TheC="0" DeltaT="{t * 5.0}" DeltaTUnit="ms" '
+        'ExposureTime="0.004"/>'
+        for t in (4, 0, 2)
+    )
+    found = metadata(ome(path, body=body))
+    assert found.frame_rate_hz == pytest.approx(200)
+    assert found.exposure_ms == pytest.approx(4)
+    found = metadata(ome(path, 'TimeIncrement="10" TimeIncrementUnit="ms"', body))
+    assert found.frame_rate_hz == pytest.approx(100)
+
+
+def test_pixels_must_be_square(path: Path) -> None:
+    with pytest.raises(DataError, match="84 nm in x and 85 nm in y"):
+        open_stack(ome(path, 'PhysicalSizeX="0.084" PhysicalSizeY="0.085"'))
+
+
+@pytest.mark.parametrize(
+    "prolog",
+    ['<!DOCTYPE OME [<!ENTITY a "aaaa">]>', "<!DOCTYPE OME SYSTEM 'file:///etc/hostname'>"],
+)
+def test_ome_document_types_are_refused(path: Path, prolog: str) -> None:
+    text = OME.format(pixels="", body="", more="").replace("?>", "?>" + prolog)
+    with pytest.raises(DataError, match="document type"):
+        open_stack(described(path, text))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("</OME>", "", "damaged"),
+        ('SizeT="5"', 'SizeT="five"', "SizeT is 'five'"),
+        ('SizeT="5"', "", "SizeT, SizeZ or SizeC"),
+        ('SizeT="5"', 'SizeT="9"', "describes 9 frames but the file holds 5"),
+        ('SizeT="5"', 'SizeT="2"', "describes 2 frames but the file holds 5"),
+        ('SizeT="5"', f'SizeT="{10**15}"', "describes 1000000000000000 frames"),
+        ('SizeC="1"', 'SizeC="2"', r"T \(time\) of length 5 and C \(channel\) of length 2"),
+        ("<Image", '<BinaryOnly MetadataFile="a.ome.tif"/><Image', "one part of an OME set"),
+    ],
+)
+def test_ome_that_does_not_fit_is_refused(path: Path, old: str, new: str, message: str) -> None:
+    text = OME.format(pixels="", body="", more="")
+    assert old in text
+    with pytest.raises(DataError, match=message) as error:
+        open_stack(described(path, text.replace(old, new)))
+    assert "\n" not in str(error.value)
+
+
+def test_ome_orders_the_frames(path: Path) -> None:
+    body = "".join(f'<TiffData FirstT="{t}" IFD="{4 - t}" PlaneCount="1"/>' for t in range(5))
+    with open_stack(ome(path, body=body)) as stack:
+        np.testing.assert_array_equal(stack.read(0, 5), movie(5)[::-1])
+        np.testing.assert_array_equal(stack.read(1, 3), movie(5)[::-1][1:3])
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        '<TiffData IFD="0" PlaneCount="4"/>',
+        '<TiffData IFD="0" PlaneCount="6"/>',
+        '<TiffData FirstT="0" IFD="0"/><TiffData FirstT="1" IFD="0"/>',
+    ],
+)
+def test_ome_must_cover_every_image_once(path: Path, body: str) -> None:
+    with pytest.raises(DataError, match="OME-XML"):
+        open_stack(ome(path, body=body))
+
+
+def test_ome_sets_of_files_are_refused(path: Path) -> None:
+    body = "".join(
+        f'<TiffData FirstT="{t}" IFD="0"><UUID FileName="part{t}.ome.tif">urn:uuid:{t}</UUID>'
+        "</TiffData>"
+        for t in range(5)
+    )
+    with pytest.raises(DataError, match=r"set of 5 files \(part0.ome.tif"):
+        open_stack(ome(path, body=body))
+
+
+def test_a_renamed_ome_file_is_read(path: Path) -> None:
+    body = (
+        '<TiffData IFD="0" PlaneCount="5"><UUID FileName="other.ome.tif">urn:uuid:1</UUID>'
+        "</TiffData>"
+    )
+    with open_stack(ome(path, body=body)) as stack:
+        assert stack.shape == (5, 10, 14)
+
+
+def test_ome_series_are_refused(path: Path) -> None:
+    more = OME[OME.index("<Image") : OME.index("{more}")].format(pixels="", body="")
+    with pytest.raises(DataError, match="2 image series"):
+        open_stack(ome(path, more=more))
+
+
+# --- ImageJ ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("unit", ["micron", "um", "µm", "\\u00B5m", "nm"])
+def test_imagej(path: Path, unit: str) -> None:
+    per_unit = [10_000, 844_000] if unit == "nm" else [10_000, 844]
+    text = f"ImageJ=1.53t\nimages=5\nframes=5\nunit={unit}\nfinterval=0.005\nfps=7\n"
+    found = metadata(described(path, text, resolution=((per_unit, per_unit), 1)))
+    assert found.pixel_size_nm == pytest.approx(84.4, rel=1e-12)
+    assert found.frame_rate_hz == pytest.approx(200)
+    assert found.source == "imagej"
+
+
+@pytest.mark.parametrize(
+    ("lines", "rate"),
+    [("fps=50.0", 50), ("finterval=5\ntunit=ms", 200), ("finterval=0\nfps=0", None)],
+)
+def test_imagej_timing(path: Path, lines: str, rate: float | None) -> None:
+    found = metadata(described(path, f"ImageJ=1.53t\nimages=5\n{lines}\n"))
+    assert found.frame_rate_hz == (rate if rate is None else pytest.approx(rate))
+
+
+@pytest.mark.parametrize("unit", ["pixel", "inch", "", "cm"])
+def test_imagej_without_calibration(path: Path, unit: str) -> None:
+    text = f"ImageJ=1.53t\nimages=5\nunit={unit}\n"
+    resolution = (([72, 1], [72, 1]), 1)
+    assert metadata(described(path, text, resolution=resolution)).pixel_size_nm is None
+
+
+def test_imagej_as_tifffile_writes_it(path: Path) -> None:
+    options = {"axes": "TYX", "unit": "um", "finterval": 0.01}
+    tifffile.imwrite(path, movie(5), imagej=True, resolution=(1 / 0.05, 1 / 0.05), metadata=options)
+    found = metadata(path)
+    assert found.pixel_size_nm == pytest.approx(50, rel=1e-6)
+    assert found.frame_rate_hz == pytest.approx(100)
+
+
+# --- Micro-Manager -----------------------------------------------------------------------------
+
+
+def frame_metadata(**fields: object) -> list[dict[str, object]]:
+    return [{"Frame": k, "ElapsedTime-ms": 40.0 + 12.5 * k, **fields} for k in range(FRAMES)]
+
+
+def test_micro_manager(path: Path) -> None:
+    fields = {"PixelSizeUm": 0.0844, "Exposure-ms": 10, "Interval_ms": 20}
+    found = metadata(write_micro_manager(path, movie(FRAMES), frame_metadata(**fields)))
+    assert found.pixel_size_nm == pytest.approx(84.4)
+    assert found.exposure_ms == 10
+    assert found.frame_rate_hz == pytest.approx(50)
+    assert found.source == "micromanager"
+
+
+@pytest.mark.parametrize("interval", [0, 5])
+def test_micro_manager_falls_back_on_time_stamps(path: Path, interval: float) -> None:
+    fields = {"PixelSizeUm": 0, "Exposure-ms": {"PropVal": "10"}, "Interval_ms": interval}
+    found = metadata(write_micro_manager(path, movie(FRAMES), frame_metadata(**fields)))
+    assert found.pixel_size_nm is None
+    assert found.exposure_ms == 10
+    assert found.frame_rate_hz == pytest.approx(80)
+
+
+def test_ome_comes_before_micro_manager(path: Path) -> None:
+    text = OME.format(pixels='PhysicalSizeX="0.05"', body="", more="")
+    fields = {"PixelSizeUm": 0.0844, "Exposure-ms": 10}
+    found = metadata(write_micro_manager(path, movie(FRAMES), frame_metadata(**fields), text))
+    assert found.pixel_size_nm == pytest.approx(50)
+    assert found.exposure_ms == 10
+    assert found.source == "ome+micromanager"
+
+
+def test_damaged_micro_manager_metadata_is_ignored(path: Path) -> None:
+    data = movie(FRAMES)
+    tags = {51123: (ASCII, "{broken")}
+    write_tiff(path, pages_of(data), data.shape[1:], tags=tags)
+    assert metadata(path) == StackMetadata()
+
+
+# --- plain TIFF --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("pixels_per_unit", "unit", "pixel_size_nm"),
+    [
+        (1e7 / 84.4, 3, 84.4),
+        (2.54e7 / 84.4, 2, 84.4),
+        (1e7 / 4.9, 3, None),
+        (1e7 / 5100, 3, None),
+        (300, 2, None),
+        (1e7 / 84.4, 1, None),
+    ],
+)
+def test_resolution_tags(
+    path: Path, pixels_per_unit: float, unit: int, pixel_size_nm: float | None
+) -> None:
+    ratio = [round(pixels_per_unit * 100), 100]
+    found = metadata(described(path, "", resolution=((ratio, ratio), unit)))
+    if pixel_size_nm is None:
+        assert found == StackMetadata()
+    else:
+        assert found.pixel_size_nm == pytest.approx(pixel_size_nm, rel=1e-6)
+        assert found.source == "tiff"
+
+
+def test_a_resolution_of_zero_is_ignored(path: Path) -> None:
+    assert metadata(described(path, "", resolution=(([0, 1], [1, 0]), 3))) == StackMetadata()
