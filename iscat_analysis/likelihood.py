@@ -288,6 +288,29 @@ class Likelihood:
                 out = (c0 - c3 - c1) / c2
         return np.where(self._used, out, np.nan)
 
+    def signal_information(self, signal: FloatArray | None = None) -> FloatArray:
+        """Fisher information of each pixel about its own signal.
+
+        Parameters
+        ----------
+        signal : ndarray, shape (ny, nx), optional
+            Where it is evaluated; without it, at no particle.
+
+        Returns
+        -------
+        ndarray, shape (ny, nx)
+            Inverse variance of `measured_signal`; 0 where masked.
+        """
+        s = np.zeros(self.grid.shape) if signal is None else signal
+        c0, c1, c2, c3 = self.data
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if self.kind == CONDITIONAL:
+                p = c2 * (1 + s) / (1 + c2 * (1 + s))
+                out = c3 * c1 * p * (1 - p) / (1 + s) ** 2
+            else:
+                out = c2**2 / np.maximum(c1 + c2 * s + c3, 1.0)
+        return np.where(self._used, out, 0.0)
+
     def _tables(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
         m = self.model
         return m.table, m.source, m.axial, 1 / m.step_nm

@@ -1,0 +1,284 @@
+"""Where something landed: a matched filter with the model's own image.
+
+The statistic at a pixel is the signal-to-noise ratio Σ w T c/√(Σ w T²) of the template T in the
+measured signal c, w the information per pixel: twice the gain in log-likelihood is its square.  The
+threshold is the height that pure noise exceeds as often as the configured number of false alarms,
+by the expected Euler characteristic of a Gaussian field (Adler and Taylor, Random Fields and
+Geometry, 2007), in the plane, or in the plane and along z where the height is free.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+from scipy.optimize import brentq
+from scipy.signal import oaconvolve
+
+from iscat_analysis.config import Detection
+from iscat_analysis.forward import ForwardModel, PixelGrid
+from iscat_analysis.likelihood import Likelihood
+from iscat_analysis.records import Candidate, FloatArray
+
+HEIGHTS_PER_FRINGE = 8
+"""Templates per interference fringe where z is free: the match falls by 4 % half-way between two."""
+
+SIDELOBE = 0.5
+"""A weaker peak inside the fitted region of a stronger one waits until that one is subtracted,
+unless it reaches this share of it."""
+
+
+@dataclass(frozen=True)
+class Templates:
+    """The model's images, normalised, at the heights searched.
+
+    Attributes
+    ----------
+    z_nm : ndarray, shape (n,)
+        Heights [nm].
+    images : ndarray, shape (n, k, k)
+        Signal per unit of `strength`, with k odd.
+    signs : ndarray, shape (n,)
+        Sign of the signal's peak.
+    quadratic : bool
+        Whether the signal grows with the square of the mass (dark field).
+    threshold : float
+        Signal-to-noise ratio that noise reaches as often as configured.
+    two_sided : bool
+        Whether negative amplitudes count.
+    """
+
+    z_nm: FloatArray
+    images: FloatArray
+    signs: FloatArray
+    quadratic: bool
+    threshold: float
+    two_sided: bool
+
+
+def make_templates(
+    model: ForwardModel,
+    detection: Detection,
+    *,
+    pixel_nm: float,
+    roi_nm: float,
+    z_range_nm: tuple[float, float] | None,
+    field_px: tuple[int, int],
+) -> Templates:
+    """Prepare the matched filter for a field.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Its reach must cover the region's diagonal.
+    detection : Detection
+        Polarity and expected false alarms.
+    pixel_nm : float
+        Pixel side [nm].
+    roi_nm : float
+        Side of the template [nm].
+    z_range_nm : (float, float) or None
+        Heights to search; None for the nominal height alone.
+    field_px : (int, int)
+        Rows and columns of the field.
+
+    Returns
+    -------
+    Templates
+        Images and threshold.
+    """
+    half = max(2, int(roi_nm / 2 / pixel_nm))
+    grid = PixelGrid.centred(2 * half + 1, pixel_nm)
+    if z_range_nm is None:
+        heights = np.array([model.height_nm])
+    else:
+        low, high = z_range_nm
+        count = math.ceil((high - low) / model.fringe_nm * HEIGHTS_PER_FRINGE) + 1
+        heights = np.linspace(low, high, count)
+    weak = _weak_mass(model)
+    images, roughness = [], []
+    for z in heights:
+        signal, gradient = model.gradient(grid, 0.0, 0.0, float(z), weak)
+        images.append(signal / weak)
+        roughness.append(_roughness(signal, gradient[: 2 if z_range_nm is None else 3]))
+    stacked = np.stack(images)
+    extremes = np.take_along_axis(
+        stacked.reshape(heights.size, -1),
+        np.abs(stacked.reshape(heights.size, -1)).argmax(axis=1)[:, None],
+        axis=1,
+    )[:, 0]
+    two_sided = z_range_nm is None and model.rho > 0 and detection.polarity == "both"
+    area = field_px[0] * field_px[1] * pixel_nm**2
+    depth = float(heights[-1] - heights[0])
+    return Templates(
+        z_nm=heights,
+        images=stacked,
+        signs=np.sign(extremes),
+        quadratic=model.rho == 0,
+        threshold=_threshold(
+            detection.false_alarms_per_movie, np.mean(roughness, axis=0), area, depth, two_sided
+        ),
+        two_sided=two_sided,
+    )
+
+
+def signal_to_noise(
+    likelihood: Likelihood, templates: Templates, explained: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Matched-filter maps.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Of the whole field.
+    templates : Templates
+        From `make_templates`.
+    explained : ndarray, shape (y, x), optional
+        Signal of particles already known, to be taken off.
+
+    Returns
+    -------
+    snr : ndarray, shape (n, y, x)
+        Signal-to-noise ratio at every height and pixel.
+    amplitude : ndarray, shape (n, y, x)
+        Linear estimate of the amplitude.
+    """
+    weight = likelihood.signal_information(explained)
+    signal = np.nan_to_num(likelihood.measured_signal())
+    if explained is not None:
+        signal = signal - explained
+    weighted = np.where(weight > 0, weight * signal, 0.0)
+    overlap, norm = (
+        np.stack([oaconvolve(image, t[::-1, ::-1], mode="same") for t in kernels])
+        for image, kernels in ((weighted, templates.images), (weight, templates.images**2))
+    )
+    norm = np.maximum(norm, 1e-9 * norm.max() if norm.max() > 0 else 1.0)
+    return overlap / np.sqrt(norm), overlap / norm
+
+
+def find_particles(
+    likelihood: Likelihood,
+    templates: Templates,
+    detection: Detection,
+    *,
+    roi_px: float,
+    explained: FloatArray | None = None,
+) -> tuple[Candidate, ...]:
+    """Peaks of the matched filter above the threshold, strongest first.
+
+    A peak inside the region of a much stronger one may be its side lobe and is held back; call
+    again with the strong one explained.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Of the whole field.
+    templates : Templates
+        From `make_templates`.
+    detection : Detection
+        Polarity.
+    roi_px : float
+        Side of the fitted region [pixels].
+    explained : ndarray, shape (y, x), optional
+        Signal of particles already known.
+
+    Returns
+    -------
+    tuple of Candidate
+        With sub-pixel positions.
+    """
+    snr, amplitude = signal_to_noise(likelihood, templates, explained)
+    ranked = np.abs(snr) if templates.two_sided else snr
+    wanted = {"both": 0, "bright": 1, "dark": -1}[detection.polarity]
+    if wanted:
+        signs = templates.signs[:, None, None] * np.sign(snr)
+        ranked = np.where(signs == wanted, np.abs(snr) if not templates.quadratic else snr, 0.0)
+        if not templates.two_sided and templates.z_nm.size > 1:
+            ranked = np.where(snr > 0, ranked, 0.0)
+    best = ranked.max(axis=0)
+    peaks = (best == maximum_filter(best, size=3)) & (best > templates.threshold)
+    rows, columns = np.nonzero(peaks)
+    found: list[Candidate] = []
+    strongest_first = np.argsort(-best[rows, columns])
+    for row, column in zip(rows[strongest_first], columns[strongest_first], strict=True):
+        height = best[row, column]
+        shadowed = any(
+            max(abs(column - other.x_px), abs(row - other.y_px)) < roi_px
+            and height < SIDELOBE * abs(other.snr)
+            for other in found
+        ) or any(
+            math.hypot(column - other.x_px, row - other.y_px) < roi_px / 6 for other in found
+        )
+        if shadowed:
+            continue
+        k = int(ranked[:, row, column].argmax())
+        dy, dx = _subpixel(best, row, column)
+        found.append(
+            Candidate(
+                x_px=float(column + dx),
+                y_px=float(row + dy),
+                z_nm=float(templates.z_nm[k]),
+                mass_kda=_mass(likelihood.model, templates, float(amplitude[k, row, column])),
+                snr=float(snr[k, row, column]),
+            )
+        )
+    return tuple(found)
+
+
+def _weak_mass(model: ForwardModel) -> float:
+    """Return a mass whose signal is linear (interferometric), or the nominal one (dark field)."""
+    if not model.rho:
+        return model.material.mass_kda
+    peak = abs(model.peak_contrast(model.height_nm, model.material.mass_kda))
+    return model.material.mass_kda * min(1.0, 1e-4 / max(peak, 1e-30))
+
+
+def _mass(model: ForwardModel, templates: Templates, amplitude: float) -> float:
+    if templates.quadratic:
+        return model.material.mass_kda * math.sqrt(
+            max(amplitude, 0.0) / model.material.mass_kda
+        )
+    return amplitude
+
+
+def _roughness(signal: FloatArray, gradient: NDArray[np.float64]) -> FloatArray:
+    """Covariance of the gradient of the unit-variance field that the filter makes of noise."""
+    norm = np.sum(signal**2)
+    cross = np.einsum("iyx,jyx->ij", gradient, gradient) / norm
+    along = np.einsum("iyx,yx->i", gradient, signal) / norm
+    return cross - np.outer(along, along)
+
+
+def _threshold(
+    alarms: float, roughness: FloatArray, area: float, depth: float, two_sided: bool
+) -> float:
+    """Height u at which the expected number of noise peaks is `alarms`."""
+    plane = area * math.sqrt(np.linalg.det(roughness[:2, :2])) / (2 * math.pi) ** 1.5
+    volume = 0.0
+    if roughness.shape[0] == 3:
+        determinant = max(float(np.linalg.det(roughness)), 0.0)
+        volume = area * depth * math.sqrt(determinant) / (2 * math.pi) ** 2
+    sides = 2 if two_sided else 1
+
+    def excess(u: float) -> float:
+        expected = sides * (plane * u + volume * (u**2 - 1)) * math.exp(-(u**2) / 2)
+        return math.log(max(expected, 1e-300)) - math.log(alarms)
+
+    return float(brentq(excess, 2.0, 30.0)) if excess(2.0) > 0 else 2.0
+
+
+def _subpixel(image: FloatArray, row: int, column: int) -> tuple[float, float]:
+    """Vertex of the parabola through a maximum and its neighbours, along each axis."""
+    shifts = []
+    for axis, index in ((0, row), (1, column)):
+        line = image[:, column] if axis == 0 else image[row]
+        if not 0 < index < line.size - 1:
+            shifts.append(0.0)
+            continue
+        low, mid, high = line[index - 1 : index + 2]
+        bend = low - 2 * mid + high
+        shifts.append(float(np.clip(0.5 * (low - high) / bend, -0.5, 0.5)) if bend < 0 else 0.0)
+    return shifts[0], shifts[1]

@@ -1,0 +1,354 @@
+"""Movies with known truth: Poisson counts of the forward model on a static background.
+
+The expected photoelectrons of frame t are P_t·B·|1 + Σ e_i|², with P_t the laser power, B the static
+background and e_i the fields of the particles present, which add coherently; in dark field
+P_t·(b + s·|Σ E_i|²).  Every frame draws from a generator of its own, derived from the seed and the
+frame number, so the bytes do not depend on how the work is divided.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import tifffile
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from iscat_analysis.camera import Camera, camera_from_config, read_map
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.records import FloatArray, Progress, silent
+
+ComplexArray = NDArray[np.complex128]
+
+TRUTH_COLUMNS = (
+    "event", "frame", "leave", "x_px", "y_px", "x_nm", "y_nm", "z_nm", "mass_kda", "contrast",
+)  # fmt: skip
+"""The columns of ``STACK.truth.csv``."""
+
+_STREAMS = {"background": 0, "power": 1, "events": 2, "frames": 3}
+_BATCH = 32  # frames drawn at once
+
+
+@dataclass(frozen=True)
+class Particle:
+    """One simulated particle: where, when, how heavy."""
+
+    frame: int
+    leave: int | None
+    x_px: float
+    y_px: float
+    z_nm: float
+    mass_kda: float
+
+
+def write_stack(
+    config: Config,
+    path: Path,
+    *,
+    seed: int | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> pd.DataFrame:
+    """Simulate a movie into a TIFF file, with its truth in ``<stem>.truth.csv`` beside it.
+
+    Parameters
+    ----------
+    config : Config
+        ``[simulation]`` and everything the forward model reads.
+    path : Path
+        Where the movie goes: OME-TIFF metadata, 16-bit counts, BigTIFF where needed.
+    seed : int, optional
+        In place of ``simulation.seed``; the same seed gives the same bytes.
+    overwrite : bool
+        Replace an existing file.
+    progress : Progress
+        Told how many frames are done.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per particle, columns `TRUTH_COLUMNS`.
+
+    Raises
+    ------
+    ConfigError
+        The pixel size is missing, or the counts do not fit into 16 bits.
+    DataError
+        The file exists, or cannot be written.
+    """
+    if config.camera.pixel_size_nm is None:
+        raise ConfigError(
+            "camera.pixel_size_nm is needed to simulate: add it, as in --set camera.pixel_size_nm=84.4"
+        )
+    truth_path = path.with_suffix(".truth.csv")
+    if not overwrite and (path.exists() or truth_path.exists()):
+        found = path if path.exists() else truth_path
+        raise DataError(f"{found}: exists already; give another name, or --overwrite")
+    movie = Movie(config, config.simulation.seed if seed is None else seed)
+    shape = (config.simulation.frames, *config.simulation.shape)
+    partial = path.with_name(path.name + ".partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tifffile.imwrite(
+            partial,
+            _counted(movie.frames(config.compute.workers), shape[0], progress),
+            shape=shape,
+            dtype=np.uint16,
+            photometric="minisblack",
+            bigtiff=2 * math.prod(shape) > 2**31,
+            ome=True,
+            metadata=_metadata(config),
+        )
+        movie.truth.to_csv(truth_path, index=False, float_format="%.10g")
+        partial.replace(path)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror or error})") from None
+    finally:
+        partial.unlink(missing_ok=True)
+    return movie.truth
+
+
+class Movie:
+    """A simulated movie, made frame by frame.
+
+    Parameters
+    ----------
+    config : Config
+        Validated, with a pixel size.
+    seed : int
+        Of every random number in it.
+
+    Attributes
+    ----------
+    background_e : ndarray, shape (y, x)
+        Expected photoelectrons without particles, per frame.
+    power : ndarray, shape (t,)
+        Laser power of each frame, mean 1.
+    particles : tuple of Particle
+        In order of landing.
+    """
+
+    def __init__(self, config: Config, seed: int) -> None:
+        simulation = config.simulation
+        self._config = config
+        self._seed = seed
+        self._pixel_nm = config.camera.pixel_size_nm or 0.0
+        self._grid = PixelGrid.region((0, simulation.shape[0]), (0, simulation.shape[1]), self._pixel_nm)
+        self.particles = self._place()
+        heights = [p.z_nm for p in self.particles]
+        self._model = forward_model(
+            config,
+            self._grid.diagonal_nm + self._pixel_nm,
+            z_max_nm=max([config.particle.height_nm, *heights]),
+        )
+        self._camera = camera_from_config(config.camera, simulation.shape, np.uint16)
+        self.background_e = self._background()
+        noise = self._generator("power").standard_normal(simulation.frames)
+        self.power = np.maximum(1 + simulation.power_noise * noise, 0.0)
+        self._signal_scale = self._scale()
+        self._check_range()
+
+    @property
+    def truth(self) -> pd.DataFrame:
+        """What was put into the movie."""
+        rows = [
+            (
+                i, p.frame, p.leave, p.x_px, p.y_px, p.x_px * self._pixel_nm,
+                p.y_px * self._pixel_nm, p.z_nm, p.mass_kda,
+                self._model.peak_contrast(p.z_nm, p.mass_kda) if self._model.rho else None,
+            )
+            for i, p in enumerate(self.particles)
+        ]  # fmt: skip
+        table = pd.DataFrame(rows, columns=list(TRUTH_COLUMNS))
+        return table.astype({"leave": "Int64"})
+
+    def frames(self, workers: int = 1) -> Iterator[NDArray[np.uint16]]:
+        """Draw the frames in order; the result does not depend on `workers`."""
+        expected = self.expected_frames()
+        with ThreadPoolExecutor(workers) as pool:
+            for start in range(0, self.power.size, _BATCH):
+                stop = min(start + _BATCH, self.power.size)
+                batch = [(t, next(expected)) for t in range(start, stop)]
+                yield from pool.map(self._draw, batch)
+
+    def expected_frames(self) -> Iterator[FloatArray]:
+        """Expected photoelectrons of each frame in order, shape (y, x)."""
+        unit = np.array([self._model.rho, 0.0])[:, None, None]
+        field = np.zeros((2, *self._grid.shape), dtype=complex)
+        fields: dict[int, ComplexArray] = {}
+        current = self._expected(field, unit)
+        for t in range(self.power.size):
+            changed = False
+            for i, particle in enumerate(self.particles):
+                if particle.frame == t:
+                    fields[i] = self._field(particle)
+                    field = field + fields[i]
+                    changed = True
+                if particle.leave == t and i in fields:
+                    field = field - fields.pop(i)
+                    changed = True
+            if changed:
+                current = self._expected(field, unit)
+            yield self.power[t] * current
+
+    def _expected(self, field: ComplexArray, unit: FloatArray) -> FloatArray:
+        q = self._model.samples[1].size
+        intensity = np.sum(np.abs(unit + field) ** 2, axis=0) if q == 1 else self._binned(field)
+        if self._model.rho:
+            return self.background_e * intensity
+        return self.background_e + self._signal_scale * intensity
+
+    def _binned(self, field: ComplexArray) -> FloatArray:
+        """Intensity averaged over the samples of each pixel; `field` is on the sample grid."""
+        weights = self._model.samples[1]
+        q = weights.size
+        unit = np.array([self._model.rho, 0.0])[:, None, None]
+        intensity = np.sum(np.abs(unit + field) ** 2, axis=0)
+        ny, nx = self._config.simulation.shape
+        return np.einsum("yixj,i,j->yx", intensity.reshape(ny, q, nx, q), weights, weights)
+
+    def _field(self, particle: Particle) -> ComplexArray:
+        offsets = self._model.samples[0] * self._pixel_nm
+        x = (self._grid.x_nm[:, None] + offsets).ravel() - particle.x_px * self._pixel_nm
+        y = (self._grid.y_nm[:, None] + offsets).ravel() - particle.y_px * self._pixel_nm
+        dx, dy = np.meshgrid(x, y)
+        return self._model.field(dx, dy, particle.z_nm, particle.mass_kda)
+
+    def _draw(self, job: tuple[int, FloatArray]) -> NDArray[np.uint16]:
+        frame, expected = job
+        rng = self._generator("frames", frame)
+        camera = self._camera
+        electrons = rng.poisson(expected).astype(float)
+        if camera.well_depth_e is not None:
+            electrons = np.minimum(electrons, camera.well_depth_e)
+        if np.any(np.asarray(camera.read_noise_e) > 0):
+            electrons += camera.read_noise_e * rng.standard_normal(electrons.shape)
+        counts = np.rint(electrons / camera.gain_e_per_adu + camera.offset_adu)
+        return np.clip(counts, 0, np.iinfo(np.uint16).max).astype(np.uint16)
+
+    def _generator(self, stream: str, index: int = 0) -> np.random.Generator:
+        return np.random.default_rng(
+            np.random.SeedSequence(self._seed, spawn_key=(_STREAMS[stream], index))
+        )
+
+    def _background(self) -> FloatArray:
+        simulation = self._config.simulation
+        shape = simulation.shape
+        if self._config.optics.scheme == "darkfield":
+            level = self._config.background.level_e or 0.0
+        else:
+            level = simulation.photons_per_pixel
+        if simulation.background == "flat":
+            return np.full(shape, level)
+        if simulation.background == "speckle":
+            optics = self._config.optics
+            grain_px = 0.21 * optics.wavelength_nm / optics.na / self._pixel_nm
+            noise = gaussian_filter(
+                self._generator("background").standard_normal(shape), max(grain_px, 0.5), mode="wrap"
+            )
+            pattern = 1 + simulation.speckle_contrast * (noise - noise.mean()) / noise.std()
+            return level * np.maximum(pattern, 0.05)
+        image = read_map(Path(simulation.background), "simulation.background", shape)
+        if not image.mean() > 0 or (image < 0).any():
+            raise ConfigError(
+                f"{simulation.background}: simulation.background needs a non-negative image"
+            )
+        return image * (level / image.mean())
+
+    def _scale(self) -> float:
+        if self._model.rho:
+            return 1.0
+        return self._model.photons_per_intensity(
+            self._config.simulation.photons_per_pixel, self._pixel_nm
+        )
+
+    def _check_range(self) -> None:
+        camera = self._camera
+        brightest = self.background_e * 1.0
+        for particle in self.particles:
+            peak = self._model.peak_contrast(particle.z_nm, particle.mass_kda)
+            brightest = np.maximum(
+                brightest, self.background_e * (self._model.rho + max(peak, 0.0) * self._model.rho)
+                + self._signal_scale * max(peak, 0.0) * (1 - self._model.rho)
+            )  # fmt: skip
+        top = brightest.max() * self.power.max()
+        top = (top + 6 * math.sqrt(top)) / np.min(camera.gain_e_per_adu) + np.max(camera.offset_adu)
+        if top > np.iinfo(np.uint16).max and camera.well_depth_e is None:
+            raise ConfigError(
+                f"the brightest pixel would hold {top:.0f} counts, more than 16 bits: raise "
+                "camera.gain_e_per_adu or lower simulation.photons_per_pixel"
+            )
+
+    def _place(self) -> tuple[Particle, ...]:
+        simulation, particle = self._config.simulation, self._config.particle
+        nominal = _nominal_mass(self._config)
+        if simulation.count is None:
+            return tuple(
+                Particle(
+                    e.frame, e.leave, e.x_px, e.y_px,
+                    particle.height_nm if e.z_nm is None else e.z_nm,
+                    nominal if e.mass_kda is None else e.mass_kda,
+                )
+                for e in sorted(simulation.events, key=lambda e: e.frame)
+            )  # fmt: skip
+        rng = self._generator("events")
+        margin = min(self._config.fit.roi_nm / 2 / self._pixel_nm, (min(simulation.shape) - 1) / 2)
+        rows, columns = simulation.shape
+        count = simulation.count
+        x = rng.uniform(margin, columns - 1 - margin, count)
+        y = rng.uniform(margin, rows - 1 - margin, count)
+        first = self._config.background.frames
+        start = first[1] if first is not None else simulation.frames // 20
+        landing = np.sort(rng.integers(start, max(simulation.frames - start // 2, start + 1), count))
+        species = np.array(simulation.species or (nominal,))
+        mass = rng.permutation(species[np.arange(count) % species.size])
+        leavers = set(rng.choice(count, simulation.leavings, replace=False).tolist())
+        particles = []
+        for i in range(count):
+            latest = simulation.frames - 1
+            leaves = i in leavers and landing[i] + 1 <= latest
+            leave = int(rng.integers(landing[i] + 1, latest + 1)) if leaves else None
+            particles.append(
+                Particle(
+                    int(landing[i]), leave, float(x[i]), float(y[i]), particle.height_nm,
+                    float(mass[i]),
+                )
+            )  # fmt: skip
+        return tuple(particles)
+
+
+def _nominal_mass(config: Config) -> float:
+    from iscat_analysis.materials import material
+
+    return material(config.particle, config.optics.wavelength_nm).mass_kda
+
+
+def _counted(
+    frames: Iterator[NDArray[np.uint16]], total: int, progress: Progress
+) -> Iterator[NDArray[np.uint16]]:
+    for done, frame in enumerate(frames, 1):
+        yield frame
+        progress("simulate", done, total)
+
+
+def _metadata(config: Config) -> dict[str, object]:
+    camera = config.camera
+    pixel_um = (camera.pixel_size_nm or 0.0) / 1000
+    metadata: dict[str, object] = {
+        "axes": "TYX",
+        "PhysicalSizeX": pixel_um,
+        "PhysicalSizeXUnit": "µm",
+        "PhysicalSizeY": pixel_um,
+        "PhysicalSizeYUnit": "µm",
+    }
+    if camera.frame_rate_hz is not None:
+        metadata |= {"TimeIncrement": 1 / camera.frame_rate_hz, "TimeIncrementUnit": "s"}
+    return metadata
