@@ -1,0 +1,193 @@
+"""What a camera can learn: Cramér–Rao bounds from the likelihood's own Fisher matrix.
+
+The matrix comes from `Likelihood.score_fisher`, the same code that fits data, so a bound and a fit
+cannot disagree about optics, noise or pixels (physics.md, section 4).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.bounds.quantum import quantum_information
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.likelihood import Likelihood
+from iscat_analysis.records import PARAMETERS
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+SINGULAR = 1e-9
+"""Eigenvalue of the normalised Fisher matrix that counts as zero.
+
+It is the squared angle between the derivatives; below it the angle is less than a hundred times the
+3e-7 to which the image's gradient is known, and an inverse would report that error."""
+
+BLIND = 1e-12
+"""Share of the light's information below which a parameter is not seen at all."""
+
+TAKES_PART = 1e-3
+"""Component of an unidentifiable direction below which a parameter is not part of it."""
+
+
+@dataclass(frozen=True)
+class Unidentifiable:
+    """A direction along which the image does not change.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Parameters that take part, as in `PARAMETERS`.
+    direction : tuple of float
+        How far each moves [nm, kDa], the first by one unit.
+    """
+
+    names: tuple[str, ...]
+    direction: tuple[float, ...]
+
+    def __str__(self) -> str:
+        """Say it in one line."""
+        if len(self.names) == 1:
+            return f"{self.names[0]}: the image does not change with it"
+        moves = (f"{n} {d:+.3g}" for n, d in zip(self.names, self.direction, strict=True))
+        return f"{'–'.join(self.names)}: the image does not change along ({', '.join(moves)})"
+
+
+@dataclass(frozen=True)
+class EventBounds:
+    """Bounds for one particle, in the order and the units of `PARAMETERS`; NaN where not free.
+
+    Attributes
+    ----------
+    crb_single : ndarray, shape (4,)
+        1/√J_jj, everything else known.
+    crb_joint : ndarray, shape (4,)
+        √[(J⁻¹)_jj] over the free parameters; NaN where it is unidentifiable.
+    qcrb : ndarray, shape (4,)
+        1/√(N K_jj) for N collected scattered photons.
+    fisher, quantum : ndarray, shape (4, 4)
+        J and N K, all four parameters.
+    unidentifiable : tuple of Unidentifiable
+        Directions among the free parameters that the image does not show.
+    weakest : tuple of float
+        The free parameters' best-hidden direction, each in units of its single bound.
+    inflation : float
+        How much larger than a unit step the bound along it is; 1 without crosstalk, NaN where
+        unidentifiable.
+    """
+
+    crb_single: FloatArray
+    crb_joint: FloatArray
+    qcrb: FloatArray
+    fisher: FloatArray
+    quantum: FloatArray
+    unidentifiable: tuple[Unidentifiable, ...]
+    weakest: tuple[float, ...]
+    inflation: float
+
+
+def event_bounds(
+    likelihood: Likelihood,
+    theta: FloatArray,
+    free: tuple[str, ...],
+    collected: float,
+    *,
+    quantum: ComplexArray | None = None,
+) -> EventBounds:
+    """Classical and quantum bounds of one particle.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Of measured or expected counts; its expected information is used.
+    theta : ndarray, shape (5,)
+        Where: x, y, z [nm], amplitude, level.
+    free : tuple of str
+        Free parameters, a subset of `PARAMETERS`.
+    collected : float
+        Scattered photons that the pupil collects in all frames.
+    quantum : complex ndarray, shape (4, 4), optional
+        `quantum_information` of one photon at this height, where it is known already.
+
+    Returns
+    -------
+    EventBounds
+        A singular matrix gives NaN and names the direction.
+
+    Raises
+    ------
+    ConfigError
+        `free` is empty or names an unknown parameter.
+    """
+    unknown = [name for name in free if name not in PARAMETERS]
+    if unknown or not free:
+        raise ConfigError(f"free = {list(free)}: choose one or more of {', '.join(PARAMETERS)}")
+    model = likelihood.model
+    if quantum is None:
+        quantum = quantum_information(model, theta[2])
+    slope = abs(model.scale.slope(theta[3]))
+    relative = abs(theta[3]) * slope  # mass for a relative step of 1 [kDa]
+    to_kda = np.array([1.0, 1.0, 1.0, 1 / slope])
+    fisher = likelihood.score_fisher(theta)[2][:4, :4] * np.outer(to_kda, to_kda)
+    per_kda = np.array([1.0, 1.0, 1.0, 1 / relative]) if relative else np.array([1.0] * 3 + [0.0])
+    light = collected * quantum.real * np.outer(per_kda, per_kda)
+    return bounds_from_matrices(fisher, light, free)
+
+
+def bounds_from_matrices(
+    fisher: FloatArray, quantum: FloatArray, free: tuple[str, ...]
+) -> EventBounds:
+    """Turn a Fisher matrix and a quantum one into bounds.
+
+    Parameters
+    ----------
+    fisher : ndarray, shape (4, 4)
+        J over `PARAMETERS`.
+    quantum : ndarray, shape (4, 4)
+        N K over `PARAMETERS`; it sets the scale on which J counts as zero.
+    free : tuple of str
+        Free parameters.
+
+    Returns
+    -------
+    EventBounds
+        See there.
+    """
+    index = [i for i, name in enumerate(PARAMETERS) if name in free]
+    seen = np.diag(fisher).copy()
+    limit = np.diag(quantum)
+    seen[~(seen > BLIND * limit)] = np.nan
+    single, joint, qcrb = (np.full(4, np.nan) for _ in range(3))
+    single[index] = 1 / np.sqrt(seen[index])
+    positive = [i for i in index if limit[i] > 0]
+    qcrb[positive] = 1 / np.sqrt(limit[positive])
+    hidden = [Unidentifiable((PARAMETERS[i],), (1.0,)) for i in index if not math.isfinite(seen[i])]
+    visible = [i for i in index if math.isfinite(seen[i])]
+    if not visible:
+        return EventBounds(single, joint, qcrb, fisher, quantum, tuple(hidden), (), math.nan)
+    scale = single[visible]
+    values, vectors = np.linalg.eigh(fisher[np.ix_(visible, visible)] * np.outer(scale, scale))
+    null = values < SINGULAR
+    for vector in vectors.T[null]:
+        step = vector * scale
+        parts = [k for k in range(len(visible)) if abs(vector[k]) > TAKES_PART]
+        first = step[parts[0]]
+        hidden.append(
+            Unidentifiable(
+                tuple(PARAMETERS[visible[k]] for k in parts),
+                tuple(float(step[k] / first) for k in parts),
+            )
+        )
+    involved = np.any(np.abs(vectors[:, null]) > TAKES_PART, axis=1)
+    variance = np.sum(vectors[:, ~null] ** 2 / values[~null], axis=1)
+    joint[visible] = np.where(involved, np.nan, scale * np.sqrt(variance))
+    weakest = np.full(4, 0.0)
+    weakest[visible] = vectors[:, 0]
+    inflation = math.nan if hidden else 1 / math.sqrt(values[0])
+    return EventBounds(
+        single, joint, qcrb, fisher, quantum, tuple(hidden),
+        tuple(float(weakest[i]) for i in index), inflation,
+    )  # fmt: skip

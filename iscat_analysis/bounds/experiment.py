@@ -1,0 +1,329 @@
+"""From a configuration to the bounds of the experiment it plans."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.bounds.classical import EventBounds, event_bounds
+from iscat_analysis.bounds.quantum import (
+    NAMES,
+    incompatible_pairs,
+    quantum_bounds,
+    quantum_information,
+    z_nm_phase_free,
+)
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.likelihood import Likelihood, asimov_conditional, asimov_poisson
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+LOST_LIGHT = 1e-3
+"""Excess of the photons on the camera over those collected that betrays coarse sampling."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One particle, one microscope, a number of frames; build it with `plan`.
+
+    Attributes
+    ----------
+    config : Config
+        What was asked for.
+    model : ForwardModel
+        The optics.
+    grid : PixelGrid
+        The field.
+    likelihood : Likelihood
+        Of the expected counts of all frames.
+    theta : ndarray, shape (5,)
+        The particle.
+    mass_kda : float
+        Its mass [kDa].
+    on_camera, collected : float
+        Scattered photons on the camera and through the pupil, in all frames after landing.
+    peak_e : float
+        Largest expected count in a pixel and frame [e].
+    """
+
+    config: Config
+    model: ForwardModel
+    grid: PixelGrid
+    likelihood: Likelihood
+    theta: FloatArray
+    mass_kda: float
+    on_camera: float
+    collected: float
+    peak_e: float
+
+    @property
+    def quantum(self) -> ComplexArray:
+        """Quantum Fisher information of one collected photon, shape (4, 4)."""
+        return quantum_information(self.model, self.theta[2])
+
+    def bounds(self, free: tuple[str, ...]) -> EventBounds:
+        """Bounds over chosen free parameters.
+
+        Parameters
+        ----------
+        free : tuple of str
+            A subset of `PARAMETERS`.
+
+        Returns
+        -------
+        EventBounds
+            For all frames.
+        """
+        return event_bounds(self.likelihood, self.theta, free, self.collected, quantum=self.quantum)
+
+
+def plan(config: Config, *, model: ForwardModel | None = None) -> Experiment:
+    """Set up the experiment of ``[bounds]``.
+
+    Parameters
+    ----------
+    config : Config
+        All sections but detection, fit range and posterior take part.
+    model : ForwardModel, optional
+        The forward model, where the optics are those of an earlier experiment.
+
+    Returns
+    -------
+    Experiment
+        Ready for bounds.
+
+    Raises
+    ------
+    ConfigError
+        The pixel size is missing, the read noise is a map, or the particle leaves the field.
+    """
+    at, camera = config.bounds, config.camera
+    pixel_nm = camera.pixel_size_nm
+    if pixel_nm is None:
+        raise ConfigError(
+            "camera.pixel_size_nm is missing: give it, as in --set camera.pixel_size_nm=84.4"
+        )
+    if isinstance(camera.read_noise_e, str):
+        raise ConfigError(
+            f"camera.read_noise_e = {camera.read_noise_e!r} is a map: bounds need a number, as in "
+            "--set camera.read_noise_e=1.5"
+        )
+    half = at.pixels * pixel_nm / 2
+    if max(abs(at.x_nm), abs(at.y_nm)) > half:
+        raise ConfigError(
+            f"bounds.x_nm = {at.x_nm:g}, bounds.y_nm = {at.y_nm:g} lies outside the field of "
+            f"±{half:g} nm: move the particle, or enlarge bounds.pixels"
+        )
+    grid = PixelGrid.centred(at.pixels, pixel_nm)
+    height = config.particle.height_nm if at.z_nm is None else at.z_nm
+    if model is None:
+        reach = math.hypot(half + abs(at.x_nm), half + abs(at.y_nm)) * 1.0001
+        model = forward_model(config, reach, z_max_nm=max(height, config.particle.height_nm))
+    mass = model.material.mass_kda
+    theta = np.array([at.x_nm, at.y_nm, height, model.scale.amplitude(mass), 0.0])
+    # with ρ = 0 the signal is the scattered light alone, still in units of the reference
+    scattered = replace(model, rho=0.0).image(grid, at.x_nm, at.y_nm, height, mass)
+    area = model.collected_area_nm2(height, mass) / pixel_nm**2
+    if model.rho:
+        level, per_frame = at.photons_per_pixel, at.photons_per_pixel
+        signal = model.image(grid, at.x_nm, at.y_nm, height, mass)
+    else:
+        level = config.background.level_e or 0.0
+        per_frame = model.photons_per_intensity(at.photons_per_pixel, pixel_nm)
+        signal = scattered
+    return Experiment(
+        config=config,
+        model=model,
+        grid=grid,
+        likelihood=_expected(model, grid, theta, level, per_frame, camera.read_noise_e, config),
+        theta=theta,
+        mass_kda=mass,
+        on_camera=at.n_after * per_frame * float(scattered.sum()),
+        collected=at.n_after * per_frame * area,
+        peak_e=level + per_frame * float(signal.max()),
+    )
+
+
+def _expected(
+    model: ForwardModel,
+    grid: PixelGrid,
+    theta: FloatArray,
+    level_e: float,
+    scale_e: float,
+    read_noise_e: float,
+    config: Config,
+) -> Likelihood:
+    before, after = config.bounds.n_before, config.bounds.n_after
+    read = read_noise_e**2
+    if model.rho and before:
+        return asimov_conditional(model, grid, theta, level_e, before, after, read_variance_e2=read)
+    extra = after * read
+    if before:  # dark field: the measured background adds its own variance
+        extra += after**2 / before * (level_e + read)
+    return asimov_poisson(
+        model, grid, theta, after * level_e, after * scale_e, extra_variance_e2=extra
+    )
+
+
+def bounds_report(config: Config) -> dict[str, Any]:
+    """Everything `iscat bounds --json` prints.
+
+    Parameters
+    ----------
+    config : Config
+        The experiment; ``fit.mode`` chooses the free parameters of the joint bound.
+
+    Returns
+    -------
+    dict
+        Bounds per scattered photon on the camera (CRB) or collected (QCRB), and for the planned
+        frames; NaN where a bound does not exist.
+
+    Raises
+    ------
+    ConfigError
+        As in `plan`.
+    """
+    experiment = plan(config)
+    return report_of(experiment)
+
+
+def report_of(experiment: Experiment) -> dict[str, Any]:
+    """Report one experiment; see `bounds_report`.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        From `plan`.
+
+    Returns
+    -------
+    dict
+        As `bounds_report` gives it.
+    """
+    config, model = experiment.config, experiment.model
+    free = FREE_PARAMETERS[config.fit.mode]
+    z_nm = float(experiment.theta[2])
+    whole = experiment.bounds(PARAMETERS)
+    joint = experiment.bounds(free)
+    mass = experiment.mass_kda
+    to_rel = np.array([1.0, 1.0, 1.0, 1 / mass])
+    # with a calibration that has an offset, a relative step of the amplitude is not one of the mass
+    per_step = np.array(
+        [1.0, 1.0, 1.0, abs(experiment.theta[3]) * abs(model.scale.slope(experiment.theta[3]))]
+    )
+    root_camera = math.sqrt(experiment.on_camera)
+    root_light = math.sqrt(experiment.collected)
+    exact = experiment.quantum
+    single, together = quantum_bounds(exact)
+    paper, _ = quantum_bounds(quantum_information(model, z_nm, measure="dong2021"))
+    per_photon = {
+        "crb_single": _named(NAMES, whole.crb_single * to_rel * root_camera),
+        "crb_joint": _named(NAMES, joint.crb_joint * to_rel * root_camera),
+        "qcrb": _named(NAMES, single * per_step * to_rel),
+        "qcrb_joint": _named(NAMES, together * per_step * to_rel),
+        "qcrb_dong2021": _named(NAMES, paper * per_step * to_rel),
+    }
+    actual = {
+        "crb_single": _named(PARAMETERS, whole.crb_single),
+        "crb_joint": _named(PARAMETERS, joint.crb_joint),
+        "qcrb": _named(PARAMETERS, single * per_step / root_light),
+        "qcrb_joint": _named(PARAMETERS, together * per_step / root_light),
+        "qcrb_dong2021": _named(PARAMETERS, paper * per_step / root_light),
+    }
+    if not model.rho:
+        alone = z_nm_phase_free(model, z_nm)
+        per_photon["qcrb"]["z_nm_phase_free"] = alone
+        actual["qcrb"]["z_nm_phase_free"] = alone / root_light
+    optics = config.optics
+    return {
+        "at": {
+            "scheme": optics.scheme,
+            "mode": config.fit.mode,
+            "free": list(free),
+            "x_nm": config.bounds.x_nm,
+            "y_nm": config.bounds.y_nm,
+            "z_nm": z_nm,
+            "mass_kda": mass,
+            "focus_nm": optics.focus_nm,
+            "attenuation": optics.attenuation if model.rho else 0.0,
+            "na": optics.na,
+            "pixel_size_nm": experiment.grid.pixel_nm,
+            "pixels": config.bounds.pixels,
+            "photons_per_pixel": config.bounds.photons_per_pixel,
+            "n_before": config.bounds.n_before,
+            "n_after": config.bounds.n_after,
+        },
+        "n_scattered": {"camera": experiment.on_camera, "collected": experiment.collected},
+        "per_photon": per_photon,
+        "actual": actual,
+        "fisher": whole.fisher,
+        "qfi": whole.quantum,
+        "qfi_imaginary": experiment.collected * exact.imag / np.outer(per_step, per_step),
+        "information_fraction": _named(PARAMETERS, information_fraction(whole)),
+        "incompatible": {"–".join(pair): v for pair, v in incompatible_pairs(exact).items()},
+        "unidentifiable": [str(direction) for direction in joint.unidentifiable],
+        "crosstalk": {
+            "inflation": joint.inflation,
+            "direction": dict(zip(free, joint.weakest, strict=False)),
+        },
+        "convention": optics.convention,
+        "emission": optics.emission,
+        "warnings": warnings_of(experiment),
+    }
+
+
+def information_fraction(bounds: EventBounds) -> FloatArray:
+    """Share of the collected light's information that the microscope uses.
+
+    Parameters
+    ----------
+    bounds : EventBounds
+        Of one particle.
+
+    Returns
+    -------
+    ndarray, shape (4,)
+        J_jj / (N K_jj), between 0 and 1.
+    """
+    return (bounds.qcrb / bounds.crb_single) ** 2
+
+
+def warnings_of(experiment: Experiment) -> list[str]:
+    """Say what makes the numbers unattainable or wrong, one line each.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        From `plan`.
+
+    Returns
+    -------
+    list of str
+        Empty where all is well.
+    """
+    config, lines = experiment.config, []
+    well = config.camera.well_depth_e
+    if well is not None and experiment.peak_e >= well:
+        lines.append(
+            f"the brightest pixel expects {experiment.peak_e:.3g} e per frame, above "
+            f"camera.well_depth_e = {well:.3g}: lower bounds.photons_per_pixel"
+        )
+    if experiment.on_camera > (1 + LOST_LIGHT) * experiment.collected:
+        lines.append(
+            f"pixels of {experiment.grid.pixel_nm:g} nm sampled at their centres count more light "
+            "than was collected: set camera.samples_per_pixel = 4"
+        )
+    return lines
+
+
+def _named(names: tuple[str, ...], values: FloatArray) -> dict[str, float]:
+    return {name: float(value) for name, value in zip(names, values, strict=True)}
