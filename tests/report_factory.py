@@ -18,7 +18,7 @@ from iscat_analysis.records import (
     Status,
 )
 
-HOSTILE = "/data/<script>alert(1)</script> & 'run' \"7\".tif"
+HOSTILE = "/data/<script>alert(1)<img src=x onerror=alert(2)> & 'run' \"7\".tif"
 PIXEL_NM = 84.4
 
 
@@ -55,7 +55,7 @@ def make_analysis(
     n: int = 40, mode: str = "mass", *, scheme: str = "iscat", posteriors: int = 0,
     refused: int = 0, seed: int = 3, side: int = 32, field: int = 128,
 ) -> Analysis:  # fmt: skip
-    """A synthetic analysis of `n` events (rows in track mode, ten to a track)."""
+    """Invent an analysis of `n` events (rows in track mode, ten to a track)."""
     rng = np.random.default_rng(seed)
     free = FREE_PARAMETERS[mode]
     dark = scheme == "darkfield"
@@ -141,7 +141,7 @@ def make_analysis(
         power_frames=np.arange(400),
         summary={"events": n, "efficiency": np.nan, "timings_s": {"fit": np.float64(1.25)}},
         provenance=Provenance(
-            command=f"iscat-fit {HOSTILE} --mode {mode}",
+            command=f"iscat-fit {HOSTILE} --mode {mode} # </script><!--<script>",
             input_path=HOSTILE,
             input_sha256="9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
             versions={"iscat-analysis": "0.1.0", "python": "3.11.7", "numpy": "2.1.0"},
@@ -153,5 +153,5 @@ def make_analysis(
 
 
 def without_events(analysis: Analysis) -> Analysis:
-    """The same movie with nothing found in it."""
+    """Take every event out of an analysis."""
     return replace(analysis, table=analysis.table.iloc[:0], views=(), warnings=())

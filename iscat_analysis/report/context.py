@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import PurePath
 from typing import Any
 
@@ -189,11 +190,10 @@ def report_context(analysis: Analysis, figures: Mapping[str, int]) -> dict[str, 
         "kicker": "iscat-analysis",
         "subtitle": (
             f"{_SCHEMES.get(analysis.scheme, analysis.scheme)}, {analysis.mode} mode: "
-            f"{_MODES[analysis.mode]}. Analysed {analysis.provenance.started}."
+            f"{_MODES[analysis.mode]}. Analysed {_when(analysis.provenance.started)}."
         ),
         "nav": sections,
-        "footer": "Made by iscat-analysis "
-        + str(analysis.provenance.versions.get("iscat-analysis", "")),
+        "footer": "iscat-analysis " + str(analysis.provenance.versions.get("iscat-analysis", "")),
         "n_events": len(table),
         "headline": _headline(table, precision, main, analysis.mode),
         "tiles": _tiles(table, precision, main),
@@ -475,6 +475,16 @@ def _provenance(analysis: Analysis) -> list[tuple[str, str]]:
         ("Seed", "none" if p.seed is None else str(p.seed)),
         ("Started", p.started),
     ]
+
+
+def _when(started: str) -> str:
+    """Write an ISO time as people do; what is not one stays as it is."""
+    try:
+        moment = datetime.fromisoformat(started)
+    except ValueError:
+        return started
+    zone = f" {moment.tzname()}" if moment.tzinfo else ""
+    return f"{moment.day} {moment:%B %Y, %H:%M}{zone}"
 
 
 def _flatten(value: Any, name: str = "") -> list[tuple[str, str]]:

@@ -14,8 +14,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, PosteriorResult, Status
+from iscat_analysis.records import (
+    FREE_PARAMETERS,
+    Analysis,
+    EventView,
+    FloatArray,
+    PosteriorResult,
+    Status,
+)
 from iscat_analysis.report.context import LABELS, UNITS
 from iscat_analysis.report.pack import (
     CREDIBLE_LEVELS,
@@ -33,9 +42,9 @@ CORNER_FIGURES = 20
 """Posteriors drawn into the folder, at most."""
 
 NUMBERED_EVENTS = 300
-"""Events in the overview that carry their number; beyond that only rings."""
+"""Events in the overview that may carry their number; the others are rings only."""
 
-DPI = 160
+DPI = 140
 """Resolution of the PNG files."""
 
 VERMILLION, BLUE, PURPLE, GREY, INK = "#D55E00", "#0072B2", "#CC79A7", "#8A8F96", "#1B1D21"
@@ -114,7 +123,7 @@ def _figure(width: float, height: float, **options: Any) -> Figure:
 
 
 def _save(figure: Figure, stem: Path) -> None:
-    figure.savefig(stem.with_suffix(".png"), dpi=DPI)
+    figure.savefig(stem.with_suffix(".png"), dpi=DPI, pil_kwargs={"compress_level": 3})
     figure.savefig(stem.with_suffix(".svg"), metadata={"Date": None})
 
 
@@ -130,21 +139,49 @@ def _overview(analysis: Analysis, table: pd.DataFrame) -> Figure:
     unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
     figure.colorbar(shown, ax=axes, label=unit, fraction=0.05, pad=0.02)
     tracks = not table["event"].is_unique
-    for event, group in table.groupby("event", sort=False):
+    for _, group in table.groupby("event", sort=False):
         x, y = group["x_px"].to_numpy(float), group["y_px"].to_numpy(float)
         if tracks:
             axes.plot(x, y, color="#56B4E9", lw=1)
         else:
             axes.plot(x, y, "o", mfc="none", mec="#F0E442", ms=11, mew=1)
-        if table["event"].nunique() <= NUMBERED_EVENTS and np.isfinite([x[0], y[0]]).all():
-            axes.annotate(
-                str(event), (x[0], y[0]), xytext=(6, 4), textcoords="offset points",
-                color="white", fontsize=7, annotation_clip=True,
-                bbox={"boxstyle": "round,pad=0.12", "fc": "black", "ec": "none", "alpha": 0.45},
-            )  # fmt: skip
+    first = table.drop_duplicates("event")[["event", "x_px", "y_px"]].dropna()
+    _number(axes, first.to_numpy(float), columns / 6.4, (rows, columns))
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
     axes.set_title("Field of view")
     return figure
+
+
+def _number(axes: Axes, events: FloatArray, per_inch: float, shape: tuple[int, int]) -> None:
+    """Write each event's number beside its ring, where it covers no other ring and no number.
+
+    `events` has the rows (number, x, y) [px]; `per_inch` is pixels to an inch of the figure.
+    """
+    ring, tall, wide = 0.08 * per_inch, 0.1 * per_inch, 0.065 * per_inch
+    taken = [(x - ring, y - ring, x + ring, y + ring) for _, x, y in events]
+    taken.append((0.0, shape[0] * 0.9, shape[1] * 0.35, float(shape[0])))
+    for number, x, y in events[:NUMBERED_EVENTS]:
+        text = f"{number:.0f}"
+        width = wide * len(text)
+        for left, top in (
+            (x + 1.3 * ring, y - tall / 2),
+            (x - 1.3 * ring - width, y - tall / 2),
+            (x - width / 2, y - 1.3 * ring - tall),
+            (x - width / 2, y + 1.3 * ring),
+        ):
+            box = (left, top, left + width, top + tall)
+            inside = left > 0 and top > 0 and box[2] < shape[1] and box[3] < shape[0]
+            if inside and not any(
+                box[0] < other[2] and box[2] > other[0] and box[1] < other[3] and box[3] > other[1]
+                for other in taken
+            ):
+                taken.append(box)
+                axes.text(
+                    left + width / 2, top + tall / 2, text, color="white", fontsize=7,
+                    ha="center", va="center",
+                    path_effects=[withStroke(linewidth=1.6, foreground="black", alpha=0.7)],
+                )  # fmt: skip
+                break
 
 
 def _scale_bar(axes: Axes, columns: int, rows: int, pixel_size_nm: float) -> None:
@@ -224,13 +261,10 @@ def _plain_log_ticks(axes: Axes) -> None:
     """Label a log axis with plain numbers, few enough not to collide."""
     for axis in (axes.xaxis, axes.yaxis):
         low, high = axis.get_view_interval()
-        if low <= 0 or high / low > 30:
-            continue
-        candidates = np.geomspace(low, high, 5)[1:-1]
-        digits = 2 if high / low > 1.5 else 3
-        ticks = sorted({float(f"{tick:.{digits}g}") for tick in candidates})
-        axis.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
-        axis.set_ticks([], minor=True)
+        narrow = high / low < 6
+        axis.set_major_locator(MaxNLocator(4) if narrow else LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_locator(NullLocator())
 
 
 def _triptych(view: EventView, analysis: Analysis) -> Figure:

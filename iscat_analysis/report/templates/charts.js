@@ -302,17 +302,17 @@ window.iscat = (() => {
         s.at.forEach((position, i) => {
           const fixed = (across ? xScale : yScale).at(position) + (s.offset || 0);
           const along = across ? yScale : xScale;
-          const stroke = (a, b, w) => {
+          const stroke = (a, b, w, opacity = 1) => {
             if (!finite(a) || !finite(b)) return;
             const [p, q] = [along.at(a), along.at(b)];
-            svg("path", { d: across ? `M${fixed} ${p}V${q}` : `M${p} ${fixed}H${q}`, style: `stroke:${color};stroke-width:${w};stroke-linecap:round;fill:none` }, root);
+            svg("path", { d: across ? `M${fixed} ${p}V${q}` : `M${p} ${fixed}H${q}`, style: `stroke:${color};stroke-width:${w};stroke-opacity:${opacity};stroke-linecap:round;fill:none` }, root);
           };
           if (s.lo2) stroke(s.lo2[i], s.hi2[i], 1.5);
-          if (s.lo) stroke(s.lo[i], s.hi[i], s.lo2 ? 5 : 2);
+          if (s.lo) stroke(s.lo[i], s.hi[i], s.lo2 ? 8 : 2, s.lo2 ? 0.4 : 1);
           if (!finite(s.mid[i])) return;
           const p = along.at(s.mid[i]);
           const [cx, cy] = across ? [fixed, p] : [p, fixed];
-          svg("circle", { cx, cy, r: 5.5, style: `fill:${color};stroke:${css("bg")};stroke-width:2` }, root);
+          svg("circle", { cx, cy, r: 4.5, style: `fill:${color}` }, root);
           targets.push([cx, cy, () => (s.tips ? s.tips[i] : `${s.name || ""}: ${fmt(s.mid[i])}`), null]);
         });
       } else if (s.kind === "rule" && finite(s.value)) {

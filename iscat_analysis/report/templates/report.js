@@ -201,8 +201,8 @@
       pair("Reduced χ², p", `${fmt(columns.chi2_reduced[i])}, ${fmt(columns.p_value[i], 2)}`),
       other.length ? pair("Flags", other.join(", ")) : null);
     const verdict = el("p", {}, el("span", { class: isOk(i) ? "status" : "status flagged" }, columns.status[i]), `: ${data.advice[columns.status[i]] || ""}`);
-    const inner = el("div", {}, pictures, el("div", {}, verdict, el("div", { class: "scroll" }, numbers), facts));
-    cell.replaceChildren(inner);
+    const right = el("div", {}, verdict, el("div", { class: "scroll" }, numbers));
+    cell.replaceChildren(el("div", {}, el("div", {}, pictures, facts), right));
     const plot = pictures.querySelector(".plot");
     if (image) {
       offerDownload(pictures);
@@ -218,15 +218,15 @@
     const posterior = data.posteriors[i];
     if (posterior) {
       const figure = cornerFigure(i);
-      inner.append(figure.node);
+      right.append(figure.node);
       figure.draw();
     } else if (data.refused[i] !== undefined) {
-      inner.append(el("p", { class: "full refused" }, el("b", {}, "Posterior refused. "), data.refused[i]));
+      right.append(el("p", { class: "refused" }, el("b", {}, "Posterior refused. "), data.refused[i]));
     }
   };
   const drawCorner = (host, i) => corner(host, data.posteriors[i], { labels, units, title: `Posterior of event ${columns.event[i]}`, estimate: Object.fromEntries(free.map((name) => [name, columns[name][i]])) });
   const cornerFigure = (i) => {
-    const node = el("figure", { class: "chart full corner", "data-title": `Posterior of event ${columns.event[i]}` }, el("figcaption", {}, el("h3", {}, "Posterior")), el("div", { class: "plot" }));
+    const node = el("figure", { class: "chart", "data-title": `Posterior of event ${columns.event[i]}` }, el("figcaption", {}, el("h3", {}, "Posterior")), el("div", { class: "plot" }));
     offerDownload(node);
     return { node, draw: () => responsive(node.querySelector(".plot"), () => drawCorner(node.querySelector(".plot"), i)) };
   };
@@ -279,7 +279,21 @@
     chosen.append(...Object.keys(data.posteriors).map((i) => el("option", { value: i }, String(columns.event[i]))));
     const host = plotOf("corner");
     const draw = responsive(host, () => drawCorner(host, chosen.value));
-    chosen.addEventListener("change", draw);
+    const tabulate = () => {
+      const i = chosen.value;
+      const p = data.posteriors[i];
+      const names = ["", "median", "central 68 %", "fit ± σ", "R̂", "ESS"];
+      byId("corner-numbers").replaceChildren(
+        el("thead", {}, el("tr", {}, ...names.map((t, k) => el("th", { scope: "col", class: k ? "num" : null }, t)))),
+        el("tbody", {}, ...p.names.map((name, k) => {
+          const half = (p.high[k] - p.low[k]) / 2;
+          const sigma = columns[`sigma_${name}`][i];
+          const cells = [fmtWith(p.median[k], half), `${fmtWith(p.low[k], half)} to ${fmtWith(p.high[k], half)}`, `${fmtWith(columns[name][i], sigma)} ± ${fmt(sigma, 2)}`, fmt(p.r_hat[k], 4), fmt(p.ess[k], 3)];
+          return el("tr", {}, el("th", { scope: "row" }, `${labels[name]} [${units[name]}]`), ...cells.map((t) => el("td", { class: "num" }, t)));
+        })));
+    };
+    tabulate();
+    chosen.addEventListener("change", () => { draw(); tabulate(); });
   }
 
   arrange();
