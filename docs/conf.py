@@ -68,13 +68,17 @@ def _write_reference() -> None:
         (GENERATED / f"{command.__name__}.txt").write_text(text + "\n", encoding="utf-8")
 
 
+LITERAL_OR_EMPHASIS = re.compile(
+    r"(``.*?``|`.*?`|(?<![\w*])\*{1,2}[^\s*](?:[^*]*[^\s*])?\*{1,2}(?!\w))"
+)
+MARKUP = re.compile(r"(?<![\\])(?:\||\*(?!\s))")
+
+
 def _escape(_app: Any, _what: str, _name: str, _obj: Any, _options: Any, lines: list[str]) -> None:
-    """Keep |E|² and t* from being read as markup; literals are left alone."""
+    """Keep |E|² and t* from being read as markup; literals and emphasis are left alone."""
     for number, line in enumerate(lines):
-        parts = re.split(r"(``.*?``|`.*?`)", line)
-        parts[::2] = [
-            re.sub(r"(?<![\\*\s])\*(?![\w*])|(?<!\\)\|", r"\\\g<0>", p) for p in parts[::2]
-        ]
+        parts = LITERAL_OR_EMPHASIS.split(line)
+        parts[::2] = [MARKUP.sub(r"\\\g<0>", part) for part in parts[::2]]
         lines[number] = "".join(parts)
 
 
