@@ -343,15 +343,14 @@ def _tiles(table: pd.DataFrame, precision: Sequence[Precision], main: str) -> li
 
 def _precision_row(p: Precision) -> list[Any]:
     unit = UNITS[p.name]
-    quartiles = f" ({number(p.over_crb[1])}–{number(p.over_crb[3])})" if p.events > 1 else ""
     return [
         {"text": f"{LABELS[p.name]} [{unit}]"},
-        {"text": str(p.events), "sort": p.events},
         {"text": number(p.sigma), "sort": _sort(p.sigma)},
         {"text": number(p.crb), "sort": _sort(p.crb)},
         {"text": number(p.qcrb), "sort": _sort(p.qcrb)},
-        {"text": number(p.over_crb[2]) + quartiles, "sort": _sort(p.over_crb[2])},
+        {"text": number(p.over_crb[2]), "sort": _sort(p.over_crb[2])},
         {"text": _percent(p.information), "sort": _sort(p.information)},
+        {"text": str(p.events), "sort": p.events},
     ]
 
 

@@ -231,7 +231,7 @@ window.iscat = (() => {
     const yScale = makeScale(spec.y, gather(series, "y"), spec.y.categories ? top : bottom, spec.y.categories ? bottom : top, 44);
     const left = Math.max(...yScale.ticks.map((t) => textWidth(t.text)), 12) + 12;
     const right = width - 14;
-    const widest = spec.x.categories ? 60 : 74;
+    const widest = spec.x.categories ? 60 : 58;
     const xScale = makeScale(spec.x, gather(series, "x"), left, right, widest);
     const plot = { left, right, top, bottom };
 

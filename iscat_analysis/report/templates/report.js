@@ -192,7 +192,7 @@
     const other = (columns.flags[i] || "").split(";").filter((f) => f && f !== columns.status[i]);
     const fixed = ["z_nm", "mass_kda"].filter((name) => !free.includes(name)).map((name) => pair(`${labels[name]}, fixed`, `${fmt(columns[name][i])} ${units[name]}`));
     const facts = el("dl", { class: "pairs" },
-      pair("Position", `x ${fmt(columns.x_px[i], 5)}, y ${fmt(columns.y_px[i], 5)} px`),
+      pair("Position", finite(columns.x_px[i]) && finite(columns.y_px[i]) ? `x ${columns.x_px[i].toFixed(2)}, y ${columns.y_px[i].toFixed(2)} px` : "—"),
       pair("Frames", `${columns.n_before[i]} before, ${columns.n_after[i]} after, from ${columns.frame[i]}`),
       ...fixed,
       pair(data.scheme === "darkfield" ? "Peak signal" : "Peak contrast", data.scheme === "darkfield" ? `${fmt(columns.contrast[i])} e⁻` : fmt(columns.contrast[i])),

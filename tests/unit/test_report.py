@@ -1,0 +1,310 @@
+"""The output folder: what is in it, that it appears whole, and that nothing foreign is lost."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from iscat_analysis.config import load_config, parse_config
+from iscat_analysis.errors import DataError
+from iscat_analysis.records import EVENT_COLUMNS, Status
+from iscat_analysis.report import check_output, render_page, render_report, write_report
+from iscat_analysis.report.context import number, precision_of
+from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder
+from iscat_analysis.report.pack import CREDIBLE_LEVELS, credible_shades, quantise
+from iscat_analysis.report.tables import event_table, jsonable
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from report_factory import HOSTILE, make_analysis, without_events
+
+
+def payload(page: str) -> dict[str, object]:
+    found = re.search(r'<script type="application/json" id="analysis">(.*?)</script>', page, re.S)
+    assert found is not None
+    return dict(json.loads(found.group(1)))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    analysis = make_analysis(12, "joint", posteriors=2, refused=1)
+    return write_report(analysis, tmp_path_factory.mktemp("out") / "movie.iscat")
+
+
+class TestFolder:
+    def test_holds_exactly_what_is_promised(self, folder: Path) -> None:
+        assert {path.name for path in folder.iterdir()} == set(OUTPUT_NAMES)
+
+    def test_leaves_no_temporary_sibling(self, folder: Path) -> None:
+        assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+
+    def test_csv_has_the_columns_in_order_and_empty_cells_for_nan(self, folder: Path) -> None:
+        lines = (folder / "fits.csv").read_text(encoding="utf-8").splitlines()
+        assert lines[0] == ",".join(EVENT_COLUMNS)
+        cells = dict(zip(EVENT_COLUMNS, lines[1 + 5].split(","), strict=True))
+        assert cells["sigma_x_nm"] == ""
+        assert all(len(cell) < 20 for line in lines[1:] for cell in line.split(",")[4:-2])
+
+    def test_csv_and_parquet_agree(self, folder: Path) -> None:
+        csv = pd.read_csv(folder / "fits.csv", keep_default_na=False, na_values=[""])
+        parquet = pd.read_parquet(folder / "fits.parquet")
+        assert list(parquet.columns) == list(EVENT_COLUMNS)
+        csv["flags"] = csv["flags"].fillna("")
+        pd.testing.assert_frame_equal(csv, parquet, rtol=1e-8, check_dtype=False)
+
+    def test_summary_is_strict_json_without_nan(self, folder: Path) -> None:
+        def refuse(name: str) -> float:
+            raise AssertionError(f"{name} is not JSON")
+
+        text = (folder / "summary.json").read_text(encoding="utf-8")
+        assert json.loads(text, parse_constant=refuse)["efficiency"] is None
+
+    def test_config_reruns_the_job(self, folder: Path) -> None:
+        expected = parse_config(
+            {"fit": {"mode": "joint"}, "optics": {"scheme": "iscat", "attenuation": 0.1}}
+        )
+        assert load_config(folder / "config.toml") == expected
+
+    def test_figures_come_in_pairs(self, folder: Path) -> None:
+        stems = {path.stem for path in (folder / "figures").glob("*.png")}
+        assert stems == {path.stem for path in (folder / "figures").glob("*.svg")}
+        assert {"overview", "precision", "mass_histogram", "power", "event_0000"} <= stems
+        assert {stem for stem in stems if "corner" in stem} == {"corner_0001", "corner_0002"}
+
+    def test_page_fetches_nothing(self, folder: Path) -> None:
+        page = (folder / "report.html").read_text(encoding="utf-8")
+        outside = set(re.findall(r"https?://[^\"' )]+", page))
+        assert outside == {"http://www.w3.org/2000/svg"}
+
+    def test_file_names_are_escaped(self, folder: Path) -> None:
+        page = (folder / "report.html").read_text(encoding="utf-8")
+        assert HOSTILE not in page
+        assert "<script>alert" not in page
+        assert "<img" not in page
+        assert page.count("</script>") == page.count("<script")
+
+
+class TestPosterior:
+    def test_only_converged_chains_are_written(self, folder: Path) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
+            import arviz
+        data = arviz.from_netcdf(str(folder / "posterior.nc"))
+        assert data.posterior["event"].values.tolist() == [1, 2]
+        assert data.posterior["mass_kda"].dims == ("chain", "draw", "event")
+        assert json.loads(data.posterior.attrs["events_not_converged"]) == [0]
+        source = make_analysis(12, "joint", posteriors=2, refused=1).views[2].posterior
+        assert source is not None
+        draws = data.posterior.sizes["draw"]
+        np.testing.assert_array_equal(
+            data.posterior["z_nm"].sel(event=2).values, source.samples[:, -draws:, 2]
+        )
+        data.close()
+
+    def test_is_absent_when_no_chain_converged(self, tmp_path: Path) -> None:
+        out = write_report(make_analysis(2, refused=2), tmp_path / "out")
+        assert not (out / "posterior.nc").exists()
+
+    def test_a_refused_chain_shows_its_message_and_no_number(self) -> None:
+        analysis = make_analysis(3, "joint", refused=1)
+        page = render_report(analysis)
+        assert "split R-hat of z_nm is 1.31" in page
+        assert payload(page)["posteriors"] == {}
+
+
+class TestOverwrite:
+    def test_an_earlier_result_stays_without_permission(self, tmp_path: Path) -> None:
+        out = write_report(without_events(make_analysis(1)), tmp_path / "out")
+        before = (out / "fits.csv").stat().st_mtime_ns
+        with pytest.raises(DataError, match="--overwrite"):
+            write_report(make_analysis(1), out)
+        assert (out / "fits.csv").stat().st_mtime_ns == before
+
+    def test_overwrite_replaces_the_whole_folder(self, tmp_path: Path) -> None:
+        out = write_report(make_analysis(2, posteriors=1), tmp_path / "out")
+        write_report(without_events(make_analysis(1)), out, overwrite=True)
+        assert not (out / "posterior.nc").exists()
+        assert len(pd.read_csv(out / "fits.csv")) == 0
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+    def test_foreign_files_are_never_replaced(self, tmp_path: Path) -> None:
+        (tmp_path / "thesis.tex").write_text("years of work")
+        with pytest.raises(DataError, match=r"thesis\.tex"):
+            check_output(tmp_path, overwrite=True)
+
+    def test_a_file_is_not_a_folder(self, tmp_path: Path) -> None:
+        (tmp_path / "out").write_text("")
+        with pytest.raises(DataError, match="is a file"):
+            check_output(tmp_path / "out", overwrite=True)
+
+    def test_empty_and_absent_folders_are_fine(self, tmp_path: Path) -> None:
+        check_output(tmp_path)
+        check_output(tmp_path / "new" / "deeper")
+
+    @pytest.mark.parametrize("trouble", [RuntimeError, KeyboardInterrupt])
+    def test_a_failure_leaves_everything_as_it_was(
+        self, tmp_path: Path, trouble: type[BaseException]
+    ) -> None:
+        out = write_report(without_events(make_analysis(1)), tmp_path / "out")
+
+        def build() -> None:
+            with atomic_folder(out, overwrite=True) as building:
+                (building / "fits.csv").write_text("half a table")
+                raise trouble
+
+        with pytest.raises(trouble):
+            build()
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+        assert (out / "fits.csv").read_text().startswith("event,")
+
+
+@pytest.mark.parametrize("mode", ["mass", "localize", "joint", "track"])
+@pytest.mark.parametrize("scheme", ["iscat", "darkfield"])
+def test_every_mode_and_scheme_makes_a_page(mode: str, scheme: str) -> None:
+    page = render_report(make_analysis(21, mode, scheme=scheme, side=16))
+    data = payload(page)
+    assert data["mode"] == mode
+    assert "NaN" not in json.dumps(data)
+    for status in Status:
+        assert status.value in page
+
+
+@pytest.mark.parametrize("n", [0, 1])
+@pytest.mark.parametrize("mode", ["mass", "localize", "joint", "track"])
+def test_none_and_one_event_make_a_folder(tmp_path: Path, n: int, mode: str) -> None:
+    analysis = make_analysis(1, mode)
+    out = write_report(analysis if n else without_events(analysis), tmp_path / "out")
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert ("Nothing was found" in page) == (n == 0)
+
+
+def test_everything_missing_still_makes_a_folder(tmp_path: Path) -> None:
+    analysis = make_analysis(3)
+    table = analysis.table.copy()
+    table[list(EVENT_COLUMNS[4:-2])] = np.nan
+    bare = replace(
+        analysis,
+        table=table,
+        ratio_image=np.full((8, 8), np.nan),
+        power=np.full(5, np.nan),
+        power_frames=np.arange(5),
+        views=tuple(
+            replace(v, contrast=v.contrast * np.nan, model=v.model * np.nan,
+                    residual=v.residual * np.nan)
+            for v in analysis.views
+        ),
+        summary={},
+    )  # fmt: skip
+    assert (write_report(bare, tmp_path / "out") / "report.html").exists()
+
+
+def test_the_page_of_5000_events_stays_below_10_mb_and_says_what_it_leaves_out() -> None:
+    small = make_analysis(10)
+    many = replace(
+        small,
+        table=pd.concat([small.table] * 500, ignore_index=True).assign(event=np.arange(5000)),
+        views=tuple(replace(small.views[i % 10], event=i) for i in range(5000)),
+    )
+    page = render_report(many)
+    assert len(page.encode()) < 10_000_000
+    held = payload(page)["images"]
+    assert isinstance(held, dict)
+    assert f"the images of the first {len(held)} of 5000 events" in page
+
+
+def test_precision_counts_only_events_that_are_ok() -> None:
+    table = event_table(make_analysis(40))
+    table["sigma_mass_kda"], table["crb_mass_kda"], table["qcrb_mass_kda"] = 3.0, 2.0, 1.0
+    table.loc[table["status"] != "ok", "sigma_mass_kda"] = 1e9
+    found = precision_of(table, "mass_kda")
+    assert found.events == (table["status"] == "ok").sum()
+    assert found.sigma == 3.0
+    assert found.over_crb[2] == 1.5
+    assert found.information == 0.25
+
+
+def test_flags_and_statuses_are_text_in_the_table() -> None:
+    analysis = make_analysis(2)
+    table = analysis.table.copy()
+    table["status"] = [Status.OK, Status.AT_BOUND]
+    table["flags"] = [(), (Status.AT_BOUND, "masked_pixels")]
+    out = event_table(replace(analysis, table=table))
+    assert out["status"].tolist() == ["ok", "at_bound"]
+    assert out["flags"].tolist() == ["", "at_bound;masked_pixels"]
+
+
+def test_a_table_without_a_column_is_refused() -> None:
+    analysis = make_analysis(2)
+    with pytest.raises(ValueError, match="snr"):
+        event_table(replace(analysis, table=analysis.table.drop(columns="snr")))
+
+
+def test_jsonable_has_no_numpy_and_no_nan() -> None:
+    value = {"a": np.float32(1.5), 2: [np.nan, np.inf, np.bool_(True)], "p": Path("x"), "n": None}
+    expected = {"a": 1.5, "2": [None, None, True], "p": "x", "n": None}
+    assert jsonable(value) == expected
+
+
+def test_quantise_keeps_zero_for_what_is_not_finite() -> None:
+    image = np.array([[np.nan, -1.0, 0.0, 1.0, 9.0]])
+    assert quantise(image, -1, 1).tolist() == [[0, 1, 128, 255, 255]]
+
+
+def test_shades_hold_the_probability_they_promise() -> None:
+    counts = np.random.default_rng(8).poisson(3.0, (30, 30)).astype(float)
+    shades = credible_shades(counts)
+    for inside, level in enumerate(CREDIBLE_LEVELS, start=1):
+        share = counts[shades >= inside].sum() / counts.sum()
+        assert level <= share <= level + counts.max() / counts.sum()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0"), (1234.5, "1234"), (-0.01234, "−0.0123"), (2.5e-7, "2.50×10⁻⁷"), (np.nan, "—"),
+     (None, "—")],
+)  # fmt: skip
+def test_numbers_are_written_for_people(value: float | None, text: str) -> None:
+    assert number(value) == text
+
+
+def test_documents_escape_what_they_are_given_and_draw_nan_as_a_gap() -> None:
+    page = render_page(
+        "document.html",
+        {
+            "title": "Bounds & <friends>",
+            "sections": [
+                {
+                    "id": "one",
+                    "title": "One",
+                    "notes": ["a < b"],
+                    "charts": [
+                        {"id": "c", "title": "</script><b>", "spec": {
+                            "x": {"label": "z"}, "y": {"label": "σ"},
+                            "series": [{"kind": "line", "color": "crb", "x": [1, 2],
+                                        "y": [np.nan, 2.0], "name": "</script>"}]}},
+                    ],
+                    "tables": [{"caption": "t", "columns": ["a", {"label": "b", "numeric": True}],
+                                "rows": [["<i>", np.nan], ["x", -1.25]]}],
+                }
+            ],
+        },
+    )  # fmt: skip
+    assert "Bounds &amp; &lt;friends&gt;" in page
+    assert "<i>" not in page
+    assert '"y":[null,2.0]' in page
+    assert "−1.25" in page
+    assert page.count("</script>") == page.count("<script")
+
+
+def test_a_page_without_a_title_is_an_error() -> None:
+    import jinja2
+
+    with pytest.raises(jinja2.UndefinedError, match="title"):
+        render_page("document.html", {"sections": []})
