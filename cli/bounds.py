@@ -67,6 +67,7 @@ def bounds(
                 f"{_short(photons['collected'])} collected"
             )
             print_result(bounds_table("per photon", report["per_photon"]))
+            print_result("")
             print_result(bounds_table("for these photons", report["actual"]))
 
 

@@ -1,0 +1,149 @@
+"""The sample configurations, run as a lab would run them: simulate, fit, compare with the truth."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from iscat_analysis.config import load_config
+from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS
+from iscat_cli import main, main_fit
+
+MODES = ["mass", "localize", "joint"]
+
+# Standard errors: of 8 events times 4 parameters, one beyond 5σ has a probability below 2e-5.
+FAR = 5.0
+
+
+@pytest.fixture(scope="module")
+def movies(tmp_path_factory, sample_configs) -> dict[str, Path]:
+    """Simulate each sample once."""
+    folder = tmp_path_factory.mktemp("samples")
+    paths = {mode: folder / f"{mode}.tif" for mode in MODES}
+    for mode, path in paths.items():
+        arguments = ["simulate", "--config", str(sample_configs[mode]), "--out", str(path)]
+        assert main([*arguments, "--quiet"]) == 0
+    return paths
+
+
+@pytest.fixture(scope="module")
+def fitted(movies, sample_configs) -> dict[str, Path]:
+    """Fit each sample once."""
+    folders = {}
+    for mode, movie in movies.items():
+        arguments = [str(movie), "--config", str(sample_configs[mode]), "--no-posterior"]
+        assert main_fit([*arguments, "--quiet"]) == 0
+        folders[mode] = movie.with_suffix(".iscat")
+    return folders
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_truth_lies_beside_the_movie(mode: str, movies, sample_configs) -> None:
+    truth = pd.read_csv(movies[mode].with_suffix(".truth.csv"))
+    events = load_config(sample_configs[mode]).simulation.events
+    assert truth["x_px"].tolist() == pytest.approx([event.x_px for event in events])
+
+
+def test_the_same_seed_writes_the_same_bytes(movies, sample_configs, tmp_path) -> None:
+    again = tmp_path / "mass.tif"
+    main(["simulate", "--config", str(sample_configs["mass"]), "--out", str(again), "--seed", "1"])
+    assert again.read_bytes() == movies["mass"].read_bytes()
+
+
+def test_a_movie_is_not_overwritten_unasked(movies, sample_configs, capsys) -> None:
+    before = movies["mass"].stat().st_mtime_ns
+    arguments = ["simulate", "--config", str(sample_configs["mass"]), "--out", str(movies["mass"])]
+    assert main(arguments) in (1, 2)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "overwrite" in line
+    assert movies["mass"].stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_bounds_of_the_samples(mode: str, sample_configs, capsys) -> None:
+    assert main(["bounds", "--config", str(sample_configs[mode]), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    for name in FREE_PARAMETERS[mode]:
+        actual = {kind: bound[name] for kind, bound in report["actual"].items() if name in bound}
+        assert 0 < actual["qcrb"] < actual["crb_single"] <= actual["crb_joint"] * (1 + 1e-12)
+    assert main(["bounds", "--config", str(sample_configs[mode])]) == 0
+    assert "per photon" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_fits_meet_the_truth(mode: str, fitted, movies) -> None:
+    fits = pd.read_csv(fitted[mode] / "fits.csv")
+    truth = pd.read_csv(movies[mode].with_suffix(".truth.csv"))
+    assert list(fits.columns) == list(EVENT_COLUMNS)
+    assert len(fits) == len(truth) == 8
+    assert set(fits["status"]) == {"ok"}
+    distance = np.hypot(
+        fits["x_px"].to_numpy()[:, None] - truth["x_px"].to_numpy(),
+        fits["y_px"].to_numpy()[:, None] - truth["y_px"].to_numpy(),
+    )
+    partner = truth.iloc[distance.argmin(axis=1)].reset_index()
+    for name in FREE_PARAMETERS[mode]:
+        pulls = (fits[name] - partner[name]) / fits[f"sigma_{name}"]
+        assert pulls.abs().max() < FAR, name
+        assert (fits[f"qcrb_{name}"] < fits[f"crb_{name}"]).all()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_folder_is_complete(mode: str, fitted) -> None:
+    names = {path.name for path in fitted[mode].iterdir()}
+    expected = {"fits.csv", "fits.parquet", "summary.json", "config.toml", "report.html", "figures"}
+    assert expected <= names
+    assert "posterior.nc" not in names
+    json.loads((fitted[mode] / "summary.json").read_text(), parse_constant=pytest.fail)
+
+
+def test_the_written_configuration_reruns_the_job(fitted, movies, tmp_path, capsys) -> None:
+    written = fitted["mass"] / "config.toml"
+    assert tomllib.loads(written.read_text())["fit"]["mode"] == "mass"
+    again = tmp_path / "again.iscat"
+    arguments = [str(movies["mass"]), "--config", str(written), "--out", str(again), "--json"]
+    assert main_fit([*arguments, "--quiet", "--strict"]) == 0
+    result = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert result["out"] == str(again)
+    first, second = (pd.read_csv(folder / "fits.csv") for folder in (fitted["mass"], again))
+    pd.testing.assert_frame_equal(first, second)
+    assert [event["x_nm"] for event in result["events"]] == pytest.approx(list(second["x_nm"]))
+
+
+@pytest.mark.usefixtures("fitted")
+def test_results_are_not_overwritten_unasked(movies, sample_configs, capsys) -> None:
+    arguments = [str(movies["mass"]), "--config", str(sample_configs["mass"]), "--no-posterior"]
+    assert main_fit([*arguments, "--quiet"]) in (1, 2)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = captured.err.splitlines()
+    assert "--overwrite" in line
+    assert main_fit([*arguments, "--quiet", "--overwrite"]) == 0
+
+
+@pytest.mark.parametrize("content", [None, b"", b"not a movie", b"II*\0\x08\0\0\0"])
+def test_what_is_no_movie_is_refused_in_one_line(content, tmp_path, capsys) -> None:
+    path = tmp_path / "movie.tif"
+    if content is not None:
+        path.write_bytes(content)
+    assert main_fit([str(path), "--set", "camera.pixel_size_nm=84.4"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = [line for line in captured.err.splitlines() if ": error: " in line]
+    assert "movie.tif" in line
+    assert "unexpected" not in line
+    assert not path.with_suffix(".iscat").exists()
+
+
+def test_frames_beyond_the_movie_are_refused(movies, sample_configs, tmp_path, capsys) -> None:
+    arguments = [str(movies["mass"]), "--config", str(sample_configs["mass"])]
+    arguments += ["--frames", "200:4000", "--out", str(tmp_path / "out"), "--quiet"]
+    assert main_fit(arguments) in (1, 2)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "400" in line
+    assert "unexpected" not in line
