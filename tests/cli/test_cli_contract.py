@@ -9,6 +9,7 @@ import ast
 import json
 import os
 import pty
+import signal
 import subprocess
 import sys
 import warnings
@@ -457,7 +458,24 @@ def test_bars_are_drawn_on_a_terminal_only(quiet: bool) -> None:
     assert plain.stderr == expected
 
 
-def test_no_command_leaves_a_traceback_when_interrupted(library, capsys) -> None:
-    library(_raising(KeyboardInterrupt()))
-    assert main(["fit", "movie.tif"]) == 130
-    assert "Traceback" not in capsys.readouterr().err
+INTERRUPTED = """
+import sys, time
+from types import SimpleNamespace
+from iscat_cli import main_fit
+def fit_stack(stack, config, *, notify, **_):
+    notify("started")
+    time.sleep(60)
+sys.modules["iscat_analysis.pipeline"] = SimpleNamespace(fit_stack=fit_stack)
+sys.exit(main_fit(["movie.tif"]))
+"""
+
+
+def test_an_interrupt_is_one_line_and_130() -> None:
+    with _python(INTERRUPTED, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline() == b"iscat-fit: started\n"
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert out == b""
+    assert err == b"iscat-fit: error: interrupted\n"
