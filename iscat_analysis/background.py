@@ -91,7 +91,9 @@ def measure_windows(
     shape = stack.shape[1:]
     variance = camera.read_variance_e2(shape)
     if before is None:
-        first = _Sum(np.full(shape, float(level_e or 0.0)), np.empty(0), np.zeros(shape, dtype=bool))
+        first = _Sum(
+            np.full(shape, float(level_e or 0.0)), np.empty(0), np.zeros(shape, dtype=bool)
+        )
         n_before, start = 0, 0
     else:
         n_before = start = before[1] - before[0]

@@ -113,9 +113,7 @@ class CameraConfig(Section):
         None, description="full well: counts at or above it are flagged as saturated"
     )
     exposure_ms: Positive | None = Field(None, description="taken from the metadata where absent")
-    frame_rate_hz: Positive | None = Field(
-        None, description="taken from the metadata where absent"
-    )
+    frame_rate_hz: Positive | None = Field(None, description="taken from the metadata where absent")
     samples_per_pixel: Annotated[int, Field(ge=1, le=9)] = Field(
         1, description="per axis, to integrate over pixels; 1 = point sampling at pixel centres"
     )
@@ -136,9 +134,7 @@ class Particle(Section):
         None, description="start value, and the truth of a simulation"
     )
     diameter_nm: Positive | None = Field(None, description="in place of mass_kda")
-    height_nm: NonNegative = Field(
-        5.0, description="z where it is fixed; start value elsewhere"
-    )
+    height_nm: NonNegative = Field(5.0, description="z where it is fixed; start value elsewhere")
 
     @model_validator(mode="after")
     def _one_of(self) -> Particle:
@@ -184,9 +180,7 @@ class Detection(Section):
     polarity: Literal["both", "dark", "bright"] = Field(
         "both", description='"both" | "dark" | "bright"'
     )
-    min_separation_nm: Positive = Field(
-        500.0, description="closer particles are flagged too_close"
-    )
+    min_separation_nm: Positive = Field(500.0, description="closer particles are flagged too_close")
 
 
 class Fit(Section):
@@ -499,8 +493,12 @@ def _apply_override(values: dict[str, Any], override: str) -> None:
     if not isinstance(table, dict):
         raise ConfigError(f"--set {override}: {section} is not a section")
     table[key] = value
-    exclusive = {"mass_kda": "diameter_nm", "diameter_nm": "mass_kda",
-                 "index": "permittivity", "permittivity": "index"}
+    exclusive = {
+        "mass_kda": "diameter_nm",
+        "diameter_nm": "mass_kda",
+        "index": "permittivity",
+        "permittivity": "index",
+    }
     if section == "particle" and key in exclusive:
         table.pop(exclusive[key], None)
 

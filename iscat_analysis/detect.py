@@ -10,7 +10,7 @@ Geometry, 2007), in the plane, or in the plane and along z where the height is f
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from scipy.optimize import brentq
 from scipy.signal import oaconvolve
 
 from iscat_analysis.config import Detection
-from iscat_analysis.forward import ForwardModel, PixelGrid
+from iscat_analysis.forward import ForwardModel, MassScale, PixelGrid
 from iscat_analysis.likelihood import Likelihood
 from iscat_analysis.records import Candidate, FloatArray
 
@@ -40,7 +40,7 @@ class Templates:
     z_nm : ndarray, shape (n,)
         Heights [nm].
     images : ndarray, shape (n, k, k)
-        Signal per unit of `strength`, with k odd.
+        Signal per unit amplitude (dark field: per unit amplitude squared), k odd.
     signs : ndarray, shape (n,)
         Sign of the signal's peak.
     quadratic : bool
@@ -98,11 +98,12 @@ def make_templates(
         low, high = z_range_nm
         count = math.ceil((high - low) / model.fringe_nm * HEIGHTS_PER_FRINGE) + 1
         heights = np.linspace(low, high, count)
-    weak = _weak_mass(model)
+    bare = replace(model, scale=MassScale())
+    weak = _weak_amplitude(bare)
     images, roughness = [], []
     for z in heights:
-        signal, gradient = model.gradient(grid, 0.0, 0.0, float(z), weak)
-        images.append(signal / weak)
+        signal, gradient = bare.gradient(grid, 0.0, 0.0, float(z), weak)
+        images.append(signal / (weak**2 if bare.rho == 0 else weak))
         roughness.append(_roughness(signal, gradient[: 2 if z_range_nm is None else 3]))
     stacked = np.stack(images)
     extremes = np.take_along_axis(
@@ -143,8 +144,8 @@ def signal_to_noise(
     -------
     snr : ndarray, shape (n, y, x)
         Signal-to-noise ratio at every height and pixel.
-    amplitude : ndarray, shape (n, y, x)
-        Linear estimate of the amplitude.
+    strength : ndarray, shape (n, y, x)
+        Linear estimate of the amplitude, in dark field of its square.
     """
     weight = likelihood.signal_information(explained)
     signal = np.nan_to_num(likelihood.measured_signal())
@@ -190,7 +191,7 @@ def find_particles(
     tuple of Candidate
         With sub-pixel positions.
     """
-    snr, amplitude = signal_to_noise(likelihood, templates, explained)
+    snr, strength = signal_to_noise(likelihood, templates, explained)
     ranked = np.abs(snr) if templates.two_sided else snr
     wanted = {"both": 0, "bright": 1, "dark": -1}[detection.polarity]
     if wanted:
@@ -209,9 +210,7 @@ def find_particles(
             max(abs(column - other.x_px), abs(row - other.y_px)) < roi_px
             and height < SIDELOBE * abs(other.snr)
             for other in found
-        ) or any(
-            math.hypot(column - other.x_px, row - other.y_px) < roi_px / 6 for other in found
-        )
+        ) or any(math.hypot(column - other.x_px, row - other.y_px) < roi_px / 6 for other in found)
         if shadowed:
             continue
         k = int(ranked[:, row, column].argmax())
@@ -221,27 +220,24 @@ def find_particles(
                 x_px=float(column + dx),
                 y_px=float(row + dy),
                 z_nm=float(templates.z_nm[k]),
-                mass_kda=_mass(likelihood.model, templates, float(amplitude[k, row, column])),
+                mass_kda=_mass(likelihood.model, templates, float(strength[k, row, column])),
                 snr=float(snr[k, row, column]),
             )
         )
     return tuple(found)
 
 
-def _weak_mass(model: ForwardModel) -> float:
-    """Return a mass whose signal is linear (interferometric), or the nominal one (dark field)."""
-    if not model.rho:
-        return model.material.mass_kda
-    peak = abs(model.peak_contrast(model.height_nm, model.material.mass_kda))
-    return model.material.mass_kda * min(1.0, 1e-4 / max(peak, 1e-30))
+def _weak_amplitude(bare: ForwardModel) -> float:
+    """Return an amplitude whose signal is linear; in dark field any will do."""
+    nominal = bare.material.mass_kda
+    peak = abs(bare.peak_contrast(bare.height_nm, nominal))
+    return nominal * min(1.0, 1e-4 / max(peak, 1e-30)) if bare.rho else nominal
 
 
-def _mass(model: ForwardModel, templates: Templates, amplitude: float) -> float:
-    if templates.quadratic:
-        return model.material.mass_kda * math.sqrt(
-            max(amplitude, 0.0) / model.material.mass_kda
-        )
-    return amplitude
+def _mass(model: ForwardModel, templates: Templates, strength: float) -> float:
+    """Mass from the linear estimate: of the amplitude, or of its square in dark field."""
+    amplitude = math.sqrt(max(strength, 0.0)) if templates.quadratic else strength
+    return float(model.scale.mass(np.asarray(amplitude)))
 
 
 def _roughness(signal: FloatArray, gradient: NDArray[np.float64]) -> FloatArray:

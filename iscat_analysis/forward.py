@@ -46,9 +46,7 @@ class PixelGrid:
     pixel_nm: float
 
     @classmethod
-    def region(
-        cls, rows: tuple[int, int], columns: tuple[int, int], pixel_nm: float
-    ) -> PixelGrid:
+    def region(cls, rows: tuple[int, int], columns: tuple[int, int], pixel_nm: float) -> PixelGrid:
         """Half-open ranges of full-frame pixels; pixel (0, 0) has its centre at (0, 0) nm."""
         return cls(np.arange(*columns) * pixel_nm, np.arange(*rows) * pixel_nm, pixel_nm)
 
@@ -414,7 +412,17 @@ class ForwardModel:
     def _geometry(
         self, grid: PixelGrid, x_nm: float, y_nm: float, amplitude: float
     ) -> tuple[
-        float, float, FloatArray, FloatArray, float, float, float, float, float, FloatArray, FloatArray
+        float,
+        float,
+        FloatArray,
+        FloatArray,
+        float,
+        float,
+        float,
+        float,
+        float,
+        FloatArray,
+        FloatArray,
     ]:
         """Arguments every image kernel takes after the profile."""
         half = grid.pixel_nm / 2

@@ -168,7 +168,8 @@ class Likelihood:
         theta = np.array(start, dtype=float)
         score, fisher = np.empty(5), np.empty((5, 5))
         max_step = np.array(
-            [0.25, 0.25, 0.1, np.inf, 1.0] * np.array([self.model.optics.wavelength_nm] * 3 + [1] * 2)
+            [0.25, 0.25, 0.1, np.inf, 1.0]
+            * np.array([self.model.optics.wavelength_nm] * 3 + [1] * 2)
         )
         value, used, outcome = maximize(
             *self._tables(), *self._pixels(), free, lower, upper, max_step, tolerance, passes,
@@ -317,7 +318,9 @@ class Likelihood:
 
     def _pixels(
         self,
-    ) -> tuple[float, FloatArray, FloatArray, float, float, FloatArray, FloatArray, int, FloatArray]:
+    ) -> tuple[
+        float, FloatArray, FloatArray, float, float, FloatArray, FloatArray, int, FloatArray
+    ]:
         offsets, weights = self.model.samples
         return (
             self.model.rho, self.grid.x_nm, self.grid.y_nm, *self.model.rotation,
@@ -488,6 +491,26 @@ def asimov_poisson(
     """
     signal = model.image(grid, *theta[:3], float(model.scale.mass(theta[3])))
     counts = background_e + scale_e * signal
-    return poisson(
-        model, grid, counts, background_e, scale_e, extra_variance_e2=extra_variance_e2
-    )
+    return poisson(model, grid, counts, background_e, scale_e, extra_variance_e2=extra_variance_e2)
+
+
+def compile_kernels(model: ForwardModel) -> None:
+    """Run every kernel once on a few pixels, so that later calls find them compiled.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Any.
+    """
+    grid = PixelGrid.region((0, 3), (0, 3), 10.0)
+    theta = np.array([10.0, 10.0, model.height_nm, 1.0, 0.0])
+    counts = np.full(grid.shape, 100.0)
+    likelihood = poisson(model, grid, counts, counts, counts)
+    free = np.array([True, True, True, True, False])
+    likelihood.maximize(theta, free, theta - 1, theta + 1, passes=2)
+    likelihood.values(theta[None])
+    likelihood.score_fisher(theta)
+    likelihood.observed_information(theta)
+    likelihood.signal(theta)
+    likelihood.scan_heights(theta[2:3], theta, None)
+    model.gradient(grid, *theta[:4])

@@ -195,6 +195,23 @@ class Alternative:
 
 
 @dataclass(frozen=True)
+class Box:
+    """Bounds of θ = (x, y, z, amplitude, level) and which of them are free.
+
+    Attributes
+    ----------
+    free : ndarray of bool, shape (5,)
+        Free parameters.
+    lower, upper : ndarray, shape (5,)
+        Bounds [nm, amplitude, 1].
+    """
+
+    free: BoolArray
+    lower: FloatArray
+    upper: FloatArray
+
+
+@dataclass(frozen=True)
 class FitResult:
     """One maximum-likelihood fit.
 
@@ -202,6 +219,10 @@ class FitResult:
     ----------
     x_nm, y_nm, z_nm, mass_kda : float
         Estimate in the full frame [nm, kDa]; a parameter that was not free holds its fixed value.
+    theta : ndarray, shape (5,)
+        The estimate as the likelihood takes it, in the full frame.
+    box : Box
+        Where it was searched.
     free : tuple of str
         Names of the free parameters, a subset of `PARAMETERS` in that order.
     sigma : ndarray, shape (4,)
@@ -229,6 +250,8 @@ class FitResult:
     y_nm: float
     z_nm: float
     mass_kda: float
+    theta: FloatArray
+    box: Box
     free: tuple[str, ...]
     sigma: FloatArray
     covariance: FloatArray

@@ -20,10 +20,10 @@ import tifffile
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from iscat_analysis.camera import Camera, camera_from_config, read_map
+from iscat_analysis.camera import camera_from_config, read_map
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.forward import PixelGrid, forward_model
 from iscat_analysis.records import FloatArray, Progress, silent
 
 ComplexArray = NDArray[np.complex128]
@@ -141,7 +141,9 @@ class Movie:
         self._config = config
         self._seed = seed
         self._pixel_nm = config.camera.pixel_size_nm or 0.0
-        self._grid = PixelGrid.region((0, simulation.shape[0]), (0, simulation.shape[1]), self._pixel_nm)
+        self._grid = PixelGrid.region(
+            (0, simulation.shape[0]), (0, simulation.shape[1]), self._pixel_nm
+        )
         self.particles = self._place()
         heights = [p.z_nm for p in self.particles]
         self._model = forward_model(
@@ -252,7 +254,9 @@ class Movie:
             optics = self._config.optics
             grain_px = 0.21 * optics.wavelength_nm / optics.na / self._pixel_nm
             noise = gaussian_filter(
-                self._generator("background").standard_normal(shape), max(grain_px, 0.5), mode="wrap"
+                self._generator("background").standard_normal(shape),
+                max(grain_px, 0.5),
+                mode="wrap",
             )
             pattern = 1 + simulation.speckle_contrast * (noise - noise.mean()) / noise.std()
             return level * np.maximum(pattern, 0.05)
@@ -307,7 +311,9 @@ class Movie:
         y = rng.uniform(margin, rows - 1 - margin, count)
         first = self._config.background.frames
         start = first[1] if first is not None else simulation.frames // 20
-        landing = np.sort(rng.integers(start, max(simulation.frames - start // 2, start + 1), count))
+        landing = np.sort(
+            rng.integers(start, max(simulation.frames - start // 2, start + 1), count)
+        )
         species = np.array(simulation.species or (nominal,))
         mass = rng.permutation(species[np.arange(count) % species.size])
         leavers = set(rng.choice(count, simulation.leavings, replace=False).tolist())

@@ -138,9 +138,7 @@ def _fields(profile, inv_step, u, v, radial, e, de, dde):
             p2 * along_v**2 + bend * along_u**2 + 2 * wv * f2[1] * along_v - w_uu * f2[0]
         )
         dde[0, 1, comp] = (
-            (p2 - bend) * along_u * along_v
-            + f2[1] * (wu * along_v + wv * along_u)
-            + w_uv * f2[0]
+            (p2 - bend) * along_u * along_v + f2[1] * (wu * along_v + wv * along_u) + w_uv * f2[0]
         )
         dde[1, 0, comp] = dde[0, 1, comp]
         z1 = base * radial[1, 2] + w * radial[1, 3]

@@ -1,0 +1,280 @@
+"""The camera: counts become photoelectrons, and counts that no camera produces are refused.
+
+A camera of gain g [e/count], offset o [counts] and read noise σ_r [e] turns N photoelectrons into
+c = o + (N + σ_r·n)/g counts, n standard normal.  `Camera` undoes it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import DTypeLike, NDArray
+
+from iscat_analysis.config import CameraConfig
+from iscat_analysis.errors import DataError
+from iscat_analysis.records import BoolArray, FloatArray
+
+_NEGATIVE_SIGMAS = 6.0  # 1e-9 of pixels in the dark
+_NEGATIVE_FRACTION = 0.01  # more pixels below the offset than a sensor has dead ones
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A calibrated camera; `camera_from_config` makes it.
+
+    Attributes
+    ----------
+    gain_e_per_adu : float or ndarray, shape (y, x)
+        Photoelectrons per count [e/count].
+    offset_adu : float or ndarray, shape (y, x)
+        Counts in the dark [counts].
+    read_noise_e : float or ndarray, shape (y, x)
+        Standard deviation per frame [e].
+    well_depth_e : float or None
+        Full well [e]; None where unknown.
+    full_scale_adu : float or None
+        Largest number the stored type can hold [counts]; None for floats.
+    """
+
+    gain_e_per_adu: float | FloatArray = 1.0
+    offset_adu: float | FloatArray = 0.0
+    read_noise_e: float | FloatArray = 0.0
+    well_depth_e: float | None = None
+    full_scale_adu: float | None = None
+
+    def to_electrons(self, counts: NDArray[Any]) -> FloatArray:
+        """Convert counts to photoelectrons.
+
+        Parameters
+        ----------
+        counts : ndarray, shape (..., y, x)
+            As stored [counts].
+
+        Returns
+        -------
+        ndarray of float64, shape (..., y, x)
+            (counts − offset)·gain [e].
+        """
+        electrons = np.array(counts, dtype=np.float64)
+        electrons -= self.offset_adu
+        electrons *= self.gain_e_per_adu
+        return electrons
+
+    def saturated(self, counts: NDArray[Any]) -> BoolArray:
+        """Find the pixels that were too bright to be measured.
+
+        Parameters
+        ----------
+        counts : ndarray, shape (..., y, x)
+            As stored [counts].
+
+        Returns
+        -------
+        ndarray of bool, shape (..., y, x)
+            At or above the well depth, or at the full scale of the stored type.
+        """
+        full = np.zeros(np.shape(counts), dtype=np.bool_)
+        if self.full_scale_adu is not None:
+            full |= counts >= self.full_scale_adu
+        if self.well_depth_e is not None:
+            full |= self.to_electrons(counts) >= self.well_depth_e
+        return full
+
+    def read_variance_e2(self, shape: tuple[int, int]) -> FloatArray:
+        """Variance of the read noise of one frame.
+
+        Parameters
+        ----------
+        shape : (int, int)
+            Rows and columns.
+
+        Returns
+        -------
+        ndarray, shape (y, x)
+            σ_r² [e²].
+        """
+        return np.broadcast_to(np.square(self.read_noise_e, dtype=np.float64), shape).copy()
+
+
+def camera_from_config(config: CameraConfig, shape_yx: tuple[int, int], dtype: DTypeLike) -> Camera:
+    """Build the camera that a configuration describes, reading its maps.
+
+    Parameters
+    ----------
+    config : CameraConfig
+        The section ``[camera]``.
+    shape_yx : (int, int)
+        Rows and columns of the movie, which every map must have.
+    dtype : dtype
+        Type of the stored counts; the largest integer it holds is full scale.
+
+    Returns
+    -------
+    Camera
+        With a (y, x) map wherever the configuration names a file.
+
+    Raises
+    ------
+    DataError
+        A map cannot be read, has another shape, or holds values that are impossible.
+    """
+    stored = np.dtype(dtype)
+    full_scale = float(np.iinfo(stored).max) if np.issubdtype(stored, np.integer) else None
+    return Camera(
+        gain_e_per_adu=_number_or_map(config.gain_e_per_adu, "gain_e_per_adu", shape_yx),
+        offset_adu=_number_or_map(config.offset_adu, "offset_adu", shape_yx),
+        read_noise_e=_number_or_map(config.read_noise_e, "read_noise_e", shape_yx),
+        well_depth_e=config.well_depth_e,
+        full_scale_adu=full_scale,
+    )
+
+
+def _number_or_map(value: float | str, key: str, shape_yx: tuple[int, int]) -> float | FloatArray:
+    if not isinstance(value, str):
+        return value
+    values = read_map(Path(value), f"camera.{key}", shape_yx)
+    where = f"{value}: camera.{key}"
+    if key == "gain_e_per_adu" and (bad := values <= 0).any():
+        raise DataError(f"{where} must be positive, but is not {_first(bad)}; repair the map")
+    if key == "read_noise_e" and (bad := values < 0).any():
+        raise DataError(f"{where} must not be negative, but is {_first(bad)}; repair the map")
+    return values
+
+
+def read_map(path: Path, key: str, shape_yx: tuple[int, int]) -> FloatArray:
+    """Read an image with one number per pixel.
+
+    Parameters
+    ----------
+    path : Path
+        TIFF file.
+    key : str
+        The configuration key that named it, for messages.
+    shape_yx : (int, int)
+        Rows and columns it must have.
+
+    Returns
+    -------
+    ndarray of float64, shape (y, x)
+        Its values, all finite.
+
+    Raises
+    ------
+    DataError
+        It cannot be read, has another shape, or is not finite everywhere.
+    """
+    where = f"{path}: {key}"
+    if not path.is_file():
+        raise DataError(f"{where} names a file that does not exist; check the path")
+    try:
+        image = np.squeeze(tifffile.imread(path))
+    except (ValueError, RuntimeError, TypeError, IndexError, KeyError, OSError) as error:
+        raise DataError(f"{where} needs a TIFF map, but it cannot be read ({error})") from None
+    if image.shape != tuple(shape_yx):
+        shown = " x ".join(str(n) for n in image.shape) or "one number"
+        raise DataError(
+            f"{where} is a map of {shown} pixels but the movie has {shape_yx[0]} x {shape_yx[1]}; "
+            "crop the map as the movie was cropped"
+        )
+    if image.dtype.kind not in "uif":
+        raise DataError(f"{where} holds {image.dtype} values; save the map as real numbers")
+    values: FloatArray = image.astype(np.float64)
+    bad = ~np.isfinite(values)
+    if bad.any():
+        raise DataError(f"{where} is not finite {_first(bad)}; repair the map")
+    return values
+
+
+def _first(bad: BoolArray) -> str:
+    """Say how many pixels are bad and where the first one is."""
+    y, x = np.unravel_index(int(np.argmax(bad)), bad.shape)
+    count = int(np.count_nonzero(bad))
+    return f"in {count} {'pixel' if count == 1 else 'pixels'}, the first at y = {y}, x = {x}"
+
+
+def check_counts(
+    counts: NDArray[Any], first_frame: int, name: str, *, camera: Camera | None = None
+) -> None:
+    """Refuse frames that no working camera produces.
+
+    A few pixels below the offset may be dead, and later stages mask them; a camera never counts
+    below zero, so there one pixel is proof that the frames are not raw.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        As stored [counts].
+    first_frame : int
+        Number of the first of them in the movie.
+    name : str
+        What the message calls the movie.
+    camera : Camera, optional
+        Gives offset, read noise and saturation; without it, gain 1, offset 0, no read noise and the
+        full scale of the type.
+
+    Raises
+    ------
+    DataError
+        A frame holds NaN or infinity, is zero throughout or saturated throughout, or lies further
+        below the offset than six standard deviations of the read noise: in one pixel if the count
+        itself is negative, otherwise in more than 1 % of the pixels.
+    """
+    if camera is None:
+        integer = np.issubdtype(counts.dtype, np.integer)
+        camera = Camera(full_scale_adu=float(np.iinfo(counts.dtype).max) if integer else None)
+    lowest, highest = counts.min(axis=(1, 2)), counts.max(axis=(1, 2))
+    floor = _negative_floor_adu(camera, counts.dtype)
+    ceiling = _ceiling_adu(camera)
+    for number in range(len(counts)):
+        frame = counts[number]
+        where = f"{name}: frame {first_frame + number}"
+        low, high = float(lowest[number]), float(highest[number])
+        if not (math.isfinite(low) and math.isfinite(high)):
+            bad = ~np.isfinite(frame)
+            raise DataError(
+                f"{where} is NaN or infinite {_first(bad)}; "
+                "leave the frame out or export the movie again"
+            )
+        if low == high == 0:
+            raise DataError(
+                f"{where} is zero throughout; it was dropped by the camera: leave it out"
+            )
+        if low < float(np.max(floor)):
+            _refuse_negative(frame, floor, where)
+        if low >= float(np.min(ceiling)) and bool(np.all(frame >= ceiling)):
+            raise DataError(
+                f"{where} is saturated throughout; lower the exposure or the laser power, "
+                "or correct camera.well_depth_e"
+            )
+
+
+def _refuse_negative(frame: NDArray[Any], floor: float | FloatArray, where: str) -> None:
+    below = np.asarray(frame < floor)
+    if not (below & (frame < 0)).any() and below.mean() <= _NEGATIVE_FRACTION:
+        return
+    raise DataError(
+        f"{where} lies below the camera's offset by more than its read noise {_first(below)} "
+        f"(lowest count {float(frame.min()):g}); give raw counts, or correct camera.offset_adu and "
+        "camera.read_noise_e"
+    )
+
+
+def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatArray:
+    """Lowest believable count: offset less six standard deviations of read noise and rounding."""
+    rounding = 1 / 12 if np.issubdtype(dtype, np.integer) else 0.0
+    sigma = np.sqrt(np.square(np.divide(camera.read_noise_e, camera.gain_e_per_adu)) + rounding)
+    floor: float | FloatArray = camera.offset_adu - _NEGATIVE_SIGMAS * sigma
+    return floor
+
+
+def _ceiling_adu(camera: Camera) -> float | FloatArray:
+    """Count from which a pixel is saturated."""
+    ceiling: float | FloatArray = math.inf
+    if camera.well_depth_e is not None:
+        ceiling = camera.offset_adu + np.divide(camera.well_depth_e, camera.gain_e_per_adu)
+    return ceiling if camera.full_scale_adu is None else np.minimum(ceiling, camera.full_scale_adu)

@@ -1,0 +1,316 @@
+"""The main job: load → calibrate → background → detect → fit → posterior → bounds → report."""
+
+from __future__ import annotations
+
+import platform
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.background import measure_windows
+from iscat_analysis.calibrate import diagnose_gain, resolve_metadata
+from iscat_analysis.camera import Camera, camera_from_config, check_counts
+from iscat_analysis.config import Config, config_to_toml
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.likelihood import compile_kernels
+from iscat_analysis.load import Stack, open_stack
+from iscat_analysis.pipeline.field import Scene, field_likelihood, fit_field, make_scene
+from iscat_analysis.pipeline.results import Row, summary_of, table_of, view_of
+from iscat_analysis.posterior import sample_posterior
+from iscat_analysis.records import Analysis, Progress, Provenance, Windows, silent
+from iscat_analysis.report import check_output, write_report
+
+DEPENDENCIES = (
+    "numpy", "scipy", "numba", "tifffile", "emcee", "arviz", "pandas", "pyarrow", "matplotlib",
+)  # fmt: skip
+
+_GAIN_FRAMES = 64  # background frames that the noise is measured on
+_PATIENCE_S = 1.5  # after which a compilation is announced
+
+Notify = Callable[[str], None]
+
+
+def _quiet(text: str) -> None:
+    """Say nothing."""
+
+
+def fit_stack(
+    stack: Path,
+    config: Config,
+    *,
+    out: Path | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+    notify: Notify = _quiet,
+    command: str = "",
+) -> Analysis:
+    """Analyse a movie and write the report.
+
+    Parameters
+    ----------
+    stack : Path
+        The movie.
+    config : Config
+        What to do; see `iscat_analysis.config`.
+    out : Path, optional
+        Output folder; default the movie's name with ``.iscat``.
+    overwrite : bool
+        Replace an earlier result.
+    progress : Progress
+        Told how far each stage is.
+    notify : callable
+        Told what the user should know, one line at a time.
+    command : str
+        The command line, for the record.
+
+    Returns
+    -------
+    Analysis
+        Everything found; also written to the folder.
+
+    Raises
+    ------
+    DataError
+        The movie cannot be analysed, or the folder exists.
+    ConfigError
+        The configuration does not suit the movie.
+    """
+    folder = stack.with_suffix(".iscat") if out is None else out
+    check_output(folder, overwrite)
+    with open_stack(stack) as movie:
+        analysis = analyse(movie, config, progress=progress, notify=notify, command=command)
+    write_report(analysis, folder, overwrite=overwrite)
+    return analysis
+
+
+def analyse(
+    movie: Stack,
+    config: Config,
+    *,
+    progress: Progress = silent,
+    notify: Notify = _quiet,
+    command: str = "",
+) -> Analysis:
+    """Analyse an open movie.
+
+    Parameters
+    ----------
+    movie : Stack
+        From `iscat_analysis.load.open_stack`.
+    config : Config
+        What to do.
+    progress, notify, command
+        As in `fit_stack`.
+
+    Returns
+    -------
+    Analysis
+        Everything found.
+    """
+    started = datetime.now(UTC).isoformat(timespec="seconds")
+    clock = _Clock()
+    warnings: list[str] = []
+
+    def tell(text: str) -> None:
+        warnings.append(text)
+        notify(text)
+
+    config, notes = resolve_metadata(config, movie.metadata)
+    for note in notes:
+        tell(note)
+    shape = (movie.shape[1], movie.shape[2])
+    camera = camera_from_config(config.camera, shape, movie.dtype)
+    before, after = frame_ranges(movie, config)
+    scene = make_scene(config, shape)
+    _warm_up(scene, notify)
+    clock.lap("model")
+
+    def check(counts: NDArray[Any], first: int) -> None:
+        check_counts(counts, first, movie.name, camera=camera)
+
+    windows = measure_windows(
+        movie,
+        camera,
+        before,
+        after,
+        method=config.background.method,
+        level_e=config.background.level_e,
+        power_normalization=config.background.power_normalization,
+        check=check,
+        progress=progress,
+    )
+    for text in _camera_warnings(movie, camera, windows):
+        tell(text)
+    clock.lap("background")
+    with ThreadPoolExecutor(config.compute.workers) as pool:
+        events, windows = fit_field(scene, windows, pool=pool, progress=progress)
+        clock.lap("fit")
+        rows = [Row(number, event, windows) for number, event in enumerate(events)]
+        if config.posterior.enabled:
+            rows = _sampled(rows, config, pool, progress)
+            clock.lap("posterior")
+    table = table_of(scene, rows)
+    image = field_likelihood(scene, windows).measured_signal()
+    if scene.additive:
+        image = windows.after_e - windows.power_ratio * windows.before_e
+    clock.lap("bounds")
+    summary = summary_of(scene, table, windows, clock.seconds)
+    provenance = Provenance(
+        command=command or "iscat_analysis.pipeline.analyse",
+        input_path=str(movie.path),
+        input_sha256=movie.sha256(),
+        versions=_versions(),
+        seed=config.simulation.seed if config.posterior.enabled else None,
+        started=started,
+    )
+    summary |= {
+        "input": {"path": provenance.input_path, "sha256": provenance.input_sha256},
+        "seed": provenance.seed,
+        "versions": dict(provenance.versions),
+        "warnings": warnings,
+    }
+    return Analysis(
+        config_toml=config_to_toml(config),
+        mode=scene.mode,
+        scheme=config.optics.scheme,
+        pixel_size_nm=scene.pixel_nm,
+        table=table,
+        views=tuple(view_of(row) for row in rows),
+        ratio_image=image,
+        power=windows.power,
+        power_frames=np.concatenate(
+            [np.arange(*windows.frames_before), np.arange(*windows.frames_after)]
+        ),
+        summary=summary,
+        provenance=provenance,
+        warnings=tuple(warnings),
+    )
+
+
+def frame_ranges(
+    movie: Stack, config: Config
+) -> tuple[tuple[int, int] | None, tuple[int, int]]:
+    """Which frames are background and which are fitted.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        ``background.frames``, ``background.method`` and ``fit.frames``.
+
+    Returns
+    -------
+    before : (int, int) or None
+        None where the background is known.
+    after : (int, int)
+        Half-open.
+
+    Raises
+    ------
+    ConfigError
+        The background frames are not given.
+    DataError
+        The background leaves no frame to fit.
+    """
+    before = config.background.frames
+    if config.background.method == "none":
+        before = None
+    elif before is None:
+        raise ConfigError(
+            "which frames come before the particles? give them as --background 0:200 "
+            'or background.frames, or a known level with background.method = "none"'
+        )
+    start = before[1] if before else 0
+    after = config.fit.frames or (start, movie.shape[0])
+    if after[1] <= after[0]:
+        raise DataError(
+            f"{movie.name}: has {movie.shape[0]} frames and the background takes "
+            f"{start} of them, so none is left to fit; change background.frames"
+        )
+    return before, after
+
+
+def _sampled(
+    rows: list[Row], config: Config, pool: ThreadPoolExecutor, progress: Progress
+) -> list[Row]:
+    settings = config.posterior
+
+    def one(row: Row) -> Row:
+        posterior = sample_posterior(
+            row.event.likelihood,
+            row.event.fit,
+            walkers=settings.walkers,
+            steps=settings.steps,
+            seed=config.simulation.seed + row.number,
+        )
+        return replace(row, posterior=posterior)
+
+    done = []
+    for row in pool.map(one, rows):
+        done.append(row)
+        progress("posterior", len(done), len(rows))
+    return done
+
+
+def _camera_warnings(movie: Stack, camera: Camera, windows: Windows) -> Iterator[str]:
+    """Say what the background frames reveal about the camera."""
+    start, stop = windows.frames_before
+    if stop - start >= 2:
+        frames = movie.read(start, min(stop, start + _GAIN_FRAMES))
+        message = diagnose_gain(frames, camera, masked=windows.masked).message
+        if message:
+            yield message
+    defects = int(np.sum(windows.masked & ~windows.saturated))
+    if defects:
+        yield f"{defects} dead or hot pixels are left out"
+    burnt = int(windows.saturated.sum())
+    if burnt:
+        yield (
+            f"{burnt} pixels are saturated in some frame and left out; "
+            "lower the exposure or the laser power"
+        )
+
+
+def _warm_up(scene: Scene, notify: Notify) -> None:
+    """Load the compiled kernels, and say so where they must be compiled first."""
+    timer = threading.Timer(
+        _PATIENCE_S, notify, ["compiling the numerical kernels, once per installation…"]
+    )
+    timer.daemon = True
+    timer.start()
+    try:
+        compile_kernels(scene.model)
+    finally:
+        timer.cancel()
+
+
+class _Clock:
+    """Seconds since the last lap, by name."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self.seconds: dict[str, float] = {}
+
+    def lap(self, name: str) -> None:
+        """Book the time since the last lap under a name."""
+        now = time.perf_counter()
+        self.seconds[name] = now - self._last
+        self._last = now
+
+
+def _versions() -> dict[str, str]:
+    return {
+        "iscat-analysis": version("iscat-analysis"),
+        "python": platform.python_version(),
+        **{name: version(name) for name in DEPENDENCIES},
+    }

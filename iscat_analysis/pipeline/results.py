@@ -1,0 +1,200 @@
+"""From fitted events to the table, the views and the summary."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.bounds import EventBounds, event_bounds
+from iscat_analysis.pipeline.field import Event, Scene, photons_scale
+from iscat_analysis.records import (
+    EVENT_COLUMNS,
+    FREE_PARAMETERS,
+    EventView,
+    FloatArray,
+    PosteriorResult,
+    Status,
+    Windows,
+)
+
+_SHORT = {"x_nm": "x_nm", "y_nm": "y_nm", "z_nm": "z_nm", "mass_kda": "mass_kda"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table and what its view shows."""
+
+    number: int
+    event: Event
+    windows: Windows
+    posterior: PosteriorResult | None = None
+
+
+def collected_photons(scene: Scene, windows: Windows, event: Event) -> float:
+    """Scattered photons that the pupil collected from one particle in the frames after.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    windows : Windows
+        Give the background light.
+    event : Event
+        The particle.
+
+    Returns
+    -------
+    float
+        Photoelectrons (the quantum efficiency counts as part of the collection).
+    """
+    area = scene.model.collected_area_nm2(event.fit.z_nm, event.fit.mass_kda)
+    if scene.additive:
+        per_pixel = photons_scale(scene, windows)
+    else:
+        used = ~windows.masked[event.region.slices]
+        per_pixel = windows.power_ratio * float(windows.before_e[event.region.slices][used].mean())
+    return per_pixel * area / scene.pixel_nm**2
+
+
+def table_of(scene: Scene, rows: Sequence[Row]) -> pd.DataFrame:
+    """Make the table of ``fits.csv``.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    rows : sequence of Row
+        The events.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns `EVENT_COLUMNS`.
+    """
+    table = pd.DataFrame([_record(scene, row) for row in rows], columns=list(EVENT_COLUMNS))
+    integers = ["event", "frame", "n_before", "n_after"]
+    numbers = [c for c in EVENT_COLUMNS if c not in (*integers, "status", "flags")]
+    return table.astype({**dict.fromkeys(integers, "int64"), **dict.fromkeys(numbers, "float64")})
+
+
+def _record(scene: Scene, row: Row) -> dict[str, Any]:
+    fit, windows = row.event.fit, row.windows
+    collected = collected_photons(scene, windows, row.event)
+    bounds: EventBounds = event_bounds(row.event.likelihood, fit.theta, fit.free, collected)
+    record: dict[str, Any] = {
+        "event": row.number,
+        "frame": windows.frames_after[0],
+        "n_before": windows.n_before,
+        "n_after": windows.n_after,
+        "x_px": fit.x_nm / scene.pixel_nm,
+        "y_px": fit.y_nm / scene.pixel_nm,
+        "x_nm": fit.x_nm,
+        "y_nm": fit.y_nm,
+        "z_nm": fit.z_nm,
+        "mass_kda": fit.mass_kda,
+        "contrast": fit.contrast if scene.model.rho else np.nan,
+        "n_scattered": collected,
+        "snr": row.event.snr,
+        "chi2_reduced": fit.chi2_reduced,
+        "p_value": fit.p_value,
+        "status": str(fit.status),
+        "flags": ";".join(str(f) for f in fit.flags),
+    }
+    for k, name in enumerate(_SHORT):
+        record[f"sigma_{name}"] = fit.sigma[k]
+        record[f"crb_{name}"] = bounds.crb_joint[k]
+        record[f"qcrb_{name}"] = bounds.qcrb[k]
+    return record
+
+
+def view_of(row: Row) -> EventView:
+    """Images of one event for the report.
+
+    Parameters
+    ----------
+    row : Row
+        The event.
+
+    Returns
+    -------
+    EventView
+        Measured signal, model and residuals.
+    """
+    likelihood, theta = row.event.likelihood, row.event.fit.theta
+    unit = likelihood.data[2] if not likelihood.model.rho else 1.0
+    return EventView(
+        event=row.number,
+        row_px=row.event.region.rows[0],
+        column_px=row.event.region.columns[0],
+        contrast=likelihood.measured_signal() * unit,
+        model=likelihood.signal(theta) * unit,
+        residual=likelihood.residuals(theta),
+        posterior=row.posterior,
+    )
+
+
+def summary_of(
+    scene: Scene, table: pd.DataFrame, windows: Windows, timings: Mapping[str, float]
+) -> dict[str, Any]:
+    """Counts, medians and efficiency, for ``summary.json``.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models and configuration.
+    table : pandas.DataFrame
+        The events.
+    windows : Windows
+        Frame ranges and power.
+    timings : mapping of str to float
+        Seconds per stage.
+
+    Returns
+    -------
+    dict
+        Nested plain values.
+    """
+    good = table[table["status"] == Status.OK]
+    precision = {}
+    for name in FREE_PARAMETERS[scene.mode]:
+        sigma, crb, qcrb = (good[f"{kind}_{name}"] for kind in ("sigma", "crb", "qcrb"))
+        precision[name] = {
+            "sigma_median": _median(sigma),
+            "crb_median": _median(crb),
+            "qcrb_median": _median(qcrb),
+            "sigma_over_crb_median": _median(sigma / crb),
+            "information_fraction_median": _median((qcrb / crb) ** 2),
+        }
+    return {
+        "mode": scene.mode,
+        "scheme": scene.model.optics.scheme,
+        "emission": scene.model.optics.emission,
+        "convention": scene.model.optics.convention,
+        "mass_scale": "calibration" if scene.config.calibration else "absolute model",
+        "events": len(table),
+        "status": dict(sorted(Counter(table["status"]).items())),
+        "frames_before": list(windows.frames_before),
+        "frames_after": list(windows.frames_after),
+        "power_ratio": windows.power_ratio,
+        "power_spread": float(np.std(windows.power)) if windows.power.size else 0.0,
+        "masked_pixels": int(windows.masked.sum()),
+        "detection_threshold_snr": scene.templates.threshold,
+        "medians": {
+            "mass_kda": _median(good["mass_kda"]),
+            "contrast": _median(good["contrast"]),
+            "n_scattered": _median(good["n_scattered"]),
+        },
+        "precision": precision,
+        "seconds": {name: round(value, 3) for name, value in timings.items()},
+    }
+
+
+def _median(values: pd.Series[float] | FloatArray) -> float | None:
+    finite = np.asarray(values, dtype=float)
+    finite = finite[np.isfinite(finite)]
+    return float(np.median(finite)) if finite.size else None
