@@ -173,9 +173,8 @@ def report_context(analysis: Analysis, figures: Mapping[str, int]) -> dict[str, 
     name = PurePath(source.replace("\\", "/")).name or "Analysis"
     sections = [
         ("summary", "Summary"),
-        ("distributions", "Distributions"),
-        ("precision", "Precision"),
-        ("events", "Events"),
+        ("distributions", "Distributions" if len(table) else "Field"),
+        *([("precision", "Precision"), ("events", "Events")] if len(table) else []),
         ("posterior", "Posterior"),
         ("diagnostics", "Diagnostics"),
         ("configuration", "Configuration"),
@@ -312,11 +311,14 @@ def _tiles(table: pd.DataFrame, precision: Sequence[Precision], main: str) -> li
     leaving = int((values < 0).sum()) if main == "mass_kda" else 0
     _, low, middle, high, _ = _quantiles(np.abs(values))
     note = f"middle half {number(low)} to {number(high)}" if values.size > 1 else ""
-    if leaving:
+    if leaving and values.size == 1:
+        note = "leaving; magnitude"
+    elif leaving:
         note = f"{values.size - leaving} landing, {leaving} leaving; magnitude"
+    what = "mass" if main == "mass_kda" else "height"
     tiles.append(
         {
-            "label": "Median mass" if main == "mass_kda" else "Median height",
+            "label": f"Median {what}" if values.size > 1 else what.capitalize(),
             "value": number(middle),
             "unit": UNITS[main] if values.size else "",
             "note": note,
@@ -437,7 +439,12 @@ def _histogram_spec(
     x: dict[str, Any] = {"label": label}
     if domain is not None:
         x["domain"] = domain
-    return {"height": 250, "x": x, "y": {"label": "events", "zero": True}, "series": series}
+    return {
+        "height": 250,
+        "x": x,
+        "y": {"label": "events", "zero": True, "whole": True},
+        "series": series,
+    }
 
 
 def _power_spec(analysis: Analysis) -> dict[str, Any] | None:
@@ -458,7 +465,7 @@ def _power_spec(analysis: Analysis) -> dict[str, Any] | None:
         "x": {"label": "frame"},
         "y": {"label": "laser power, relative"},
         "series": [
-            {"kind": "line", "name": "power", "color": "qcrb", "thin": True,
+            {"kind": "line", "name": "power", "color": "ink", "thin": True,
              "x": frames, "y": np.round(power, 7)},
             {"kind": "rule", "color": "plain", "axis": "y", "value": 1.0},
         ],

@@ -1,6 +1,6 @@
 // Charts as inline SVG from small declarative specs; shared by every page.
 //
-// spec = { x: axis, y: axis, height, series: [...] },  axis = { label, scale: "linear"|"log", domain, categories }
+// spec = { x: axis, y: axis, height, series: [...] },  axis = { label, scale: "linear"|"log", domain, categories, zero, whole }
 //   { kind: "points",   name, color, x, y, ids, mask, hollow }
 //   { kind: "line",     name, color, x, y, dash }
 //   { kind: "bars",     name, color, edges, counts, base }        base: counts underneath, to stack
@@ -112,7 +112,8 @@ window.iscat = (() => {
     const back = (p) => { const t = a + ((p - start) / (stop - start)) * (b - a); return log ? Math.exp(t) : t; };
     const count = Math.max(2, Math.floor(Math.abs(stop - start) / labelSize));
     const { ticks, step } = (log ? logTicks : niceTicks)(lo, hi, count);
-    return { at, lo, hi, invert: back, ticks: ticks.map((v) => ({ v, text: tickText(v, step) })) };
+    const shown = axis.whole ? ticks.filter((v) => Number.isInteger(v)) : ticks;
+    return { at, lo, hi, invert: back, ticks: shown.map((v) => ({ v, text: tickText(v, axis.whole ? 1 : step) })) };
   };
 
   // ---- text ------------------------------------------------------------------------------------
@@ -399,11 +400,11 @@ window.iscat = (() => {
         const down = head.getAttribute("aria-sort") === "ascending";
         table.querySelectorAll("th").forEach((th) => th.setAttribute("aria-sort", "none"));
         head.setAttribute("aria-sort", down ? "descending" : "ascending");
-        const key = (row) => { const cell = row.cells[column]; return cell.dataset.sort ?? cell.textContent.trim(); };
+        const key = (row) => { const cell = row.cells[column]; const text = cell.dataset.sort ?? cell.textContent.trim().replaceAll("−", "-"); return text === "—" ? "" : text; };
         const rows = [...table.tBodies[0].rows];
-        const numeric = rows.every((row) => key(row) === "" || Number.isFinite(Number(key(row).replace("−", "-"))));
-        const value = (row) => { const k = key(row); return numeric ? (k === "" ? Infinity : Number(k.replace("−", "-"))) : k; };
-        rows.sort((a, b) => { const [p, q] = [value(a), value(b)]; const c = p < q ? -1 : p > q ? 1 : 0; return down ? -c : c; });
+        const numeric = rows.every((row) => key(row) === "" || Number.isFinite(Number(key(row))));
+        const value = (row) => { const k = key(row); return numeric ? (k === "" ? Infinity : Number(k)) : k; };
+        rows.sort((a, b) => { const [p, q] = [value(a), value(b)]; if (p === Infinity || q === Infinity) return (p === Infinity) - (q === Infinity); const c = p < q ? -1 : p > q ? 1 : 0; return down ? -c : c; });
         table.tBodies[0].append(...rows);
       });
     });

@@ -74,10 +74,10 @@
       counts[!mask[i] ? "out" : isOk(i) ? "ok" : "flagged"][k] += 1;
     });
     const below = counts.ok.map((c, k) => c + counts.flagged[k]);
-    const series = [{ kind: "bars", name: "ok", color: "qcrb", edges, counts: counts.ok }];
+    const series = [{ kind: "bars", name: "ok", color: "ok", edges, counts: counts.ok }];
     if (counts.flagged.some(Boolean)) series.push({ kind: "bars", name: "flagged", color: "flag", edges, counts: counts.flagged, base: counts.ok });
     if (counts.out.some(Boolean)) series.push({ kind: "bars", name: "filtered out", color: "plain", opacity: 0.3, edges, counts: counts.out, base: below });
-    chart(host, { x: { label: `${labels[name]} [${units[name]}]`, domain: [lo, hi] }, y: { label: "events", zero: true }, series }, {
+    chart(host, { x: { label: `${labels[name]} [${units[name]}]`, domain: [lo, hi] }, y: { label: "events", zero: true, whole: true }, series }, {
       brushed: state.ranges[name] || null,
       onBrush: (range) => { if (range) state.ranges[name] = range; else delete state.ranges[name]; showRange(); refresh(); },
     });
@@ -92,8 +92,8 @@
   };
   const timeline = (host) => {
     const series = data.mode === "track" ? [...tracks().values()].map((rows) => ({ kind: "line", color: "plain", thin: true, x: rows.map((i) => columns.frame[i]), y: rows.map((i) => columns[main][i]) })) : [];
-    series.push(...split(columns.frame, columns[main], "qcrb"));
-    chart(host, { x: { label: "frame" }, y: { label: `${labels[main]} [${units[main]}]` }, series }, { tip: (s, k) => summaryOf(s.ids[k]), onPick: openEvent });
+    series.push(...split(columns.frame, columns[main], "ok"));
+    chart(host, { x: { label: "frame", whole: true }, y: { label: `${labels[main]} [${units[main]}]` }, series }, { tip: (s, k) => summaryOf(s.ids[k]), onPick: openEvent });
   };
   const tracks = () => {
     const found = new Map();
