@@ -6,6 +6,7 @@ Lengths are nm, wavenumbers rad/nm.  Angles θ are those in the immersion oil.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,9 +79,12 @@ def gauss_legendre(
     return theta, weight
 
 
+@cache
 def _unit_gauss_legendre(nodes: int) -> tuple[FloatArray, FloatArray]:
     x, w = np.polynomial.legendre.leggauss(nodes)
-    return (x + 1) / 2, w / 2
+    x, w = (x + 1) / 2, w / 2
+    x.flags.writeable = w.flags.writeable = False
+    return x, w
 
 
 def rectangle(alpha: float, nodes: int) -> tuple[FloatArray, FloatArray]:

@@ -1,7 +1,8 @@
 """Bounds: what no unbiased estimator can beat, given the camera or given the light itself.
 
 `quantum` holds what the collected light knows, `classical` what the camera can learn of it, and
-`experiment` plans a measurement from a configuration.
+`experiment` plans a measurement from a configuration; `scan` varies one thing, `planning` turns the
+question round, and `paper` reproduces Dong et al. (2021).
 """
 
 from __future__ import annotations
@@ -20,26 +21,54 @@ from iscat_analysis.bounds.experiment import (
     report_of,
     warnings_of,
 )
+from iscat_analysis.bounds.paper import Reproduction, reproduce
+from iscat_analysis.bounds.planning import (
+    Best,
+    Cost,
+    Effort,
+    Goal,
+    budget,
+    effort,
+    optimize,
+    parse_target,
+)
 from iscat_analysis.bounds.quantum import (
     incompatible_pairs,
     quantum_bounds,
     quantum_information,
     z_nm_phase_free,
 )
+from iscat_analysis.bounds.scan import AXES, Axis, Scan, changed, parse_scan, scan
 
 __all__ = [
+    "AXES",
+    "Axis",
+    "Best",
+    "Cost",
+    "Effort",
     "EventBounds",
     "Experiment",
+    "Goal",
+    "Reproduction",
+    "Scan",
     "Unidentifiable",
     "bounds_from_matrices",
     "bounds_report",
+    "budget",
+    "changed",
+    "effort",
     "event_bounds",
     "incompatible_pairs",
     "information_fraction",
+    "optimize",
+    "parse_scan",
+    "parse_target",
     "plan",
     "quantum_bounds",
     "quantum_information",
     "report_of",
+    "reproduce",
+    "scan",
     "warnings_of",
     "z_nm_phase_free",
 ]

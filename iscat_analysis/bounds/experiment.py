@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.bounds.classical import EventBounds, event_bounds
+from iscat_analysis.bounds.classical import EventBounds, bounds_from_matrices, event_bounds
 from iscat_analysis.bounds.quantum import (
     NAMES,
     incompatible_pairs,
@@ -213,7 +213,7 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
     free = FREE_PARAMETERS[config.fit.mode]
     z_nm = float(experiment.theta[2])
     whole = experiment.bounds(PARAMETERS)
-    joint = experiment.bounds(free)
+    joint = bounds_from_matrices(whole.fisher, whole.quantum, free)
     mass = experiment.mass_kda
     to_rel = np.array([1.0, 1.0, 1.0, 1 / mass])
     # with a calibration that has an offset, a relative step of the amplitude is not one of the mass

@@ -1,0 +1,409 @@
+"""Dong et al. (2021), whole: every panel and Table 1, in the authors' convention and exactly.
+
+The authors' convention is that of their program (physics.md, section 7): 110 nodes of a rectangle
+rule, a z derivative that refocuses, points on ``linspace(-2, 2 µm, 151)``, and one normalisation,
+the scattered photons on that field at z = focus = 0.  The exact curves use the default model, hold
+the stage when the particle moves, and are per collected photon, as the quantum bounds are.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.pupil import make_pupil, rectangle
+from iscat_analysis.bounds.experiment import Experiment, plan
+from iscat_analysis.bounds.quantum import Measure, quantum_bounds, quantum_information
+from iscat_analysis.config import Config, parse_config
+from iscat_analysis.forward import ForwardModel, forward_model
+from iscat_analysis.records import PARAMETERS, Progress, silent
+
+FloatArray = NDArray[np.float64]
+Convention = Literal["dong2021", "exact"]
+
+SCHEMES = ("iscat", "cobri", "darkfield")
+
+OPTICS: dict[str, Any] = {
+    "wavelength_nm": 517.5, "na": 1.3, "n_immersion": 1.5, "n_glass": 1.5, "n_sample": 1.33,
+}  # fmt: skip
+PARTICLE: dict[str, Any] = {
+    "kind": "gold", "permittivity": (-3.7328, 2.7725), "density_kg_m3": 19300.0,
+    "diameter_nm": 30.0,
+}  # fmt: skip
+"""D21, appendix C."""
+
+COBRI_ATTENUATION = 0.0601
+"""Makes COBRI's reference as strong as iSCAT's (D21, Fig. 2)."""
+
+PIXELS = 151
+FIELD_NM = 4000.0
+FOCUS_NM = 1000.0
+HEIGHT_NM = 5.0
+"""Field, focus of Figs. 2 and 4a–b, and height of Figs. 3 and 4c–d [nm]."""
+
+IMAGE_HEIGHTS_NM = (0.0, 500.0, 950.0, 1000.0, 1500.0)
+"""Heights of Fig. 2a; D21 does not print its own.  950 → 1000 nm is a quarter of iSCAT's fringe."""
+
+HEIGHTS_NM = np.arange(0.0, 3001.0, 20.0)
+FOCI_NM = np.arange(-5000.0, 5001.0, 100.0)
+ATTENUATIONS = {"cobri": (0.0601, 0.02, 0.006, 0.002), "iscat": (1.0, 0.3, 0.1, 0.03)}
+"""Abscissae of the curves, and the references of Fig. 4."""
+
+TABLE_NODES = 100
+"""Nodes per angle of the authors' rectangle rule for Table 1."""
+
+PRINTED = {"x": 71.0, "y": 57.0, "z_iscat": 18.0, "z_cobri": 114.0, "mass": 0.5}
+"""Table 1 as printed [nm; relative], and the mass bound of the text."""
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """Everything D21 shows.
+
+    Attributes
+    ----------
+    curves : pandas.DataFrame
+        Long form, one row per point: ``panel`` ("2b", "2c", "2d", "2e", "3", "4a"…"4d"),
+        ``scheme``, ``convention``, ``attenuation``, ``quantity``, ``x``, ``value``.
+    images : dict
+        (scheme, height [nm]) → intensity over the incident, shape (151, 151); Fig. 2a.
+    table : pandas.DataFrame
+        Table 1: ``quantity``, ``unit``, ``printed``, ``authors``, ``dong2021``, ``exact``,
+        ``reciprocal``.
+    quantum : dict
+        (measure, scheme) → single quantum bounds per collected photon, shape (4,).
+    """
+
+    curves: pd.DataFrame
+    images: dict[tuple[str, float], FloatArray]
+    table: pd.DataFrame
+    quantum: dict[tuple[Measure, str], FloatArray]
+
+
+def paper_config(
+    scheme: str,
+    convention: Convention = "exact",
+    *,
+    z_nm: float = HEIGHT_NM,
+    focus_nm: float = 0.0,
+    attenuation: float | None = None,
+    **optics: Any,  # keys of [optics], validated there
+) -> Config:
+    """Set up D21's microscope.
+
+    Parameters
+    ----------
+    scheme : str
+        ``"iscat"``, ``"cobri"`` or ``"darkfield"``.
+    convention : {"exact", "dong2021"}
+        Whose integrals, prefactors and z derivative.
+    z_nm, focus_nm : float
+        Height and focus [nm].
+    attenuation : float, optional
+        Default 1, and 0.0601 for COBRI.
+    **optics
+        Further keys of ``[optics]``.
+
+    Returns
+    -------
+    Config
+        One frame, known background.
+    """
+    authors = convention == "dong2021"
+    if attenuation is None:
+        attenuation = COBRI_ATTENUATION if scheme == "cobri" else 1.0
+    return parse_config(
+        {
+            "optics": {
+                **OPTICS, "scheme": scheme, "focus_nm": focus_nm, "attenuation": attenuation,
+                "convention": convention, "axial": "refocus" if authors else "stage", **optics,
+            },
+            "camera": {"pixel_size_nm": FIELD_NM / (PIXELS - 1 if authors else PIXELS)},
+            "particle": {**PARTICLE, "height_nm": z_nm},
+            "bounds": {
+                "pixels": PIXELS, "n_before": 0, "n_after": 1, "photons_per_pixel": 1.0,
+            },
+            "fit": {"mode": "joint"},
+        }
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Point:
+    """Bounds of one set-up, per photon.
+
+    Attributes
+    ----------
+    single, joint : ndarray, shape (4,)
+        Over x, y, z [nm] and relative mass.
+    phase : float
+        Phase between the on-axis scattered field and the reference [rad]; NaN in dark field.
+    snr : float
+        On-axis pixel's signal over its noise, D21's SNR.
+    """
+
+    single: FloatArray
+    joint: FloatArray
+    phase: float
+    snr: float
+
+
+def photons_of_authors(scheme: str, attenuation: float | None = None) -> float:
+    """Scattered photons on the field at z = focus = 0, the authors' normalisation.
+
+    Parameters
+    ----------
+    scheme : str
+        Scheme.
+    attenuation : float, optional
+        As in `paper_config`.
+
+    Returns
+    -------
+    float
+        For one background photon per pixel (dark field: one collected photon).
+    """
+    return plan(
+        paper_config(scheme, "dong2021", z_nm=0.0, focus_nm=0.0, attenuation=attenuation)
+    ).on_camera
+
+
+def point(config: Config, photons: float | None) -> Point:
+    """Bounds of one set-up, normalised as the figures are.
+
+    Parameters
+    ----------
+    config : Config
+        From `paper_config`.
+    photons : float or None
+        Divide by these, the authors' way; None for the collected photons.
+
+    Returns
+    -------
+    Point
+        Per photon.
+    """
+    experiment = plan(config)
+    found = experiment.bounds(PARAMETERS)
+    per = np.array([1, 1, 1, 1 / experiment.mass_kda])
+    root = math.sqrt(experiment.collected if photons is None else photons)
+    return Point(
+        found.crb_single * per * root, found.crb_joint * per * root, *_on_axis(experiment, root)
+    )
+
+
+def _on_axis(experiment: Experiment, root: float) -> tuple[float, float]:
+    model, z_nm = experiment.model, float(experiment.theta[2])
+    at = np.zeros(1)
+    along = complex(model.field(at, at, z_nm, experiment.mass_kda)[0, 0])
+    power, scale = abs(along) ** 2, float(experiment.likelihood.data[2, 0, 0])
+    signal = power + 2 * model.rho * along.real
+    noise = math.sqrt(model.rho + signal)
+    phase = math.atan2(along.imag, along.real) if model.rho else math.nan
+    return phase, signal / noise * math.sqrt(scale) / root
+
+
+def reproduce(*, workers: int = 2, progress: Progress = silent) -> Reproduction:
+    """Compute every panel and Table 1.
+
+    Parameters
+    ----------
+    workers : int
+        Threads.
+    progress : Progress, optional
+        Told after each curve.
+
+    Returns
+    -------
+    Reproduction
+        Curves, images, table.
+    """
+    jobs: list[tuple[tuple[str, ...], str, Convention, float | None]] = []
+    conventions: tuple[Convention, ...] = ("dong2021", "exact")
+    for convention in conventions:
+        for scheme in SCHEMES:
+            jobs.append((("2b", "2c", "2d", "2e"), scheme, convention, None))
+            jobs.append((("3",), scheme, convention, None))
+        for scheme, panels in (("cobri", ("4a", "4c")), ("iscat", ("4b", "4d"))):
+            for attenuation in ATTENUATIONS[scheme]:
+                jobs.extend(((panel,), scheme, convention, attenuation) for panel in panels)
+    parts: list[pd.DataFrame] = []
+    with ThreadPoolExecutor(workers) as pool:
+        for done, part in enumerate(pool.map(lambda job: _curves(*job), jobs), start=1):
+            parts.append(part)
+            progress("curves of Dong et al. (2021)", done, len(jobs))
+    images = {(scheme, z): _intensity(scheme, z) for scheme in SCHEMES for z in IMAGE_HEIGHTS_NM}
+    measures: tuple[Measure, ...] = ("dong2021", "exact")
+    quantum = {
+        (measure, scheme): quantum_bounds(
+            quantum_information(_model(scheme), HEIGHT_NM, measure=measure)
+        )[0]
+        for measure in measures
+        for scheme in SCHEMES
+    }
+    return Reproduction(pd.concat(parts, ignore_index=True), images, table1(), quantum)
+
+
+def _curves(
+    panels: tuple[str, ...], scheme: str, convention: Convention, attenuation: float | None
+) -> pd.DataFrame:
+    over_z = panels[0] in ("2b", "4a", "4b")
+    photons = photons_of_authors(scheme, attenuation) if convention == "dong2021" else None
+    axis = HEIGHTS_NM if over_z else FOCI_NM
+    points = [
+        point(
+            paper_config(
+                scheme,
+                convention,
+                z_nm=value if over_z else HEIGHT_NM,
+                focus_nm=FOCUS_NM if over_z else value,
+                attenuation=attenuation,
+            ),
+            photons,
+        )
+        for value in axis
+    ]
+    single = np.array([p.single for p in points])
+    joint = np.array([p.joint for p in points])
+    quantities: dict[str, list[tuple[str, FloatArray]]] = {
+        "2b": [("phase", np.unwrap([p.phase for p in points]))],
+        "2c": [("snr", np.array([p.snr for p in points]))],
+        "2d": [("x", single[:, 0]), ("y", single[:, 1])],
+        "2e": [("z", single[:, 2])],
+        "3": [("mass", single[:, 3]), ("mass joint", joint[:, 3])],
+        "4a": [("z", single[:, 2])],
+        "4b": [("z", single[:, 2])],
+        "4c": [("mass", single[:, 3])],
+        "4d": [("mass", single[:, 3])],
+    }
+    frames = [
+        pd.DataFrame(
+            {
+                "panel": panel,
+                "scheme": scheme,
+                "convention": convention,
+                "attenuation": reference_of(scheme, attenuation),
+                "quantity": name,
+                "x": axis,
+                "value": values,
+            }
+        )
+        for panel in panels
+        if not (panel == "2b" and scheme == "darkfield")
+        for name, values in quantities[panel]
+    ]
+    return pd.concat(frames, ignore_index=True)
+
+
+def reference_of(scheme: str, attenuation: float | None) -> float:
+    """Amplitude of the reference that passes; 0 in dark field.
+
+    Parameters
+    ----------
+    scheme : str
+        Scheme.
+    attenuation : float or None
+        As in `paper_config`.
+
+    Returns
+    -------
+    float
+        β.
+    """
+    if scheme == "darkfield":
+        return 0.0
+    default = COBRI_ATTENUATION if scheme == "cobri" else 1.0
+    return default if attenuation is None else attenuation
+
+
+def _intensity(scheme: str, z_nm: float) -> FloatArray:
+    """Compute the detected over the incident intensity (Fig. 2a)."""
+    config = paper_config(scheme, z_nm=z_nm, focus_nm=FOCUS_NM)
+    experiment = plan(config)
+    model = experiment.model
+    signal = model.image(experiment.grid, 0.0, 0.0, z_nm, experiment.mass_kda)
+    return model.reference**2 * (1 + signal) if model.rho else signal
+
+
+def _model(scheme: str, **optics: Any) -> ForwardModel:  # as in paper_config
+    return forward_model(paper_config(scheme, **optics), 1.0)
+
+
+def table1() -> pd.DataFrame:
+    """Make Table 1: quantum bounds per collected photon, five ways.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns ``quantity``, ``unit``, ``printed``, ``authors`` (D21's formulas with its program's
+        rectangle rule), ``dong2021`` (the same formulas integrated exactly), ``exact`` (physics.md,
+        section 5) and ``reciprocal`` (exact, energy-conserving emission).
+    """
+    ways = {
+        "authors": {s: rectangle_rule_bounds(s) for s in ("iscat", "cobri")},
+        "dong2021": {s: _single(_model(s), "dong2021") for s in ("iscat", "cobri")},
+        "exact": {s: _single(_model(s), "exact") for s in ("iscat", "cobri")},
+        "reciprocal": {
+            s: _single(_model(s, emission="reciprocal"), "exact") for s in ("iscat", "cobri")
+        },
+    }
+    rows = []
+    for name, unit, index, scheme in (
+        ("x", "nm", 0, "iscat"),
+        ("y", "nm", 1, "iscat"),
+        ("z_iscat", "nm", 2, "iscat"),
+        ("z_cobri", "nm", 2, "cobri"),
+        ("mass", "relative", 3, "iscat"),
+    ):
+        row: dict[str, Any] = {"quantity": name, "unit": unit, "printed": PRINTED[name]}
+        rows.append(row | {way: found[scheme][index] for way, found in ways.items()})
+    return pd.DataFrame(rows)
+
+
+def _single(model: ForwardModel, measure: Measure) -> FloatArray:
+    return quantum_bounds(quantum_information(model, HEIGHT_NM, measure=measure))[0]
+
+
+def rectangle_rule_bounds(scheme: str) -> FloatArray:
+    """Table 1 as the authors' program computes it.
+
+    100 × 100 points of ``linspace(0, α)`` and ``linspace(0, 2π)``, all of equal weight, so that
+    φ = 0 counts twice.
+
+    Parameters
+    ----------
+    scheme : str
+        ``"iscat"`` or ``"cobri"``.
+
+    Returns
+    -------
+    ndarray, shape (4,)
+        x, y, z [nm] and relative mass.
+    """
+    model = _model(scheme)
+    optics = model.optics
+    theta, weight = rectangle(math.asin(optics.na / optics.n_immersion), TABLE_NODES)
+    pupil = make_pupil(
+        theta, weight, wavenumber=model.wavenumber, n_immersion=optics.n_immersion,
+        n_glass=optics.n_glass, n_sample=optics.n_sample,
+        direction=1.0 if scheme == "iscat" else -1.0, reciprocal=False,
+    )  # fmt: skip
+    phi = np.linspace(0.0, 2 * math.pi, TABLE_NODES)
+    p, s = np.abs(pupil.t_p_cos) ** 2, np.abs(pupil.t_s) ** 2
+    density = np.outer(p, np.cos(phi) ** 2) + np.outer(s, np.sin(phi) ** 2)
+    density *= pupil.apodization[:, None] ** 2
+    density /= density.sum()
+    kappa = pupil.axial.real / (1.0 if scheme == "iscat" else optics.n_sample)
+    slopes = (
+        np.outer(pupil.transverse, np.cos(phi)),
+        np.outer(pupil.transverse, np.sin(phi)),
+        np.outer(kappa, np.ones(phi.size)),
+        np.ones(density.shape),
+    )
+    return np.array([1 / math.sqrt(4 * float((q**2 * density).sum())) for q in slopes])

@@ -1,0 +1,386 @@
+"""Planning an experiment: the best setting, the photons a target takes, and where precision goes.
+
+All three ask the question of `plan` and `event_bounds` backwards; the bound they speak of is the
+joint one over the free parameters of the mode.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy.optimize import brentq, minimize_scalar
+
+from iscat_analysis.bounds.experiment import plan
+from iscat_analysis.bounds.scan import AXES, Scan, changed, scan
+from iscat_analysis.config import Config, parse_config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Progress, silent
+
+TARGETS = {"x": "x_nm", "y": "y_nm", "z": "z_nm", "mass": "mass_kda"}
+"""What a user calls the parameters."""
+
+FOCUS_REACH_NM = 2000.0
+"""Foci searched on either side of the particle [nm]."""
+
+FOCUS_STEP_NM = 25.0
+"""Grid of the search; the bound changes over half a wavelength and more [nm]."""
+
+ATTENUATION_DECADES = 4
+"""Attenuations searched below 1."""
+
+MAX_FRAMES = 1e12
+"""More frames than any experiment has."""
+
+
+@dataclass(frozen=True)
+class Best:
+    """The setting with the smallest bound.
+
+    Attributes
+    ----------
+    axis, parameter : str
+        What was varied, and for what.
+    value : float
+        The best setting.
+    here : float
+        The configured one.
+    bound, bound_here : float
+        Joint bound at both, for all frames [nm or kDa]; NaN where unidentifiable.
+    note : str
+        What was held fixed.
+    scan : Scan
+        The coarse search.
+    """
+
+    axis: str
+    parameter: str
+    value: float
+    here: float
+    bound: float
+    bound_here: float
+    note: str
+    scan: Scan
+
+
+def optimize(
+    config: Config,
+    axis: Literal["focus", "attenuation"],
+    target: str,
+    *,
+    progress: Progress = silent,
+) -> Best:
+    """Find the focus or the attenuation that makes one bound smallest.
+
+    Parameters
+    ----------
+    config : Config
+        The experiment.
+    axis : {"focus", "attenuation"}
+        What to vary.  The light on the particle is held; attenuations at which a pixel would exceed
+        ``camera.well_depth_e`` are left out.
+    target : {"mass", "z", "x", "y"}
+        Whose joint bound is to be small.
+    progress : Progress, optional
+        Told after each point of the coarse search.
+
+    Returns
+    -------
+    Best
+        The best setting beside the configured one.
+
+    Raises
+    ------
+    ConfigError
+        The target is unknown or not free in this mode, or no setting works.
+    """
+    if axis not in ("focus", "attenuation"):
+        raise ConfigError(f"--optimize {axis}: choose focus or attenuation")
+    parameter = _parameter(config, target)
+    line = AXES[axis]
+    column = f"crb_joint_{parameter}"
+    if axis == "focus":
+        height = config.particle.height_nm
+        grid = height + np.arange(-FOCUS_REACH_NM, FOCUS_REACH_NM + 1, FOCUS_STEP_NM)
+        note = "light on the particle held; the oil thickness follows the focus"
+    else:
+        grid = np.logspace(-ATTENUATION_DECADES, 0, 20 * ATTENUATION_DECADES + 1)
+        note = "light on the particle held; the background follows the attenuation squared"
+    coarse = scan(config, line, grid, progress=progress)
+    well = config.camera.well_depth_e or math.inf
+    score = coarse.table[column].where(coarse.table["peak_e"] < well).to_numpy(float)
+    if not np.isfinite(score).any():
+        raise ConfigError(
+            f"--optimize {axis}: {parameter} is unidentifiable or the camera saturated at every "
+            "setting; lower bounds.photons_per_pixel, or free fewer parameters with --mode"
+        )
+    best = int(np.nanargmin(score))
+
+    def bound(value: float) -> float:
+        experiment = plan(changed(config, line, value))
+        if experiment.peak_e >= well:
+            return math.inf
+        found = experiment.bounds(coarse.free).crb_joint[PARAMETERS.index(parameter)]
+        return float(found) if math.isfinite(found) else math.inf
+
+    value, smallest = float(grid[best]), float(score[best])
+    if 0 < best < grid.size - 1:
+        fine = minimize_scalar(
+            bound, bounds=(grid[best - 1], grid[best + 1]), method="bounded",
+            options={"xatol": 1e-3 * (grid[best + 1] - grid[best - 1])},
+        )  # fmt: skip
+        if fine.fun < smallest:
+            value, smallest = float(fine.x), float(fine.fun)
+    here = plan(config).bounds(coarse.free).crb_joint[PARAMETERS.index(parameter)]
+    return Best(axis, parameter, value, line.value(config), smallest, float(here), note, coarse)
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A precision to be reached.
+
+    Attributes
+    ----------
+    parameter : str
+        As in `PARAMETERS`.
+    value : float
+        Standard deviation [nm or kDa].
+    """
+
+    parameter: str
+    value: float
+
+
+def parse_target(text: str, config: Config) -> Goal:
+    """Read what follows ``--target``.
+
+    Parameters
+    ----------
+    text : str
+        ``"mass=5kDa"``, ``"z=2nm"``, or without the unit.
+    config : Config
+        Its mode says which parameters are free.
+
+    Returns
+    -------
+    Goal
+        What is wanted.
+
+    Raises
+    ------
+    ConfigError
+        The syntax, the unit or the parameter is wrong.
+    """
+    match = re.fullmatch(r"\s*(\w+)\s*=\s*([0-9.eE+-]+)\s*([A-Za-zµ]*)\s*", text)
+    if match is None:
+        raise ConfigError(f"--target {text}: write it as mass=5kDa or z=2nm")
+    parameter = _parameter(config, match[1])
+    unit = "kDa" if parameter == "mass_kda" else "nm"
+    factors = {"kda": 1.0, "mda": 1e3, "da": 1e-3} if unit == "kDa" else {"nm": 1.0, "um": 1e3}
+    factor = factors.get(match[3].lower() or unit.lower())
+    try:
+        value = float(match[2])
+    except ValueError:
+        value = math.nan
+    if factor is None or not (math.isfinite(value) and value > 0):
+        raise ConfigError(
+            f"--target {text}: give a positive number of {unit}, as in {match[1]}=5{unit}"
+        )
+    return Goal(parameter, value * factor)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What a precision costs.
+
+    Attributes
+    ----------
+    background : str
+        How the background is known.
+    n_before, n_after : float
+        Frames; infinite where no number of frames reaches the goal.
+    seconds : float or None
+        Both together at ``camera.frame_rate_hz``, where that is known.
+    collected : float
+        Collected scattered photons.
+    """
+
+    background: str
+    n_before: float
+    n_after: float
+    seconds: float | None
+    collected: float
+
+
+def effort(config: Config, goal: Goal) -> list[Effort]:
+    """How many frames and photons a precision takes.
+
+    Parameters
+    ----------
+    config : Config
+        The experiment; its frames are replaced.
+    goal : Goal
+        The precision.
+
+    Returns
+    -------
+    list of Effort
+        With the configured background frames, with as many before as after, and with a known
+        background.
+
+    Raises
+    ------
+    ConfigError
+        The parameter is unidentifiable here.
+    """
+    before = config.bounds.n_before
+    finite = config.optics.scheme != "darkfield" or config.background.level_e is not None
+    ways: list[tuple[str, Callable[[int], int]]] = []
+    if before and finite:
+        ways.append((f"{before} frames before", lambda _: before))
+        ways.append(("as many frames before as after", lambda n: n))
+    ways.append(("known", lambda _: 0))
+    return [_effort(config, goal, name, way) for name, way in ways]
+
+
+def _effort(config: Config, goal: Goal, name: str, before: Callable[[int], int]) -> Effort:
+    def bound(n_after: int) -> float:
+        return _bound(_with(config, bounds={"n_after": n_after, "n_before": before(n_after)}), goal)
+
+    one = bound(1)
+    if not math.isfinite(one):
+        raise ConfigError(
+            f"--target: {goal.parameter} is unidentifiable here; change the focus or free fewer "
+            "parameters with --mode"
+        )
+    if bound(int(MAX_FRAMES)) > goal.value:
+        return Effort(name, before(0), math.inf, None, math.inf)
+    frames = 1
+    if one > goal.value:
+        root = brentq(
+            lambda t: bound(max(1, round(math.exp(t)))) / goal.value - 1,
+            0.0, math.log(MAX_FRAMES), xtol=1e-3,
+        )  # fmt: skip
+        frames = max(1, round(math.exp(root)))
+        step = max(1, round(frames * 1e-4))
+        while bound(frames) > goal.value:
+            frames += step
+        while frames > step and bound(frames - step) <= goal.value:
+            frames -= step
+    reached = plan(_with(config, bounds={"n_after": frames, "n_before": before(frames)}))
+    rate = config.camera.frame_rate_hz
+    seconds = (frames + before(frames)) / rate if rate else None
+    return Effort(name, before(frames), frames, seconds, reached.collected)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """One line of a budget.
+
+    Attributes
+    ----------
+    cause : str
+        What costs precision.
+    factor : float
+        By how much it multiplies the standard deviation.
+    bound : float
+        The bound after it [nm or kDa].
+    """
+
+    cause: str
+    factor: float
+    bound: float
+
+
+def budget(config: Config, parameter: str) -> list[Cost]:
+    """Where the precision goes, from the light's own bound to this experiment's.
+
+    Parameters
+    ----------
+    config : Config
+        The experiment.
+    parameter : str
+        As in `PARAMETERS`, free in this mode.
+
+    Returns
+    -------
+    list of Cost
+        The quantum bound (factor 1), then shot noise (this microscope and field with pixels of no
+        size, background known, the other parameters too), crosstalk with the other free
+        parameters, pixelation, finite background, read noise.  The product of the factors times
+        the first bound is the last, which is the joint bound of `bounds_report`.
+
+    Raises
+    ------
+    ConfigError
+        As in `plan`.
+    """
+    free = FREE_PARAMETERS[config.fit.mode]
+    at = PARAMETERS.index(parameter)
+    quiet = _with(config, camera={"read_noise_e": 0.0}, bounds={"n_before": 0})
+    fine = _with(quiet, **_refined(quiet))
+    ideal = plan(fine).bounds(PARAMETERS)
+    steps = [
+        ("quantum bound", float(ideal.qcrb[at])),
+        ("shot noise", float(ideal.crb_single[at])),
+        ("crosstalk", float(plan(fine).bounds(free).crb_joint[at])),
+    ]
+    for cause, one in (
+        ("pixelation", quiet),
+        ("finite background", _with(config, camera={"read_noise_e": 0.0})),
+        ("read noise", config),
+    ):
+        steps.append((cause, float(plan(one).bounds(free).crb_joint[at])))
+    lines, before = [], steps[0][1]
+    for cause, bound in steps:
+        lines.append(Cost(cause, bound / before, bound))
+        before = bound
+    return lines
+
+
+FINE_PIXELS = 24
+"""Fine pixels per wavelength over NA; finer ones change no bound by 1e-4."""
+
+MOST_PIXELS = 1200
+"""Side of the finest field."""
+
+
+def _refined(config: Config) -> dict[str, dict[str, Any]]:
+    """Divide the same field into pixels so small that they cost nothing."""
+    pixel = config.camera.pixel_size_nm
+    if pixel is None:
+        return {}
+    wanted = math.ceil(pixel * FINE_PIXELS * config.optics.na / config.optics.wavelength_nm)
+    split = max(1, min(wanted, MOST_PIXELS // config.bounds.pixels))
+    photons = config.bounds.photons_per_pixel
+    if config.optics.scheme != "darkfield":
+        photons /= split**2
+    return {
+        "camera": {"pixel_size_nm": pixel / split},
+        "bounds": {"pixels": config.bounds.pixels * split, "photons_per_pixel": photons},
+    }
+
+
+def _with(config: Config, **sections: dict[str, Any]) -> Config:
+    values = config.model_dump(exclude_none=True)
+    for section, keys in sections.items():
+        values.setdefault(section, {}).update(keys)
+    return parse_config(values)
+
+
+def _bound(config: Config, goal: Goal) -> float:
+    free = FREE_PARAMETERS[config.fit.mode]
+    return float(plan(config).bounds(free).crb_joint[PARAMETERS.index(goal.parameter)])
+
+
+def _parameter(config: Config, target: str) -> str:
+    parameter = TARGETS.get(target.lower())
+    if parameter is None:
+        raise ConfigError(f"{target}: choose one of {', '.join(TARGETS)}")
+    if parameter not in FREE_PARAMETERS[config.fit.mode]:
+        raise ConfigError(f"{target} is not free in mode {config.fit.mode}: choose --mode joint")
+    return parameter

@@ -1,0 +1,307 @@
+"""Bounds along one axis of an experiment.
+
+The light that falls on the particle is held: where the attenuation or the pixel size changes, the
+background per pixel follows (β² and pixel area); the scattered photons stay.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numba import get_num_threads
+from numpy.typing import NDArray
+
+from iscat_analysis.bounds.classical import bounds_from_matrices
+from iscat_analysis.bounds.experiment import Experiment, information_fraction, plan
+from iscat_analysis.config import Config, parse_config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.forward import forward_model
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Progress, silent
+
+FloatArray = NDArray[np.float64]
+
+MAX_POINTS = 100_000
+"""Points of a scan at most."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Something that can be varied.
+
+    Attributes
+    ----------
+    name : str
+        What the user types.
+    label : str
+        For figures, with the unit.
+    value : callable
+        Config → its present value.
+    change : callable
+        (Config, value) → the sections to change.
+    rebuilds : bool
+        Whether the forward model depends on it.
+    """
+
+    name: str
+    label: str
+    value: Callable[[Config], float]
+    change: Callable[[Config, float], Mapping[str, Mapping[str, Any]]]
+    rebuilds: bool
+
+
+def _pixel_nm(config: Config) -> float:
+    if config.camera.pixel_size_nm is None:
+        raise ConfigError(
+            "camera.pixel_size_nm is missing: give it, as in --set camera.pixel_size_nm=84.4"
+        )
+    return config.camera.pixel_size_nm
+
+
+def _height(config: Config) -> float:
+    z_nm = config.bounds.z_nm
+    return config.particle.height_nm if z_nm is None else z_nm
+
+
+def _attenuated(config: Config, value: float) -> Mapping[str, Mapping[str, Any]]:
+    if config.optics.scheme == "darkfield":
+        raise ConfigError(
+            "attenuation: dark field has no reference to attenuate; choose optics.scheme = "
+            '"iscat" or "cobri"'
+        )
+    power = (value / config.optics.attenuation) ** 2
+    photons = config.bounds.photons_per_pixel * power
+    return {"optics": {"attenuation": value}, "bounds": {"photons_per_pixel": photons}}
+
+
+def _pixelated(config: Config, value: float) -> Mapping[str, Mapping[str, Any]]:
+    old = _pixel_nm(config)
+    side = config.bounds.pixels * old
+    photons = config.bounds.photons_per_pixel
+    if config.optics.scheme != "darkfield":
+        photons *= (value / old) ** 2
+    return {
+        "camera": {"pixel_size_nm": value},
+        "bounds": {
+            "pixels": round(side / value) if value > 0 else 0,
+            "photons_per_pixel": photons,
+        },
+    }
+
+
+def _field(config: Config, value: float) -> Mapping[str, Mapping[str, Any]]:
+    return {"bounds": {"pixels": round(value / _pixel_nm(config))}}
+
+
+AXES = {
+    axis.name: axis
+    for axis in (
+        Axis("z", "height z [nm]", _height, lambda _, v: {"bounds": {"z_nm": v}}, False),
+        Axis(
+            "focus", "focus height [nm]", lambda c: c.optics.focus_nm,
+            lambda _, v: {"optics": {"focus_nm": v}}, True,
+        ),
+        Axis(
+            "attenuation", "amplitude of the reference that passes",
+            lambda c: c.optics.attenuation, _attenuated, True,
+        ),
+        Axis(
+            "na", "numerical aperture", lambda c: c.optics.na,
+            lambda _, v: {"optics": {"na": v}}, True,
+        ),
+        Axis("pixel", "pixel size [nm]", _pixel_nm, _pixelated, False),
+        Axis(
+            "fov", "field of view [nm]", lambda c: c.bounds.pixels * _pixel_nm(c), _field, False
+        ),
+        Axis(
+            "photons", "background photons per pixel and frame",
+            lambda c: c.bounds.photons_per_pixel,
+            lambda _, v: {"bounds": {"photons_per_pixel": v}}, False,
+        ),
+    )
+}  # fmt: skip
+"""What `--scan` knows."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Bounds along one axis.
+
+    Attributes
+    ----------
+    name, label : str
+        The axis.
+    here : float
+        Where the configuration stands on it.
+    free : tuple of str
+        Free parameters of the joint bound.
+    table : pandas.DataFrame
+        One row per value, the axis first, then bounds [nm, kDa] and photon numbers.
+    """
+
+    name: str
+    label: str
+    here: float
+    free: tuple[str, ...]
+    table: pd.DataFrame
+
+
+def parse_scan(text: str) -> tuple[Axis, FloatArray]:
+    """Read what follows ``--scan``.
+
+    Parameters
+    ----------
+    text : str
+        ``"z=0:2000:50"`` (start, stop included, step) or ``"attenuation=1,0.3,0.1"``.
+
+    Returns
+    -------
+    axis : Axis
+        What varies.
+    values : ndarray, shape (n,)
+        Its values.
+
+    Raises
+    ------
+    ConfigError
+        The syntax is wrong, or there is no such axis.
+    """
+    name, equals, numbers = text.partition("=")
+    name = name.strip().lower()
+    if not equals or name not in AXES:
+        raise ConfigError(
+            f"--scan {text}: write it as NAME=start:stop:step or NAME=a,b,c, "
+            f"with NAME one of {', '.join(AXES)}; as in --scan z=0:2000:50"
+        )
+    try:
+        parts = [float(part) for part in numbers.replace(",", ":").split(":")]
+    except ValueError:
+        raise ConfigError(
+            f"--scan {text}: {numbers!r} is not start:stop:step nor a,b,c; "
+            f"as in --scan {name}=0:2000:50"
+        ) from None
+    if not all(map(math.isfinite, parts)):
+        raise ConfigError(f"--scan {text}: needs finite numbers")
+    if ":" not in numbers:
+        return AXES[name], np.array(parts)
+    if "," in numbers or len(parts) != 3:
+        raise ConfigError(
+            f"--scan {text}: needs three numbers start:stop:step, as in --scan {name}=0:2000:50"
+        )
+    start, stop, step = parts
+    if step == 0 or (stop - start) / step < 0:
+        raise ConfigError(
+            f"--scan {text}: the step {step:g} does not lead from {start:g} to {stop:g}; "
+            "change its sign or size"
+        )
+    count = math.floor((stop - start) / step * (1 + 1e-12) + 1e-9) + 1
+    if count > MAX_POINTS:
+        raise ConfigError(
+            f"--scan {text}: has {count} points, at most {MAX_POINTS}; take a larger step"
+        )
+    return AXES[name], np.array([start + step * i for i in range(count)])
+
+
+def changed(config: Config, axis: Axis, value: float) -> Config:
+    """Move a configuration along an axis.
+
+    Parameters
+    ----------
+    config : Config
+        Where it stands.
+    axis : Axis
+        What changes.
+    value : float
+        To what.
+
+    Returns
+    -------
+    Config
+        Validated.
+
+    Raises
+    ------
+    ConfigError
+        The value is impossible.
+    """
+    values = config.model_dump(exclude_none=True)
+    for section, keys in axis.change(config, float(value)).items():
+        values.setdefault(section, {}).update(keys)
+    return parse_config(values, where=f"{axis.name} = {value:g}")
+
+
+def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress = silent) -> Scan:
+    """Bounds along one axis, on `compute.workers` threads.
+
+    Parameters
+    ----------
+    config : Config
+        The experiment.
+    axis : Axis
+        From `parse_scan`, or `AXES`.
+    values : ndarray, shape (n,)
+        Its values.
+    progress : Progress, optional
+        Told after each point.
+
+    Returns
+    -------
+    Scan
+        Bounds for all frames, in nm and kDa.
+
+    Raises
+    ------
+    ConfigError
+        A value is impossible, or `plan` refuses.
+    """
+    free = FREE_PARAMETERS[config.fit.mode]
+    plans = [changed(config, axis, value) for value in values]
+    model = None
+    if not axis.rebuilds:
+        reach = max(_reach(one) for one in plans)
+        heights = [_height(one) for one in plans]
+        model = forward_model(config, reach, z_max_nm=max(*heights, config.particle.height_nm))
+
+    def row(one: Config) -> dict[str, Any]:
+        return _row(plan(one, model=model), free)
+
+    rows = []
+    with ThreadPoolExecutor(min(config.compute.workers, get_num_threads())) as pool:
+        for done, result in enumerate(pool.map(row, plans), start=1):
+            rows.append(result)
+            progress(f"scan over {axis.name}", done, len(plans))
+    table = pd.DataFrame(rows)
+    table.insert(0, axis.name, values)
+    return Scan(axis.name, axis.label, axis.value(config), free, table)
+
+
+def _reach(config: Config) -> float:
+    half = config.bounds.pixels * _pixel_nm(config) / 2
+    return 1.0001 * math.hypot(half + abs(config.bounds.x_nm), half + abs(config.bounds.y_nm))
+
+
+def _row(experiment: Experiment, free: tuple[str, ...]) -> dict[str, Any]:
+    whole = experiment.bounds(PARAMETERS)
+    joint = bounds_from_matrices(whole.fisher, whole.quantum, free)
+    fraction = information_fraction(whole)
+    row: dict[str, Any] = {}
+    for kind, values in (
+        ("crb_single", whole.crb_single),
+        ("crb_joint", joint.crb_joint),
+        ("qcrb", whole.qcrb),
+        ("information", fraction),
+    ):
+        row |= {f"{kind}_{name}": v for name, v in zip(PARAMETERS, values, strict=True)}
+    return row | {
+        "n_camera": experiment.on_camera,
+        "n_collected": experiment.collected,
+        "photons_per_pixel": experiment.config.bounds.photons_per_pixel,
+        "peak_e": experiment.peak_e,
+        "inflation": joint.inflation,
+        "unidentifiable": "; ".join(map(str, joint.unidentifiable)),
+    }
