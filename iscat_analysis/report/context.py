@@ -43,7 +43,7 @@ _MODES = {
     "joint": "position in three dimensions and mass",
     "track": "position and mass in every frame, linked into tracks",
 }
-_SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "dark field"}
+_SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "Dark field"}
 
 
 @dataclass(frozen=True)

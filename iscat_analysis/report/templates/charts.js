@@ -1,7 +1,7 @@
 // Charts as inline SVG from small declarative specs; shared by every page.
 //
 // spec = { x: axis, y: axis, height, series: [...] },  axis = { label, scale: "linear"|"log", domain, categories, zero, whole }
-//   { kind: "points",   name, color, x, y, ids, mask, hollow }
+//   { kind: "points",   name, color, x, y, ids, mask, hollow, under }
 //   { kind: "line",     name, color, x, y, dash }
 //   { kind: "bars",     name, color, edges, counts, base }        base: counts underneath, to stack
 //   { kind: "interval", name, color, at, mid, lo, hi, lo2, hi2, offset }  along the axis that is not categorical
@@ -257,7 +257,8 @@ window.iscat = (() => {
 
     const targets = []; // [px, py, text, id]
     const many = series.some((s) => s.kind === "points" && s.x.length > 800);
-    for (const s of series) {
+    const layers = many ? [...series.filter((s) => s.under), ...series.filter((s) => !s.under)] : series;
+    for (const s of layers) {
       const color = css(s.color);
       if (s.kind === "points") {
         const groups = [[[], []], [[], []]];
@@ -284,11 +285,11 @@ window.iscat = (() => {
         s.x.forEach((vx, i) => {
           if (!finite(vx) || !finite(s.y[i])) { pen = false; return; }
           const [px, py] = [xScale.at(vx), yScale.at(s.y[i])];
-          d += `${pen ? "L" : "M"}${px.toFixed(1)} ${py.toFixed(1)}`;
+          d += pen ? `L${px.toFixed(1)} ${py.toFixed(1)}` : `M${px.toFixed(1)} ${py.toFixed(1)}h0`;
           pen = true;
           targets.push([px, py, () => `${s.name || ""}\n${spec.x.label}: ${fmt(vx, 4)}\n${spec.y.label}: ${fmt(s.y[i], 4)}`.trim(), null]);
         });
-        svg("path", { d, style: `fill:none;stroke:${color};stroke-width:${s.thin ? 1 : 1.8};stroke-linejoin:round;${s.dash ? "stroke-dasharray:5 4" : ""}` }, root);
+        svg("path", { d, style: `fill:none;stroke:${color};stroke-width:${s.thin ? 1 : 1.8};stroke-linejoin:round;stroke-linecap:${s.dash ? "butt" : "round"};${s.dash ? "stroke-dasharray:5 4" : ""}` }, root);
       } else if (s.kind === "bars") {
         s.counts.forEach((count, i) => {
           if (!count) return;

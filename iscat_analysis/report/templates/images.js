@@ -74,13 +74,13 @@ window.iscat.images = (() => {
     svg("image", { href: picture(image.data, image.w, image.h, "grey"), width: image.w * image.factor * k, height: image.h * image.factor * k, preserveAspectRatio: "none", style: "image-rendering:pixelated" }, frame);
     const at = (v) => (v + 0.5) * k;
     for (const track of tracks || []) svg("path", { d: track.map(([x, y], i) => `${i ? "L" : "M"}${at(x).toFixed(1)} ${at(y).toFixed(1)}`).join(""), style: "fill:none;stroke:#56b4e9;stroke-width:1.4;stroke-linejoin:round" }, frame);
-    const r = marks.length > 400 ? 4 : Math.max(6, Math.min(14, width / 36));
+    const r = marks.length > 1500 ? 2.5 : marks.length > 400 ? 4 : Math.max(6, Math.min(14, width / 36));
     const ring = (list) => list.map((m) => `M${(at(m.x) - r).toFixed(1)} ${at(m.y).toFixed(1)}a${r} ${r} 0 1 0 ${2 * r} 0a${r} ${r} 0 1 0 ${-2 * r} 0`).join("");
     const shown = marks.filter((m) => m.active);
     svg("path", { d: ring(marks.filter((m) => !m.active)), style: "fill:none;stroke:#fff;stroke-opacity:.28;stroke-width:1" }, frame);
     if (!(tracks && tracks.length)) {
-      svg("path", { d: ring(shown), style: "fill:none;stroke:#000;stroke-opacity:.45;stroke-width:3.4" }, frame);
-      svg("path", { d: ring(shown), style: "fill:none;stroke:#f0e442;stroke-width:1.5" }, frame);
+      if (shown.length <= 1500) svg("path", { d: ring(shown), style: "fill:none;stroke:#000;stroke-opacity:.45;stroke-width:3.4" }, frame);
+      svg("path", { d: ring(shown), style: `fill:none;stroke:#f0e442;stroke-width:${shown.length > 1500 ? 0.8 : 1.5}` }, frame);
     }
     // Numbers where they fit: never over a neighbour's number or ring.
     const taken = shown.map((m) => [at(m.x) - r, at(m.y) - r, at(m.x) + r, at(m.y) + r]);

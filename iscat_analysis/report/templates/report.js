@@ -87,7 +87,7 @@
     return [[true, "ok", color], [false, "flagged", "flag"]].flatMap(([wanted, name, tint]) => {
       const ids = pick(wanted);
       if (!ids.length) return [];
-      return [{ kind: "points", name: extra.name ? `${extra.name}${wanted ? "" : ", flagged"}` : name, color: tint, x: ids.map((i) => x[i]), y: ids.map((i) => y[i]), ids, mask: ids.map((i) => mask[i]), hollow: !wanted, ...extra.look }];
+      return [{ kind: "points", name: extra.name ? `${extra.name}${wanted ? "" : ", flagged"}` : name, color: tint, x: ids.map((i) => x[i]), y: ids.map((i) => y[i]), ids, mask: ids.map((i) => mask[i]), hollow: !wanted, under: !wanted }];
     });
   };
   const timeline = (host) => {
