@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,6 +119,26 @@ class MassScale:
 
 
 @dataclass(frozen=True)
+class AxialTable:
+    """Radial profiles along z, without their carrier; see `iscat_analysis._kernels.radial`.
+
+    Attributes
+    ----------
+    heights : ndarray, shape (n, 3, 4, intervals·6)
+        Profile and its first two derivatives, per step, at each height.
+    first_nm, step_nm : float
+        First height and step [nm].
+    kappa : float
+        Wavenumber of the carrier [rad/nm].
+    """
+
+    heights: FloatArray
+    first_nm: float
+    step_nm: float
+    kappa: float
+
+
+@dataclass(frozen=True)
 class ForwardModel:
     """Expected images of one particle in one microscope; build it with `forward_model`.
 
@@ -145,6 +166,8 @@ class ForwardModel:
         Bessel matrices.
     step_nm : float
         Radial step [nm].
+    z_range_nm : (float, float)
+        Heights that fits may ask for [nm].
     samples : (ndarray, ndarray)
         Sample offsets inside a pixel, as fractions of it, and their weights.
     scale : MassScale
@@ -162,6 +185,7 @@ class ForwardModel:
     strength: complex
     table: FloatArray
     step_nm: float
+    z_range_nm: tuple[float, float]
     samples: tuple[FloatArray, FloatArray]
     scale: MassScale = MassScale()
 
@@ -198,14 +222,30 @@ class ForwardModel:
 
         Returns
         -------
-        ndarray, shape (intervals, 6, 4·orders)
+        ndarray, shape (4·orders, intervals, 6)
             See `iscat_analysis._kernels.radial`.
         """
         points = self.table.shape[3]
         nodes = np.empty((4 * orders, 3 * points))
-        out = np.empty((points - 1, 6, 4 * orders))
+        out = np.empty((4 * orders, points - 1, 6))
         radial_profile(self.table, self.source, self.axial, z_nm, orders, nodes, out)
         return out
+
+    @cached_property
+    def axial_table(self) -> AxialTable:
+        """Profiles at the heights of `z_range_nm`, for the kernels that interpolate along z."""
+        low, high = self.z_range_nm
+        kappa = float(self.axial.real.min() + self.axial.real.max()) / 2
+        step = STEP / float(np.abs(self.axial - kappa).max())
+        count = max(math.ceil((high - low) / step), 1) + 1
+        points = self.table.shape[3]
+        nodes, out = np.empty((12, 3 * points)), np.empty((12, points - 1, 6))
+        heights = np.empty((count, 3, 4, 6 * (points - 1)))
+        for i in range(count):
+            z = low + i * step
+            radial_profile(self.table, self.source, self.axial - kappa, z, 3, nodes, out)
+            heights[i] = out.reshape(3, 4, -1) * (step ** np.arange(3))[:, None, None]
+        return AxialTable(heights, low, step, kappa)
 
     def image(
         self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
@@ -382,10 +422,10 @@ class ForwardModel:
     def _radial(self, r: FloatArray, z_nm: float) -> tuple[ComplexArray, ComplexArray]:
         """F0 and F2 at distances r, from the table."""
         profile = self.profile(z_nm, 1)
-        index = np.minimum((r / self.step_nm).astype(int), profile.shape[0] - 1)
+        index = np.minimum((r / self.step_nm).astype(int), profile.shape[1] - 1)
         t = r / self.step_nm - index
         powers = t[..., None] ** np.arange(6)
-        values = np.einsum("...p,...pc->...c", powers, profile[index])
+        values = np.einsum("...p,c...p->...c", powers, profile[:, index])
         return values[..., 0] + 1j * values[..., 1], values[..., 2] + 1j * values[..., 3]
 
     def _peak(self, z_nm: float, amplitude: float) -> tuple[float, float, float]:
@@ -550,6 +590,7 @@ def forward_model(
         strength=strength,
         table=bessel_table(pupil.transverse, step, intervals),
         step_nm=step,
+        z_range_nm=(min(config.fit.z_range_nm[0], height), z_max_nm),
         samples=(points / 2, weights / 2),
     )
     if config.calibration is None:

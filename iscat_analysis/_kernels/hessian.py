@@ -35,7 +35,7 @@ def signal_hessian(
 
     Parameters
     ----------
-    profile : ndarray, shape (intervals, 6, 12)
+    profile : ndarray, shape (12, intervals, 6)
         From `radial_profile` with three orders.
     inv_step, rho, x, y, x_p, y_p, amplitude, cos_psi, sin_psi, offsets, weights
         As in `iscat_analysis._kernels.image.signal_gradient`.
@@ -101,7 +101,7 @@ def _fields(profile, inv_step, u, v, radial, e, de, dde):
     t = r * inv_step
     i = int(t)
     t -= i
-    c = profile[i]
+    c = profile[:, i]
     for k in range(6):
         for n in range(3):
             total = 0j
@@ -109,7 +109,7 @@ def _fields(profile, inv_step, u, v, radial, e, de, dde):
                 factor = 1.0
                 for m in range(n):
                     factor *= p - m
-                total = total * t + factor * (c[p, 2 * k] + 1j * c[p, 2 * k + 1])
+                total = total * t + factor * (c[2 * k, p] + 1j * c[2 * k + 1, p])
             radial[n, k] = total * inv_step**n
     f0, f2 = radial[:, 0], radial[:, 1]
     safe = r if r > 1e-6 else 1e-6

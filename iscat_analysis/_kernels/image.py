@@ -39,36 +39,36 @@ def _row_fields(profile, inv_step, x, x_p, dy, with_gradient, f):
             i = np.uintp(t)
             t -= i
             for k in range(4):
-                v = profile[i, 5, k]
+                v = profile[k, i, 5]
                 d = 5 * v
-                v = v * t + profile[i, 4, k]
-                d = d * t + 4 * profile[i, 4, k]
-                v = v * t + profile[i, 3, k]
-                d = d * t + 3 * profile[i, 3, k]
-                v = v * t + profile[i, 2, k]
-                d = d * t + 2 * profile[i, 2, k]
-                v = v * t + profile[i, 1, k]
-                f[8 + k, j] = d * t + profile[i, 1, k]
-                f[k, j] = v * t + profile[i, 0, k]
+                v = v * t + profile[k, i, 4]
+                d = d * t + 4 * profile[k, i, 4]
+                v = v * t + profile[k, i, 3]
+                d = d * t + 3 * profile[k, i, 3]
+                v = v * t + profile[k, i, 2]
+                d = d * t + 2 * profile[k, i, 2]
+                v = v * t + profile[k, i, 1]
+                f[8 + k, j] = d * t + profile[k, i, 1]
+                f[k, j] = v * t + profile[k, i, 0]
             for k in range(4, 8):
-                v = profile[i, 5, k]
-                v = v * t + profile[i, 4, k]
-                v = v * t + profile[i, 3, k]
-                v = v * t + profile[i, 2, k]
-                v = v * t + profile[i, 1, k]
-                f[k, j] = v * t + profile[i, 0, k]
+                v = profile[k, i, 5]
+                v = v * t + profile[k, i, 4]
+                v = v * t + profile[k, i, 3]
+                v = v * t + profile[k, i, 2]
+                v = v * t + profile[k, i, 1]
+                f[k, j] = v * t + profile[k, i, 0]
     else:
         for j in range(x.size):
             t = f[12, j]
             i = np.uintp(t)
             t -= i
             for k in range(4):
-                v = profile[i, 5, k]
-                v = v * t + profile[i, 4, k]
-                v = v * t + profile[i, 3, k]
-                v = v * t + profile[i, 2, k]
-                v = v * t + profile[i, 1, k]
-                f[k, j] = v * t + profile[i, 0, k]
+                v = profile[k, i, 5]
+                v = v * t + profile[k, i, 4]
+                v = v * t + profile[k, i, 3]
+                v = v * t + profile[k, i, 2]
+                v = v * t + profile[k, i, 1]
+                f[k, j] = v * t + profile[k, i, 0]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -202,7 +202,7 @@ def signal_gradient(
 
     Parameters
     ----------
-    profile : ndarray, shape (intervals, 6, 8 or more)
+    profile : ndarray, shape (8 or more, intervals, 6)
         From `radial_profile`.
     inv_step : float
         One over the radial step [1/nm].

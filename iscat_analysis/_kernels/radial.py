@@ -1,4 +1,4 @@
-"""The radial functions of the field, as a quintic table that is exact along z.
+"""The radial functions of the field, as quintic tables along r and along z.
 
 The field in the frame of the polarisation is
 
@@ -6,12 +6,17 @@ The field in the frame of the polarisation is
 
 with F0 = I0 and F2 = I2/r², both entire and even in r and band-limited at k·NA.  On a uniform
 radial grid their values and first two radial derivatives are linear in the pupil's phase vector
-at height z, so one pass over the precomputed Bessel matrices gives quintic Hermite coefficients at
-any z, evanescent waves included; there is no interpolation along z.  With step h the quintic errs
-by (h k NA)⁶/46080 of the peak.
+at height z, so one pass over the precomputed Bessel matrices (`radial_profile`) gives quintic
+Hermite coefficients at any z, evanescent waves included.  With step h the quintic errs by
+(h k NA)⁶/46080 of the peak.
 
-A *profile* has shape (intervals, 6, channels): powers of t ∈ [0, 1) in each interval, then Re F0,
-Im F0, Re F2, Im F2, followed by the same four for ∂/∂z, and for ∂²/∂z² where asked.
+A fit asks for hundreds of heights in one range.  There the mean phase exp(iκz) is divided out, the
+profile and its first two derivatives along z are tabulated, and `profile_at` interpolates them by
+the same quintic, at a tenth of the cost and with the same error.
+
+A *profile* has shape (channels, intervals, 6), the last axis the powers of t ∈ [0, 1) in each
+interval; the channels are Re F0, Im F0, Re F2, Im F2, followed by the same four for ∂/∂z, and for
+∂²/∂z² where asked.
 """
 
 from __future__ import annotations
@@ -24,7 +29,7 @@ from scipy.special import j0, j1
 FloatArray = NDArray[np.float64]
 
 STEP = 0.3
-"""Radial step times k·NA: 1.6e-8 of the peak in the field, 3e-7 in its gradient."""
+"""Step times bandwidth, along r and z: 1.6e-8 of the peak in the field, 3e-7 in its gradient."""
 
 
 def reduced_bessel(x: FloatArray) -> FloatArray:
@@ -131,7 +136,7 @@ def radial_profile(
         1: fields only; 2: with ∂/∂z; 3: with ∂²/∂z².
     nodes : ndarray, shape (4·orders, 3·(intervals + 1))
         Scratch.
-    profile : ndarray, shape (intervals, 6, 4·orders)
+    profile : ndarray, shape (4·orders, intervals, 6)
         Filled.
     """
     n = axial.size
@@ -162,13 +167,98 @@ def radial_profile(
         s = nodes[channel, 2 * points :]
         for k in range(points - 1):
             rise = f[k + 1] - f[k]
-            profile[k, 0, channel] = f[k]
-            profile[k, 1, channel] = d[k]
-            profile[k, 2, channel] = 0.5 * s[k]
-            profile[k, 3, channel] = (
+            profile[channel, k, 0] = f[k]
+            profile[channel, k, 1] = d[k]
+            profile[channel, k, 2] = 0.5 * s[k]
+            profile[channel, k, 3] = (
                 10 * rise - 6 * d[k] - 4 * d[k + 1] - 1.5 * s[k] + 0.5 * s[k + 1]
             )
-            profile[k, 4, channel] = -15 * rise + 8 * d[k] + 7 * d[k + 1] + 1.5 * s[k] - s[k + 1]
-            profile[k, 5, channel] = (
+            profile[channel, k, 4] = -15 * rise + 8 * d[k] + 7 * d[k + 1] + 1.5 * s[k] - s[k + 1]
+            profile[channel, k, 5] = (
                 6 * rise - 3 * d[k] - 3 * d[k + 1] - 0.5 * s[k] + 0.5 * s[k + 1]
             )
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+def _mix(t, v, d, out):
+    """Fill `out` (2, n) with the combinations v and d (6) of the six rows of t (6, n)."""
+    t0, t1, t2, t3, t4, t5 = t[0], t[1], t[2], t[3], t[4], t[5]
+    v0, v1, v2, v3, v4, v5 = v[0], v[1], v[2], v[3], v[4], v[5]
+    d0, d1, d2, d3, d4, d5 = d[0], d[1], d[2], d[3], d[4], d[5]
+    value, slope = out[0], out[1]
+    for j in range(value.size):
+        value[j] = v0 * t0[j] + v1 * t1[j] + v2 * t2[j] + v3 * t3[j] + v4 * t4[j] + v5 * t5[j]
+        slope[j] = d0 * t0[j] + d1 * t1[j] + d2 * t2[j] + d3 * t3[j] + d4 * t4[j] + d5 * t5[j]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+def _turn(re, im, cos, sin, out_re, out_im):
+    """Multiply re + i·im by cos + i·sin."""
+    for j in range(re.size):
+        a, b = re[j], im[j]
+        out_re[j] = a * cos - b * sin
+        out_im[j] = a * sin + b * cos
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def profile_at(
+    heights: FloatArray,
+    first_nm: float,
+    step_nm: float,
+    kappa: float,
+    z_nm: float,
+    intervals: int,
+    work: FloatArray,
+    profile: FloatArray,
+) -> None:
+    """Fill the first intervals of a profile, with ∂/∂z, by interpolation along z.
+
+    Parameters
+    ----------
+    heights : ndarray, shape (n, 3, 4, intervals·6)
+        At each height: profile without its carrier, step·∂z and step²·∂z² of it.
+    first_nm, step_nm : float
+        First height and step [nm].
+    kappa : float
+        Wavenumber of the carrier exp(iκz) [rad/nm].
+    z_nm : float
+        Height [nm], inside the table.
+    intervals : int
+        How many are wanted.
+    work : ndarray, shape (4, 2, intervals·6)
+        Scratch.
+    profile : ndarray, shape (8, intervals, 6)
+        Filled.
+    """
+    place = (z_nm - first_nm) / step_nm
+    i = min(max(int(place), 0), heights.shape[0] - 2)
+    t = place - i
+    t2, t3, t4, t5 = t**2, t**3, t**4, t**5
+    v, d = np.empty(6), np.empty(6)
+    v[3] = 10 * t3 - 15 * t4 + 6 * t5
+    v[0] = 1 - v[3]
+    v[1] = t - 6 * t3 + 8 * t4 - 3 * t5
+    v[2] = 0.5 * t2 - 1.5 * t3 + 1.5 * t4 - 0.5 * t5
+    v[4] = -4 * t3 + 7 * t4 - 3 * t5
+    v[5] = 0.5 * t3 - t4 + 0.5 * t5
+    d[3] = 30 * t2 - 60 * t3 + 30 * t4
+    d[0] = -d[3]
+    d[1] = 1 - 18 * t2 + 32 * t3 - 15 * t4
+    d[2] = t - 4.5 * t2 + 6 * t3 - 2.5 * t4
+    d[4] = -12 * t2 + 28 * t3 - 15 * t4
+    d[5] = 1.5 * t2 - 4 * t3 + 2.5 * t4
+    d /= step_nm
+    six = heights[i : i + 2].reshape(6, 4, heights.shape[3])
+    used = 6 * min(intervals, profile.shape[1])
+    for channel in range(4):
+        _mix(six[:, channel], v, d, work[channel, :, :used])
+    cos, sin = np.cos(kappa * z_nm), np.sin(kappa * z_nm)
+    flat = profile.reshape(8, heights.shape[3])
+    for c in range(0, 4, 2):
+        re, im = work[c, 0, :used], work[c + 1, 0, :used]
+        slope_re, slope_im = work[c, 1, :used], work[c + 1, 1, :used]
+        for j in range(re.size):
+            slope_re[j] -= kappa * im[j]
+            slope_im[j] += kappa * re[j]
+        _turn(re, im, cos, sin, flat[c], flat[c + 1])
+        _turn(slope_re, slope_im, cos, sin, flat[c + 4], flat[c + 5])

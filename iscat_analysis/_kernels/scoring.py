@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.image import FAST, SCRATCH, sampled_row, sampled_signal
-from iscat_analysis._kernels.radial import radial_profile
+from iscat_analysis._kernels.radial import profile_at
 
 FloatArray = NDArray[np.float64]
 
@@ -202,19 +202,35 @@ def value_pass(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _intervals(x, y, offsets, theta, inv_step):
+    """Radial intervals between the particle and the farthest sample."""
+    margin = abs(offsets[-1])
+    dx = max(abs(x[0] - theta[0]), abs(x[-1] - theta[0])) + margin
+    dy = max(abs(y[0] - theta[1]), abs(y[-1] - theta[1])) + margin
+    return int(np.sqrt(dx * dx + dy * dy) * inv_step) + 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scratch(heights):
+    """Work space and profile for `profile_at`."""
+    width = heights.shape[3]
+    return np.empty((4, 2, width)), np.empty((8, width // 6, 6))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def value_batch(
-    table, source, axial, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
+    heights, first_nm, height_step, kappa, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
     thetas, out,
 ):  # fmt: skip
     """Log-likelihood at many θ, shape (n, 5); the profile is remade only where z changes."""
-    points = table.shape[3]
-    nodes = np.empty((4, 3 * points))
-    profile = np.empty((points - 1, 6, 4))
+    work, profile = _scratch(heights)
     z = np.nan
     for k in range(thetas.shape[0]):
         if thetas[k, 2] != z:
             z = thetas[k, 2]
-            radial_profile(table, source, axial, z, 1, nodes, profile)
+            profile_at(
+                heights, first_nm, height_step, kappa, z, profile.shape[1], work, profile
+            )
         out[k] = value_pass(
             profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
             thetas[k],
@@ -268,14 +284,14 @@ def _scoring_step(score, fisher, active, damping, step):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def maximize(
-    table, source, axial, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
+    heights, first_nm, height_step, kappa, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
     free, lower, upper, max_step, tolerance, iterations, theta, score, fisher,
 ):  # fmt: skip
     """Damped Fisher scoring inside a box, from θ, which is overwritten with the estimate.
 
     Parameters
     ----------
-    table, source, axial, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights
+    heights, first_nm, height_step, kappa, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights
         The model; see `radial_profile` and `signal_gradient`.
     kind : int
         CONDITIONAL or POISSON.
@@ -286,14 +302,15 @@ def maximize(
     lower, upper, max_step : ndarray, shape (5,)
         Box, and largest change of each parameter in one step.
     tolerance : float
-        Stop when the expected gain in log-likelihood, half the squared step in standard
-        deviations, falls below it.
+        When the expected gain in log-likelihood, half the squared step in standard deviations,
+        falls below it, that step is taken and is the last: what remains is smaller by the relative
+        difference between observed and expected information.
     iterations : int
         Passes over the data at most.
     theta : ndarray, shape (5,)
         Start; overwritten.
     score, fisher : ndarray, shape (5,), (5, 5)
-        Filled with those at the estimate.
+        Filled with those at the last pass.
 
     Returns
     -------
@@ -304,14 +321,13 @@ def maximize(
     outcome : int
         CONVERGED, STALLED or EXHAUSTED.
     """
-    points = table.shape[3]
-    nodes = np.empty((8, 3 * points))
-    profile = np.empty((points - 1, 6, 8))
+    work, profile = _scratch(heights)
     step, trial = np.empty(5), np.empty(5)
     trial_score, trial_fisher = np.empty(5), np.empty((5, 5))
     active = np.empty(5, dtype=np.bool_)
     damping = 0.0
-    radial_profile(table, source, axial, theta[2], 2, nodes, profile)
+    reach = profile.shape[1] if not free[2] else _intervals(x, y, offsets, theta, inv_step)
+    profile_at(heights, first_nm, height_step, kappa, theta[2], reach, work, profile)
     value = score_pass(
         profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, theta,
         score, fisher,
@@ -337,9 +353,11 @@ def maximize(
             trial[i] = min(max(theta[i] + shrink * step[i], lower[i]), upper[i])
             gain += 0.5 * score[i] * (trial[i] - theta[i])
         if damping == 0.0 and gain < tolerance:
-            return value, passes, CONVERGED
-        if trial[2] != theta[2]:
-            radial_profile(table, source, axial, trial[2], 2, nodes, profile)
+            theta[:] = trial
+            return value + gain, passes, CONVERGED
+        if free[2]:
+            reach = _intervals(x, y, offsets, trial, inv_step)
+            profile_at(heights, first_nm, height_step, kappa, trial[2], reach, work, profile)
         trial_value = score_pass(
             profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, trial,
             trial_score, trial_fisher,
@@ -358,22 +376,21 @@ def maximize(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def scan_heights(
-    table, source, axial, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
-    heights, free_amplitude, lower_amplitude, upper_amplitude, theta, values, amplitudes,
+    heights, first_nm, height_step, kappa, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
+    places, free_amplitude, lower_amplitude, upper_amplitude, theta, values, amplitudes,
 ):  # fmt: skip
     """Profile log-likelihood along z at fixed (x, y): the amplitude takes two scoring steps.
 
-    Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the rest and the start.
+    Fills `values` and `amplitudes`, shape (n,), for the heights `places`; θ gives the rest and the start.
     """
-    points = table.shape[3]
-    nodes = np.empty((8, 3 * points))
-    profile = np.empty((points - 1, 6, 8))
+    work, profile = _scratch(heights)
     score, fisher = np.empty(5), np.empty((5, 5))
     here = theta.copy()
-    for k in range(heights.size):
-        here[2] = heights[k]
+    for k in range(places.size):
+        here[2] = places[k]
         here[3] = theta[3]
-        radial_profile(table, source, axial, here[2], 2, nodes, profile)
+        reach = _intervals(x, y, offsets, here, inv_step)
+        profile_at(heights, first_nm, height_step, kappa, here[2], reach, work, profile)
         if free_amplitude:
             for _ in range(2):
                 score_pass(
