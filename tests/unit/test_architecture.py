@@ -17,6 +17,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8"), str(path)) for path i
 
 # The generator interface of numpy.random is its only part without hidden state.
 STATELESS = {"default_rng", "Generator", "SeedSequence", "BitGenerator", "PCG64", "Philox"}
+STATELESS |= {"RandomState"}  # a seeded one of its own: emcee takes no Generator
 
 
 def _where(path: Path, node: ast.AST) -> str:
