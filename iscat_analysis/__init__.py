@@ -1,1 +1,1 @@
-"""Particle position and mass from interferometric scattering movies, and how near the bound they are."""
+"""Particles in interferometric scattering movies, and how near their fits come to the bound."""

@@ -220,7 +220,8 @@ def _defects(before_e: FloatArray) -> BoolArray:
     local = median_filter(before_e, size=5, mode="nearest")
     if not local.mean() > 0:
         return np.zeros(before_e.shape, dtype=bool)
-    return (local > 0) & ((before_e < DEAD * local) | (before_e > HOT * local))
+    off = (before_e < DEAD * local) | (before_e > HOT * local)
+    return np.asarray(off & (local > 0), dtype=bool)
 
 
 def _frame_power(before_e: FloatArray, after_e: FloatArray) -> FloatArray:

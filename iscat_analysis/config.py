@@ -1,7 +1,7 @@
 """The configuration: one frozen, validated model for each section of the TOML file.
 
 Lengths are nm, masses kDa, counts photoelectrons; ranges are half-open ``[start, stop)`` frames;
-complex numbers are ``[re, im]``.  Every field carries the text that `iscat config` prints beside it.
+complex numbers are ``[re, im]``.  Every field carries the text `iscat config` prints beside it.
 """
 
 from __future__ import annotations
@@ -431,19 +431,17 @@ def config_to_toml(config: Config, *, comments: bool = True) -> str:
             if key == "events":
                 tables = [_event_toml(event) for event in value or ()]
                 continue
-            if value is None:
-                line = f"# {key} ="
-            else:
-                line = f"{key} = {_toml_value(value)}"
             if value is None and not comments:
                 continue
+            line = f"# {key} =" if value is None else f"{key} = {_toml_value(value)}"
             lines.append(f"{line:<36} # {info.description}" if comments else line)
         blocks.append("\n".join([*lines, *tables]))
     return "\n\n".join(blocks) + "\n"
 
 
 def _model_of(annotation: Any) -> type[Section]:
-    return next(a for a in get_args(annotation) if a is not type(None))
+    model: type[Section] = next(a for a in get_args(annotation) if a is not type(None))
+    return model
 
 
 def _event_toml(event: SimulatedEvent) -> str:

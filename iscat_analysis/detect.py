@@ -24,7 +24,7 @@ from iscat_analysis.likelihood import Likelihood
 from iscat_analysis.records import Candidate, FloatArray
 
 HEIGHTS_PER_FRINGE = 8
-"""Templates per interference fringe where z is free: the match falls by 4 % half-way between two."""
+"""Templates per interference fringe where z is free: half-way between two the match loses 4 %."""
 
 SIDELOBE = 0.5
 """A weaker peak inside the fitted region of a stronger one waits until that one is subtracted,
@@ -245,7 +245,8 @@ def _roughness(signal: FloatArray, gradient: NDArray[np.float64]) -> FloatArray:
     norm = np.sum(signal**2)
     cross = np.einsum("iyx,jyx->ij", gradient, gradient) / norm
     along = np.einsum("iyx,yx->i", gradient, signal) / norm
-    return cross - np.outer(along, along)
+    covariance: FloatArray = cross - np.outer(along, along)
+    return covariance
 
 
 def _threshold(

@@ -16,6 +16,6 @@ class DataError(IscatError):
 
 
 class ConfigError(IscatError):
-    """The configuration or an argument is wrong: names the key, the value, the remedy (status 2)."""
+    """The configuration or an argument is wrong: names key, value and remedy (status 2)."""
 
     exit_status = 2

@@ -183,7 +183,7 @@ def _optima(likelihood: Likelihood, start: Candidate, box: Box) -> list[Optimum]
 
 
 def _heights(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[FloatArray]:
-    """Starts at the local maxima of the likelihood along z, and at the given height."""
+    """Start at the local maxima of the likelihood along z, and at the given height."""
     low, high = box.lower[2], box.upper[2]
     count = math.ceil((high - low) / likelihood.model.fringe_nm * SCANS_PER_FRINGE) + 1
     heights = np.linspace(low, high, max(count, 3))

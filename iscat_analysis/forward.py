@@ -1,7 +1,7 @@
 """The forward model: optics, particle and pixel grid → expected image and its derivatives.
 
-One `ForwardModel` serves the simulator, the fits, the posterior and the bounds.  Its *signal* is the
-contrast C in the interferometric schemes and |E_sca|² for unit incident amplitude in dark field
+One `ForwardModel` serves the simulator, the fits, the posterior and the bounds.  Its *signal* is
+the contrast C in the interferometric schemes and |E_sca|² for unit incident amplitude in dark field
 (D21, section II; physics.md, sections 1–3 and 8).
 """
 
@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.hessian import signal_hessian
-from iscat_analysis._kernels.image import signal_gradient, signal_image
+from iscat_analysis._kernels.image import Lens, Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil, rectangle
-from iscat_analysis._kernels.radial import STEP, bessel_table, radial_profile
+from iscat_analysis._kernels.radial import STEP, AxialTable, bessel_table, radial_profile
 from iscat_analysis.config import Calibration, Config, Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.materials import Material, material
@@ -49,12 +49,14 @@ class PixelGrid:
     @classmethod
     def region(cls, rows: tuple[int, int], columns: tuple[int, int], pixel_nm: float) -> PixelGrid:
         """Half-open ranges of full-frame pixels; pixel (0, 0) has its centre at (0, 0) nm."""
-        return cls(np.arange(*columns) * pixel_nm, np.arange(*rows) * pixel_nm, pixel_nm)
+        return cls(
+            np.arange(*columns) * float(pixel_nm), np.arange(*rows) * float(pixel_nm), pixel_nm
+        )
 
     @classmethod
     def centred(cls, pixels: int, pixel_nm: float) -> PixelGrid:
         """Return a square field with centres (i − (n−1)/2)·pixel."""
-        axis = (np.arange(pixels) - (pixels - 1) / 2) * pixel_nm
+        axis = (np.arange(pixels, dtype=np.float64) - (pixels - 1) / 2) * pixel_nm
         return cls(axis, axis, pixel_nm)
 
     @property
@@ -119,26 +121,6 @@ class MassScale:
 
 
 @dataclass(frozen=True)
-class AxialTable:
-    """Radial profiles along z, without their carrier; see `iscat_analysis._kernels.radial`.
-
-    Attributes
-    ----------
-    heights : ndarray, shape (n, 3, 4, intervals·6)
-        Profile and its first two derivatives, per step, at each height.
-    first_nm, step_nm : float
-        First height and step [nm].
-    kappa : float
-        Wavenumber of the carrier [rad/nm].
-    """
-
-    heights: FloatArray
-    first_nm: float
-    step_nm: float
-    kappa: float
-
-
-@dataclass(frozen=True)
 class ForwardModel:
     """Expected images of one particle in one microscope; build it with `forward_model`.
 
@@ -197,13 +179,18 @@ class ForwardModel:
     @property
     def reach_nm(self) -> float:
         """Largest distance from the particle that the radial table covers [nm]."""
-        return self.step_nm * (self.table.shape[3] - 1)
+        return self.step_nm * float(self.table.shape[3] - 1)
 
     @property
-    def rotation(self) -> tuple[float, float]:
-        """Cosine and sine of the polarisation angle."""
+    def lens(self) -> Lens:
+        """Step, reference and polarisation, as the kernels take them."""
         psi = math.radians(self.optics.polarization_deg)
-        return math.cos(psi), math.sin(psi)
+        return Lens(1 / self.step_nm, self.rho, math.cos(psi), math.sin(psi))
+
+    def pixels(self, grid: PixelGrid) -> Pixels:
+        """Return a grid with the samples inside its pixels, as the kernels take them."""
+        offsets, weights = self.samples
+        return Pixels(grid.x_nm, grid.y_nm, offsets * grid.pixel_nm, weights)
 
     @property
     def fringe_nm(self) -> float:
@@ -347,7 +334,7 @@ class ForwardModel:
         complex ndarray, shape (2, *dx_nm.shape)
             Components along and across the polarisation.
         """
-        c, s = self.rotation
+        _, _, c, s = self.lens
         u, v = c * dx_nm + s * dy_nm, c * dy_nm - s * dx_nm
         f0, f2 = self._radial(np.hypot(u, v), z_nm)
         amplitude = self.scale.amplitude(mass_kda)
@@ -451,19 +438,7 @@ class ForwardModel:
 
     def _geometry(
         self, grid: PixelGrid, x_nm: float, y_nm: float, amplitude: float
-    ) -> tuple[
-        float,
-        float,
-        FloatArray,
-        FloatArray,
-        float,
-        float,
-        float,
-        float,
-        float,
-        FloatArray,
-        FloatArray,
-    ]:
+    ) -> tuple[Lens, Pixels, float, float, float]:
         """Arguments every image kernel takes after the profile."""
         half = grid.pixel_nm / 2
         far_x = max(abs(grid.x_nm[0] - x_nm), abs(grid.x_nm[-1] - x_nm)) + half
@@ -473,11 +448,7 @@ class ForwardModel:
                 f"the grid extends {math.hypot(far_x, far_y):.0f} nm from the particle, the model "
                 f"was built for {self.reach_nm:.0f} nm: give forward_model a larger reach_nm"
             )
-        offsets, weights = self.samples
-        return (
-            1 / self.step_nm, self.rho, grid.x_nm, grid.y_nm, x_nm, y_nm, amplitude,
-            *self.rotation, offsets * grid.pixel_nm, weights,
-        )  # fmt: skip
+        return self.lens, self.pixels(grid), x_nm, y_nm, amplitude
 
 
 def forward_model(

@@ -22,6 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.image import Lens, Pixels
+from iscat_analysis._kernels.radial import AxialTable
 from iscat_analysis._kernels.scoring import (
     CONDITIONAL,
     CONVERGED,
@@ -94,7 +96,8 @@ class Likelihood:
     @property
     def _used(self) -> BoolArray:
         column = 3 if self.kind == CONDITIONAL else 2
-        return self.data[column] > 0
+        used: BoolArray = self.data[column] > 0
+        return used
 
     def values(self, thetas: FloatArray) -> FloatArray:
         """Log-likelihood at many parameter vectors.
@@ -110,7 +113,7 @@ class Likelihood:
             Relative to no particle.
         """
         out = np.empty(len(thetas))
-        value_batch(*self._tables(), *self._pixels(), np.ascontiguousarray(thetas), out)
+        value_batch(*self._arguments, np.ascontiguousarray(thetas), out)
         return out
 
     def score_fisher(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -132,7 +135,7 @@ class Likelihood:
         """
         score, fisher = np.empty(5), np.empty((5, 5))
         value = score_pass(
-            self.model.profile(theta[2]), 1 / self.model.step_nm, *self._pixels(),
+            self.model.profile(theta[2]), *self._arguments[1:],
             np.ascontiguousarray(theta, dtype=float), score, fisher,
         )  # fmt: skip
         return value, score, fisher
@@ -168,14 +171,11 @@ class Likelihood:
         """
         theta = np.array(start, dtype=float)
         score, fisher = np.empty(5), np.empty((5, 5))
-        max_step = np.array(
-            [0.25, 0.25, 0.1, np.inf, 1.0]
-            * np.array([self.model.optics.wavelength_nm] * 3 + [1] * 2)
-        )
+        wavelength = self.model.optics.wavelength_nm
+        max_step = np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, np.inf, 1.0])
         value, used, outcome = maximize(
-            *self._tables(), *self._pixels(), free, lower, upper, max_step, tolerance, passes,
-            theta, score, fisher,
-        )  # fmt: skip
+            *self._arguments, free, lower, upper, max_step, tolerance, passes, theta, score, fisher
+        )
         return Optimum(theta, value, used, outcome == CONVERGED, fisher)
 
     def scan_heights(
@@ -198,10 +198,9 @@ class Likelihood:
             Log-likelihood and amplitude at each height.
         """
         values, amplitudes = np.empty(heights.size), np.empty(heights.size)
-        low, high = amplitude_range if amplitude_range is not None else (0.0, 0.0)
         scan_heights(
-            *self._tables(), *self._pixels(), np.ascontiguousarray(heights, dtype=float),
-            amplitude_range is not None, low, high, np.ascontiguousarray(theta, dtype=float),
+            *self._arguments, np.ascontiguousarray(heights, dtype=float),
+            amplitude_range or (0.0, 0.0), np.ascontiguousarray(theta, dtype=float),
             values, amplitudes,
         )  # fmt: skip
         return values, amplitudes
@@ -249,7 +248,7 @@ class Likelihood:
         return info
 
     def residuals(self, theta: FloatArray) -> FloatArray:
-        """Data minus model in standard deviations.
+        """Give data minus model in standard deviations.
 
         Parameters
         ----------
@@ -276,18 +275,14 @@ class Likelihood:
 
     def signal(self, theta: FloatArray) -> FloatArray:
         """Signal of the model at θ, shape (ny, nx)."""
-        return self.model.image(
-            self.grid, theta[0], theta[1], theta[2], float(self.model.scale.mass(theta[3]))
-        )
+        return _signal(self.model, self.grid, theta)
 
     def measured_signal(self) -> FloatArray:
         """Signal that the counts show, shape (ny, nx); NaN where masked."""
         c0, c1, c2, c3 = self.data
         with np.errstate(divide="ignore", invalid="ignore"):
-            if self.kind == CONDITIONAL:
-                out = c0 / ((c1 - c0) * c2) - 1
-            else:
-                out = (c0 - c3 - c1) / c2
+            conditional = self.kind == CONDITIONAL
+            out = c0 / ((c1 - c0) * c2) - 1 if conditional else (c0 - c3 - c1) / c2
         return np.where(self._used, out, np.nan)
 
     def signal_information(self, signal: FloatArray | None = None) -> FloatArray:
@@ -304,7 +299,7 @@ class Likelihood:
             Inverse variance of `measured_signal`; 0 where masked.
         """
         s = np.zeros(self.grid.shape) if signal is None else signal
-        c0, c1, c2, c3 = self.data
+        _, c1, c2, c3 = self.data
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.kind == CONDITIONAL:
                 p = c2 * (1 + s) / (1 + c2 * (1 + s))
@@ -313,20 +308,11 @@ class Likelihood:
                 out = c2**2 / np.maximum(c1 + c2 * s + c3, 1.0)
         return np.where(self._used, out, 0.0)
 
-    def _tables(self) -> tuple[FloatArray, float, float, float, float]:
-        table = self.model.axial_table
-        return table.heights, table.first_nm, table.step_nm, table.kappa, 1 / self.model.step_nm
-
-    def _pixels(
-        self,
-    ) -> tuple[
-        float, FloatArray, FloatArray, float, float, FloatArray, FloatArray, int, FloatArray
-    ]:
-        offsets, weights = self.model.samples
-        return (
-            self.model.rho, self.grid.x_nm, self.grid.y_nm, *self.model.rotation,
-            offsets * self.grid.pixel_nm, weights, self.kind, self.data,
-        )  # fmt: skip
+    @property
+    def _arguments(self) -> tuple[AxialTable, Lens, Pixels, int, FloatArray]:
+        """What every scoring kernel takes first."""
+        model = self.model
+        return model.axial_table, model.lens, model.pixels(self.grid), self.kind, self.data
 
 
 def conditional(
@@ -452,7 +438,7 @@ def asimov_conditional(
     Likelihood
         Of kind CONDITIONAL, with the read-noise weight taken at the truth.
     """
-    signal = model.image(grid, *theta[:3], float(model.scale.mass(theta[3])))
+    signal = _signal(model, grid, theta)
     before = np.broadcast_to(n_before * np.asarray(background_e, dtype=float), grid.shape)
     after = n_after * np.asarray(background_e) * (1 + signal)
     exact = conditional(model, grid, before, after, n_after / n_before)
@@ -490,7 +476,7 @@ def asimov_poisson(
     Likelihood
         Of kind POISSON.
     """
-    signal = model.image(grid, *theta[:3], float(model.scale.mass(theta[3])))
+    signal = _signal(model, grid, theta)
     counts = background_e + scale_e * signal
     return poisson(model, grid, counts, background_e, scale_e, extra_variance_e2=extra_variance_e2)
 
@@ -515,3 +501,8 @@ def compile_kernels(model: ForwardModel) -> None:
     likelihood.signal(theta)
     likelihood.scan_heights(theta[2:3], theta, None)
     model.gradient(grid, *theta[:4])
+
+
+def _signal(model: ForwardModel, grid: PixelGrid, theta: FloatArray) -> FloatArray:
+    x, y, z, amplitude = (float(value) for value in theta[:4])
+    return model.image(grid, x, y, z, float(model.scale.mass(np.asarray(amplitude))))

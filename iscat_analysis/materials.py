@@ -60,10 +60,6 @@ def _polystyrene(wavelength_nm: float) -> complex:
     return complex(math.sqrt(1 + 1.4435 * l2 / (l2 - 0.020216)))
 
 
-def _protein(wavelength_nm: float) -> complex:
-    return 1.46 + 0j
-
-
 def _inside(kind: str, wavelength_nm: float, low: float, high: float) -> None:
     if not low <= wavelength_nm <= high:
         raise ConfigError(
@@ -83,7 +79,7 @@ _KINDS = {
     "gold": _Kind(_gold, 19300.0, sphere_mass_kda(30.0, 19300.0)),
     "silica": _Kind(_silica, 2200.0, sphere_mass_kda(30.0, 2200.0)),
     "polystyrene": _Kind(_polystyrene, 1050.0, sphere_mass_kda(30.0, 1050.0)),
-    "protein": _Kind(_protein, 1350.0, 150.0),
+    "protein": _Kind(lambda _: 1.46 + 0j, 1350.0, 150.0),
 }
 
 

@@ -10,12 +10,13 @@ refused.
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import emcee
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln
 
 from iscat_analysis.likelihood import Likelihood
 from iscat_analysis.records import PARAMETERS, FitResult, FloatArray, PosteriorResult
@@ -113,7 +114,8 @@ class _Proposal:
 
     centres: FloatArray  # (modes, d)
     log_weights: FloatArray  # (modes,)
-    factor: FloatArray  # (d, d), Cholesky factor of the scale matrix
+    factor: FloatArray  # (d, d), square root of the scale matrix
+    whiten: FloatArray  # (d, d), its inverse
 
     @classmethod
     def around(cls, likelihood: Likelihood, fit: FitResult, index: NDArray[np.intp]) -> _Proposal:
@@ -131,7 +133,12 @@ class _Proposal:
                 centres.append(theta[index])
                 gaps.append(other.log_likelihood_gap)
         weights = -np.minimum(gaps, 3.0)
-        return cls(np.array(centres), weights - logsumexp(weights), factor)
+        return cls(
+            np.array(centres),
+            weights - np.logaddexp.reduce(weights),
+            factor,
+            np.linalg.inv(factor),
+        )
 
     def draw(self, count: int, random: np.random.RandomState) -> FloatArray:
         """Draw points, shape (count, d)."""
@@ -143,11 +150,12 @@ class _Proposal:
     def log_density(self, points: FloatArray) -> FloatArray:
         """Log density of points, shape (n,)."""
         d = self.factor.shape[0]
-        white = np.linalg.solve(self.factor, (points[None] - self.centres[:, None]).reshape(-1, d).T)
-        squares = np.sum(white**2, axis=0).reshape(len(self.centres), -1)
+        apart = (points[None] - self.centres[:, None]).reshape(-1, d)
+        squares = np.sum((apart @ self.whiten.T) ** 2, axis=1).reshape(len(self.centres), -1)
         norm = gammaln((_DEGREES + d) / 2) - gammaln(_DEGREES / 2)
         log_t = norm - 0.5 * (_DEGREES + d) * np.log1p(squares / _DEGREES)
-        return logsumexp(log_t + self.log_weights[:, None], axis=0)
+        density: FloatArray = np.logaddexp.reduce(log_t + self.log_weights[:, None], axis=0)
+        return density
 
     def __call__(
         self, points: FloatArray, random: np.random.RandomState
@@ -174,7 +182,7 @@ def _scatter(
     upper: FloatArray,
     random: np.random.RandomState,
 ) -> FloatArray:
-    """Walkers' first positions: draws of the proposal, reflected into the box."""
+    """Place the walkers: draws of the proposal, reflected into the box."""
     points = proposal.draw(walkers, random)
     width = upper - lower
     folded = np.mod(points - lower, 2 * width)
@@ -182,7 +190,7 @@ def _scatter(
 
 
 def _after_burn_in(sampler: emcee.EnsembleSampler) -> tuple[FloatArray, FloatArray]:
-    """Samples (chain, draw, parameter) and log-likelihoods (chain, draw) without the burn-in."""
+    """Cut off the burn-in: samples (chain, draw, parameter), log-likelihoods (chain, draw)."""
     tau = float(np.max(sampler.get_autocorr_time(tol=0, quiet=True)))
     length = sampler.iteration
     burn_in = min(max(length // 10, math.ceil(5 * tau) if math.isfinite(tau) else 0), length // 2)
@@ -191,7 +199,9 @@ def _after_burn_in(sampler: emcee.EnsembleSampler) -> tuple[FloatArray, FloatArr
 
 
 def _diagnose(samples: FloatArray) -> _Verdict:
-    import arviz  # takes seconds to import, and only chains need it
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # about its own next version
+        import arviz  # takes seconds, and only chains need it
 
     draws = samples.shape[1]
     tau = emcee.autocorr.integrated_time(np.moveaxis(samples, 0, 1), tol=0, quiet=True)
@@ -201,7 +211,8 @@ def _diagnose(samples: FloatArray) -> _Verdict:
     tail = np.array([float(arviz.ess(c, method="tail")) for c in columns])
     complaints = []
     if not np.all(draws > MIN_TAUS * tau):
-        complaints.append(f"{draws} draws are fewer than {MIN_TAUS:.0f} × τ = {MIN_TAUS * tau.max():.0f}")
+        needed = MIN_TAUS * float(tau.max())
+        complaints.append(f"{draws} draws are fewer than {MIN_TAUS:.0f} × τ = {needed:.0f}")
     if not np.all(r_hat < MAX_R_HAT):
         complaints.append(f"split R̂ = {r_hat.max():.3f} is not below {MAX_R_HAT}")
     if not (np.all(bulk > MIN_ESS) and np.all(tail > MIN_ESS)):

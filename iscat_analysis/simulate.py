@@ -1,9 +1,9 @@
 """Movies with known truth: Poisson counts of the forward model on a static background.
 
-The expected photoelectrons of frame t are P_t·B·|1 + Σ e_i|², with P_t the laser power, B the static
-background and e_i the fields of the particles present, which add coherently; in dark field
-P_t·(b + s·|Σ E_i|²).  Every frame draws from a generator of its own, derived from the seed and the
-frame number, so the bytes do not depend on how the work is divided.
+The expected photoelectrons of frame t are P_t·B·|1 + Σ e_i|², with P_t the laser power, B the
+static background and e_i the fields of the particles present, which add coherently; in dark field
+P_t·(b + s·|Σ E_i|²).  Every frame draws from a generator of its own, derived from the seed and
+the frame number, so the bytes do not depend on how the work is divided.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from iscat_analysis.camera import camera_from_config, read_map
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.forward import PixelGrid, forward_model
+from iscat_analysis.materials import material
 from iscat_analysis.records import FloatArray, Progress, silent
 
 ComplexArray = NDArray[np.complex128]
@@ -35,6 +36,7 @@ TRUTH_COLUMNS = (
 
 _STREAMS = {"background": 0, "power": 1, "events": 2, "frames": 3}
 _BATCH = 32  # frames drawn at once
+_NO_UUID = "urn:uuid:00000000-0000-0000-0000-000000000000"
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,8 @@ def write_stack(
     """
     if config.camera.pixel_size_nm is None:
         raise ConfigError(
-            "camera.pixel_size_nm is needed to simulate: add it, as in --set camera.pixel_size_nm=84.4"
+            "camera.pixel_size_nm is needed to simulate: add it, as in "
+            "--set camera.pixel_size_nm=84.4"
         )
     truth_path = path.with_suffix(".truth.csv")
     if not overwrite and (path.exists() or truth_path.exists()):
@@ -182,7 +185,7 @@ class Movie:
                 yield from pool.map(self._draw, batch)
 
     def expected_frames(self) -> Iterator[FloatArray]:
-        """Expected photoelectrons of each frame in order, shape (y, x)."""
+        """Yield the expected photoelectrons of each frame in order, shape (y, x)."""
         unit = np.array([self._model.rho, 0.0])[:, None, None]
         field = np.zeros((2, *self._grid.shape), dtype=complex)
         fields: dict[int, ComplexArray] = {}
@@ -205,8 +208,8 @@ class Movie:
         q = self._model.samples[1].size
         intensity = np.sum(np.abs(unit + field) ** 2, axis=0) if q == 1 else self._binned(field)
         if self._model.rho:
-            return self.background_e * intensity
-        return self.background_e + self._signal_scale * intensity
+            return np.asarray(self.background_e * intensity)
+        return np.asarray(self.background_e + self._signal_scale * intensity)
 
     def _binned(self, field: ComplexArray) -> FloatArray:
         """Intensity averaged over the samples of each pixel; `field` is on the sample grid."""
@@ -259,13 +262,13 @@ class Movie:
                 mode="wrap",
             )
             pattern = 1 + simulation.speckle_contrast * (noise - noise.mean()) / noise.std()
-            return level * np.maximum(pattern, 0.05)
+            return np.asarray(level * np.maximum(pattern, 0.05))
         image = read_map(Path(simulation.background), "simulation.background", shape)
         if not image.mean() > 0 or (image < 0).any():
             raise ConfigError(
                 f"{simulation.background}: simulation.background needs a non-negative image"
             )
-        return image * (level / image.mean())
+        return np.asarray(image * (level / image.mean()))
 
     def _scale(self) -> float:
         if self._model.rho:
@@ -276,14 +279,11 @@ class Movie:
 
     def _check_range(self) -> None:
         camera = self._camera
-        brightest = self.background_e * 1.0
-        for particle in self.particles:
-            peak = self._model.peak_contrast(particle.z_nm, particle.mass_kda)
-            brightest = np.maximum(
-                brightest, self.background_e * (self._model.rho + max(peak, 0.0) * self._model.rho)
-                + self._signal_scale * max(peak, 0.0) * (1 - self._model.rho)
-            )  # fmt: skip
-        top = brightest.max() * self.power.max()
+        peaks = (self._model.peak_contrast(p.z_nm, p.mass_kda) for p in self.particles)
+        peak = max((0.0, *peaks))
+        level = float(self.background_e.max())
+        top = level * (1 + peak) if self._model.rho else level + self._signal_scale * peak
+        top *= float(self.power.max())
         top = (top + 6 * math.sqrt(top)) / np.min(camera.gain_e_per_adu) + np.max(camera.offset_adu)
         if top > np.iinfo(np.uint16).max and camera.well_depth_e is None:
             raise ConfigError(
@@ -293,7 +293,7 @@ class Movie:
 
     def _place(self) -> tuple[Particle, ...]:
         simulation, particle = self._config.simulation, self._config.particle
-        nominal = _nominal_mass(self._config)
+        nominal = material(particle, self._config.optics.wavelength_nm).mass_kda
         if simulation.count is None:
             return tuple(
                 Particle(
@@ -331,12 +331,6 @@ class Movie:
         return tuple(particles)
 
 
-def _nominal_mass(config: Config) -> float:
-    from iscat_analysis.materials import material
-
-    return material(config.particle, config.optics.wavelength_nm).mass_kda
-
-
 def _counted(
     frames: Iterator[NDArray[np.uint16]], total: int, progress: Progress
 ) -> Iterator[NDArray[np.uint16]]:
@@ -350,6 +344,7 @@ def _metadata(config: Config) -> dict[str, object]:
     pixel_um = (camera.pixel_size_nm or 0.0) / 1000
     metadata: dict[str, object] = {
         "axes": "TYX",
+        "UUID": _NO_UUID,  # a random one would make every file different
         "PhysicalSizeX": pixel_um,
         "PhysicalSizeXUnit": "µm",
         "PhysicalSizeY": pixel_um,

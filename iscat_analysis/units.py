@@ -47,4 +47,4 @@ def sphere_diameter_nm(mass_kda: float, density_kg_m3: float) -> float:
     float
         Diameter [nm].
     """
-    return (mass_kda * KILODALTON_KG / density_kg_m3 * 6 / math.pi) ** (1 / 3) / NM
+    return math.cbrt(mass_kda * KILODALTON_KG / density_kg_m3 * 6 / math.pi) / NM

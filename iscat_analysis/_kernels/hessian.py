@@ -11,23 +11,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.image import Lens, Pixels
+
 FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def signal_hessian(
     profile: FloatArray,
-    inv_step: float,
-    rho: float,
-    x: FloatArray,
-    y: FloatArray,
+    lens: Lens,
+    pixels: Pixels,
     x_p: float,
     y_p: float,
     amplitude: float,
-    cos_psi: float,
-    sin_psi: float,
-    offsets: FloatArray,
-    weights: FloatArray,
     first: FloatArray,
     second: FloatArray,
 ) -> None:
@@ -37,13 +34,15 @@ def signal_hessian(
     ----------
     profile : ndarray, shape (12, intervals, 6)
         From `radial_profile` with three orders.
-    inv_step, rho, x, y, x_p, y_p, amplitude, cos_psi, sin_psi, offsets, weights
+    lens, pixels, x_p, y_p, amplitude
         As in `iscat_analysis._kernels.image.signal_gradient`.
     first : ndarray, shape (5, ny, nx)
         Filled with s and its derivatives in (x_p, y_p, z, a).
     second : ndarray, shape (4, 4, ny, nx)
         Filled with the second derivatives.
     """
+    inv_step, rho, cos_psi, sin_psi = lens
+    x, y, offsets, weights = pixels
     first[:] = 0.0
     second[:] = 0.0
     q = offsets.size
@@ -95,7 +94,16 @@ def signal_hessian(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fields(profile, inv_step, u, v, radial, e, de, dde):
+def _fields(
+    profile: FloatArray,
+    inv_step: float,
+    u: float,
+    v: float,
+    radial: ComplexArray,
+    e: ComplexArray,
+    de: ComplexArray,
+    dde: ComplexArray,
+) -> None:
     """Fill e, its first derivatives and its second in (u, v, z)."""
     r = np.sqrt(u * u + v * v)
     t = r * inv_step

@@ -15,6 +15,8 @@ pixel and so runs scalar (76 multiply-adds); the second combines them and runs i
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -27,8 +29,52 @@ SCRATCH = 13
 """Rows of scratch a row of pixels needs: 8 fields, 4 slopes, the distance in steps."""
 
 
+class Lens(NamedTuple):
+    """What turns a profile into a signal.
+
+    Attributes
+    ----------
+    inv_step : float
+        One over the radial step [1/nm].
+    rho : float
+        1 with a reference, 0 in dark field.
+    cos_psi, sin_psi : float
+        Polarisation angle.
+    """
+
+    inv_step: float
+    rho: float
+    cos_psi: float
+    sin_psi: float
+
+
+class Pixels(NamedTuple):
+    """A grid of pixels and the samples inside each.
+
+    Attributes
+    ----------
+    x, y : ndarray, shape (nx,), (ny,)
+        Pixel centres [nm].
+    offsets, weights : ndarray, shape (q,)
+        Samples inside a pixel [nm] and their weights, summing to 1.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    offsets: FloatArray
+    weights: FloatArray
+
+
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _row_fields(profile, inv_step, x, x_p, dy, with_gradient, f):
+def _row_fields(
+    profile: FloatArray,
+    inv_step: float,
+    x: FloatArray,
+    x_p: float,
+    dy: float,
+    with_gradient: bool,
+    f: FloatArray,
+) -> None:
     """Fill f with the profile's channels, and the slopes d/dt of the first four."""
     for j in range(x.size):
         dx = x[j] - x_p
@@ -72,11 +118,22 @@ def _row_fields(profile, inv_step, x, x_p, dy, with_gradient, f):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def row_gradient(profile, inv_step, rho, x, x_p, dy, amplitude, cos_psi, sin_psi, weight, f, out):
-    """Add weight × (s, ∂s/∂x_p, ∂s/∂y_p, ∂s/∂z, ∂s/∂a) of one row to `out`, shape (5, nx).
+def _row_gradient(
+    profile: FloatArray,
+    lens: Lens,
+    x: FloatArray,
+    x_p: float,
+    dy: float,
+    amplitude: float,
+    weight: float,
+    f: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Add weight × (s, ∂s/∂x_p, ∂s/∂y_p, ∂s/∂z, ∂s/∂a) of one row to `out` (5, nx).
 
     `dy` is the row's y minus the particle's; the profile has 8 channels or more.
     """
+    inv_step, rho, cos_psi, sin_psi = lens
     _row_fields(profile, inv_step, x, x_p, dy, True, f)
     a = amplitude
     for j in range(x.size):
@@ -111,8 +168,19 @@ def row_gradient(profile, inv_step, rho, x, x_p, dy, amplitude, cos_psi, sin_psi
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def row_signal(profile, inv_step, rho, x, x_p, dy, amplitude, cos_psi, sin_psi, weight, f, out):
+def _row_signal(
+    profile: FloatArray,
+    lens: Lens,
+    x: FloatArray,
+    x_p: float,
+    dy: float,
+    amplitude: float,
+    weight: float,
+    f: FloatArray,
+    out: FloatArray,
+) -> None:
     """Add weight × s of one row to `out`, shape (nx,); the profile has 4 channels or more."""
+    inv_step, rho, cos_psi, sin_psi = lens
     _row_fields(profile, inv_step, x, x_p, dy, False, f)
     a = amplitude
     for j in range(x.size):
@@ -126,104 +194,94 @@ def row_signal(profile, inv_step, rho, x, x_p, dy, amplitude, cos_psi, sin_psi, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sampled_row(
-    profile, inv_step, rho, x, y_row, x_p, y_p, amplitude, cos_psi, sin_psi, offsets, weights,
-    f, out,
-):  # fmt: skip
-    """Signal and gradient of one row, averaged over q × q samples per pixel; `out` (5, nx)."""
+def row_gradient(
+    profile: FloatArray,
+    lens: Lens,
+    pixels: Pixels,
+    row: int,
+    x_p: float,
+    y_p: float,
+    amplitude: float,
+    f: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Fill `out` (5, nx) with signal and gradient of one row, averaged over the samples."""
     out[:] = 0.0
-    for i in range(offsets.size):
-        dy = y_row + offsets[i] - y_p
-        for j in range(offsets.size):
-            row_gradient(
-                profile, inv_step, rho, x, x_p - offsets[j], dy, amplitude, cos_psi, sin_psi,
-                weights[i] * weights[j], f, out,
+    for i in range(pixels.offsets.size):
+        dy = pixels.y[row] + pixels.offsets[i] - y_p
+        for j in range(pixels.offsets.size):
+            _row_gradient(
+                profile, lens, pixels.x, x_p - pixels.offsets[j], dy, amplitude,
+                pixels.weights[i] * pixels.weights[j], f, out,
             )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sampled_signal(
-    profile, inv_step, rho, x, y_row, x_p, y_p, amplitude, cos_psi, sin_psi, offsets, weights,
-    f, out,
-):  # fmt: skip
-    """Signal of one row, averaged over q × q samples per pixel; `out` (nx,)."""
+def row_signal(
+    profile: FloatArray,
+    lens: Lens,
+    pixels: Pixels,
+    row: int,
+    x_p: float,
+    y_p: float,
+    amplitude: float,
+    f: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Fill `out` (nx,) with the signal of one row, averaged over the samples in each pixel."""
     out[:] = 0.0
-    for i in range(offsets.size):
-        dy = y_row + offsets[i] - y_p
-        for j in range(offsets.size):
-            row_signal(
-                profile, inv_step, rho, x, x_p - offsets[j], dy, amplitude, cos_psi, sin_psi,
-                weights[i] * weights[j], f, out,
+    for i in range(pixels.offsets.size):
+        dy = pixels.y[row] + pixels.offsets[i] - y_p
+        for j in range(pixels.offsets.size):
+            _row_signal(
+                profile, lens, pixels.x, x_p - pixels.offsets[j], dy, amplitude,
+                pixels.weights[i] * pixels.weights[j], f, out,
             )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def signal_image(
     profile: FloatArray,
-    inv_step: float,
-    rho: float,
-    x: FloatArray,
-    y: FloatArray,
+    lens: Lens,
+    pixels: Pixels,
     x_p: float,
     y_p: float,
     amplitude: float,
-    cos_psi: float,
-    sin_psi: float,
-    offsets: FloatArray,
-    weights: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Signal on a pixel grid; `out` has shape (ny, nx), the rest as in `signal_gradient`."""
-    f = np.empty((SCRATCH, x.size))
-    for row in range(y.size):
-        sampled_signal(
-            profile, inv_step, rho, x, y[row], x_p, y_p, amplitude, cos_psi, sin_psi, offsets,
-            weights, f, out[row],
-        )  # fmt: skip
+    """Fill `out` (ny, nx) with the signal on a pixel grid; the rest as in `signal_gradient`."""
+    f = np.empty((SCRATCH, pixels.x.size))
+    for row in range(pixels.y.size):
+        row_signal(profile, lens, pixels, row, x_p, y_p, amplitude, f, out[row])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def signal_gradient(
     profile: FloatArray,
-    inv_step: float,
-    rho: float,
-    x: FloatArray,
-    y: FloatArray,
+    lens: Lens,
+    pixels: Pixels,
     x_p: float,
     y_p: float,
     amplitude: float,
-    cos_psi: float,
-    sin_psi: float,
-    offsets: FloatArray,
-    weights: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Signal and gradient on a pixel grid, averaged over q × q samples in each pixel.
+    """Signal and gradient on a pixel grid.
 
     Parameters
     ----------
     profile : ndarray, shape (8 or more, intervals, 6)
         From `radial_profile`.
-    inv_step : float
-        One over the radial step [1/nm].
-    rho : float
-        1 with a reference, 0 in dark field.
-    x, y : ndarray, shape (nx,), (ny,)
-        Pixel centres [nm].
+    lens : Lens
+        Step, reference, polarisation.
+    pixels : Pixels
+        Grid and samples.
     x_p, y_p : float
         Particle [nm].
     amplitude : float
         a.
-    cos_psi, sin_psi : float
-        Polarisation angle.
-    offsets, weights : ndarray, shape (q,)
-        Samples inside a pixel [nm] and their weights, summing to 1.
     out : ndarray, shape (ny, 5, nx)
         Filled with s, ∂s/∂x_p, ∂s/∂y_p, ∂s/∂z, ∂s/∂a.
     """
-    f = np.empty((SCRATCH, x.size))
-    for row in range(y.size):
-        sampled_row(
-            profile, inv_step, rho, x, y[row], x_p, y_p, amplitude, cos_psi, sin_psi, offsets,
-            weights, f, out[row],
-        )  # fmt: skip
+    f = np.empty((SCRATCH, pixels.x.size))
+    for row in range(pixels.y.size):
+        row_gradient(profile, lens, pixels, row, x_p, y_p, amplitude, f, out[row])

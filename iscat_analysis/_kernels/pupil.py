@@ -1,4 +1,4 @@
-"""Quadrature over the pupil and the Fresnel coefficients on it (D21 section II; physics.md, 1–2, 8).
+"""Quadrature over the pupil and the Fresnel coefficients on it (D21, section II; physics.md, 8).
 
 Lengths are nm, wavenumbers rad/nm.  Angles θ are those in the immersion oil.
 """
@@ -88,7 +88,7 @@ def _unit_gauss_legendre(nodes: int) -> tuple[FloatArray, FloatArray]:
 
 
 def rectangle(alpha: float, nodes: int) -> tuple[FloatArray, FloatArray]:
-    """The rule of D21's program: both ends included, step α/n (physics.md, section 7, point 7).
+    """Make the rule of D21's program: both ends included, step α/n (physics.md, section 7).
 
     Parameters
     ----------

@@ -21,6 +21,8 @@ interval; the channels are Re F0, Im F0, Re F2, Im F2, followed by the same four
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -30,6 +32,25 @@ FloatArray = NDArray[np.float64]
 
 STEP = 0.3
 """Step times bandwidth, along r and z: 1.6e-8 of the peak in the field, 3e-7 in its gradient."""
+
+
+class AxialTable(NamedTuple):
+    """Profiles along z, without their carrier exp(iκz).
+
+    Attributes
+    ----------
+    heights : ndarray, shape (n, 3, 4, intervals·6)
+        At each height: the profile, step·∂z and step²·∂z² of it.
+    first_nm, step_nm : float
+        First height and step [nm].
+    kappa : float
+        Wavenumber of the carrier [rad/nm].
+    """
+
+    heights: FloatArray
+    first_nm: float
+    step_nm: float
+    kappa: float
 
 
 def reduced_bessel(x: FloatArray) -> FloatArray:
@@ -103,7 +124,15 @@ def bessel_table(transverse: FloatArray, step_nm: float, intervals: int) -> Floa
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
-def _add_four(w, a, b, c, d, n0, n1):
+def _add_four(
+    w: FloatArray,
+    a: FloatArray,
+    b: FloatArray,
+    c: FloatArray,
+    d: FloatArray,
+    n0: FloatArray,
+    n1: FloatArray,
+) -> None:
     """Add four rows of the Bessel matrix, with the complex weights w (2, 4), to two channels."""
     for j in range(a.size):
         n0[j] += w[0, 0] * a[j] + w[0, 1] * b[j] + w[0, 2] * c[j] + w[0, 3] * d[j]
@@ -180,7 +209,7 @@ def radial_profile(
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
-def _mix(t, v, d, out):
+def _mix(t: FloatArray, v: FloatArray, d: FloatArray, out: FloatArray) -> None:
     """Fill `out` (2, n) with the combinations v and d (6) of the six rows of t (6, n)."""
     t0, t1, t2, t3, t4, t5 = t[0], t[1], t[2], t[3], t[4], t[5]
     v0, v1, v2, v3, v4, v5 = v[0], v[1], v[2], v[3], v[4], v[5]
@@ -192,7 +221,14 @@ def _mix(t, v, d, out):
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
-def _turn(re, im, cos, sin, out_re, out_im):
+def _turn(
+    re: FloatArray,
+    im: FloatArray,
+    cos: float,
+    sin: float,
+    out_re: FloatArray,
+    out_im: FloatArray,
+) -> None:
     """Multiply re + i·im by cos + i·sin."""
     for j in range(re.size):
         a, b = re[j], im[j]
@@ -202,10 +238,7 @@ def _turn(re, im, cos, sin, out_re, out_im):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def profile_at(
-    heights: FloatArray,
-    first_nm: float,
-    step_nm: float,
-    kappa: float,
+    axial: AxialTable,
     z_nm: float,
     intervals: int,
     work: FloatArray,
@@ -215,12 +248,8 @@ def profile_at(
 
     Parameters
     ----------
-    heights : ndarray, shape (n, 3, 4, intervals·6)
-        At each height: profile without its carrier, step·∂z and step²·∂z² of it.
-    first_nm, step_nm : float
-        First height and step [nm].
-    kappa : float
-        Wavenumber of the carrier exp(iκz) [rad/nm].
+    axial : AxialTable
+        Profiles along z.
     z_nm : float
         Height [nm], inside the table.
     intervals : int
@@ -230,6 +259,7 @@ def profile_at(
     profile : ndarray, shape (8, intervals, 6)
         Filled.
     """
+    heights, first_nm, step_nm, kappa = axial
     place = (z_nm - first_nm) / step_nm
     i = min(max(int(place), 0), heights.shape[0] - 2)
     t = place - i

@@ -19,10 +19,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.image import FAST, SCRATCH, sampled_row, sampled_signal
-from iscat_analysis._kernels.radial import profile_at
+from iscat_analysis._kernels.image import FAST, SCRATCH, Lens, Pixels, row_gradient, row_signal
+from iscat_analysis._kernels.radial import AxialTable, profile_at
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 CONDITIONAL, POISSON = 0, 1
 
@@ -37,7 +38,7 @@ FLOOR = 1e-300
 
 
 @njit(inline="always")
-def _log1p(x):
+def _log1p(x: float) -> float:
     """ln(1+x) = 2 artanh(x/(2+x)) by its series, error below 1e-16 for |x| < SERIES."""
     w = x / (2.0 + x)
     w2 = w * w
@@ -46,7 +47,7 @@ def _log1p(x):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _row_value(kind, data, row, level, s):
+def _row_value(kind: int, data: FloatArray, row: int, level: float, s: FloatArray) -> float:
     """Log-likelihood of one row of signals s, relative to the same row without a particle."""
     c0, c1, c2, c3 = data[0, row], data[1, row], data[2, row], data[3, row]
     total = 0.0
@@ -88,7 +89,9 @@ def _row_value(kind, data, row, level, s):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _row_score(kind, data, row, level, g, sums):
+def _row_score(
+    kind: int, data: FloatArray, row: int, level: float, g: FloatArray, sums: FloatArray
+) -> None:
     """Add one row to the 5 scores and 15 Fisher entries in `sums`; g holds s and its gradient."""
     c0, c1, c2, c3 = data[0, row], data[1, row], data[2, row], data[3, row]
     b0 = b1 = b2 = b3 = b4 = 0.0
@@ -158,20 +161,23 @@ def _row_score(kind, data, row, level, g, sums):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def score_pass(
-    profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, theta,
-    score, fisher,
-):  # fmt: skip
+    profile: FloatArray,
+    lens: Lens,
+    pixels: Pixels,
+    kind: int,
+    data: FloatArray,
+    theta: FloatArray,
+    score: FloatArray,
+    fisher: FloatArray,
+) -> float:
     """Fill score (5) and Fisher matrix (5, 5) at θ and return the log-likelihood."""
     level = np.exp(theta[4])
-    f = np.empty((SCRATCH, x.size))
-    g = np.empty((5, x.size))
+    f = np.empty((SCRATCH, pixels.x.size))
+    g = np.empty((5, pixels.x.size))
     sums = np.zeros(20)
     total = 0.0
-    for row in range(y.size):
-        sampled_row(
-            profile, inv_step, rho, x, y[row], theta[0], theta[1], theta[3], cos_psi, sin_psi,
-            offsets, weights, f, g,
-        )  # fmt: skip
+    for row in range(pixels.y.size):
+        row_gradient(profile, lens, pixels, row, theta[0], theta[1], theta[3], f, g)
         total += _row_value(kind, data, row, level, g[0])
         _row_score(kind, data, row, level, g, sums)
     k = 5
@@ -185,60 +191,65 @@ def score_pass(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def value_pass(
-    profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, theta
-):  # fmt: skip
+    profile: FloatArray,
+    lens: Lens,
+    pixels: Pixels,
+    kind: int,
+    data: FloatArray,
+    theta: FloatArray,
+) -> float:
     """Log-likelihood at θ, without derivatives."""
     level = np.exp(theta[4])
-    f = np.empty((SCRATCH, x.size))
-    s = np.empty(x.size)
+    f = np.empty((SCRATCH, pixels.x.size))
+    s = np.empty(pixels.x.size)
     total = 0.0
-    for row in range(y.size):
-        sampled_signal(
-            profile, inv_step, rho, x, y[row], theta[0], theta[1], theta[3], cos_psi, sin_psi,
-            offsets, weights, f, s,
-        )  # fmt: skip
+    for row in range(pixels.y.size):
+        row_signal(profile, lens, pixels, row, theta[0], theta[1], theta[3], f, s)
         total += _row_value(kind, data, row, level, s)
     return total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _intervals(x, y, offsets, theta, inv_step):
+def _intervals(pixels: Pixels, theta: FloatArray, inv_step: float) -> int:
     """Radial intervals between the particle and the farthest sample."""
-    margin = abs(offsets[-1])
+    x, y = pixels.x, pixels.y
+    margin = abs(pixels.offsets[-1])
     dx = max(abs(x[0] - theta[0]), abs(x[-1] - theta[0])) + margin
     dy = max(abs(y[0] - theta[1]), abs(y[-1] - theta[1])) + margin
     return int(np.sqrt(dx * dx + dy * dy) * inv_step) + 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scratch(heights):
+def _scratch(axial: AxialTable) -> tuple[FloatArray, FloatArray]:
     """Work space and profile for `profile_at`."""
-    width = heights.shape[3]
+    width = axial.heights.shape[3]
     return np.empty((4, 2, width)), np.empty((8, width // 6, 6))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def value_batch(
-    heights, first_nm, height_step, kappa, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
-    thetas, out,
-):  # fmt: skip
-    """Log-likelihood at many θ, shape (n, 5); the profile is remade only where z changes."""
-    work, profile = _scratch(heights)
+    axial: AxialTable,
+    lens: Lens,
+    pixels: Pixels,
+    kind: int,
+    data: FloatArray,
+    thetas: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Fill `out` (n) with the log-likelihood at θ (n, 5); where z repeats, so does the profile."""
+    work, profile = _scratch(axial)
     z = np.nan
     for k in range(thetas.shape[0]):
         if thetas[k, 2] != z:
             z = thetas[k, 2]
-            profile_at(
-                heights, first_nm, height_step, kappa, z, profile.shape[1], work, profile
-            )
-        out[k] = value_pass(
-            profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
-            thetas[k],
-        )  # fmt: skip
+            profile_at(axial, z, profile.shape[1], work, profile)
+        out[k] = value_pass(profile, lens, pixels, kind, data, thetas[k])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scoring_step(score, fisher, active, damping, step):
+def _scoring_step(
+    score: FloatArray, fisher: FloatArray, active: BoolArray, damping: float, step: FloatArray
+) -> bool:
     """Solve (F + damping·diag F) step = score on the active parameters; False if singular."""
     n = 0
     index = np.empty(5, dtype=np.int64)
@@ -284,9 +295,21 @@ def _scoring_step(score, fisher, active, damping, step):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def maximize(
-    heights, first_nm, height_step, kappa, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
-    free, lower, upper, max_step, tolerance, iterations, theta, score, fisher,
-):  # fmt: skip
+    axial: AxialTable,
+    lens: Lens,
+    pixels: Pixels,
+    kind: int,
+    data: FloatArray,
+    free: BoolArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    max_step: FloatArray,
+    tolerance: float,
+    iterations: int,
+    theta: FloatArray,
+    score: FloatArray,
+    fisher: FloatArray,
+) -> tuple[float, int, int]:
     """Damped Fisher scoring inside a box, from θ, which is overwritten with the estimate.
 
     Parameters
@@ -321,17 +344,14 @@ def maximize(
     outcome : int
         CONVERGED, STALLED or EXHAUSTED.
     """
-    work, profile = _scratch(heights)
+    work, profile = _scratch(axial)
     step, trial = np.empty(5), np.empty(5)
     trial_score, trial_fisher = np.empty(5), np.empty((5, 5))
     active = np.empty(5, dtype=np.bool_)
     damping = 0.0
-    reach = profile.shape[1] if not free[2] else _intervals(x, y, offsets, theta, inv_step)
-    profile_at(heights, first_nm, height_step, kappa, theta[2], reach, work, profile)
-    value = score_pass(
-        profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, theta,
-        score, fisher,
-    )  # fmt: skip
+    reach = profile.shape[1] if not free[2] else _intervals(pixels, theta, lens.inv_step)
+    profile_at(axial, theta[2], reach, work, profile)
+    value = score_pass(profile, lens, pixels, kind, data, theta, score, fisher)
     passes = 1
     while passes < iterations:
         for i in range(5):
@@ -356,12 +376,11 @@ def maximize(
             theta[:] = trial
             return value + gain, passes, CONVERGED
         if free[2]:
-            reach = _intervals(x, y, offsets, trial, inv_step)
-            profile_at(heights, first_nm, height_step, kappa, trial[2], reach, work, profile)
+            reach = _intervals(pixels, trial, lens.inv_step)
+            profile_at(axial, trial[2], reach, work, profile)
         trial_value = score_pass(
-            profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, trial,
-            trial_score, trial_fisher,
-        )  # fmt: skip
+            profile, lens, pixels, kind, data, trial, trial_score, trial_fisher
+        )
         passes += 1
         if trial_value >= value - 1e-3 * tolerance - 1e-13 * abs(value):
             value = trial_value
@@ -376,31 +395,35 @@ def maximize(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def scan_heights(
-    heights, first_nm, height_step, kappa, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
-    places, free_amplitude, lower_amplitude, upper_amplitude, theta, values, amplitudes,
-):  # fmt: skip
+    axial: AxialTable,
+    lens: Lens,
+    pixels: Pixels,
+    kind: int,
+    data: FloatArray,
+    heights: FloatArray,
+    amplitude_range: tuple[float, float],
+    theta: FloatArray,
+    values: FloatArray,
+    amplitudes: FloatArray,
+) -> None:
     """Profile log-likelihood along z at fixed (x, y): the amplitude takes two scoring steps.
 
-    Fills `values` and `amplitudes`, shape (n,), for the heights `places`; θ gives the rest and the start.
+    Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the rest and the start.  An
+    empty amplitude range holds the amplitude fixed.
     """
-    work, profile = _scratch(heights)
+    work, profile = _scratch(axial)
     score, fisher = np.empty(5), np.empty((5, 5))
     here = theta.copy()
-    for k in range(places.size):
-        here[2] = places[k]
+    low, high = amplitude_range
+    for k in range(heights.size):
+        here[2] = heights[k]
         here[3] = theta[3]
-        reach = _intervals(x, y, offsets, here, inv_step)
-        profile_at(heights, first_nm, height_step, kappa, here[2], reach, work, profile)
-        if free_amplitude:
+        reach = _intervals(pixels, here, lens.inv_step)
+        profile_at(axial, here[2], reach, work, profile)
+        if low < high:
             for _ in range(2):
-                score_pass(
-                    profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data,
-                    here, score, fisher,
-                )  # fmt: skip
+                score_pass(profile, lens, pixels, kind, data, here, score, fisher)
                 if fisher[3, 3] > 0:
-                    moved = here[3] + score[3] / fisher[3, 3]
-                    here[3] = min(max(moved, lower_amplitude), upper_amplitude)
-        values[k] = value_pass(
-            profile, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights, kind, data, here
-        )
+                    here[3] = min(max(here[3] + score[3] / fisher[3, 3], low), high)
+        values[k] = value_pass(profile, lens, pixels, kind, data, here)
         amplitudes[k] = here[3]

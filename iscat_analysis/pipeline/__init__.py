@@ -196,9 +196,7 @@ def analyse(
     )
 
 
-def frame_ranges(
-    movie: Stack, config: Config
-) -> tuple[tuple[int, int] | None, tuple[int, int]]:
+def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, tuple[int, int]]:
     """Which frames are background and which are fitted.
 
     Parameters

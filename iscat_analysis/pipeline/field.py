@@ -1,14 +1,14 @@
 """Detection and fitting over a whole field, in turns.
 
-What the fits explain is taken off the image before it is searched again, so a side lobe never counts
-as a particle and a faint neighbour is not lost.  Every fit sees its neighbours' signal as part of
-its background, and the laser power is estimated again with all particles accounted for.
+What the fits explain is taken off the image before it is searched again, so a side lobe never
+counts as a particle and a faint neighbour is not lost.  Every fit sees its neighbours' signal as
+part of its background, and the laser power is estimated again with all particles accounted for.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ import numpy as np
 from iscat_analysis.background import refine_power
 from iscat_analysis.config import Config
 from iscat_analysis.detect import Templates, find_particles, make_templates
-from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.errors import ConfigError
 from iscat_analysis.fit import fit_particle, window_nm
 from iscat_analysis.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.likelihood import Likelihood, conditional, poisson
@@ -152,10 +152,11 @@ def make_scene(config: Config, field_px: tuple[int, int]) -> Scene:
     model = forward_model(config, reach)
     mode = config.fit.mode
     free_z = "z_nm" in FREE_PARAMETERS[mode]
+    field = PixelGrid.region((0, field_px[0]), (0, field_px[1]), pixel)
     return Scene(
         config=config,
         model=model,
-        wide=forward_model(config, PixelGrid.region((0, field_px[0]), (0, field_px[1]), pixel).diagonal_nm),
+        wide=forward_model(config, field.diagonal_nm),
         templates=make_templates(
             model,
             config.detection,
@@ -300,7 +301,9 @@ def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Event]) 
 
 def _pixel_nm(config: Config) -> float:
     if config.camera.pixel_size_nm is None:
-        raise ConfigError("camera.pixel_size_nm is needed: set it, as in --set camera.pixel_size_nm=84.4")
+        raise ConfigError(
+            "camera.pixel_size_nm is needed: set it, as in --set camera.pixel_size_nm=84.4"
+        )
     return config.camera.pixel_size_nm
 
 

@@ -141,7 +141,7 @@ def view_of(row: Row) -> EventView:
 def summary_of(
     scene: Scene, table: pd.DataFrame, windows: Windows, timings: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Counts, medians and efficiency, for ``summary.json``.
+    """Gather counts, medians and efficiency, for ``summary.json``.
 
     Parameters
     ----------
