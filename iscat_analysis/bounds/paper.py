@@ -50,10 +50,21 @@ HEIGHT_NM = 5.0
 IMAGE_HEIGHTS_NM = (0.0, 500.0, 950.0, 1000.0, 1500.0)
 """Heights of Fig. 2a; D21 does not print its own.  950 → 1000 nm is a quarter of iSCAT's fringe."""
 
-HEIGHTS_NM = np.arange(0.0, 3001.0, 20.0)
-FOCI_NM = np.arange(-5000.0, 5001.0, 100.0)
-ATTENUATIONS = {"cobri": (0.0601, 0.02, 0.006, 0.002), "iscat": (1.0, 0.3, 0.1, 0.03)}
-"""Abscissae of the curves, and the references of Fig. 4."""
+HEIGHTS_NM = np.arange(0.0, 3001.0, 10.0)
+FOCI_NM = np.arange(-5000.0, 5001.0, 50.0)
+ATTENUATIONS: dict[str, tuple[float, ...]] = {
+    "iscat": (1.0, 0.1, 0.03, 0.01),
+    "cobri": (COBRI_ATTENUATION, 0.006, 0.002, 0.0006),
+    "darkfield": (0.0,),
+}
+"""Abscissae of the curves, and the references of Fig. 4; Figs. 2 and 3 have the first."""
+
+FIGURE_4 = {
+    "iscat": (("4b",), ("4d",)),
+    "cobri": (("4a",), ("4c",)),
+    "darkfield": (("4a", "4b"), ("4c", "4d")),
+}
+"""Panels of Fig. 4 that show a scheme, over z and over focus; dark field is where both end."""
 
 TABLE_NODES = 100
 """Nodes per angle of the authors' rectangle rule for Table 1."""
@@ -106,7 +117,7 @@ def paper_config(
     z_nm, focus_nm : float
         Height and focus [nm].
     attenuation : float, optional
-        Default 1, and 0.0601 for COBRI.
+        Default that of Figs. 2 and 3.
     **optics
         Further keys of ``[optics]``.
 
@@ -117,7 +128,7 @@ def paper_config(
     """
     authors = convention == "dong2021"
     if attenuation is None:
-        attenuation = COBRI_ATTENUATION if scheme == "cobri" else 1.0
+        attenuation = ATTENUATIONS[scheme][0]
     return parse_config(
         {
             "optics": {
@@ -228,11 +239,12 @@ def reproduce(*, workers: int = 2, progress: Progress = silent) -> Reproduction:
     conventions: tuple[Convention, ...] = ("dong2021", "exact")
     for convention in conventions:
         for scheme in SCHEMES:
-            jobs.append((("2b", "2c", "2d", "2e"), scheme, convention, None))
-            jobs.append((("3",), scheme, convention, None))
-        for scheme, panels in (("cobri", ("4a", "4c")), ("iscat", ("4b", "4d"))):
-            for attenuation in ATTENUATIONS[scheme]:
-                jobs.extend(((panel,), scheme, convention, attenuation) for panel in panels)
+            over_z, over_focus = FIGURE_4[scheme]
+            jobs.append((("2b", "2c", "2d", "2e", *over_z), scheme, convention, None))
+            jobs.append((("3", *over_focus), scheme, convention, None))
+            for attenuation in ATTENUATIONS[scheme][1:]:
+                jobs.append((over_z, scheme, convention, attenuation))
+                jobs.append((over_focus, scheme, convention, attenuation))
     parts: list[pd.DataFrame] = []
     with ThreadPoolExecutor(workers) as pool:
         for done, part in enumerate(pool.map(lambda job: _curves(*job), jobs), start=1):
@@ -288,7 +300,7 @@ def _curves(
                 "panel": panel,
                 "scheme": scheme,
                 "convention": convention,
-                "attenuation": reference_of(scheme, attenuation),
+                "attenuation": ATTENUATIONS[scheme][0] if attenuation is None else attenuation,
                 "quantity": name,
                 "x": axis,
                 "value": values,
@@ -299,27 +311,6 @@ def _curves(
         for name, values in quantities[panel]
     ]
     return pd.concat(frames, ignore_index=True)
-
-
-def reference_of(scheme: str, attenuation: float | None) -> float:
-    """Amplitude of the reference that passes; 0 in dark field.
-
-    Parameters
-    ----------
-    scheme : str
-        Scheme.
-    attenuation : float or None
-        As in `paper_config`.
-
-    Returns
-    -------
-    float
-        β.
-    """
-    if scheme == "darkfield":
-        return 0.0
-    default = COBRI_ATTENUATION if scheme == "cobri" else 1.0
-    return default if attenuation is None else attenuation
 
 
 def _intensity(scheme: str, z_nm: float) -> FloatArray:

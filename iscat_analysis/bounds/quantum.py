@@ -74,7 +74,8 @@ def quantum_information(
     along = light.mean(q2, light.p * 0.75 + light.s * 0.25)
     across = light.mean(q2, light.p * 0.25 + light.s * 0.75)
     both = light.p + light.s
-    c, s = model.rotation
+    psi = math.radians(model.optics.polarization_deg)
+    c, s = math.cos(psi), math.sin(psi)
     out = np.zeros((4, 4), dtype=np.complex128)
     out[0, 0] = c**2 * along + s**2 * across
     out[1, 1] = s**2 * along + c**2 * across
