@@ -1,10 +1,12 @@
-"""`iscat bounds`: what no estimator can beat."""
+"""`iscat bounds`: what no estimator can beat, and what it takes to come near."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +16,7 @@ from iscat_cli.options import (
     DebugOption,
     JsonOption,
     ModeOption,
+    OverwriteOption,
     QuietOption,
     SetOption,
 )
@@ -21,9 +24,19 @@ from iscat_cli.options import (
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from iscat_analysis.config import Config
+
 EXAMPLE = """Example: the bounds for a 1 MDa protein on the coverslip.
 
     iscat bounds --config setup.toml --mode joint --set particle.mass_kda=1000
+
+Along the focus, with a figure; the best focus for the mass; what 5 kDa takes:
+
+    iscat bounds --config setup.toml --scan focus=-1000:1000:20 --out focus.bounds
+
+    iscat bounds --config setup.toml --optimize focus --for mass
+
+    iscat bounds --config setup.toml --target mass=5kDa
 """
 
 KINDS = {
@@ -34,12 +47,73 @@ KINDS = {
 }
 
 
+class Preset(StrEnum):
+    """A paper to reproduce."""
+
+    DONG2021 = "dong2021"
+
+
+class Optimized(StrEnum):
+    """A setting to optimise."""
+
+    FOCUS = "focus"
+    ATTENUATION = "attenuation"
+
+
+class Parameter(StrEnum):
+    """What to optimise it for."""
+
+    X = "x"
+    Y = "y"
+    Z = "z"
+    MASS = "mass"
+
+
 def bounds(
     context: typer.Context,
     *,
     config: ConfigOption = None,
     mode: ModeOption = None,
+    scan: Annotated[
+        str | None,
+        typer.Option(
+            "--scan",
+            metavar="NAME=A:B:STEP",
+            help="Bounds along z, focus, attenuation, na, pixel, fov or photons; B is included, "
+            "and NAME=a,b,c lists values.",
+            show_default=False,
+        ),
+    ] = None,
+    optimize: Annotated[
+        Optimized | None,
+        typer.Option("--optimize", help="Find the best focus or attenuation.", show_default=False),
+    ] = None,
+    wanted: Annotated[
+        Parameter | None,
+        typer.Option("--for", help="What --optimize shall make precise.", show_default=False),
+    ] = None,
+    target: Annotated[
+        str | None,
+        typer.Option(
+            "--target",
+            metavar="NAME=VALUE",
+            help="Frames and photons that a precision takes, as in mass=5kDa or z=2nm, and what "
+            "costs how much.",
+            show_default=False,
+        ),
+    ] = None,
+    preset: Annotated[
+        Preset | None,
+        typer.Option(
+            "--preset", help="Reproduce every table and figure of a paper.", show_default=False
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder for figures.", show_default=False),
+    ] = None,
     settings: SetOption = None,
+    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
     debug: DebugOption = False,
@@ -51,24 +125,168 @@ def bounds(
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
         from iscat_analysis.config import load_config
+        from iscat_analysis.errors import ConfigError
 
+        chosen = [o for o in (scan, optimize, target, preset) if o is not None]
+        if len(chosen) > 1:
+            raise ConfigError("choose one of --scan, --optimize, --target, --preset")
+        if (optimize is None) != (wanted is None):
+            raise ConfigError("--optimize and --for go together, as in --optimize focus --for mass")
+        if preset is not None:
+            if out is None:
+                raise ConfigError(f"--preset {preset} needs --out DIR, the folder to write")
+            if config is not None or settings or mode is not None:
+                raise ConfigError(
+                    f"--preset {preset} has its own configuration: leave --config, --set and "
+                    "--mode away"
+                )
+            _paper(messages, out, overwrite=overwrite, as_json=as_json)
+            return
         changes = [*(settings or ()), *([f'fit.mode="{mode.value}"'] if mode else ())]
         resolved = load_config(config, changes)
+        if out is not None:
+            from iscat_analysis.report.bounds import BOUNDS_FILES
+            from iscat_analysis.report.output import check_output
+
+            check_output(out, overwrite, known=BOUNDS_FILES)
 
         from iscat_analysis.bounds import bounds_report
 
         report = bounds_report(resolved)
+        for line in report["warnings"]:
+            messages.notify(f"warning: {line}")
+        along: dict[str, Any] = {}
+        if scan is not None:
+            along = _scan(messages, resolved, scan, report)
+        elif optimize is not None and wanted is not None:
+            along = _optimize(messages, resolved, optimize.value, wanted.value, report)
+        elif target is not None:
+            report |= _target(resolved, target)
+        if out is not None:
+            from iscat_analysis.report.bounds import write_bounds
+
+            write_bounds(report, out, overwrite=overwrite, **along)
+            messages.notify(f"wrote {out}")
         if as_json:
             print_json(report)
-        else:
-            photons = report["n_scattered"]
-            print_result(
-                f"scattered photons: {_short(photons['camera'])} on the camera, "
-                f"{_short(photons['collected'])} collected"
-            )
-            print_result(bounds_table("per photon", report["per_photon"]))
-            print_result("")
-            print_result(bounds_table("for these photons", report["actual"]))
+            return
+        _print(report)
+
+
+def _print(report: Mapping[str, Any]) -> None:
+    photons = report["n_scattered"]
+    print_result(
+        f"scattered photons: {_short(photons['camera'])} on the camera, "
+        f"{_short(photons['collected'])} collected"
+    )
+    if "scan" in report:
+        print_result(_scan_table(report["scan"], report["at"]["free"]))
+    elif "optimum" in report:
+        print_result(_optimum_table(report["optimum"]))
+        print_result(report["optimum"]["note"])
+    elif "target" in report:
+        print_result(_effort_table(report["target"]))
+        print_result(_budget_table(report["target"]))
+        if report["target"]["note"]:
+            print_result(report["target"]["note"])
+    else:
+        print_result(bounds_table("per photon", report["per_photon"]))
+        print_result(bounds_table("for these photons", report["actual"]))
+        print_result(_information(report))
+    for line in report["unidentifiable"]:
+        print_result(f"unidentifiable: {line}")
+
+
+def _scan(messages: Messages, config: Config, text: str, report: dict[str, Any]) -> dict[str, Any]:
+    """Run a scan, add it to the report, and return what the figure needs."""
+    from iscat_analysis.bounds import parse_scan, scan
+
+    axis, values = parse_scan(text)
+    with messages.progress() as progress:
+        found = scan(config, axis, values, progress=progress)
+    if axis.name in ("attenuation", "pixel"):
+        messages.notify("the light on the particle is held: photons_per_pixel follows")
+    report["scan"] = {
+        "name": found.name,
+        "label": found.label,
+        "here": found.here,
+        "columns": found.table.to_dict("list"),
+    }
+    return {"table": found.table, "label": found.label, "here": found.here}
+
+
+def _optimize(
+    messages: Messages, config: Config, axis: str, wanted: str, report: dict[str, Any]
+) -> dict[str, Any]:
+    """Search, add the optimum to the report, and return what the figure needs."""
+    from iscat_analysis.bounds import optimize
+
+    with messages.progress() as progress:
+        best = optimize(
+            config, "focus" if axis == "focus" else "attenuation", wanted, progress=progress
+        )
+    report["optimum"] = {
+        "of": best.axis,
+        "for": best.parameter,
+        "value": best.value,
+        "bound": best.bound,
+        "configured": best.here,
+        "bound_configured": best.bound_here,
+        "note": best.note,
+    }
+    return {"table": best.scan.table, "label": best.scan.label, "here": best.here}
+
+
+def _target(config: Config, text: str) -> dict[str, Any]:
+    """Return the price of a precision, and where precision goes now."""
+    from dataclasses import asdict
+
+    from iscat_analysis.bounds import budget, effort, parse_target
+
+    goal = parse_target(text, config)
+    return {
+        "target": {
+            "parameter": goal.parameter,
+            "value": goal.value,
+            "effort": [asdict(way) for way in effort(config, goal)],
+            "budget": [asdict(line) for line in budget(config, goal.parameter)],
+            "note": ""
+            if config.camera.samples_per_pixel > 1
+            else "camera.samples_per_pixel = 1 samples pixels at their centres and hides what they "
+            "cost: --set camera.samples_per_pixel=4",
+        }
+    }
+
+
+def _paper(messages: Messages, out: Path, *, overwrite: bool, as_json: bool) -> None:
+    from iscat_analysis.bounds.paper import FIELD_NM, reproduce
+    from iscat_analysis.report.bounds import PAPER_FILES, write_paper
+    from iscat_analysis.report.output import check_output
+
+    check_output(out, overwrite, known=PAPER_FILES)
+    with messages.progress() as progress:
+        found = reproduce(progress=progress)
+    write_paper(
+        found.curves,
+        found.images,
+        found.table,
+        found.quantum,
+        out,
+        field_nm=FIELD_NM,
+        overwrite=overwrite,
+    )
+    messages.notify(f"wrote {out}; open {out / 'comparison.html'}")
+    if as_json:
+        print_json({"table_1": found.table.to_dict("records")})
+        return
+    table = _table("quantum bound of one photon")
+    names = ("printed", "authors", "dong2021", "exact", "reciprocal")
+    for name in names:
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in found.table.to_dict("records"):
+        unit = " [nm]" if row["unit"] == "nm" else ""
+        table.add_row(f"{row['quantity']}{unit}", *(_short(row[name]) for name in names))
+    print_result(table)
 
 
 def bounds_table(title: str, values: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -86,18 +304,98 @@ def bounds_table(title: str, values: Mapping[str, Mapping[str, Any]]) -> Table:
     rich.table.Table
         What a kind does not know is a dash.
     """
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
+    table = _table(title)
     kinds = [kind for kind in KINDS if kind in values]
-    table = Table(box=box.SIMPLE_HEAD if Console().is_terminal else None, pad_edge=False)
-    table.add_column(title, no_wrap=True)
     for kind in kinds:
         table.add_column(KINDS[kind], justify="right", no_wrap=True)
     for name in dict.fromkeys(name for kind in kinds for name in values[kind]):
         table.add_row(name, *(_short(values[kind].get(name)) for kind in kinds))
     return table
+
+
+def _information(report: Mapping[str, Any]) -> Table:
+    table = _table("information used")
+    table.add_column("of the light's", justify="right", no_wrap=True)
+    table.add_column("no single measurement is best for it and", no_wrap=True)
+    rivals = [pair.split("–") for pair in report["incompatible"]]
+    for name, share in report["information_fraction"].items():
+        alias = name.replace("_kda", "_rel")
+        others = [a if b == alias else b for a, b in rivals if alias in (a, b)]
+        table.add_row(
+            name,
+            "–" if share is None or not math.isfinite(share) else f"{100 * share:.1f} %",
+            ", ".join(other.replace("_rel", "_kda") for other in others) or "–",
+        )
+    return table
+
+
+def _scan_table(found: Mapping[str, Any], free: list[str]) -> Table:
+    table = _table(found["label"])
+    columns = found["columns"]
+    for name in free:
+        table.add_column(f"CRB {name}", justify="right", no_wrap=True)
+        table.add_column("QCRB", justify="right", no_wrap=True)
+    for i, value in enumerate(columns[found["name"]]):
+        cells = []
+        for name in free:
+            cells += [_short(columns[f"crb_joint_{name}"][i]), _short(columns[f"qcrb_{name}"][i])]
+        table.add_row(f"{value:g}", *cells)
+    return table
+
+
+def _optimum_table(best: Mapping[str, Any]) -> Table:
+    table = _table(str(best["of"]))
+    table.add_column("value", justify="right", no_wrap=True)
+    table.add_column(f"CRB {best['for']}", justify="right", no_wrap=True)
+    table.add_row("best", _short(best["value"]), _short(best["bound"]))
+    table.add_row("configured", _short(best["configured"]), _short(best["bound_configured"]))
+    return table
+
+
+def _effort_table(target: Mapping[str, Any]) -> Table:
+    unit = target["parameter"].split("_")[1].replace("kda", "kDa")
+    table = _table(f"{target['value']:g} {unit} takes, with the background")
+    for name in ("frames before", "frames after", "seconds", "collected photons"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for way in target["effort"]:
+        if not math.isfinite(way["n_after"]):
+            table.add_row(way["background"], _count(way["n_before"]), "never enough", "–", "–")
+            continue
+        table.add_row(
+            way["background"], _count(way["n_before"]), _count(way["n_after"]),
+            _short(way["seconds"]), _short(way["collected"]),
+        )  # fmt: skip
+    return table
+
+
+def _budget_table(target: Mapping[str, Any]) -> Table:
+    unit = target["parameter"].split("_")[1].replace("kda", "kDa")
+    table = _table("now")
+    table.add_column("factor", justify="right", no_wrap=True)
+    table.add_column(f"σ [{unit}]", justify="right", no_wrap=True)
+    product = 1.0
+    for line in target["budget"]:
+        first = line["cause"] == "quantum bound"
+        product *= line["factor"]
+        table.add_row(
+            line["cause"], "" if first else f"{line['factor']:.3f}", _short(line["bound"])
+        )
+    table.add_row("all", f"{product:.3f}", _short(target["budget"][-1]["bound"]))
+    return table
+
+
+def _table(title: str) -> Table:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD if Console().is_terminal else None, pad_edge=False)
+    table.add_column(title, no_wrap=True)
+    return table
+
+
+def _count(value: float) -> str:
+    return f"{value:,.0f}".replace(",", " ")
 
 
 def _short(value: float | None) -> str:

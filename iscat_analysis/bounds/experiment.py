@@ -19,7 +19,7 @@ from iscat_analysis.bounds.quantum import (
 )
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.likelihood import Likelihood, asimov_conditional, asimov_poisson
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
 
@@ -85,7 +85,9 @@ class Experiment:
         return event_bounds(self.likelihood, self.theta, free, self.collected, quantum=self.quantum)
 
 
-def plan(config: Config, *, model: ForwardModel | None = None) -> Experiment:
+def plan(
+    config: Config, *, model: ForwardModel | None = None, scale: MassScale | None = None
+) -> Experiment:
     """Set up the experiment of ``[bounds]``.
 
     Parameters
@@ -94,6 +96,9 @@ def plan(config: Config, *, model: ForwardModel | None = None) -> Experiment:
         All sections but detection, fit range and posterior take part.
     model : ForwardModel, optional
         The forward model, where the optics are those of an earlier experiment.
+    scale : MassScale, optional
+        Mass ↔ amplitude of an earlier experiment, in place of ``[calibration]``: the line was
+        measured at the optics of that one.
 
     Returns
     -------
@@ -126,7 +131,9 @@ def plan(config: Config, *, model: ForwardModel | None = None) -> Experiment:
     height = config.particle.height_nm if at.z_nm is None else at.z_nm
     if model is None:
         reach = math.hypot(half + abs(at.x_nm), half + abs(at.y_nm)) * 1.0001
-        model = forward_model(config, reach, z_max_nm=max(height, config.particle.height_nm))
+        optics = config if scale is None else config.model_copy(update={"calibration": None})
+        model = forward_model(optics, reach, z_max_nm=max(height, config.particle.height_nm))
+        model = model if scale is None else replace(model, scale=scale)
     mass = model.material.mass_kda
     theta = np.array([at.x_nm, at.y_nm, height, model.scale.amplitude(mass), 0.0])
     # with ρ = 0 the signal is the scattered light alone, still in units of the reference

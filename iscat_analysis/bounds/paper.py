@@ -94,7 +94,7 @@ class Reproduction:
     curves: pd.DataFrame
     images: dict[tuple[str, float], FloatArray]
     table: pd.DataFrame
-    quantum: dict[tuple[Measure, str], FloatArray]
+    quantum: dict[tuple[str, str], FloatArray]
 
 
 def paper_config(
@@ -252,7 +252,7 @@ def reproduce(*, workers: int = 2, progress: Progress = silent) -> Reproduction:
             progress("curves of Dong et al. (2021)", done, len(jobs))
     images = {(scheme, z): _intensity(scheme, z) for scheme in SCHEMES for z in IMAGE_HEIGHTS_NM}
     measures: tuple[Measure, ...] = ("dong2021", "exact")
-    quantum = {
+    quantum: dict[tuple[str, str], FloatArray] = {
         (measure, scheme): quantum_bounds(
             quantum_information(_model(scheme), HEIGHT_NM, measure=measure)
         )[0]

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
 from iscat_analysis.bounds.experiment import plan
-from iscat_analysis.bounds.scan import AXES, Scan, changed, scan
+from iscat_analysis.bounds.scan import AXES, Scan, calibrated_scale, changed, scan
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Progress, silent
@@ -119,9 +119,10 @@ def optimize(
             "setting; lower bounds.photons_per_pixel, or free fewer parameters with --mode"
         )
     best = int(np.nanargmin(score))
+    scale = calibrated_scale(config)
 
     def bound(value: float) -> float:
-        experiment = plan(changed(config, line, value))
+        experiment = plan(changed(config, line, value), scale=scale)
         if experiment.peak_e >= well:
             return math.inf
         found = experiment.bounds(coarse.free).crb_joint[PARAMETERS.index(parameter)]

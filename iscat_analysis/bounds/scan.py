@@ -1,7 +1,8 @@
 """Bounds along one axis of an experiment.
 
 The light that falls on the particle is held: where the attenuation or the pixel size changes, the
-background per pixel follows (β² and pixel area); the scattered photons stay.
+background per pixel follows (β² and pixel area); the scattered photons stay.  A calibration belongs
+to the configured optics: it fixes how strongly a mass scatters, there and along the scan.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from iscat_analysis.bounds.classical import bounds_from_matrices
 from iscat_analysis.bounds.experiment import Experiment, information_fraction, plan
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.forward import forward_model
+from iscat_analysis.forward import MassScale, forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Progress, silent
 
 FloatArray = NDArray[np.float64]
@@ -260,6 +261,7 @@ def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress =
         A value is impossible, or `plan` refuses.
     """
     free = FREE_PARAMETERS[config.fit.mode]
+    scale = calibrated_scale(config)
     plans = [changed(config, axis, value) for value in values]
     model = None
     if not axis.rebuilds:
@@ -268,7 +270,7 @@ def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress =
         model = forward_model(config, reach, z_max_nm=max(*heights, config.particle.height_nm))
 
     def row(one: Config) -> dict[str, Any]:
-        return _row(plan(one, model=model), free)
+        return _row(plan(one, model=model, scale=scale), free)
 
     rows = []
     with ThreadPoolExecutor(min(config.compute.workers, get_num_threads())) as pool:
@@ -278,6 +280,22 @@ def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress =
     table = pd.DataFrame(rows)
     table.insert(0, axis.name, values)
     return Scan(axis.name, axis.label, axis.value(config), free, table)
+
+
+def calibrated_scale(config: Config) -> MassScale | None:
+    """Mass scale that a calibration fixes at the configured optics.
+
+    Parameters
+    ----------
+    config : Config
+        The experiment.
+
+    Returns
+    -------
+    MassScale or None
+        None without a calibration.
+    """
+    return plan(config).model.scale if config.calibration is not None else None
 
 
 def _reach(config: Config) -> float:

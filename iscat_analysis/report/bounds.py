@@ -227,7 +227,10 @@ def scan_figure(table: pd.DataFrame, label: str, here: float) -> Figure:
         if len(names) > len(labels):
             handles, labels = more, names
     if x.min() <= here <= x.max():
-        handles, labels = [*handles, *grid[1, 0].lines[-1:]], [*labels, f"configured: {here:g}"]
+        handles, labels = (
+            [*handles, *grid[1, 0].lines[-1:]],
+            [*labels, f"configured: {here:g}".replace("-", "−")],
+        )
     figure.legend(handles, labels, loc="outside upper center", ncols=4)
     return figure
 
@@ -324,8 +327,10 @@ def _log(axes: Axes) -> None:
     """Set a logarithmic y axis with plain numbers."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    subs = (1.0,) if high / low > 200 else (1.0, 2.0, 5.0) if high / low > 4 else None
-    axes.yaxis.set_major_locator(LogLocator(subs=subs or (1, 1.5, 2, 3, 4, 5, 6, 7, 8, 9)))
+    steps = {200.0: (1.0,), 20.0: (1.0, 2.0, 5.0), 4.0: (1.0, 2.0, 3.0, 5.0, 7.0)}
+    finest = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
+    subs = next((subs for span, subs in steps.items() if high / low > span), finest)
+    axes.yaxis.set_major_locator(LogLocator(subs=subs))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
 
