@@ -49,9 +49,8 @@ class PixelGrid:
     @classmethod
     def region(cls, rows: tuple[int, int], columns: tuple[int, int], pixel_nm: float) -> PixelGrid:
         """Half-open ranges of full-frame pixels; pixel (0, 0) has its centre at (0, 0) nm."""
-        return cls(
-            np.arange(*columns) * float(pixel_nm), np.arange(*rows) * float(pixel_nm), pixel_nm
-        )
+        x, y = (np.arange(*span, dtype=np.float64) * pixel_nm for span in (columns, rows))
+        return cls(x, y, pixel_nm)
 
     @classmethod
     def centred(cls, pixels: int, pixel_nm: float) -> PixelGrid:

@@ -186,39 +186,36 @@ class Movie:
 
     def expected_frames(self) -> Iterator[FloatArray]:
         """Yield the expected photoelectrons of each frame in order, shape (y, x)."""
-        unit = np.array([self._model.rho, 0.0])[:, None, None]
-        field = np.zeros((2, *self._grid.shape), dtype=complex)
-        fields: dict[int, ComplexArray] = {}
-        current = self._expected(field, unit)
+        q = self._model.samples[1].size
+        rows, columns = self._grid.shape
+        field = np.zeros((2, rows * q, columns * q), dtype=complex)
+        present: dict[int, ComplexArray] = {}
+        current = self._expected(field)
         for t in range(self.power.size):
             changed = False
             for i, particle in enumerate(self.particles):
                 if particle.frame == t:
-                    fields[i] = self._field(particle)
-                    field = field + fields[i]
+                    present[i] = self._field(particle)
+                    field = field + present[i]
                     changed = True
-                if particle.leave == t and i in fields:
-                    field = field - fields.pop(i)
+                if particle.leave == t and i in present:
+                    field = field - present.pop(i)
                     changed = True
             if changed:
-                current = self._expected(field, unit)
+                current = self._expected(field)
             yield self.power[t] * current
 
-    def _expected(self, field: ComplexArray, unit: FloatArray) -> FloatArray:
-        q = self._model.samples[1].size
-        intensity = np.sum(np.abs(unit + field) ** 2, axis=0) if q == 1 else self._binned(field)
-        if self._model.rho:
-            return np.asarray(self.background_e * intensity)
-        return np.asarray(self.background_e + self._signal_scale * intensity)
-
-    def _binned(self, field: ComplexArray) -> FloatArray:
-        """Intensity averaged over the samples of each pixel; `field` is on the sample grid."""
+    def _expected(self, field: ComplexArray) -> FloatArray:
+        """Average over the samples inside each pixel, on which `field` is given."""
         weights = self._model.samples[1]
         q = weights.size
-        unit = np.array([self._model.rho, 0.0])[:, None, None]
-        intensity = np.sum(np.abs(unit + field) ** 2, axis=0)
-        ny, nx = self._config.simulation.shape
-        return np.einsum("yixj,i,j->yx", intensity.reshape(ny, q, nx, q), weights, weights)
+        rows, columns = self._grid.shape
+        reference = np.array([self._model.rho, 0.0])[:, None, None]
+        intensity = np.sum(np.abs(reference + field) ** 2, axis=0).reshape(rows, q, columns, q)
+        signal = np.einsum("yixj,i,j->yx", intensity, weights, weights)
+        if self._model.rho:
+            return np.asarray(self.background_e * signal)
+        return np.asarray(self.background_e + self._signal_scale * signal)
 
     def _field(self, particle: Particle) -> ComplexArray:
         offsets = self._model.samples[0] * self._pixel_nm

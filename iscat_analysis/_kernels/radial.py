@@ -209,15 +209,12 @@ def radial_profile(
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
-def _mix(t: FloatArray, v: FloatArray, d: FloatArray, out: FloatArray) -> None:
-    """Fill `out` (2, n) with the combinations v and d (6) of the six rows of t (6, n)."""
+def _mix(t: FloatArray, w: FloatArray, out: FloatArray) -> None:
+    """Fill `out` (n) with the combination w (6) of the six rows of t (6, n)."""
     t0, t1, t2, t3, t4, t5 = t[0], t[1], t[2], t[3], t[4], t[5]
-    v0, v1, v2, v3, v4, v5 = v[0], v[1], v[2], v[3], v[4], v[5]
-    d0, d1, d2, d3, d4, d5 = d[0], d[1], d[2], d[3], d[4], d[5]
-    value, slope = out[0], out[1]
-    for j in range(value.size):
-        value[j] = v0 * t0[j] + v1 * t1[j] + v2 * t2[j] + v3 * t3[j] + v4 * t4[j] + v5 * t5[j]
-        slope[j] = d0 * t0[j] + d1 * t1[j] + d2 * t2[j] + d3 * t3[j] + d4 * t4[j] + d5 * t5[j]
+    w0, w1, w2, w3, w4, w5 = w[0], w[1], w[2], w[3], w[4], w[5]
+    for j in range(out.size):
+        out[j] = w0 * t0[j] + w1 * t1[j] + w2 * t2[j] + w3 * t3[j] + w4 * t4[j] + w5 * t5[j]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
@@ -244,7 +241,7 @@ def profile_at(
     work: FloatArray,
     profile: FloatArray,
 ) -> None:
-    """Fill the first intervals of a profile, with ∂/∂z, by interpolation along z.
+    """Fill the first intervals of a profile by interpolation along z.
 
     Parameters
     ----------
@@ -256,8 +253,8 @@ def profile_at(
         How many are wanted.
     work : ndarray, shape (4, 2, intervals·6)
         Scratch.
-    profile : ndarray, shape (8, intervals, 6)
-        Filled.
+    profile : ndarray, shape (8 or 4, intervals, 6)
+        Filled; with 8 channels ∂/∂z too.
     """
     heights, first_nm, step_nm, kappa = axial
     place = (z_nm - first_nm) / step_nm
@@ -280,15 +277,19 @@ def profile_at(
     d /= step_nm
     six = heights[i : i + 2].reshape(6, 4, heights.shape[3])
     used = 6 * min(intervals, profile.shape[1])
-    for channel in range(4):
-        _mix(six[:, channel], v, d, work[channel, :, :used])
+    with_slope = profile.shape[0] == 8
     cos, sin = np.cos(kappa * z_nm), np.sin(kappa * z_nm)
-    flat = profile.reshape(8, heights.shape[3])
+    flat = profile.reshape(profile.shape[0], heights.shape[3])
+    for channel in range(4):
+        _mix(six[:, channel], v, work[channel, 0, :used])
+        if with_slope:
+            _mix(six[:, channel], d, work[channel, 1, :used])
     for c in range(0, 4, 2):
         re, im = work[c, 0, :used], work[c + 1, 0, :used]
-        slope_re, slope_im = work[c, 1, :used], work[c + 1, 1, :used]
-        for j in range(re.size):
-            slope_re[j] -= kappa * im[j]
-            slope_im[j] += kappa * re[j]
+        if with_slope:
+            slope_re, slope_im = work[c, 1, :used], work[c + 1, 1, :used]
+            for j in range(used):
+                slope_re[j] -= kappa * im[j]
+                slope_im[j] += kappa * re[j]
+            _turn(slope_re, slope_im, cos, sin, flat[c + 4], flat[c + 5])
         _turn(re, im, cos, sin, flat[c], flat[c + 1])
-        _turn(slope_re, slope_im, cos, sin, flat[c + 4], flat[c + 5])

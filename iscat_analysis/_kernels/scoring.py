@@ -220,10 +220,10 @@ def _intervals(pixels: Pixels, theta: FloatArray, inv_step: float) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scratch(axial: AxialTable) -> tuple[FloatArray, FloatArray]:
+def _scratch(axial: AxialTable, channels: int) -> tuple[FloatArray, FloatArray]:
     """Work space and profile for `profile_at`."""
     width = axial.heights.shape[3]
-    return np.empty((4, 2, width)), np.empty((8, width // 6, 6))
+    return np.empty((4, 2, width)), np.empty((channels, width // 6, 6))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -237,7 +237,7 @@ def value_batch(
     out: FloatArray,
 ) -> None:
     """Fill `out` (n) with the log-likelihood at θ (n, 5); where z repeats, so does the profile."""
-    work, profile = _scratch(axial)
+    work, profile = _scratch(axial, 4)
     z = np.nan
     for k in range(thetas.shape[0]):
         if thetas[k, 2] != z:
@@ -344,7 +344,7 @@ def maximize(
     outcome : int
         CONVERGED, STALLED or EXHAUSTED.
     """
-    work, profile = _scratch(axial)
+    work, profile = _scratch(axial, 8)
     step, trial = np.empty(5), np.empty(5)
     trial_score, trial_fisher = np.empty(5), np.empty((5, 5))
     active = np.empty(5, dtype=np.bool_)
@@ -411,7 +411,7 @@ def scan_heights(
     Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the rest and the start.  An
     empty amplitude range holds the amplitude fixed.
     """
-    work, profile = _scratch(axial)
+    work, profile = _scratch(axial, 8)
     score, fisher = np.empty(5), np.empty((5, 5))
     here = theta.copy()
     low, high = amplitude_range

@@ -322,13 +322,23 @@ def _search(scene: Scene, windows: Windows, events: Sequence[Event]) -> list[Can
         explained=explained,
     )
     near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na) / scene.pixel_nm
-    return [
-        c
-        for c in found
-        if all(
-            math.hypot(c.x_px - e.candidate.x_px, c.y_px - e.candidate.y_px) > near for e in events
-        )
-    ]
+    return [c for c in found if all(_is_new(c, event, scene.roi_px, near) for event in events)]
+
+
+def _is_new(candidate: Candidate, event: Event, roi_px: int, near_px: float) -> bool:
+    """Whether a peak is another particle than a fitted one, and not what its fit left over.
+
+    A second particle explains most of the χ² in excess around the first; the residue of a model
+    that does not suit the first is spread over many peaks.
+    """
+    here = event.candidate
+    distance = math.hypot(candidate.x_px - here.x_px, candidate.y_px - here.y_px)
+    if distance <= near_px:
+        return False
+    if distance > 2 * roi_px or Status.POOR_FIT not in event.fit.flags:
+        return True
+    excess = (event.fit.chi2_reduced - 1) * event.likelihood.n_pixels
+    return candidate.snr**2 > 0.5 * excess
 
 
 def _fit_all(
