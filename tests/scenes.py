@@ -68,7 +68,7 @@ def draw_windows(
     read_noise_e: float = 0.0,
     power_ratio: float | None = None,
 ) -> Windows:
-    """Sums before and after landing: sums of Poisson counts are Poisson, so frames are not drawn."""
+    """Draw the sums before and after landing: sums of Poisson counts are Poisson themselves."""
     expected = list(movie.expected_frames())
     before, after = sum(expected[:landing]), sum(expected[landing:])
     n_before, n_after = landing, len(expected) - landing
