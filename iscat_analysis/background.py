@@ -22,6 +22,9 @@ from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress,
 DEAD, HOT = 0.2, 5.0
 """A pixel below or above these multiples of its neighbourhood's median is masked."""
 
+DEFECT_SIGMAS = 6.0
+"""Unless noise alone could have put it there: dark backgrounds scatter by more than their mean."""
+
 _BLOCK_BYTES = 64 * 2**20
 _CLIP_SIGMAS = 3.0
 _LEAST_TOTAL_E = 1e4  # fewer background photoelectrons say too little about the power
@@ -102,7 +105,7 @@ def measure_windows(
             first = replace(first, total_e=n_before * _median(stack, camera, before))
     second = _sum_frames(stack, camera, after, check, progress, start, total)
     saturated = first.saturated | second.saturated
-    masked = saturated | _defects(first.total_e)
+    masked = saturated | _defects(first.total_e, n_before * variance)
     windows = Windows(
         before_e=first.total_e,
         after_e=second.total_e,
@@ -117,7 +120,58 @@ def measure_windows(
         frames_after=after,
         power=_frame_power(first.frame_totals_e, second.frame_totals_e),
     )
-    return replace(windows, power_ratio=_robust_ratio(windows)) if power_normalization else windows
+    return start_power(windows) if power_normalization else windows
+
+
+def add_frames(windows: Windows, camera: Camera, counts: NDArray[Any], first: int) -> Windows:
+    """Replace the frames after landing by others.
+
+    Parameters
+    ----------
+    windows : Windows
+        Keeps its frames before.
+    camera : Camera
+        Counts → photoelectrons.
+    counts : ndarray, shape (t, y, x)
+        The new frames after [counts].
+    first : int
+        Number of the first of them.
+
+    Returns
+    -------
+    Windows
+        With ρ the ratio of the frame counts; see `start_power`.
+    """
+    n = len(counts)
+    electrons = camera.to_electrons(counts)
+    saturated: BoolArray = np.any(camera.saturated(counts), axis=0)
+    variance = camera.read_variance_e2((counts.shape[1], counts.shape[2]))
+    return replace(
+        windows,
+        after_e=electrons.sum(axis=0),
+        n_after=n,
+        power_ratio=n / max(windows.n_before, 1),
+        read_variance_after_e2=n * variance,
+        masked=(windows.masked & ~windows.saturated) | saturated,
+        saturated=saturated,
+        frames_after=(first, first + n),
+    )
+
+
+def start_power(windows: Windows) -> Windows:
+    """Estimate ρ from the pixels that no particle has changed noticeably.
+
+    Parameters
+    ----------
+    windows : Windows
+        The sums.
+
+    Returns
+    -------
+    Windows
+        With ρ from a clipped ratio; `refine_power` improves it once the particles are known.
+    """
+    return replace(windows, power_ratio=_robust_ratio(windows))
 
 
 def refine_power(windows: Windows, explained: FloatArray, *, additive: bool) -> Windows:
@@ -216,12 +270,11 @@ def _median(stack: FrameSource, camera: Camera, span: tuple[int, int]) -> FloatA
     return camera.to_electrons(out)
 
 
-def _defects(before_e: FloatArray) -> BoolArray:
-    local = median_filter(before_e, size=5, mode="nearest")
-    if not local.mean() > 0:
-        return np.zeros(before_e.shape, dtype=bool)
+def _defects(before_e: FloatArray, read_variance_e2: FloatArray) -> BoolArray:
+    local = np.maximum(median_filter(before_e, size=5, mode="nearest"), 0.0)
     off = (before_e < DEAD * local) | (before_e > HOT * local)
-    return np.asarray(off & (local > 0), dtype=bool)
+    noise = np.sqrt(np.maximum(local, 1.0) + read_variance_e2)
+    return np.asarray(off & (np.abs(before_e - local) > DEFECT_SIGMAS * noise), dtype=bool)
 
 
 def _frame_power(before_e: FloatArray, after_e: FloatArray) -> FloatArray:

@@ -24,9 +24,17 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.likelihood import compile_kernels
 from iscat_analysis.load import Stack, open_stack
 from iscat_analysis.pipeline.field import Scene, field_likelihood, fit_field, make_scene
-from iscat_analysis.pipeline.results import Row, summary_of, table_of, view_of
+from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
+from iscat_analysis.pipeline.tracking import track_particles
 from iscat_analysis.posterior import sample_posterior
-from iscat_analysis.records import Analysis, Progress, Provenance, Windows, silent
+from iscat_analysis.records import (
+    Analysis,
+    PosteriorResult,
+    Progress,
+    Provenance,
+    Windows,
+    silent,
+)
 from iscat_analysis.report import check_output, write_report
 
 DEPENDENCIES = (
@@ -83,12 +91,17 @@ def fit_stack(
         The movie cannot be analysed, or the folder exists.
     ConfigError
         The configuration does not suit the movie.
+    KeyboardInterrupt
+        The user stopped it; what was finished is in the folder.
     """
     folder = stack.with_suffix(".iscat") if out is None else out
     check_output(folder, overwrite)
     with open_stack(stack) as movie:
         analysis = analyse(movie, config, progress=progress, notify=notify, command=command)
     write_report(analysis, folder, overwrite=overwrite)
+    if analysis.summary["interrupted"]:
+        notify(f"interrupted; what was finished is in {folder}")
+        raise KeyboardInterrupt
     return analysis
 
 
@@ -130,7 +143,8 @@ def analyse(
     shape = (movie.shape[1], movie.shape[2])
     camera = camera_from_config(config.camera, shape, movie.dtype)
     before, after = frame_ranges(movie, config)
-    scene = make_scene(config, shape)
+    searches = after[1] - after[0] if config.fit.mode == "track" else 1
+    scene = make_scene(config, shape, searches=searches)
     _warm_up(scene, notify)
     clock.lap("model")
 
@@ -152,30 +166,32 @@ def analyse(
         tell(text)
     clock.lap("background")
     with ThreadPoolExecutor(config.compute.workers) as pool:
-        events, windows = fit_field(scene, windows, pool=pool, progress=progress)
-        clock.lap("fit")
-        rows = [Row(number, event, windows) for number, event in enumerate(events)]
-        if config.posterior.enabled:
-            rows = _sampled(rows, config, pool, progress)
-            clock.lap("posterior")
-    table = table_of(scene, rows)
+        if scene.mode == "track":
+            found = track_particles(
+                scene, movie, camera, windows, check=check, pool=pool, progress=progress
+            )
+        else:
+            found = _bound_particles(scene, windows, clock, pool=pool, progress=progress)
+    windows = found.windows
     image = field_likelihood(scene, windows).measured_signal()
     if scene.additive:
         image = windows.after_e - windows.power_ratio * windows.before_e
-    clock.lap("bounds")
-    summary = summary_of(scene, table, windows, clock.seconds)
+    clock.lap("results")
+    summary = summary_of(scene, found.table, windows, clock.seconds)
+    sampled = config.posterior.enabled and scene.mode != "track"
     provenance = Provenance(
         command=command or "iscat_analysis.pipeline.analyse",
         input_path=str(movie.path),
         input_sha256=movie.sha256(),
         versions=_versions(),
-        seed=config.simulation.seed if config.posterior.enabled else None,
+        seed=config.simulation.seed if sampled else None,
         started=started,
     )
     summary |= {
         "input": {"path": provenance.input_path, "sha256": provenance.input_sha256},
         "seed": provenance.seed,
         "versions": dict(provenance.versions),
+        "interrupted": found.interrupted,
         "warnings": warnings,
     }
     return Analysis(
@@ -183,8 +199,8 @@ def analyse(
         mode=scene.mode,
         scheme=config.optics.scheme,
         pixel_size_nm=scene.pixel_nm,
-        table=table,
-        views=tuple(view_of(row) for row in rows),
+        table=found.table,
+        views=found.views,
         ratio_image=image,
         power=windows.power,
         power_frames=np.concatenate(
@@ -238,26 +254,50 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
     return before, after
 
 
-def _sampled(
-    rows: list[Row], config: Config, pool: ThreadPoolExecutor, progress: Progress
-) -> list[Row]:
-    settings = config.posterior
+def _bound_particles(
+    scene: Scene,
+    windows: Windows,
+    clock: _Clock,
+    *,
+    pool: ThreadPoolExecutor,
+    progress: Progress,
+) -> Found:
+    """Find, fit and sample the particles that bound between the two windows."""
+    events, windows = fit_field(scene, windows, pool=pool, progress=progress)
+    clock.lap("fit")
+    rows = [Row(number, event, windows) for number, event in enumerate(events)]
+    interrupted = False
+    if scene.config.posterior.enabled:
+        rows, interrupted = _sampled(scene, rows, pool, progress)
+        clock.lap("posterior")
+    views = tuple(view_of(row) for row in rows)
+    return Found(table_of(scene, rows), views, windows, interrupted)
 
-    def one(row: Row) -> Row:
-        posterior = sample_posterior(
+
+def _sampled(
+    scene: Scene, rows: list[Row], pool: ThreadPoolExecutor, progress: Progress
+) -> tuple[list[Row], bool]:
+    """Sample the posteriors; an interrupt keeps those that are done."""
+    settings, seed = scene.config.posterior, scene.config.simulation.seed
+
+    def one(row: Row) -> PosteriorResult:
+        return sample_posterior(
             row.event.likelihood,
             row.event.fit,
             walkers=settings.walkers,
             steps=settings.steps,
-            seed=config.simulation.seed + row.number,
+            seed=seed + row.number,
         )
-        return replace(row, posterior=posterior)
 
-    done = []
-    for row in pool.map(one, rows):
-        done.append(row)
-        progress("posterior", len(done), len(rows))
-    return done
+    done: list[Row] = []
+    try:
+        for row, posterior in zip(rows, pool.map(one, rows), strict=True):
+            done.append(replace(row, posterior=posterior))
+            progress("posterior", len(done), len(rows))
+    except KeyboardInterrupt:
+        pool.shutdown(wait=False, cancel_futures=True)
+        return done + rows[len(done) :], True
+    return done, False
 
 
 def _camera_warnings(movie: Stack, camera: Camera, windows: Windows) -> Iterator[str]:

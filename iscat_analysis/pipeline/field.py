@@ -115,7 +115,7 @@ class Scene:
         return self.model.rho == 0
 
 
-def make_scene(config: Config, field_px: tuple[int, int]) -> Scene:
+def make_scene(config: Config, field_px: tuple[int, int], *, searches: int = 1) -> Scene:
     """Build the models and the matched filter for a field.
 
     Parameters
@@ -124,6 +124,8 @@ def make_scene(config: Config, field_px: tuple[int, int]) -> Scene:
         With a pixel size.
     field_px : (int, int)
         Rows and columns.
+    searches : int
+        Images that will be searched; they share the expected false alarms.
 
     Returns
     -------
@@ -159,7 +161,11 @@ def make_scene(config: Config, field_px: tuple[int, int]) -> Scene:
         wide=forward_model(config, field.diagonal_nm),
         templates=make_templates(
             model,
-            config.detection,
+            config.detection.model_copy(
+                update={
+                    "false_alarms_per_movie": config.detection.false_alarms_per_movie / searches
+                }
+            ),
             pixel_nm=pixel,
             roi_nm=config.fit.roi_nm,
             z_range_nm=config.fit.z_range_nm if free_z else None,

@@ -35,6 +35,28 @@ class Row:
     posterior: PosteriorResult | None = None
 
 
+@dataclass(frozen=True)
+class Found:
+    """What a strategy found in a movie.
+
+    Attributes
+    ----------
+    table : pandas.DataFrame
+        Columns `EVENT_COLUMNS`.
+    views : tuple of EventView
+        Images, in the order of the table, or one per track.
+    windows : Windows
+        The sums, with the final laser power.
+    interrupted : bool
+        Whether the user stopped it; what was finished is kept.
+    """
+
+    table: pd.DataFrame
+    views: tuple[EventView, ...]
+    windows: Windows
+    interrupted: bool = False
+
+
 def collected_photons(scene: Scene, windows: Windows, event: Event) -> float:
     """Scattered photons that the pupil collected from one particle in the frames after.
 

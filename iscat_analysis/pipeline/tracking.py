@@ -1,0 +1,113 @@
+"""Mode ``track``: every frame is fitted on its own, then the positions are linked into tracks."""
+
+from __future__ import annotations
+
+import logging
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.background import Check, add_frames, start_power
+from iscat_analysis.camera import Camera
+from iscat_analysis.pipeline.field import Event, Scene, fit_field
+from iscat_analysis.pipeline.results import Found, Row, table_of, view_of
+from iscat_analysis.records import EventView, FrameSource, Progress, Windows
+
+MEMORY = 3
+"""Frames a particle may be missed in without losing its track."""
+
+
+def track_particles(
+    scene: Scene,
+    movie: FrameSource,
+    camera: Camera,
+    windows: Windows,
+    *,
+    check: Check,
+    pool: ThreadPoolExecutor,
+    progress: Progress,
+) -> Found:
+    """Fit each frame after the background, starting from the frame before, and link.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models and matched filter.
+    movie : FrameSource
+        The movie.
+    camera : Camera
+        Counts → photoelectrons.
+    windows : Windows
+        The background, and all frames after it summed.
+    check : callable
+        Refuses impossible counts.
+    pool : ThreadPoolExecutor
+        Runs the fits of a frame.
+    progress : Progress
+        Told the frames.
+
+    Returns
+    -------
+    Found
+        One row per particle and frame, numbered by track; one view per track.  An interrupt keeps
+        the frames that are done.
+    """
+    first, last = windows.frames_after
+    tables: list[pd.DataFrame] = []
+    views: list[EventView] = []
+    events: tuple[Event, ...] = ()
+    interrupted = False
+    try:
+        for frame in range(first, last):
+            here = _one_frame(movie, camera, windows, frame, check, scene)
+            starts = [event.candidate for event in events]
+            events, here = fit_field(scene, here, starts=starts, pool=pool)
+            rows = [Row(number, event, here) for number, event in enumerate(events)]
+            tables.append(table_of(scene, rows))
+            views += [view_of(row) for row in rows]
+            progress("track", frame + 1 - first, last - first)
+    except KeyboardInterrupt:
+        interrupted = True
+    table = pd.concat(tables, ignore_index=True) if tables else table_of(scene, [])
+    views = views[: len(table)]
+    table["event"] = _link(table, scene.config.detection.min_separation_nm)
+    seen: dict[int, EventView] = {}
+    for track, view in zip(table["event"], views, strict=True):
+        seen.setdefault(int(track), replace(view, event=int(track)))
+    order = np.lexsort((table["frame"], table["event"]))
+    return Found(
+        table=table.iloc[order].reset_index(drop=True),
+        views=tuple(seen[track] for track in sorted(seen)),
+        windows=windows,
+        interrupted=interrupted,
+    )
+
+
+def _one_frame(
+    movie: FrameSource,
+    camera: Camera,
+    windows: Windows,
+    frame: int,
+    check: Check,
+    scene: Scene,
+) -> Windows:
+    counts = movie.read(frame, frame + 1)
+    check(counts, frame)
+    single = add_frames(windows, camera, counts, frame)
+    return start_power(single) if scene.config.background.power_normalization else single
+
+
+def _link(table: pd.DataFrame, reach_nm: float) -> pd.Series[int]:
+    """Track number of every row; a particle moves less than `reach_nm` between frames."""
+    if table.empty:
+        return table["event"]
+    import trackpy
+
+    logging.getLogger("trackpy").setLevel(logging.WARNING)  # it reports every frame
+    positions = table[["x_nm", "y_nm", "frame"]]
+    linked = trackpy.link(
+        positions, search_range=reach_nm, memory=MEMORY, pos_columns=["x_nm", "y_nm"]
+    )
+    return linked["particle"].reindex(table.index).astype("int64")
