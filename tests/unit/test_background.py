@@ -1,0 +1,228 @@
+"""Sums before and after landing, and the laser power that the particles must not disturb."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scenes import Stack
+
+from iscat_analysis.background import measure_windows, refine_power
+from iscat_analysis.camera import Camera
+from iscat_analysis.errors import DataError
+
+SHAPE = (48, 56)
+SIGMAS = 4.0
+
+
+def _spots(depth: float, count: int = 8) -> np.ndarray:
+    """Dark spots with rings, as strong as `depth`."""
+    y, x = np.indices(SHAPE)
+    rng = np.random.default_rng(1)
+    contrast = np.zeros(SHAPE)
+    for cy, cx in rng.uniform(8, 40, (count, 2)):
+        r = np.hypot(y - cy, x - cx)
+        contrast -= depth * np.cos(r / 1.5) * np.exp(-((r / 4) ** 2))
+    return contrast
+
+
+def _movie(
+    seed: int, *, contrast: np.ndarray | float = 0.0, power_noise: float = 0.01, level: float = 2e3
+) -> tuple[Stack, np.ndarray]:
+    """Make 30 + 20 frames with speckle and their laser power."""
+    rng = np.random.default_rng(seed)
+    power = 1 + power_noise * rng.standard_normal(50)
+    light = level * np.random.default_rng(2).uniform(0.7, 1.3, SHAPE)
+    frames = [
+        rng.poisson(p * light * (1 + (contrast if t >= 30 else 0.0))) for t, p in enumerate(power)
+    ]
+    return Stack(np.array(frames, dtype="u2")), power
+
+
+BEFORE, AFTER = (0, 30), (30, 50)
+
+
+def test_sums_are_plain_sums() -> None:
+    stack, _ = _movie(0)
+    camera = Camera(gain_e_per_adu=2.0, offset_adu=10.0, read_noise_e=3.0)
+    windows = measure_windows(stack, camera, (2, 12), (15, 40))
+    electrons = 2.0 * (stack.counts.astype(float) - 10)
+    np.testing.assert_allclose(windows.before_e, electrons[2:12].sum(axis=0))
+    np.testing.assert_allclose(windows.after_e, electrons[15:40].sum(axis=0))
+    assert (windows.n_before, windows.n_after) == (10, 25)
+    assert (windows.frames_before, windows.frames_after) == ((2, 12), (15, 40))
+    np.testing.assert_allclose(windows.read_variance_before_e2, 90.0)
+    np.testing.assert_allclose(windows.read_variance_after_e2, 225.0)
+    assert not windows.masked.any()
+
+
+def test_background_frames_may_follow_the_fitted_ones() -> None:
+    stack, _ = _movie(0)
+    windows = measure_windows(stack, Camera(), (30, 50), (0, 30))
+    np.testing.assert_allclose(windows.before_e, stack.counts[30:].sum(axis=0))
+
+
+@pytest.mark.parametrize("known", [0.0, 0.05])
+def test_frame_power_is_the_lasers(known: float) -> None:
+    stack, power = _movie(3, power_noise=known)
+    measured = measure_windows(stack, Camera(), BEFORE, AFTER).power
+    expected = power / power[:30].mean()
+    spread = np.sqrt(2 / (2e3 * np.prod(SHAPE)))
+    assert np.abs(measured - expected).max() < 5 * spread
+
+
+# ---- the ratio -------------------------------------------------------------------------------
+
+
+def _ratio_pulls(
+    seeds: range, *, contrast: np.ndarray, robust: bool, refine: bool = False
+) -> np.ndarray:
+    """Error of ρ in standard errors of counting."""
+    pulls = []
+    for seed in seeds:
+        stack, power = _movie(seed, contrast=contrast)
+        truth = power[30:].sum() / power[:30].sum()
+        windows = measure_windows(stack, Camera(), BEFORE, AFTER)
+        if refine:
+            windows = refine_power(windows, contrast, additive=False)
+        before, after = windows.before_e.sum(), windows.after_e.sum()
+        ratio = windows.power_ratio if robust else after / before
+        pulls.append((ratio / truth - 1) / np.sqrt(1 / before + 1 / after))
+    return np.array(pulls)
+
+
+def _assert_unbiased(pulls: np.ndarray, spread: float) -> None:
+    assert abs(pulls.mean()) < SIGMAS * spread / np.sqrt(len(pulls))
+    assert pulls.std() < spread * (1 + SIGMAS / np.sqrt(2 * len(pulls)))
+
+
+def test_the_ratio_is_right_on_blank_frames() -> None:
+    _assert_unbiased(_ratio_pulls(range(40), contrast=np.zeros(SHAPE), robust=True), 1.1)
+
+
+def test_strong_particles_hardly_disturb_the_ratio() -> None:
+    """Before anything is fitted: clipping takes off what is seen in single pixels."""
+    contrast = _spots(0.4)
+    pulls = _ratio_pulls(range(12), contrast=contrast, robust=True)
+    naive = _ratio_pulls(range(12), contrast=contrast, robust=False)
+    assert abs(naive.mean()) > 100
+    assert abs(pulls.mean()) < 0.2 * abs(naive.mean())
+
+
+def test_the_plain_ratio_of_totals_is_biased() -> None:
+    """Control: the test below can fail."""
+    with pytest.raises(AssertionError):
+        _assert_unbiased(_ratio_pulls(range(40), contrast=_spots(0.05), robust=False), 1.1)
+
+
+@pytest.mark.parametrize("depth", [0.05, 0.4])
+def test_with_the_particles_explained_the_ratio_is_unbiased(depth: float) -> None:
+    contrast = _spots(depth)
+    pulls = _ratio_pulls(range(40), contrast=contrast, robust=True, refine=True)
+    _assert_unbiased(pulls, 1.1)
+
+
+def test_without_normalisation_the_frames_are_counted() -> None:
+    stack, _ = _movie(0)
+    windows = measure_windows(stack, Camera(), BEFORE, AFTER, power_normalization=False)
+    assert windows.power_ratio == 20 / 30
+
+
+# ---- other backgrounds -------------------------------------------------------------------------
+
+
+def test_the_median_forgets_a_visitor() -> None:
+    stack, _ = _movie(4, power_noise=0.0)
+    stack.counts[5:11, 20:24, 20:24] *= 3
+    windows = measure_windows(stack, Camera(offset_adu=7.0), BEFORE, AFTER, method="median")
+    expected = 30 * (np.median(stack.counts[:30], axis=0) - 7.0)
+    np.testing.assert_allclose(windows.before_e, expected)
+    mean = measure_windows(stack, Camera(offset_adu=7.0), BEFORE, AFTER)
+    assert mean.before_e[22, 22] > 1.2 * windows.before_e[22, 22]
+
+
+def test_a_known_background_needs_no_frames() -> None:
+    stack, power = _movie(5, power_noise=0.02)
+    windows = measure_windows(stack, Camera(), None, AFTER, method="none", level_e=2e3)
+    assert windows.n_before == 0
+    assert windows.frames_before == (0, 0)
+    np.testing.assert_array_equal(windows.before_e, 2e3)
+    total = windows.after_e.sum()
+    expected = total / (2e3 * np.prod(SHAPE))
+    assert windows.power_ratio == pytest.approx(expected, rel=0.02)
+    fixed = measure_windows(
+        stack, Camera(), None, AFTER, method="none", level_e=2e3, power_normalization=False
+    )
+    assert fixed.power_ratio == 20
+    assert windows.power.size == 20
+
+
+# ---- defects ---------------------------------------------------------------------------------
+
+
+def test_dead_and_hot_pixels_are_masked() -> None:
+    stack, _ = _movie(6)
+    bad = np.zeros(SHAPE, dtype=bool)
+    bad[0, 0] = bad[10, 20] = bad[47, 55] = True
+    stack.counts[:, 10, 20] = 0
+    stack.counts[:, 0, 0] = 20000
+    stack.counts[:, 47, 55] = 3
+    windows = measure_windows(stack, Camera(), BEFORE, AFTER)
+    np.testing.assert_array_equal(windows.masked, bad)
+    assert not windows.saturated.any()
+
+
+def test_saturated_pixels_are_masked_even_for_one_frame() -> None:
+    stack, _ = _movie(6)
+    stack.counts[3, 4, 5] = 65535
+    stack.counts[44, 6, 7] = 40000
+    camera = Camera(full_scale_adu=65535.0, well_depth_e=39000.0)
+    windows = measure_windows(stack, camera, BEFORE, AFTER)
+    assert np.argwhere(windows.saturated).tolist() == [[4, 5], [6, 7]]
+    assert windows.masked[4, 5]
+    assert windows.masked[6, 7]
+
+
+@pytest.mark.parametrize("level", [0.0, 0.02, 0.5])
+@pytest.mark.parametrize("read_noise_e", [0.0, 2.0])
+def test_the_noise_of_a_dark_background_is_no_defect(level: float, read_noise_e: float) -> None:
+    """In dark field the background may be nothing but read noise and a few photons."""
+    rng = np.random.default_rng(7)
+    frames = rng.poisson(level, (50, *SHAPE)) + read_noise_e * rng.standard_normal((50, *SHAPE))
+    frames[:, 30, 31] += 20.0  # a hot pixel
+    camera = Camera(read_noise_e=read_noise_e)
+    windows = measure_windows(Stack(frames), camera, BEFORE, AFTER)
+    assert np.argwhere(windows.masked).tolist() == [[30, 31]]
+
+
+# ---- ranges ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ((0, 60), (60, 70), "has 50 frames, but the background range asks for 0:60"),
+        ((0, 30), (30, 51), "has 50 frames, but the fitted range asks for 30:51"),
+        ((0, 30), (29, 50), "overlap"),
+        ((10, 30), (0, 11), "overlap"),
+        ((0, 50), (50, 50), "no frame is left"),
+    ],
+)
+def test_impossible_ranges_are_refused(
+    before: tuple[int, int], after: tuple[int, int], message: str
+) -> None:
+    stack, _ = _movie(0)
+    with pytest.raises(DataError, match=message):
+        measure_windows(stack, Camera(), before, after)
+
+
+def test_every_frame_is_checked_and_counted_once() -> None:
+    stack, _ = _movie(0)
+    seen: list[int] = []
+    steps: list[tuple[int, int]] = []
+    measure_windows(
+        stack, Camera(), BEFORE, AFTER,
+        check=lambda counts, first: seen.extend(range(first, first + len(counts))),
+        progress=lambda _, done, total: steps.append((done, total)),
+    )  # fmt: skip
+    assert seen == list(range(50))
+    assert steps[-1] == (50, 50)
