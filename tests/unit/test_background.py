@@ -141,7 +141,7 @@ def test_the_median_forgets_a_visitor() -> None:
 
 
 def test_a_known_background_needs_no_frames() -> None:
-    stack, power = _movie(5, power_noise=0.02)
+    stack, _ = _movie(5, power_noise=0.02)
     windows = measure_windows(stack, Camera(), None, AFTER, method="none", level_e=2e3)
     assert windows.n_before == 0
     assert windows.frames_before == (0, 0)
