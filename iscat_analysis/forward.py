@@ -26,6 +26,9 @@ from iscat_analysis.units import KILODALTON_KG, NM
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+NEAR_CRITICAL = 0.98
+"""NA over n_sample from which the quadrature minds the critical angle."""
+
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
 
@@ -490,13 +493,14 @@ def forward_model(
     if z_max_nm is None:
         z_max_nm = max(config.fit.z_range_nm[1], height)
     alpha = math.asin(optics.na / ni)
-    critical = math.asin(ns / ni) if optics.na > ns else None
+    near = NEAR_CRITICAL * ns < optics.na and ns < ni
+    critical = math.asin(ns / ni) if near else None
     if paper:
         theta, weight = rectangle(alpha, nodes or DONG2021_FIELD_NODES)
     else:
         rise = 1 - math.cos(alpha)
         turns = k * (optics.na * reach_nm + ns * z_max_nm + ni * abs(oil_nm) * rise)
-        beyond = (alpha - critical) / alpha if critical else 0.0
+        beyond = max(0.0, (alpha - critical) / alpha) if critical else 0.0
         theta, weight = gauss_legendre(
             alpha,
             critical,

@@ -58,7 +58,7 @@ def gauss_legendre(
     alpha : float
         Upper limit [rad].
     critical : float or None
-        Critical angle [rad], None where it is not below α.
+        Critical angle [rad], None where it is far above α.
     nodes : int
         Nodes below the critical angle, or altogether.
     nodes_above : int
@@ -72,6 +72,10 @@ def gauss_legendre(
     x, w = _unit_gauss_legendre(nodes)
     if critical is None:
         return alpha * x, alpha * w
+    if critical >= alpha:
+        least = np.sqrt(1 - alpha / critical)
+        u = least + (1 - least) * x[::-1]
+        return critical * (1 - u**2), 2 * critical * (1 - least) * u * w[::-1]
     x2, w2 = _unit_gauss_legendre(nodes_above)
     below, above = critical, alpha - critical
     theta = np.concatenate([(critical - below * x**2)[::-1], critical + above * x2**2])

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.forward import ForwardModel
+from iscat_analysis.forward import NEAR_CRITICAL, ForwardModel
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -178,7 +178,7 @@ def _collected(model: ForwardModel, z_nm: float, measure: Measure) -> _Light:
     optics = model.optics
     alpha = math.asin(optics.na / optics.n_immersion)
     critical = None
-    if optics.na > optics.n_sample:
+    if NEAR_CRITICAL * optics.n_sample < optics.na and optics.n_sample < optics.n_immersion:
         critical = math.asin(optics.n_sample / optics.n_immersion)
     theta, weight = gauss_legendre(alpha, critical, NODES, NODES)
     pupil = make_pupil(
