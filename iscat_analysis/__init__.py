@@ -1,1 +1,109 @@
-"""Particles in interferometric scattering movies, and how near their fits come to the bound."""
+"""Particles in interferometric scattering movies, and how near their fits come to the bound.
+
+The flow of a measurement, each step a name of this package::
+
+    import iscat_analysis as ia
+
+    setup = ia.configure("setup.toml", settings={"optics.na": 1.42})   # a Config, validated
+    result = ia.fit_movie("movie.tif", config=setup, background=(0, 200))
+    result                      # summary and table; in a notebook, drawn as HTML
+    result.table                # pandas.DataFrame, one row per event
+    result.view(0)              # matplotlib Figure: data, model, residual
+    result.posterior(0)         # arviz.InferenceData
+    result.save("movie.iscat")  # report.html, fits.csv, fits.parquet, …
+    ia.compute_bounds(setup)    # what no estimate from such frames can beat
+
+`fit_movie` runs load → calibrate → background → detect → fit → posterior → bounds.  The modules of
+these names hold the stages; `iscat_analysis.pipeline` joins them, and `fit_stack` there is what the
+command line calls.  `simulate_movie` makes a movie whose truth is known, `open_stack` reads frames
+lazily, `schema` gives the JSON schema of what the commands print.
+
+Lengths are nm, masses kDa, counts photoelectrons, as the names say; axes are (t, y, x); frame
+ranges are half-open.  Errors meant for the user are `ConfigError` and `DataError`, both an
+`IscatError`.
+
+Names are imported when they are first used, so that ``import iscat_analysis`` is quick.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from iscat_analysis.config import Config as Config
+    from iscat_analysis.config import config_to_toml as config_to_toml
+    from iscat_analysis.config import load_config as load_config
+    from iscat_analysis.errors import ConfigError as ConfigError
+    from iscat_analysis.errors import DataError as DataError
+    from iscat_analysis.errors import IscatError as IscatError
+    from iscat_analysis.load import Stack as Stack
+    from iscat_analysis.load import open_stack as open_stack
+    from iscat_analysis.notebook import Bounds as Bounds
+    from iscat_analysis.notebook import Result as Result
+    from iscat_analysis.notebook import compute_bounds as compute_bounds
+    from iscat_analysis.notebook import configure as configure
+    from iscat_analysis.notebook import fit_movie as fit_movie
+    from iscat_analysis.notebook import simulate_movie as simulate_movie
+    from iscat_analysis.pipeline import fit_stack as fit_stack
+    from iscat_analysis.records import EVENT_COLUMNS as EVENT_COLUMNS
+    from iscat_analysis.records import FREE_PARAMETERS as FREE_PARAMETERS
+    from iscat_analysis.records import Analysis as Analysis
+    from iscat_analysis.records import Status as Status
+    from iscat_analysis.schemas import schema as schema
+
+_HOME = {
+    "configure": "notebook",
+    "fit_movie": "notebook",
+    "Result": "notebook",
+    "simulate_movie": "notebook",
+    "compute_bounds": "notebook",
+    "Bounds": "notebook",
+    "Config": "config",
+    "load_config": "config",
+    "config_to_toml": "config",
+    "open_stack": "load",
+    "Stack": "load",
+    "fit_stack": "pipeline",
+    "Analysis": "records",
+    "Status": "records",
+    "EVENT_COLUMNS": "records",
+    "FREE_PARAMETERS": "records",
+    "IscatError": "errors",
+    "ConfigError": "errors",
+    "DataError": "errors",
+    "schema": "schemas",
+}
+
+__all__ = [
+    "EVENT_COLUMNS",
+    "FREE_PARAMETERS",
+    "Analysis",
+    "Bounds",
+    "Config",
+    "ConfigError",
+    "DataError",
+    "IscatError",
+    "Result",
+    "Stack",
+    "Status",
+    "compute_bounds",
+    "config_to_toml",
+    "configure",
+    "fit_movie",
+    "fit_stack",
+    "load_config",
+    "open_stack",
+    "schema",
+    "simulate_movie",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

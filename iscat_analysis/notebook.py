@@ -1,0 +1,534 @@
+"""What a notebook user meets: a movie goes in, a `Result` comes out and shows itself.
+
+Each function is one call of the stages below with plain arguments: paths may be text, keys of the
+configuration are given as a mapping.
+"""
+
+from __future__ import annotations
+
+import html
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from iscat_analysis.bounds import bounds_report, parse_scan, scan
+from iscat_analysis.config import Config, load_config, parse_config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.load import open_stack
+from iscat_analysis.pipeline import analyse
+from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Progress, silent
+from iscat_analysis.report import check_output, write_report
+from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
+from iscat_analysis.simulate import write_stack
+
+if TYPE_CHECKING:
+    from arviz import InferenceData
+
+ROWS_SHOWN = 20
+"""Events that a `Result` shows of itself in a notebook."""
+
+_UNITS = {
+    "x_nm": ("x", "nm"),
+    "y_nm": ("y", "nm"),
+    "z_nm": ("z", "nm"),
+    "mass_kda": ("mass", "kDa"),
+}
+_COLUMNS = ("event", "frame", "x_px", "y_px", "z_nm", "mass_kda")
+
+
+def configure(
+    source: str | Path | Config | None = None,
+    *,
+    settings: Mapping[str, Any] | None = None,
+) -> Config:
+    """Make a configuration from a file, from another one, or from the defaults.
+
+    Parameters
+    ----------
+    source : str, Path or Config, optional
+        A TOML file, or a configuration to change; without it, the defaults.
+    settings : mapping of str to Any, optional
+        ``{"section.key": value}``, as in ``{"optics.na": 1.3, "fit.frames": (200, 400)}``; these
+        win over the source, and None removes a key.
+
+    Returns
+    -------
+    Config
+        Validated and immutable; `iscat_analysis.config` documents every key and its unit.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, a key is unknown (the nearest known one is named), or a value is
+        impossible.
+    """
+    base = source if isinstance(source, Config) else load_config(_path(source))
+    if not settings:
+        return base
+    values = base.model_dump(exclude_none=True)
+    for name, value in settings.items():
+        section, dot, key = name.partition(".")
+        if not (dot and section and key):
+            raise ConfigError(f'settings: write "{name}" as "section.key", as in "optics.na"')
+        table = values.setdefault(section, {})
+        if value is None:
+            table.pop(key, None)
+        else:
+            table[key] = value
+    return parse_config(values, where="settings")
+
+
+def fit_movie(
+    movie: str | Path,
+    *,
+    config: str | Path | Config | None = None,
+    settings: Mapping[str, Any] | None = None,
+    mode: str | None = None,
+    background: tuple[int, int] | None = None,
+    frames: tuple[int, int] | None = None,
+    pixel_size_nm: float | None = None,
+    posterior: bool | None = None,
+    workers: int | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> Result:
+    """Fit the particles of a movie; in memory, unless `out` names a folder.
+
+    Parameters
+    ----------
+    movie : str or Path
+        A TIFF file, frames (t, y, x) in counts.
+    config : str, Path or Config, optional
+        As for `configure`.
+    settings : mapping of str to Any, optional
+        As for `configure`; they win over `config`, and the arguments below win over both.
+    mode : str, optional
+        ``"mass"`` (x, y, mass), ``"localize"`` (x, y, z), ``"joint"`` (x, y, z, mass) or
+        ``"track"`` (joint in every frame, linked).
+    background : (int, int), optional
+        Frames before the particles bound, ``[start, stop)``.
+    frames : (int, int), optional
+        Frames to fit, ``[start, stop)``; default all after the background.
+    pixel_size_nm : float, optional
+        In the sample plane [nm]; default as the movie's metadata say.
+    posterior : bool, optional
+        Sample the posterior of every event; default as configured.
+    workers : int, optional
+        Threads.
+    out : str or Path, optional
+        Folder for the report and the tables; nothing is written without it.
+    overwrite : bool
+        Replace an earlier result in `out`.
+    progress : Progress
+        Called with the stage and the steps done and in all.
+
+    Returns
+    -------
+    Result
+        Table, figures, posteriors.
+
+    Raises
+    ------
+    DataError
+        The movie cannot be analysed, or `out` may not be written.
+    ConfigError
+        A setting is unknown or impossible, or does not suit the movie.
+    """
+    given: dict[str, Any] = {
+        "fit.mode": mode,
+        "background.frames": background,
+        "fit.frames": frames,
+        "camera.pixel_size_nm": pixel_size_nm,
+        "posterior.enabled": posterior,
+        "compute.workers": workers,
+    }
+    named = {key: value for key, value in given.items() if value is not None}
+    resolved = configure(config, settings={**(settings or {}), **named})
+    path, folder = Path(movie), _path(out)
+    if folder is not None:
+        check_output(folder, overwrite)
+    with open_stack(path) as stack:
+        analysis = analyse(
+            stack, resolved, progress=progress, command=f"iscat_analysis.fit_movie({str(path)!r})"
+        )
+    result = Result(analysis)
+    if folder is not None:
+        result.save(folder, overwrite=overwrite)
+    return result
+
+
+def simulate_movie(
+    config: str | Path | Config,
+    path: str | Path,
+    *,
+    seed: int | None = None,
+    settings: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> pd.DataFrame:
+    """Write a shot-noise movie of particles whose position and mass are known.
+
+    Parameters
+    ----------
+    config : str, Path or Config
+        As for `configure`; its ``[simulation]`` says what is in the movie.
+    path : str or Path
+        The TIFF file; ``<stem>.truth.csv`` lands beside it.
+    seed : int, optional
+        In place of ``simulation.seed``; the same seed gives the same bytes.
+    settings : mapping of str to Any, optional
+        As for `configure`.
+    overwrite : bool
+        Replace an existing file.
+    progress : Progress
+        Told how many frames are done.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per particle: frames, position [px, nm], height [nm], mass [kDa], peak contrast.
+
+    Raises
+    ------
+    ConfigError
+        A setting is unknown or impossible, or the counts do not fit into 16 bits.
+    DataError
+        The file exists, or cannot be written.
+    """
+    resolved = configure(config, settings=settings)
+    return write_stack(resolved, Path(path), seed=seed, overwrite=overwrite, progress=progress)
+
+
+def compute_bounds(
+    config: str | Path | Config | None = None,
+    *,
+    settings: Mapping[str, Any] | None = None,
+    mode: str | None = None,
+) -> Bounds:
+    """Compute what no estimate from a planned experiment can beat.
+
+    Parameters
+    ----------
+    config : str, Path or Config, optional
+        As for `configure`; its ``[bounds]`` describes the experiment.
+    settings : mapping of str to Any, optional
+        As for `configure`.
+    mode : str, optional
+        Which parameters are free in the joint bound; as for `fit_movie`.
+
+    Returns
+    -------
+    Bounds
+        Classical and quantum Cramér–Rao bounds (Dong et al., J. Phys. D 54, 394002, 2021).
+
+    Raises
+    ------
+    ConfigError
+        A setting is unknown or impossible, or the pixel size is missing.
+    """
+    chosen = {"fit.mode": mode} if mode is not None else {}
+    resolved = configure(config, settings={**(settings or {}), **chosen})
+    return Bounds(resolved, bounds_report(resolved))
+
+
+def _path(source: str | Path | None) -> Path | None:
+    return None if source is None else Path(source)
+
+
+@dataclass(frozen=True, repr=False)
+class Result:
+    """What a fit found; shows itself in a notebook.
+
+    Attributes
+    ----------
+    analysis : Analysis
+        Everything, as the stages know it.
+    """
+
+    analysis: Analysis
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """One row per event, the columns of ``fits.csv``, which carry their units."""
+        return self.analysis.table
+
+    @property
+    def summary(self) -> Mapping[str, Any]:
+        """Counts, medians, efficiency and provenance, as in ``summary.json``."""
+        return self.analysis.summary
+
+    @property
+    def mode(self) -> str:
+        """What was free: ``"mass"``, ``"localize"``, ``"joint"`` or ``"track"``."""
+        return self.analysis.mode
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know, one line each."""
+        return self.analysis.warnings
+
+    @property
+    def config_toml(self) -> str:
+        """The resolved configuration, which reruns the job."""
+        return self.analysis.config_toml
+
+    def __len__(self) -> int:
+        return len(self.analysis.table)
+
+    def images(self, event: int) -> EventView:
+        """Give the images of one event.
+
+        Parameters
+        ----------
+        event : int
+            Its number in the table.
+
+        Returns
+        -------
+        EventView
+            `contrast`, `model` and `residual`, each of shape (y, x).
+
+        Raises
+        ------
+        DataError
+            There is no such event.
+        """
+        return view_of(self.analysis, event)
+
+    def view(self, event: int) -> Figure:
+        """Draw data, model and residual of one event.
+
+        Parameters
+        ----------
+        event : int
+            Its number in the table.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Three panels.
+
+        Raises
+        ------
+        DataError
+            There is no such event.
+        """
+        return draw_event(self.analysis, event)
+
+    def overview(self) -> Figure:
+        """Draw the field of view, its events numbered."""
+        return draw(self.analysis, "overview")
+
+    def histogram(self) -> Figure:
+        """Draw the histogram of the masses [kDa]; of the heights [nm] where the mass is fixed."""
+        return draw(self.analysis, "histogram")
+
+    def precision(self) -> Figure:
+        """Draw each event's σ and QCRB against its CRB, for every free parameter."""
+        return draw(self.analysis, "precision")
+
+    def corner(self, event: int) -> Figure:
+        """Draw the posterior of one event.
+
+        Parameters
+        ----------
+        event : int
+            Its number in the table.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            A corner plot.
+
+        Raises
+        ------
+        DataError
+            There is no such event, it was not sampled, or its chain did not converge.
+        """
+        return draw_corner(self.analysis, event)
+
+    def posterior(self, event: int) -> InferenceData:
+        """Give the posterior samples of one event.
+
+        Parameters
+        ----------
+        event : int
+            Its number in the table.
+
+        Returns
+        -------
+        arviz.InferenceData
+            Group `posterior` with one variable (chain, draw) for each free parameter [nm, kDa], and
+            `sample_stats` with the log-likelihood.
+
+        Raises
+        ------
+        DataError
+            There is no such event, it was not sampled, or its chain did not converge.
+        """
+        found = posterior_of(self.analysis, event)
+        with warnings.catch_warnings():
+            # ArviZ announces its next major version on import, once a day.
+            warnings.simplefilter("ignore", FutureWarning)
+            import arviz
+            import xarray
+        axes = ("chain", "draw")
+        chains, draws, _ = found.samples.shape
+        coordinates = {"chain": range(chains), "draw": range(draws)}
+        variables = {
+            name: (axes, found.samples[..., k], {"units": _UNITS[name][1]})
+            for k, name in enumerate(found.names)
+        }
+        about = {
+            "event": int(event),
+            "sampling_library": "emcee",
+            "input_path": self.analysis.provenance.input_path,
+            "input_sha256": self.analysis.provenance.input_sha256,
+        }
+        return arviz.InferenceData(
+            posterior=xarray.Dataset(variables, coords=coordinates, attrs=about),
+            sample_stats=xarray.Dataset(
+                {"log_likelihood": (axes, found.log_likelihood)}, coords=coordinates, attrs=about
+            ),
+        )
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the report, the tables and the figures into a folder.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Appears complete or not at all.
+        overwrite : bool
+            Replace an earlier result.
+
+        Returns
+        -------
+        Path
+            The folder; ``report.html`` is in it.
+
+        Raises
+        ------
+        DataError
+            The folder holds something already, or cannot be written.
+        """
+        return write_report(self.analysis, Path(folder), overwrite=overwrite)
+
+    def _heading(self) -> str:
+        count, analysis = len(self), self.analysis
+        name = Path(analysis.provenance.input_path).name or "movie"
+        return f"{count} event{'' if count == 1 else 's'} in {name}, mode {analysis.mode}"
+
+    def _facts(self) -> list[tuple[str, str]]:
+        status: Mapping[str, int] = self.summary.get("status", {})
+        facts = [("status", ", ".join(f"{n} {name}" for name, n in status.items()) or "no events")]
+        precision: Mapping[str, Mapping[str, float | None]] = self.summary.get("precision", {})
+        for name in FREE_PARAMETERS[self.mode]:
+            medians = precision.get(name, {})
+            cells = [
+                f"{symbol} {medians[key]:.3g}"
+                for symbol, key in (
+                    ("σ", "sigma_median"), ("CRB", "crb_median"), ("QCRB", "qcrb_median"),
+                )
+                if medians.get(key) is not None
+            ]  # fmt: skip
+            symbol, unit = _UNITS[name]
+            if cells:
+                facts.append((symbol, f"{', '.join(cells)} {unit} (medians)"))
+        facts += [("warning", text) for text in self.warnings]
+        return facts
+
+    def __repr__(self) -> str:
+        lines = [f"  {name:<8}{text}" for name, text in self._facts()]
+        hint = "  look at .table, .view(0), .histogram(), .posterior(0); keep with .save(folder)"
+        return "\n".join([f"Result: {self._heading()}", *lines, hint])
+
+    def _repr_html_(self) -> str:
+        facts = "".join(
+            f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
+            f"<td style='text-align:left'>{html.escape(text)}</td></tr>"
+            for name, text in self._facts()
+        )
+        names = [*_COLUMNS, *(f"sigma_{name}" for name in FREE_PARAMETERS[self.mode]), "status"]
+        shown = self.table[names].head(ROWS_SHOWN)
+        rest = len(self) - len(shown)
+        more = f"<p>… and {rest} more in <code>.table</code></p>" if rest else ""
+        body = shown.to_html(index=False, float_format="{:.4g}".format, border=0, escape=True)
+        return (
+            f"<p><b>{html.escape(self._heading())}</b></p><table>{facts}</table>"
+            f"{body if len(self) else ''}{more}"
+        )
+
+
+@dataclass(frozen=True, repr=False)
+class Bounds:
+    """Bounds of a planned experiment; shows itself in a notebook.
+
+    Attributes
+    ----------
+    config : Config
+        The experiment.
+    report : mapping
+        Everything, as `iscat bounds --json` prints it.
+    """
+
+    config: Config
+    report: Mapping[str, Any]
+
+    @property
+    def actual(self) -> pd.DataFrame:
+        """Bounds for the planned frames [nm, kDa]: one row per parameter, one column per kind."""
+        return self._frame("actual")
+
+    @property
+    def per_photon(self) -> pd.DataFrame:
+        """Bounds for one scattered photon, on the camera (CRB) or collected [nm, relative]."""
+        return self._frame("per_photon")
+
+    def scan(self, values: str, *, progress: Progress = silent) -> pd.DataFrame:
+        """Vary one thing and compute the bounds at each step.
+
+        Parameters
+        ----------
+        values : str
+            ``"axis=start:stop:step"``, as in ``"focus=-1000:1000:50"``.
+        progress : Progress
+            Told after each step.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row per value, the axis first, then bounds [nm, kDa] and photon numbers.
+
+        Raises
+        ------
+        ConfigError
+            There is no such axis (the known ones are named), or a value is impossible.
+        """
+        axis, points = parse_scan(values)
+        return scan(self.config, axis, points, progress=progress).table
+
+    def _frame(self, which: str) -> pd.DataFrame:
+        kinds: Mapping[str, Mapping[str, float]] = self.report[which]
+        return pd.DataFrame({kind: dict(values) for kind, values in kinds.items()})
+
+    def _heading(self) -> str:
+        at, photons = self.report["at"], self.report["n_scattered"]
+        return (
+            f"{at['mass_kda']:.4g} kDa at z = {at['z_nm']:g} nm, {at['scheme']}, "
+            f"{at['n_after']} frames, {photons['collected']:.4g} scattered photons collected"
+        )
+
+    def __repr__(self) -> str:
+        text: str = self.actual.to_string(float_format="{:.4g}".format, na_rep="–")
+        return f"Bounds: {self._heading()}\n{text}"
+
+    def _repr_html_(self) -> str:
+        body = self.actual.to_html(float_format="{:.4g}".format, na_rep="–", border=0)
+        return f"<p><b>{html.escape(self._heading())}</b></p>{body}"

@@ -1,0 +1,184 @@
+"""The report's figures one at a time, for a notebook."""
+
+from __future__ import annotations
+
+import functools
+import io
+from collections.abc import Callable, Mapping
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, PosteriorResult, Status
+from iscat_analysis.report import figures
+from iscat_analysis.report.tables import event_table
+
+
+def draw(analysis: Analysis, kind: str) -> Figure:
+    """Draw one figure of the whole analysis.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    kind : str
+        ``"overview"``, ``"histogram"``, ``"precision"`` or ``"power"``.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Shows itself in a notebook; `Figure.savefig` writes it.
+
+    Raises
+    ------
+    DataError
+        There is nothing to draw.
+    ValueError
+        No such kind of figure.
+    """
+    table = event_table(analysis)
+    free = FREE_PARAMETERS[analysis.mode]
+    main = "mass_kda" if "mass_kda" in free else "z_nm"
+    kinds: Mapping[str, Callable[[], Figure]] = {
+        "overview": lambda: figures._overview(analysis, table),
+        "histogram": lambda: figures._histogram(table, main),
+        "precision": lambda: figures._precision(table, free),
+        "power": lambda: figures._power(analysis),
+    }
+    if kind not in kinds:
+        raise ValueError(f"kind = {kind!r}: choose one of {', '.join(kinds)}")
+    if kind in ("histogram", "precision") and not np.isfinite(table[main].to_numpy(float)).any():
+        raise DataError(f"{_movie(analysis)}: no event was found, so there is no {kind} to draw")
+    return _shown(kinds[kind])
+
+
+def draw_event(analysis: Analysis, event: int) -> Figure:
+    """Draw data, model and residual of one event.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    event : int
+        Its number in the table.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Three panels.
+
+    Raises
+    ------
+    DataError
+        There is no such event.
+    """
+    view = view_of(analysis, event)
+    return _shown(lambda: figures._triptych(view, analysis))
+
+
+def draw_corner(analysis: Analysis, event: int) -> Figure:
+    """Draw the posterior of one event: each parameter, and each pair.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    event : int
+        Its number in the table.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A corner plot; the shades hold 25, 50, 75 and 95 % of the samples.
+
+    Raises
+    ------
+    DataError
+        There is no such event, it was not sampled, or its chain did not converge.
+    """
+    posterior = posterior_of(analysis, event)
+    return _shown(lambda: figures._corner(posterior, event))
+
+
+def view_of(analysis: Analysis, event: int) -> EventView:
+    """Find the images of one event.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    event : int
+        Its number in the table; of a track, its first frame.
+
+    Returns
+    -------
+    EventView
+        Images of shape (y, x), and the chain where sampled.
+
+    Raises
+    ------
+    DataError
+        There is no such event.
+    """
+    for view in analysis.views:
+        if view.event == event:
+            return view
+    known = [view.event for view in analysis.views]
+    held = f"it has events {min(known)} to {max(known)}" if known else "no event was found"
+    raise DataError(f"{_movie(analysis)}: there is no event {event}; {held}")
+
+
+def posterior_of(analysis: Analysis, event: int) -> PosteriorResult:
+    """Find the converged chain of one event.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    event : int
+        Its number in the table.
+
+    Returns
+    -------
+    PosteriorResult
+        Samples of shape (chain, draw, parameter).
+
+    Raises
+    ------
+    DataError
+        There is no such event, it was not sampled, or its chain did not converge.
+    """
+    posterior = view_of(analysis, event).posterior
+    if posterior is None:
+        status = analysis.table.loc[analysis.table["event"] == event, "status"].iloc[0]
+        why = "" if status == Status.OK else f" (its fit is {status})"
+        raise DataError(
+            f"{_movie(analysis)}: the posterior of event {event} was not sampled{why}; "
+            "fit again with posterior.enabled = true"
+        )
+    if not posterior.converged:
+        raise DataError(
+            f"{_movie(analysis)}: the chain of event {event} has not converged "
+            f"({posterior.message}), so it is not a posterior; raise posterior.steps"
+        )
+    return posterior
+
+
+def _movie(analysis: Analysis) -> str:
+    return analysis.provenance.input_path or "the movie"
+
+
+def _shown(make: Callable[[], Figure]) -> Figure:
+    with mpl.rc_context(figures._STYLE):
+        figure = make()
+    # A notebook asks an object for its picture; pyplot, with its global state, is not needed.
+    setattr(figure, "_repr_png_", functools.partial(_png, figure))  # noqa: B010
+    return figure
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=100)
+    return buffer.getvalue()
