@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.load.hdf5 import SIGNATURE
+from iscat_analysis.load.refeyn import open_refeyn
 from iscat_analysis.load.stack import Frames, Stack
 from iscat_analysis.load.tiff import open_tiff
 
@@ -21,11 +23,11 @@ _READERS: Mapping[bytes, Callable[[Path], Frames]] = {
     b"MM\x00\x2a": open_tiff,
     b"II\x2b\x00": open_tiff,
     b"MM\x00\x2b": open_tiff,
+    SIGNATURE[:4]: open_refeyn,
 }
 """The first bytes of a file and what opens it."""
 
 _FOREIGN: Mapping[bytes, str] = {
-    b"\x89HDF\r\n\x1a\n": "an HDF5 file",
     b"\x93NUMPY": "a NumPy array",
     b"\x89PNG": "a PNG picture",
     b"\xff\xd8\xff": "a JPEG picture",
@@ -41,7 +43,8 @@ def open_stack(path: Path) -> Stack:
     """Open a movie without reading its pixels.
 
     TIFF, BigTIFF, OME-TIFF, ImageJ and Micro-Manager stacks are read; strips or tiles;
-    uncompressed, LZW, Deflate, Zstandard, PackBits or LZMA.
+    uncompressed, LZW, Deflate, Zstandard, PackBits or LZMA.  So are Refeyn's ``.mp`` movies, of
+    OneMP and TwoMP, compressed or not.
 
     Parameters
     ----------
@@ -77,5 +80,8 @@ def open_stack(path: Path) -> Stack:
     if reader is None:
         names = (name for mark, name in _FOREIGN.items() if signature.startswith(mark))
         found = next(names, "not one")
-        raise DataError(f"{path}: needs to be a TIFF file but is {found}; export the movie as TIFF")
+        raise DataError(
+            f"{path}: needs to be a TIFF file or a Refeyn .mp movie but is {found}; "
+            "export the movie as TIFF"
+        )
     return Stack(path, reader(path))

@@ -32,6 +32,10 @@ class Frames(Protocol):
     def metadata(self) -> StackMetadata:
         """What the file says of itself."""
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of how the metadata came about."""
+
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Frames ``[start, stop)``, already known to exist, as a new array (t, y, x)."""
 
@@ -95,6 +99,11 @@ class Stack:
     def metadata(self) -> StackMetadata:
         """Pixel size, exposure and frame rate, as far as the file gives them."""
         return self._frames.metadata
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """One sentence for each metadata value that the file implies but does not state."""
+        return self._frames.notes
 
     def close(self) -> None:
         """Release the file; closing twice is harmless."""

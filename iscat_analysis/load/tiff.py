@@ -27,6 +27,7 @@ from iscat_analysis.load.descriptions import (
 )
 from iscat_analysis.load.directory import Directory, DirectoryReader, Layout
 from iscat_analysis.load.hints import Hints, merge
+from iscat_analysis.load.mapped import map_file, refuse_changed
 from iscat_analysis.load.ome import is_ome, read_ome
 from iscat_analysis.records import StackMetadata
 
@@ -103,6 +104,11 @@ class TiffFrames:
         """What the file says of itself."""
         return self._metadata
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Nothing: what TIFF metadata say is taken as they say it."""
+        return ()
+
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
 
@@ -121,7 +127,7 @@ class TiffFrames:
         DataError
             The file has changed since it was opened, or its pixels cannot be decoded.
         """
-        self._refuse_changed()
+        refuse_changed(self._path, self._data)
         block = np.empty((stop - start, *self._shape[1:]), dtype=self._dtype)
         if start == stop:
             return block
@@ -173,18 +179,6 @@ class TiffFrames:
             return starts[0] + size * np.arange(n_frames, dtype=np.int64)
         return np.array(starts, dtype=np.int64)
 
-    def _refuse_changed(self) -> None:
-        """Touching mapped bytes beyond a file's end kills the process, so look first."""
-        try:
-            size = self._path.stat().st_size
-        except OSError as error:
-            raise DataError(f"{self._path}: can no longer be read ({error.strerror})") from None
-        if size < len(self._data):
-            raise DataError(
-                f"{self._path}: shrank from {len(self._data)} to {size} bytes while it was open; "
-                "wait until it is written, then start again"
-            )
-
     def _decode_into(self, image: NDArray[Any], frame: Directory, number: int) -> None:
         rows, columns = image.shape
         decode = self._decode
@@ -222,8 +216,7 @@ def open_tiff(path: Path) -> TiffFrames:
     DataError
         It is not a movie, is cut short, or contradicts its own description.
     """
-    with path.open("rb") as file:
-        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    data = map_file(path)
     try:
         return _open_mapped(data, path)
     except BaseException:

@@ -1,0 +1,51 @@
+"""A file in memory-mapped pages, and the look that must come before they are touched."""
+
+from __future__ import annotations
+
+import mmap
+from pathlib import Path
+
+from iscat_analysis.errors import DataError
+
+
+def map_file(path: Path) -> mmap.mmap:
+    """Map a whole file for reading.
+
+    Parameters
+    ----------
+    path : Path
+        The file; not empty.
+
+    Returns
+    -------
+    mmap
+        Its bytes.
+    """
+    with path.open("rb") as file:
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+def refuse_changed(path: Path, data: mmap.mmap) -> None:
+    """Touching mapped bytes beyond a file's end kills the process, so look first.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    data : mmap
+        From `map_file`.
+
+    Raises
+    ------
+    DataError
+        The file is gone, or shorter than it was.
+    """
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise DataError(f"{path}: can no longer be read ({error.strerror})") from None
+    if size < len(data):
+        raise DataError(
+            f"{path}: shrank from {len(data)} to {size} bytes while it was open; "
+            "wait until it is written, then start again"
+        )
