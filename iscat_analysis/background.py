@@ -25,7 +25,7 @@ DEAD, HOT = 0.2, 5.0
 DEFECT_SIGMAS = 6.0
 """Unless noise alone could have put it there: dark backgrounds scatter by more than their mean."""
 
-_BLOCK_BYTES = 64 * 2**20
+_BLOCK_BYTES = 16 * 2**20
 _CLIP_SIGMAS = 3.0
 _LEAST_TOTAL_E = 1e4  # fewer background photoelectrons say too little about the power
 

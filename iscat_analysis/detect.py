@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import maximum_filter
-from scipy.optimize import brentq
-from scipy.signal import oaconvolve
 
 from iscat_analysis.config import Detection
 from iscat_analysis.forward import ForwardModel, MassScale, PixelGrid
@@ -152,10 +151,8 @@ def signal_to_noise(
     if explained is not None:
         signal = signal - explained
     weighted = np.where(weight > 0, weight * signal, 0.0)
-    overlap, norm = (
-        np.stack([oaconvolve(image, t[::-1, ::-1], mode="same") for t in kernels])
-        for image, kernels in ((weighted, templates.images), (weight, templates.images**2))
-    )
+    overlap = _correlate(weighted, templates.images)
+    norm = _correlate(weight, templates.images**2)
     norm = np.maximum(norm, 1e-9 * norm.max() if norm.max() > 0 else 1.0)
     return overlap / np.sqrt(norm), overlap / norm
 
@@ -227,6 +224,19 @@ def find_particles(
     return tuple(found)
 
 
+def _correlate(image: FloatArray, kernels: FloatArray) -> FloatArray:
+    """Cross-correlation of an image with centred kernels (n, k, k), shape (n, y, x)."""
+    rows, columns = image.shape
+    half = kernels.shape[1] // 2
+    padded = [next_fast_len(size + 2 * half, real=True) for size in image.shape]
+    spectrum = rfft2(image, padded)
+    out = np.empty((len(kernels), rows, columns))
+    for k, kernel in enumerate(kernels):
+        full = irfft2(spectrum * rfft2(kernel[::-1, ::-1], padded), padded)
+        out[k] = full[half : half + rows, half : half + columns]
+    return out
+
+
 def _weak_amplitude(bare: ForwardModel) -> float:
     """Return an amplitude whose signal is linear; in dark field any will do."""
     nominal = bare.material.mass_kda
@@ -260,11 +270,10 @@ def _threshold(
         volume = area * depth * math.sqrt(determinant) / (2 * math.pi) ** 2
     sides = 2 if two_sided else 1
 
-    def excess(u: float) -> float:
-        expected = sides * (plane * u + volume * (u**2 - 1)) * math.exp(-(u**2) / 2)
-        return math.log(max(expected, 1e-300)) - math.log(alarms)
-
-    return float(brentq(excess, 2.0, 30.0)) if excess(2.0) > 0 else 2.0
+    heights = np.linspace(2.0, 30.0, 28001)
+    polynomial = sides * (plane * heights + volume * (heights**2 - 1))
+    expected = np.log(polynomial) - heights**2 / 2
+    return float(np.interp(-math.log(alarms), -expected, heights))
 
 
 def _subpixel(image: FloatArray, row: int, column: int) -> tuple[float, float]:
