@@ -35,6 +35,9 @@ from iscat_analysis.records import (
 MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""
 
+SPREAD_NM = 10_000.0
+"""Farther than this from a particle its rings are left out; they are 1e-4 of its peak."""
+
 _SWEEPS = 2  # fits of everything with everything else in place, after the last round
 _DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
 _SATURATION_NM = 500.0  # saturated pixels nearer than this spoil a fit
@@ -51,6 +54,11 @@ class Region:
     def slices(self) -> tuple[slice, slice]:
         """Index of the region in a full frame."""
         return slice(*self.rows), slice(*self.columns)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns it has."""
+        return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
 
 
 @dataclass(frozen=True)
@@ -86,7 +94,7 @@ class Scene:
     model : ForwardModel
         For fitted regions.
     wide : ForwardModel
-        For the whole field.
+        For signals up to `SPREAD_NM` away.
     templates : Templates
         Matched filter.
     mode : str
@@ -154,11 +162,11 @@ def make_scene(config: Config, field_px: tuple[int, int], *, searches: int = 1) 
     model = forward_model(config, reach)
     mode = config.fit.mode
     free_z = "z_nm" in FREE_PARAMETERS[mode]
-    field = PixelGrid.region((0, field_px[0]), (0, field_px[1]), pixel)
+    field_nm = math.hypot(field_px[0] + 1, field_px[1] + 1) * pixel
     return Scene(
         config=config,
         model=model,
-        wide=forward_model(config, field.diagonal_nm),
+        wide=forward_model(config, min(field_nm, math.sqrt(2) * (SPREAD_NM + 2 * pixel))),
         templates=make_templates(
             model,
             config.detection.model_copy(
@@ -298,10 +306,9 @@ def photons_scale(scene: Scene, windows: Windows) -> float:
 
 def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Event]) -> FloatArray:
     """Signal of all fitted particles over the field, shape (y, x)."""
-    grid = PixelGrid.region((0, shape[0]), (0, shape[1]), scene.pixel_nm)
     total = np.zeros(shape)
     for event in events:
-        total += scene.wide.image(grid, *_place(event))
+        _add_signal(scene, event, Region((0, shape[0]), (0, shape[1])), total)
     return total
 
 
@@ -313,8 +320,22 @@ def _pixel_nm(config: Config) -> float:
     return config.camera.pixel_size_nm
 
 
-def _place(event: Event) -> tuple[float, float, float, float]:
-    return event.fit.x_nm, event.fit.y_nm, event.fit.z_nm, event.fit.mass_kda
+def _add_signal(scene: Scene, event: Event, region: Region, total: FloatArray) -> None:
+    """Add a particle's signal to the pixels of a region that it reaches."""
+    fit = event.fit
+    spans = []
+    for centre, (low, high) in ((fit.y_nm, region.rows), (fit.x_nm, region.columns)):
+        first = max(low, math.ceil((centre - SPREAD_NM) / scene.pixel_nm))
+        spans.append((first, min(high, math.floor((centre + SPREAD_NM) / scene.pixel_nm) + 1)))
+    rows, columns = spans
+    if rows[0] >= rows[1] or columns[0] >= columns[1]:
+        return
+    grid = PixelGrid.region(rows, columns, scene.pixel_nm)
+    inside = (
+        slice(rows[0] - region.rows[0], rows[1] - region.rows[0]),
+        slice(columns[0] - region.columns[0], columns[1] - region.columns[0]),
+    )
+    total[inside] += scene.wide.image(grid, fit.x_nm, fit.y_nm, fit.z_nm, fit.mass_kda)
 
 
 def _search(scene: Scene, windows: Windows, events: Sequence[Event]) -> list[Candidate]:
@@ -366,11 +387,10 @@ def _fit_all(
         if "z_nm" not in free:
             start = replace(start, z_nm=height)
         region = _region(scene, windows, start)
-        grid = PixelGrid.region(region.rows, region.columns, scene.pixel_nm)
-        others = np.zeros(grid.shape)
+        others = np.zeros(region.shape)
         for number, event in enumerate(events):
             if number != index:
-                others += scene.wide.image(grid, *_place(event))
+                _add_signal(scene, event, region, others)
         likelihood = region_likelihood(scene, windows, region, others)
         if likelihood.n_pixels < 0.5 * others.size:
             return None
