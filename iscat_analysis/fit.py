@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.stats import chi2
 
 from iscat_analysis.likelihood import Likelihood, Optimum
 from iscat_analysis.records import (
@@ -23,6 +22,7 @@ from iscat_analysis.records import (
     FloatArray,
     Status,
 )
+from iscat_analysis.residuals import goodness_of_fit
 
 AMBIGUITY_ODDS = 1000.0
 """A second height whose odds against the best are shorter than this is reported as ambiguous."""
@@ -132,9 +132,7 @@ def fit_particle(
     alternatives = _alternatives(optima, likelihood.model.fringe_nm)
     names = tuple(name for name, free in zip(PARAMETERS, box.free[:4], strict=True) if free)
     sigma, covariance = _uncertainty(likelihood, best, box)
-    freedom = likelihood.n_pixels - int(box.free.sum())
-    squares = float(np.nansum(likelihood.residuals(best.theta) ** 2))
-    p_value = float(chi2.sf(squares, freedom)) if freedom > 0 else math.nan
+    chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free)
     flags = []
     if not best.converged or not np.all(np.isfinite(sigma[box.free[:4]])):
         flags.append(Status.NOT_CONVERGED)
@@ -158,7 +156,7 @@ def fit_particle(
         contrast=likelihood.model.peak_contrast(float(best.theta[2]), mass),
         log_likelihood=best.log_likelihood,
         iterations=best.passes,
-        chi2_reduced=squares / freedom if freedom > 0 else math.nan,
+        chi2_reduced=chi2_reduced,
         p_value=p_value,
         status=flags[0] if flags else Status.OK,
         flags=tuple(flags),

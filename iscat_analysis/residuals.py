@@ -16,13 +16,14 @@ Each p-value is uniform on good data; `goodness_of_fit` joins them by Šidák's 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtr, bdtrc, chdtrc, gammainc, gammaincc
-from scipy.stats import gamma
+from scipy.special import betainc, chdtrc, gammainc, gammaincc, ndtr, ndtri, pdtr, pdtrc
 
-from iscat_analysis._kernels.scoring import CONDITIONAL
+from iscat_analysis._kernels.score_test import score_statistic
+from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR
 from iscat_analysis.likelihood import LEVEL, Likelihood
 
 FloatArray = NDArray[np.float64]
@@ -37,9 +38,13 @@ WAIST = 0.5
 POOLED_COUNTS = 5.0
 """Cells that expect fewer counts are joined until they expect as many."""
 
+MANY_COUNTS = 1e6
+"""Counts above which tails are normal: 5 σ out to a few per cent."""
+
 _TESTS = 3
 _SUSPECTS = 8  # largest residuals whose exact tail is looked up
-_DEPENDENT = 1e-9  # share of a mode outside the fitted directions that counts as none
+_DEPENDENT = 1e-8  # share of a mode outside the fitted directions that counts as none
+_FINEST = 1e-11  # tail below which whole counts are not told from continuous ones
 
 
 def goodness_of_fit(
@@ -68,10 +73,11 @@ def goodness_of_fit(
     -----
     Z. Šidák, J. Am. Stat. Assoc. 62, 626 (1967).
     """
-    chi2, spread_p = scatter(likelihood, theta, free)
+    view = _look(likelihood, theta)
+    chi2, spread_p = _scatter(view, free)
     if not math.isfinite(spread_p):
         return chi2, math.nan
-    worst = min(spread_p, structure(likelihood, theta, free), outlier(likelihood, theta))
+    worst = min(spread_p, _structure(likelihood, theta, free, view), _outlier(view))
     return chi2, -math.expm1(_TESTS * math.log1p(-min(worst, 1 - 1e-16)))
 
 
@@ -90,17 +96,10 @@ def scatter(likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> tuple
 
     Notes
     -----
-    The squared residual of a count of variance v and excess kurtosis κ has variance 2 + κ; χ²
-    follows a gamma law with that variance.
+    The squared residual of a count of excess kurtosis κ has variance 2 + κ; χ² follows a gamma law
+    with that variance.
     """
-    residual, kurtosis = _cells(likelihood, theta)
-    freedom = residual.size - int(np.count_nonzero(free))
-    if freedom <= 0:
-        return math.nan, math.nan
-    chi2 = float(residual @ residual)
-    variance = (2.0 + float(kurtosis.mean())) * freedom
-    law = gamma(2 * freedom**2 / variance / 2, scale=variance / freedom)
-    return chi2 / freedom, float(min(1.0, 2 * min(law.sf(chi2), law.cdf(chi2))))
+    return _scatter(_look(likelihood, theta), free)
 
 
 def structure(likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> float:
@@ -114,31 +113,14 @@ def structure(likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> flo
     Returns
     -------
     float
-        1 where the fitted directions leave none to test.
+        Uniform on good data.
 
     Notes
     -----
     A mode B multiplies the expected counts by 1 + ε B.  Its score, made independent of the fitted
     directions, is compared with its information (C. R. Rao, Proc. Camb. Phil. Soc. 44, 50, 1948).
     """
-    weight, relative = _whitening(likelihood, theta)
-    used = weight > 0
-    modes = _modes(likelihood, theta)[:, used] * weight[used]
-    signal, gradient = likelihood.model.gradient(
-        likelihood.grid, *theta[:3], float(likelihood.model.scale.mass(theta[3]))
-    )
-    del signal
-    directions = np.concatenate([gradient * relative, np.ones((1, *weight.shape))])
-    fitted = directions[np.asarray(free, dtype=bool)][:, used] * weight[used]
-    residual = likelihood.residuals(theta)[used]
-    size = np.linalg.norm(fitted, axis=1)
-    basis, _ = np.linalg.qr((fitted[size > 0] / size[size > 0, None]).T)
-    modes = modes / np.linalg.norm(modes, axis=1)[:, None]
-    modes = modes - (modes @ basis) @ basis.T
-    values, vectors = np.linalg.eigh(modes @ modes.T)
-    kept = values > _DEPENDENT * values[-1]
-    score = vectors[:, kept].T @ (modes @ residual)
-    return float(chdtrc(int(kept.sum()), float(np.sum(score**2 / values[kept]))))
+    return _structure(likelihood, theta, free, _look(likelihood, theta))
 
 
 def outlier(likelihood: Likelihood, theta: FloatArray) -> float:
@@ -154,82 +136,144 @@ def outlier(likelihood: Likelihood, theta: FloatArray) -> float:
     float
         Two-sided, for as many pixels as there are.
     """
-    residual = np.nan_to_num(likelihood.residuals(theta))
-    suspects = np.argsort(-np.abs(residual), axis=None)[:_SUSPECTS]
-    count, tail = likelihood.n_pixels, 1.0
-    rate, trials = _expected(likelihood, theta)
-    observed = likelihood.data[0]
-    for i in suspects:
-        k, mean = math.floor(observed.flat[i] + 1e-9), rate.flat[i]
-        if not _conditional(likelihood):
-            above = float(gammainc(k, mean)) if k > 0 else 1.0
-            below = float(gammaincc(k + 1, mean))
-        else:
-            # read noise takes its share of the variance, as if that share of the counts were lost
-            share = likelihood.data[3].flat[i]
-            n = round(share * trials.flat[i])
-            k = min(round(share * observed.flat[i]), n)
-            p = mean / trials.flat[i]
-            above = float(bdtrc(k - 1, n, p)) if k > 0 else 1.0
-            below = float(bdtr(k, n, p))
-        tail = min(tail, 2 * min(above, below))
-    return -math.expm1(count * math.log1p(-min(max(tail, 0.0), 1 - 1e-16)))
+    return _outlier(_look(likelihood, theta))
 
 
-def _conditional(likelihood: Likelihood) -> bool:
-    return likelihood.kind == CONDITIONAL
+@dataclass(frozen=True)
+class _View:
+    """Used pixels of one fit, each array of shape (n,) but the last two."""
+
+    observed: FloatArray  # counts after landing
+    rate: FloatArray  # their expectation
+    total: FloatArray | None  # counts before and after; None unless conditional
+    share: FloatArray  # of the variance that is not read noise; 1 where that is part of the rate
+    residual: FloatArray  # in standard deviations
+    weight: FloatArray  # root of the information on ln(intensity)
+    relative: FloatArray  # d ln(intensity) / d signal
+    gradient: FloatArray  # (4, n), of the signal
+    used: BoolArray  # (ny, nx)
 
 
-def _expected(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Expected counts after landing, and the total they are a part of (conditional only)."""
-    level = math.exp(theta[LEVEL])
-    signal = likelihood.signal(theta)
-    c0, c1, c2, c3 = likelihood.data
-    del c0
-    if _conditional(likelihood):
-        q = c2 * level * (1 + signal)
-        return c1 * q / (1 + q), c1
-    return level * (c1 + c2 * signal) + c3, c1
+def _look(likelihood: Likelihood, theta: FloatArray) -> _View:
+    model = likelihood.model
+    signal, gradient = model.gradient(
+        likelihood.grid,
+        float(theta[0]),
+        float(theta[1]),
+        float(theta[2]),
+        float(model.scale.mass(theta[3])),
+    )
+    conditional = likelihood.kind == CONDITIONAL
+    used = likelihood.data[3 if conditional else 2] > 0
+    c0, c1, c2, c3 = (c[used] for c in likelihood.data)
+    level, s = math.exp(theta[LEVEL]), signal[used]
+    if conditional:
+        bright = np.maximum(1 + s, FLOOR)
+        p = c2 * level * bright / (1 + c2 * level * bright)
+        rate, total, share = c1 * p, c1, c3
+        weight = np.sqrt(share * rate * (1 - p))
+        residual = (c0 - rate) * share / np.maximum(weight, FLOOR)
+        relative = 1 / bright
+    else:
+        light = np.maximum(level * (c1 + c2 * s), FLOOR)
+        rate, total, share = light + c3, None, np.ones(s.size)
+        weight = light / np.sqrt(rate)
+        residual = (c0 - rate) / np.sqrt(rate)
+        relative = c2 * level / light
+    return _View(c0, rate, total, share, residual, weight, relative, gradient[:, used], used)
 
 
-def _cells(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _scatter(view: _View, free: BoolArray) -> tuple[float, float]:
+    residual, kurtosis = _cells(view)
+    freedom = residual.size - int(np.count_nonzero(free))
+    if freedom <= 0:
+        return math.nan, math.nan
+    chi2 = float(residual @ residual)
+    spread = 1 + float(kurtosis.mean()) / 2  # of χ², over that of normal residuals
+    above = float(gammaincc(freedom / spread / 2, chi2 / spread / 2))
+    return chi2 / freedom, 2 * min(above, 1 - above)
+
+
+def _cells(view: _View) -> tuple[FloatArray, FloatArray]:
     """Residuals in standard deviations and their excess kurtosis, cells of few counts pooled."""
-    residual = likelihood.residuals(theta)
-    used = np.isfinite(residual)
-    rate, total = _expected(likelihood, theta)
-    rate = rate[used]
-    if _conditional(likelihood):
-        p = rate / total[used]
-        return residual[used], (1 - 6 * p * (1 - p)) / np.maximum(rate * (1 - p), 1.0)
-    excess = likelihood.data[0][used] - rate
+    if view.total is not None:
+        p = view.rate / view.total
+        return view.residual, view.share * (
+            1 / np.maximum(view.rate * (1 - p), 1.0) - 6 / view.total
+        )
+    rate, excess = view.rate, view.observed - view.rate
     few = rate < POOLED_COUNTS
     if np.any(few):
-        order = np.argsort(rate[few])[::-1]
-        sums = np.cumsum(rate[few][order])
-        bins = (sums / POOLED_COUNTS).astype(int)
-        pooled_rate = np.bincount(bins, rate[few][order])
-        pooled = np.bincount(bins, excess[few][order])
-        filled = pooled_rate > 0
-        rate = np.concatenate([rate[~few], pooled_rate[filled]])
-        excess = np.concatenate([excess[~few], pooled[filled]])
+        order = np.argsort(-rate[few])
+        bins = (np.cumsum(rate[few][order]) / POOLED_COUNTS).astype(int)
+        pooled = (np.bincount(bins, v[few][order]) for v in (rate, excess))
+        together, surplus = (np.asarray(v) for v in pooled)
+        filled = together > 0
+        rate = np.concatenate([rate[~few], together[filled]])
+        excess = np.concatenate([excess[~few], surplus[filled]])
     return excess / np.sqrt(rate), 1 / rate
 
 
-def _whitening(likelihood: Likelihood, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Root of each pixel's information on ln(intensity), and d ln(intensity)/d signal."""
-    rate, total = _expected(likelihood, theta)
-    signal = likelihood.signal(theta)
-    c1, c2, c3 = likelihood.data[1:]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        if _conditional(likelihood):
-            weight = np.sqrt(c3 * rate * (1 - rate / total))
-            relative = 1 / (1 + signal)
-        else:
-            light = rate - c3
-            weight = light / np.sqrt(rate)
-            relative = c2 * math.exp(theta[LEVEL]) / light
-    usable = np.isfinite(likelihood.residuals(theta)) & np.isfinite(weight) & np.isfinite(relative)
-    return np.where(usable, weight, 0.0), np.where(usable, relative, 0.0)
+def _structure(likelihood: Likelihood, theta: FloatArray, free: BoolArray, view: _View) -> float:
+    level = np.ones((1, view.rate.size))
+    fitted = np.concatenate([view.gradient * view.relative, level])[np.asarray(free, dtype=bool)]
+    modes = _modes(likelihood, theta)[:, view.used]
+    vectors = np.concatenate([fitted, modes]) * view.weight
+    chi2, freedom = score_statistic(vectors, len(fitted), view.residual, _DEPENDENT)
+    return float(chdtrc(freedom, chi2)) if freedom else 1.0
+
+
+def _outlier(view: _View) -> float:
+    suspects = np.argsort(-np.abs(view.residual))[:_SUSPECTS]
+    least = min((_tail(view, int(i)) for i in suspects), default=1.0)
+    if view.total is not None:
+        return -math.expm1(view.rate.size * math.log1p(-min(least, 1 - 1e-16)))
+    # counts are whole: what each pixel can attain below `least` is less than that
+    below = _attainable(view.rate, least)
+    return -math.expm1(float(np.sum(np.log1p(-np.minimum(below, 1 - 1e-16)))))
+
+
+def _tail(view: _View, i: int) -> float:
+    """Two-sided probability of a count as far out as pixel i's."""
+    k, mean = float(view.observed[i]), float(view.rate[i])
+    n = math.inf if view.total is None else float(view.total[i]) * float(view.share[i])
+    variance = (
+        mean if view.total is None else n * (mean / view.total[i]) * (1 - mean / view.total[i])
+    )
+    if variance > MANY_COUNTS:
+        return float(2 * ndtr(-abs(view.residual[i])))
+    if view.total is None:
+        k = math.floor(k + 1e-9)
+        above = float(gammainc(k, mean)) if k > 0 else 1.0
+        return min(1.0, 2 * min(above, float(gammaincc(k + 1, mean))))
+    # read noise takes its share of the variance, as if that share of the counts were lost
+    share, total = float(view.share[i]), float(view.total[i])
+    n, p, k = share * total, mean / total, share * k
+    above = float(betainc(k, n - k + 1, p)) if k > 0 else 1.0
+    below = float(betainc(n - k, k + 1, 1 - p)) if k < n else 1.0
+    return min(1.0, 2 * min(above, below))
+
+
+def _attainable(rate: FloatArray, tail: float) -> FloatArray:
+    """Probability that a Poisson count has a two-sided tail of at most `tail`, for each rate."""
+    half = tail / 2
+    if half < _FINEST or half >= 0.5:
+        return np.full(rate.size, min(tail, 1.0))
+    out = np.full(rate.size, tail)
+    few = rate < MANY_COUNTS
+    mean = rate[few]
+    z, offsets = -float(ndtri(half)), np.arange(-3.0, 4.0)[:, None]
+    above, below = (
+        np.floor(mean * np.maximum(1 - 1 / (9 * mean) + turn / (3 * np.sqrt(mean)), 0) ** 3)
+        for turn in (z, -z)  # Wilson and Hilferty, Proc. Natl. Acad. Sci. 17, 684 (1931)
+    )
+    both = np.zeros(mean.size)
+    for law, near in ((pdtrc, above), (pdtr, below)):
+        counts = near + offsets
+        tails = np.where(counts >= 0, law(np.maximum(counts, 0), mean), 1.0)
+        both += np.max(np.where(tails <= half * (1 + 1e-9), tails, 0.0), axis=0)
+    out[few] = both
+    return out
 
 
 def _modes(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
