@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.camera import Camera
-from iscat_analysis.config import Config
+from iscat_analysis.config import Config, plausible_pixel
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, FloatArray, StackMetadata
 
@@ -45,7 +45,7 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
     Raises
     ------
     DataError
-        Neither gives the pixel size.
+        Neither gives the pixel size, or the movie gives one that no microscope has.
     """
     notes = []
     found: dict[str, float] = {}
@@ -59,6 +59,8 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
         if read is None:
             continue
         if given is None:
+            if key == "pixel_size_nm":
+                _refuse_unlikely(read, metadata.source)
             found[key] = read
         elif abs(read / given - 1) > _DISAGREEMENT:
             notes.append(
@@ -73,6 +75,15 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
         )
     camera = config.camera.model_copy(update=found)
     return config.model_copy(update={"camera": camera}), tuple(notes)
+
+
+def _refuse_unlikely(pixel_nm: float, source: str) -> None:
+    try:
+        plausible_pixel(pixel_nm)
+    except ValueError as error:
+        raise DataError(
+            f"the movie's {source} metadata: {error}, as in --set camera.pixel_size_nm=84.4"
+        ) from None
 
 
 @dataclass(frozen=True)

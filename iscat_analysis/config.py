@@ -34,6 +34,21 @@ def _ordered(frames: tuple[int, int]) -> tuple[int, int]:
     return frames
 
 
+PIXEL_NM = (1.0, 2000.0)
+"""Pixel sizes in the sample plane that a microscope can have [nm]; outside, the unit is wrong."""
+
+
+def plausible_pixel(size_nm: float) -> float:
+    """Return a pixel size in the sample plane [nm], unless no microscope has it."""
+    low, high = PIXEL_NM
+    if not low <= size_nm <= high:
+        raise ValueError(
+            f"a pixel of {size_nm:g} nm is not between {low:g} and {high:g} nm: give its size in "
+            "the sample plane (not on the sensor), in nanometres"
+        )
+    return size_nm
+
+
 Frames = Annotated[tuple[int, int], AfterValidator(_ordered)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -99,7 +114,7 @@ class Optics(Section):
 class CameraConfig(Section):
     """The detector, in the sample plane."""
 
-    pixel_size_nm: Positive | None = Field(
+    pixel_size_nm: Annotated[Positive, AfterValidator(plausible_pixel)] | None = Field(
         None, description="in the sample plane; taken from the TIFF metadata where absent"
     )
     gain_e_per_adu: Positive | str = Field(

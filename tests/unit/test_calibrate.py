@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from iscat_analysis.calibrate import (
-    Camera,
-    GainDiagnosis,
-    camera_from_config,
-    check_counts,
-    diagnose_gain,
-    resolve_metadata,
-)
+from iscat_analysis.calibrate import GainDiagnosis, diagnose_gain, resolve_metadata
+from iscat_analysis.camera import Camera, camera_from_config, check_counts
 from iscat_analysis.config import CameraConfig, parse_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import StackMetadata
@@ -149,6 +143,12 @@ def test_the_configuration_wins_and_says_so() -> None:
     assert notes[0].startswith("the pixel size is 84.4 nm in the configuration")
     assert "50 nm in the movie's imagej metadata" in notes[0]
     assert "frame rate" in notes[1]
+
+
+@pytest.mark.parametrize("size_nm", [6.5e6, 6500.0, 0.0844])
+def test_a_pixel_size_that_no_microscope_has_is_refused(size_nm: float) -> None:
+    with pytest.raises(DataError, match=r"ome metadata.*sample plane.*--set camera\.pixel_size_nm"):
+        resolve_metadata(parse_config({}), StackMetadata(size_nm, source="ome"))
 
 
 def test_a_pixel_size_is_needed() -> None:

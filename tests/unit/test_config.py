@@ -80,6 +80,8 @@ IMPOSSIBLE = [
     (["optics.focus_nm=inf"], "optics.focus_nm"),
     (["optics.scheme=iskat"], "optics.scheme"),
     (["camera.pixel_size_nm=0"], "camera.pixel_size_nm"),
+    (["camera.pixel_size_nm=84400"], "84400 nm is not between 1 and 2000 nm"),
+    (["camera.pixel_size_nm=0.0844"], "0.0844 nm is not between 1 and 2000 nm"),
     (["camera.gain_e_per_adu=-1"], "camera.gain_e_per_adu"),
     (["camera.samples_per_pixel=10"], "camera.samples_per_pixel"),
     (["particle.kind=custom"], "needs permittivity or index"),
@@ -215,7 +217,7 @@ def configurations(draw: st.DrawFn) -> Config:
             "scheme": draw(st.sampled_from(["iscat", "cobri", "darkfield"])),
         },
         "camera": {
-            "pixel_size_nm": draw(st.none() | positive),
+            "pixel_size_nm": draw(st.none() | st.floats(1, 2000)),
             "gain_e_per_adu": draw(positive | text.filter(lambda t: not _is_number(t))),
             "well_depth_e": draw(st.none() | positive),
         },

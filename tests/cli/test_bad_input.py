@@ -1,0 +1,404 @@
+"""Bad input, through the real commands: one clear line, status 1 or 2, nothing half-written."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from iscat_cli import main, main_fit
+
+UNUSABLE, USAGE, INTERRUPTED = 1, 2, 130
+
+FRAMES, SIDE = 24, 48
+
+Run = Callable[..., str]
+
+
+def _counts(dtype: str = "u2") -> NDArray:
+    return np.random.default_rng(1).poisson(1000.0, (FRAMES, SIDE, SIDE)).astype(dtype)
+
+
+def _save(path: Path, counts: NDArray, **options: object) -> Path:
+    tifffile.imwrite(path, counts, photometric="minisblack", **options)
+    return path
+
+
+@pytest.fixture
+def movie(tmp_path: Path) -> Path:
+    """Write a movie with nothing wrong, and nothing in it."""
+    return _save(tmp_path / "movie.tif", _counts())
+
+
+GOOD = ["--set", "camera.pixel_size_nm=84.4", "--background", "0:12", "--no-posterior"]
+
+
+@pytest.fixture
+def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run iscat-fit, which must refuse in one line and leave the folder as it was."""
+
+    def run(path: Path, *arguments: str, status: int = UNUSABLE, options: list[str] = GOOD) -> str:
+        before = _listing(tmp_path)
+        assert main_fit([str(path), *options, *arguments, "--quiet"]) == status
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        (line,) = captured.err.splitlines()
+        assert line.startswith("iscat-fit: error: ")
+        for sign_of_a_bug in ("unexpected", "Traceback", "--debug", "pydantic"):
+            assert sign_of_a_bug not in line
+        assert _listing(tmp_path) == before
+        return line
+
+    return run
+
+
+def _listing(folder: Path) -> dict[str, int]:
+    return {
+        str(p.relative_to(folder)): p.stat().st_size if p.is_file() else -1
+        for p in folder.rglob("*")
+    }
+
+
+def test_the_movie_of_these_tests_is_good(movie: Path, capsys) -> None:
+    """Control: without a fault it is analysed."""
+    assert main_fit([str(movie), *GOOD, "--quiet"]) == 0
+    assert "0 events" in capsys.readouterr().out
+    assert (movie.with_suffix(".iscat") / "report.html").is_file()
+
+
+# ---- files -----------------------------------------------------------------------------------
+
+
+def test_missing_file(refused: Run, tmp_path: Path) -> None:
+    assert "absent.tif" in refused(tmp_path / "absent.tif")
+
+
+def test_a_folder_for_a_movie(refused: Run, tmp_path: Path) -> None:
+    (tmp_path / "folder.tif").mkdir()
+    assert "folder.tif" in refused(tmp_path / "folder.tif")
+
+
+@pytest.mark.parametrize("content", [b"", b"PNG and so on" * 100, b"II*\0" + bytes(40)])
+def test_not_a_tiff(content: bytes, refused: Run, tmp_path: Path) -> None:
+    path = tmp_path / "picture.tif"
+    path.write_bytes(content)
+    assert "picture.tif" in refused(path)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.7, 0.999])
+def test_truncated_tiff(share: float, refused: Run, movie: Path) -> None:
+    content = movie.read_bytes()
+    movie.write_bytes(content[: int(share * len(content))])
+    line = refused(movie)
+    assert "movie.tif" in line
+    assert any(word in line for word in ("truncated", "ends", "incomplete", "missing"))
+
+
+def test_a_single_frame(refused: Run, tmp_path: Path) -> None:
+    line = refused(_save(tmp_path / "image.tif", _counts()[0]))
+    assert "image.tif" in line
+    assert "frame" in line
+
+
+def test_rgb(refused: Run, tmp_path: Path) -> None:
+    path = tmp_path / "colour.tif"
+    tifffile.imwrite(path, np.zeros((4, 32, 32, 3), dtype="u1"), photometric="rgb")
+    line = refused(path)
+    assert "colour" in line.replace("colour.tif", "") or "RGB" in line
+
+
+# ---- counts ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -50.0])
+@pytest.mark.parametrize("frame", [3, 17])
+def test_impossible_counts(value: float, frame: int, refused: Run, tmp_path: Path) -> None:
+    counts = _counts("f4")
+    counts[frame, 5, 6] = value
+    line = refused(_save(tmp_path / "float.tif", counts))
+    assert f"frame {frame}" in line
+
+
+def test_zero_frames(refused: Run, tmp_path: Path) -> None:
+    counts = _counts()
+    counts[7] = 0
+    assert "frame 7 is zero" in refused(_save(tmp_path / "dropped.tif", counts))
+
+
+def test_saturated_frames(refused: Run, tmp_path: Path) -> None:
+    counts = _counts()
+    counts[20] = 65535
+    assert "frame 20 is saturated" in refused(_save(tmp_path / "bright.tif", counts))
+
+
+def test_counts_below_the_offset(refused: Run, movie: Path) -> None:
+    line = refused(movie, "--set", "camera.offset_adu=5000")
+    assert "camera.offset_adu" in line
+
+
+# ---- frames ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("span", ["0:24", "0:25", "0:4000"])
+def test_fewer_frames_than_the_background_wants(span: str, refused: Run, movie: Path) -> None:
+    line = refused(movie, "--background", span)
+    assert "24" in line
+    assert "background" in line
+
+
+def test_no_background_named(refused: Run, movie: Path) -> None:
+    line = refused(movie, status=USAGE, options=GOOD[:2])
+    assert "--background" in line
+
+
+def test_fitted_frames_beyond_the_movie(refused: Run, movie: Path) -> None:
+    assert "24" in refused(movie, "--frames", "12:40")
+
+
+def test_fitted_frames_inside_the_background(refused: Run, movie: Path) -> None:
+    assert "overlap" in refused(movie, "--frames", "6:20")
+
+
+@pytest.mark.parametrize("text", ["12", "12-24", "a:b", "24:12", "12:12", "-1:5", "1:2:3", ""])
+def test_syntax_of_frames(text: str, refused: Run, movie: Path) -> None:
+    assert "A:B" in refused(movie, f"--frames={text}", status=USAGE)
+
+
+# ---- units and optics --------------------------------------------------------------------------
+
+
+def test_pixel_size_unknown_everywhere(refused: Run, movie: Path) -> None:
+    line = refused(movie, options=GOOD[2:])
+    assert "pixel size" in line
+    assert "camera.pixel_size_nm" in line
+
+
+@pytest.mark.parametrize("size", ["84400", "0.0844", "0", "-84.4", "nan", "84,4"])
+def test_pixel_size_in_the_wrong_unit(size: str, refused: Run, movie: Path) -> None:
+    """Picometres or micrometres, where nanometres are asked for."""
+    line = refused(movie, "--set", f"camera.pixel_size_nm={size}", status=USAGE)
+    assert "camera.pixel_size_nm" in line
+
+
+def test_pixel_size_of_the_sensor_in_the_metadata(refused: Run, tmp_path: Path) -> None:
+    path = tmp_path / "movie.ome.tif"
+    sizes = {"PhysicalSizeX": 6.5, "PhysicalSizeY": 6.5}
+    _save(path, _counts(), ome=True, metadata={"axes": "TYX", **sizes})
+    line = refused(path, options=GOOD[2:])
+    assert "sample plane" in line
+    assert "6500" in line
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ("optics.na=1.6", "n_immersion"),
+        ("optics.na=1.515", "n_immersion"),
+        ("optics.attenuation=0", "darkfield"),
+        ("optics.wavelength_nm=-525", "wavelength_nm"),
+        ("optics.wavelenght_nm=525", "did you mean wavelength_nm"),
+        ("optic.na=1.3", "did you mean optics"),
+        ("fit.mode=fast", "fit.mode"),
+        ("fit.roi_nm=9000", "more than the field"),
+        ("fit.z_range_nm=[500,100]", "z_range_nm"),
+        ("calibration.gradient_per_kda=3.1e-5", "wrong sign"),
+        ("optics.na", "section.key=value"),
+        ("fit.frames=[12]", "fit.frames"),
+        ("posterior.walkers=7", "walkers"),
+    ],
+)
+def test_impossible_settings(setting: str, expected: str, refused: Run, movie: Path) -> None:
+    assert expected in refused(movie, "--set", setting, status=USAGE)
+
+
+def test_gold_where_its_table_ends(refused: Run, movie: Path) -> None:
+    settings = ["--set", "particle.kind=gold", "--set", "optics.wavelength_nm=5000"]
+    line = refused(movie, *settings, "--set", "fit.roi_nm=3000", status=USAGE)
+    assert "gold" in line
+
+
+# ---- configuration files -----------------------------------------------------------------------
+
+
+def test_unknown_key_in_a_file(refused: Run, movie: Path, tmp_path: Path) -> None:
+    setup = tmp_path / "setup.toml"
+    setup.write_text("[camera]\npixelsize_nm = 84.4\n")
+    line = refused(movie, "--config", str(setup), status=USAGE)
+    assert "setup.toml" in line
+    assert "pixel_size_nm" in line
+
+
+@pytest.mark.parametrize("kind", ["absent", "folder", "binary", "broken"])
+def test_unreadable_configurations(kind: str, refused: Run, movie: Path, tmp_path: Path) -> None:
+    setup = tmp_path / "setup.toml"
+    if kind == "folder":
+        setup.mkdir()
+    elif kind == "binary":
+        setup.write_bytes(b"\xff\xfe\x00\x01")
+    elif kind == "broken":
+        setup.write_text("[optics\nna = 1.3")
+    assert "setup.toml" in refused(movie, "--config", str(setup), status=USAGE)
+
+
+def test_a_map_of_another_size(refused: Run, movie: Path, tmp_path: Path) -> None:
+    gain = _save(tmp_path / "gain.tif", np.ones((9, 9), dtype="f4"))
+    line = refused(movie, "--set", f"camera.gain_e_per_adu={gain}")
+    assert "gain.tif" in line
+    assert "9 x 9" in line
+
+
+# ---- output ----------------------------------------------------------------------------------
+
+
+def test_output_folder_with_results(refused: Run, movie: Path, capsys) -> None:
+    assert main_fit([str(movie), *GOOD, "--quiet"]) == 0
+    capsys.readouterr()
+    assert "--overwrite" in refused(movie)
+
+
+@pytest.mark.parametrize("overwrite", [[], ["--overwrite"]])
+def test_output_folder_of_somebody_else(
+    overwrite: list[str], refused: Run, movie: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "thesis"
+    other.mkdir()
+    (other / "chapter1.tex").write_text("It was a dark background.")
+    assert "thesis" in refused(movie, "--out", str(other), *overwrite)
+
+
+def test_output_folder_that_is_a_file(refused: Run, movie: Path) -> None:
+    assert "file" in refused(movie, "--out", str(movie), "--overwrite")
+
+
+def test_output_inside_a_file(refused: Run, movie: Path) -> None:
+    assert "movie.tif" in refused(movie, "--out", str(movie / "results"))
+
+
+# ---- simulate and bounds -------------------------------------------------------------------------
+
+
+def _simulation(folder: Path, text: str) -> Path:
+    setup = folder / "simulation.toml"
+    setup.write_text(text)
+    return setup
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "expected"),
+    [
+        (
+            "[camera]\npixel_size_nm = 84.4\n[[simulation.events]]\nframe = 2\n"
+            "x_px = 128.0\ny_px = 5.0\n",
+            USAGE,
+            "outside",
+        ),
+        (
+            "[camera]\npixel_size_nm = 84.4\n[[simulation.events]]\nframe = 400\n"
+            "x_px = 12.0\ny_px = 5.0\n",
+            USAGE,
+            "400",
+        ),
+        ("[simulation]\nframes = 4\n", USAGE, "pixel_size_nm"),
+        (
+            "[camera]\npixel_size_nm = 84.4\n[simulation]\nphotons_per_pixel = 1e6\n",
+            USAGE,
+            "16 bits",
+        ),
+        (
+            '[camera]\npixel_size_nm = 84.4\n[simulation]\nbackground = "none.tif"\n',
+            UNUSABLE,
+            "none.tif",
+        ),
+    ],
+)
+def test_impossible_simulations(
+    text: str, status: int, expected: str, tmp_path: Path, capsys
+) -> None:
+    setup = _simulation(tmp_path, text)
+    out = tmp_path / "out" / "movie.tif"
+    assert main(["simulate", "--config", str(setup), "--out", str(out), "--quiet"]) == status
+    captured = capsys.readouterr()
+    (line,) = captured.err.splitlines()
+    assert expected in line
+    assert captured.out == ""
+    assert not out.parent.exists()
+
+
+def test_impossible_bounds(capsys) -> None:
+    assert main(["bounds", "--set", "optics.na=1.6"]) == USAGE
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "n_immersion" in line
+
+
+# ---- without --quiet, and interrupted ------------------------------------------------------------
+
+
+def test_progress_does_not_hide_the_one_error(movie: Path, tmp_path: Path) -> None:
+    """As a user sees it: another process, and nothing asked to be quiet."""
+    counts = _counts("f4")
+    counts[20, 5, 5] = np.nan
+    path = _save(tmp_path / "late.tif", counts)
+    command = [sys.executable, "-c", "import sys, iscat_cli; sys.exit(iscat_cli.main_fit())"]
+    done = subprocess.run([*command, str(path), *GOOD], capture_output=True, text=True, check=False)
+    assert done.returncode == UNUSABLE
+    assert done.stdout == ""
+    errors = [line for line in done.stderr.splitlines() if "error" in line]
+    assert len(errors) == 1
+    assert "frame 20" in errors[0]
+    assert not path.with_suffix(".iscat").exists()
+    assert movie.exists()
+
+
+@pytest.mark.parametrize("stage", ["simulate", "posterior"])
+def test_ctrl_c_midway(stage: str, tmp_path: Path) -> None:
+    """An interrupt leaves no partial movie and no partial results, and says so in one line."""
+    setup = _simulation(
+        tmp_path,
+        "[camera]\npixel_size_nm = 84.4\n[background]\nframes = [0, 10]\n"
+        "[posterior]\nsteps = 1000000\n[calibration]\ngradient_per_kda = -3.1e-5\n"
+        f"[simulation]\nshape = [64, 64]\nframes = {20 if stage == 'posterior' else 60000}\n"
+        "[[simulation.events]]\nframe = 10\nx_px = 30\ny_px = 31\nmass_kda = 3000\n",
+    )
+    movie = tmp_path / "movie.tif"
+    simulate = ["simulate", "--config", str(setup), "--out", str(movie)]
+    command = [sys.executable, "-c", "import sys, iscat_cli; sys.exit(iscat_cli.main())"]
+    if stage == "posterior":
+        assert main([*simulate, "--quiet"]) == 0
+        command += ["fit", str(movie), "--config", str(setup)]
+        sign = "detect: 8 of 8"
+    else:
+        command += simulate
+        sign = None
+    left = _listing(tmp_path)
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    try:
+        if sign is None:
+            while not (tmp_path / "movie.tif.partial").exists() and process.poll() is None:
+                time.sleep(0.05)
+        else:
+            for line in process.stderr:
+                if sign in line:
+                    break
+        process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=120)[1]
+    finally:
+        process.kill()
+    assert process.returncode == INTERRUPTED
+    assert [line for line in said.splitlines() if "interrupted" in line]
+    assert "Traceback" not in said
+    if stage == "simulate":
+        assert _listing(tmp_path) == left
+    else:
+        kept = movie.with_suffix(".iscat")
+        assert not kept.exists() or (kept / "fits.csv").is_file()
+        assert {p.name for p in tmp_path.iterdir()} <= {
+            "movie.tif", "movie.truth.csv", "simulation.toml", "movie.iscat",
+        }  # fmt: skip
