@@ -454,7 +454,12 @@ class ForwardModel:
 
 
 def forward_model(
-    config: Config, reach_nm: float, *, z_max_nm: float | None = None, nodes: int | None = None
+    config: Config,
+    reach_nm: float,
+    *,
+    z_max_nm: float | None = None,
+    nodes: int | None = None,
+    like: ForwardModel | None = None,
 ) -> ForwardModel:
     """Build the forward model of a configuration.
 
@@ -470,6 +475,8 @@ def forward_model(
     nodes : int, optional
         Quadrature nodes per panel, or of D21's rectangle rule; by default chosen from the phase
         that turns across the pupil.
+    like : ForwardModel, optional
+        A neighbour in a scan; its Bessel table is taken over where it is the same.
 
     Returns
     -------
@@ -551,6 +558,13 @@ def forward_model(
     source = np.stack([common * (pupil.t_s + pupil.t_p_cos), common * (pupil.t_s - pupil.t_p_cos)])
     step = STEP / (k * optics.na)
     intervals = math.ceil(reach_nm / step) + 1
+    same = (
+        like is not None
+        and like.step_nm == step
+        and like.table.shape[3] == intervals + 1
+        and np.array_equal(like.pupil.transverse, pupil.transverse)
+    )
+    table = like.table if same and like else bessel_table(pupil.transverse, step, intervals)
     points, weights = np.polynomial.legendre.leggauss(config.camera.samples_per_pixel)
     model = ForwardModel(
         optics=optics,
@@ -562,7 +576,7 @@ def forward_model(
         source=source,
         axial=axial,
         strength=strength,
-        table=bessel_table(pupil.transverse, step, intervals),
+        table=table,
         step_nm=step,
         z_range_nm=(min(config.fit.z_range_nm[0], height), z_max_nm),
         samples=(points / 2, weights / 2),

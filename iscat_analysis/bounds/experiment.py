@@ -86,7 +86,11 @@ class Experiment:
 
 
 def plan(
-    config: Config, *, model: ForwardModel | None = None, scale: MassScale | None = None
+    config: Config,
+    *,
+    model: ForwardModel | None = None,
+    scale: MassScale | None = None,
+    like: ForwardModel | None = None,
 ) -> Experiment:
     """Set up the experiment of ``[bounds]``.
 
@@ -99,6 +103,8 @@ def plan(
     scale : MassScale, optional
         Mass ↔ amplitude of an earlier experiment, in place of ``[calibration]``: the line was
         measured at the optics of that one.
+    like : ForwardModel, optional
+        A neighbour in a scan, whose tables may serve again.
 
     Returns
     -------
@@ -132,7 +138,8 @@ def plan(
     if model is None:
         reach = math.hypot(half + abs(at.x_nm), half + abs(at.y_nm)) * 1.0001
         optics = config if scale is None else config.model_copy(update={"calibration": None})
-        model = forward_model(optics, reach, z_max_nm=max(height, config.particle.height_nm))
+        highest = max(height, config.particle.height_nm)
+        model = forward_model(optics, reach, z_max_nm=highest, like=like)
         model = model if scale is None else replace(model, scale=scale)
     mass = model.material.mass_kda
     theta = np.array([at.x_nm, at.y_nm, height, model.scale.amplitude(mass), 0.0])

@@ -200,7 +200,10 @@ def point(config: Config, photons: float | None) -> Point:
     Point
         Per photon.
     """
-    experiment = plan(config)
+    return _point(plan(config), photons)
+
+
+def _point(experiment: Experiment, photons: float | None) -> Point:
     found = experiment.bounds(PARAMETERS)
     per = np.array([1, 1, 1, 1 / experiment.mass_kda])
     root = math.sqrt(experiment.collected if photons is None else photons)
@@ -268,19 +271,18 @@ def _curves(
     over_z = panels[0] in ("2b", "4a", "4b")
     photons = photons_of_authors(scheme, attenuation) if convention == "dong2021" else None
     axis = HEIGHTS_NM if over_z else FOCI_NM
-    points = [
-        point(
-            paper_config(
-                scheme,
-                convention,
-                z_nm=value if over_z else HEIGHT_NM,
-                focus_nm=FOCUS_NM if over_z else value,
-                attenuation=attenuation,
-            ),
-            photons,
+    points, like = [], None
+    for value in axis:
+        config = paper_config(
+            scheme,
+            convention,
+            z_nm=value if over_z else HEIGHT_NM,
+            focus_nm=FOCUS_NM if over_z else value,
+            attenuation=attenuation,
         )
-        for value in axis
-    ]
+        experiment = plan(config, like=like)
+        points.append(_point(experiment, photons))
+        like = experiment.model
     single = np.array([p.single for p in points])
     joint = np.array([p.joint for p in points])
     quantities: dict[str, list[tuple[str, FloatArray]]] = {

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from numba import get_num_threads
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from iscat_analysis.bounds.classical import bounds_from_matrices
 from iscat_analysis.bounds.experiment import Experiment, information_fraction, plan
@@ -26,6 +27,9 @@ from iscat_analysis.forward import MassScale, forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Progress, silent
 
 FloatArray = NDArray[np.float64]
+
+STRETCH = 16
+"""Neighbouring points that one thread does in a row, handing tables on."""
 
 MAX_POINTS = 100_000
 """Points of a scan at most."""
@@ -230,10 +234,20 @@ def changed(config: Config, axis: Axis, value: float) -> Config:
     ConfigError
         The value is impossible.
     """
-    values = config.model_dump(exclude_none=True)
-    for section, keys in axis.change(config, float(value)).items():
-        values.setdefault(section, {}).update(keys)
-    return parse_config(values, where=f"{axis.name} = {value:g}")
+    changes = axis.change(config, float(value))
+    try:
+        return config.model_copy(
+            update={
+                name: type(section).model_validate({**section.model_dump(), **changes[name]})
+                for name in changes
+                if (section := getattr(config, name)) is not None
+            }
+        )
+    except ValidationError:  # again, as a whole, for a message that names the key
+        values = config.model_dump(exclude_none=True)
+        for name, keys in changes.items():
+            values.setdefault(name, {}).update(keys)
+        return parse_config(values, where=f"{axis.name} = {value:g}")
 
 
 def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress = silent) -> Scan:
@@ -248,7 +262,7 @@ def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress =
     values : ndarray, shape (n,)
         Its values.
     progress : Progress, optional
-        Told after each point.
+        Told now and then.
 
     Returns
     -------
@@ -269,14 +283,20 @@ def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress =
         heights = [_height(one) for one in plans]
         model = forward_model(config, reach, z_max_nm=max(*heights, config.particle.height_nm))
 
-    def row(one: Config) -> dict[str, Any]:
-        return _row(plan(one, model=model, scale=scale), free)
+    def stretch(part: list[Config]) -> list[dict[str, Any]]:
+        found, like = [], None
+        for one in part:
+            experiment = plan(one, model=model, scale=scale, like=like)
+            found.append(_row(experiment, free))
+            like = experiment.model
+        return found
 
-    rows = []
+    rows: list[dict[str, Any]] = []
+    parts = [plans[i : i + STRETCH] for i in range(0, len(plans), STRETCH)]
     with ThreadPoolExecutor(min(config.compute.workers, get_num_threads())) as pool:
-        for done, result in enumerate(pool.map(row, plans), start=1):
-            rows.append(result)
-            progress(f"scan over {axis.name}", done, len(plans))
+        for found in pool.map(stretch, parts):
+            rows += found
+            progress(f"scan over {axis.name}", len(rows), len(plans))
     table = pd.DataFrame(rows)
     table.insert(0, axis.name, values)
     return Scan(axis.name, axis.label, axis.value(config), free, table)
