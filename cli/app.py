@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import io
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -61,7 +63,7 @@ def main_fit(arguments: Sequence[str] | None = None) -> int:
         Exit status.
     """
     app = _empty()
-    app.command(epilog=FIT_EXAMPLE.replace("iscat fit", "iscat-fit"))(fit)
+    app.command(epilog=_as_written(FIT_EXAMPLE.replace("iscat fit", "iscat-fit")))(fit)
     return _run(app, "iscat-fit", list(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -69,7 +71,8 @@ def _umbrella() -> typer.Typer:
     app = _empty()
     app.callback()(_iscat)
     for command, example in COMMANDS:
-        app.command(epilog=example)(command)
+        summary = (command.__doc__ or "").partition("\n")[0]
+        app.command(epilog=_as_written(example), short_help=summary)(command)
     return app
 
 
@@ -77,8 +80,21 @@ def _empty() -> typer.Typer:
     return typer.Typer(
         context_settings={"help_option_names": ["-h", "--help"]},
         pretty_exceptions_enable=False,
-        rich_markup_mode="markdown",
+        rich_markup_mode=None,
     )
+
+
+def _as_written(text: str) -> str:
+    """Keep help's own line breaks: a paragraph that begins with a backspace is not filled."""
+    return "\n\n".join(f"\b\n{paragraph}" for paragraph in text.strip("\n").split("\n\n"))
+
+
+def _nearest(text: str) -> str:
+    """Add the likeliest choice to a complaint that lists them all."""
+    found = re.search(r"'([^']*)' is not one of (.+)$", text)
+    choices = re.findall(r"'([^']*)'", found[2]) if found else []
+    near = difflib.get_close_matches(found[1], choices, n=1) if found else []
+    return f"{text}; did you mean '{near[0]}'?" if near else text
 
 
 def _print_version(wanted: bool) -> None:
@@ -91,7 +107,9 @@ def _iscat(
     *,
     show_version: Annotated[
         bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="Print it."),
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     """Position and mass of single particles from interferometric scattering movies."""
@@ -113,7 +131,7 @@ def _run(app: typer.Typer, program: str, arguments: list[str]) -> int:
         context = getattr(error, "ctx", None)
         name = context.command_path if context is not None else program
         text = error.format_message().replace("Value error, ", "").rstrip(".")
-        Messages(name).error(f"{text}; see {name} --help")
+        Messages(name).error(f"{_nearest(text)}; see {name} --help")
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):
         Messages(program).error("interrupted")

@@ -2,20 +2,57 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import typer
 
 from iscat_cli.console import Messages, failures, print_result
 from iscat_cli.options import DebugOption, ModeOption
 
-EXAMPLE = """Example:
+WIDTH = 80
+
+EXAMPLE = """Example: a file to edit, and what it says checked without running anything.
 
     iscat config --mode joint > setup.toml
+    iscat bounds --config setup.toml --set camera.pixel_size_nm=84.4
 """
 
 
 def config(context: typer.Context, *, mode: ModeOption = None, debug: DebugOption = False) -> None:
-    """Print a complete configuration, each key with what it means."""
+    """Print a complete configuration, each key with what it means.
+
+    A key without a value is unset; take the # away and fill it in.
+    """
     with failures(Messages(context.command_path), debug=debug):
         from iscat_analysis.config import config_to_toml, load_config
 
-        print_result(config_to_toml(load_config(None, [f"fit.mode={mode.value}"] if mode else ())))
+        text = config_to_toml(load_config(None, [f"fit.mode={mode.value}"] if mode else ()))
+        text = _INTRODUCTION + text.replace("\n[bounds]", f"\n{_one_event()}\n[bounds]", 1)
+        print_result("\n".join(_folded(line) for line in text.splitlines()))
+
+
+_INTRODUCTION = """\
+# Lengths are nm, masses kDa, counts photoelectrons; ranges are half-open, [start, stop) frames.
+# A line that begins with # is unset.  Relative paths are relative to this file.
+
+"""
+
+
+def _folded(line: str) -> str:
+    """Let a comment that would leave a narrow terminal go on in the next line."""
+    _, mark, comment = line.partition("  # ")
+    if not mark or len(line) <= WIDTH:
+        return line
+    column = len(line) - len(comment)
+    first, *rest = textwrap.wrap(comment, WIDTH - column)
+    return "\n".join([line[:column] + first, *(f"{'# ':>{column}}{more}" for more in rest)])
+
+
+def _one_event() -> str:
+    """Write the keys of one simulated particle, which the defaults have none of."""
+    from iscat_analysis.config import SimulatedEvent
+
+    lines = ["# [[simulation.events]]  one such block for each particle, in place of count"]
+    for key, field in SimulatedEvent.model_fields.items():
+        lines.append(f"{f'# {key} =':<36} # {field.description}")
+    return "\n".join(lines) + "\n"

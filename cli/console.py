@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 import threading
@@ -18,10 +19,14 @@ import typer
 from rich.console import Console, RenderableType
 
 if TYPE_CHECKING:
+    from rich.progress import Progress as Bars
+    from rich.progress import TaskID
+
     from iscat_analysis.records import Progress
 
 INTERRUPTED = 130
 UNEXPECTED = 1
+SECONDS_TO_FIRST_LINE = 2.0
 SECONDS_BETWEEN_LINES = 10.0
 PLAIN_WIDTH = 200
 
@@ -81,20 +86,37 @@ class Messages:
         if self.quiet:
             yield _ignore
         elif self._terminal.is_terminal:
+            from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
             from rich.progress import Progress as Bars
-            from rich.progress import TaskID
 
-            tasks: dict[str, TaskID] = {}
-            with Bars(console=self._terminal, transient=True) as bars:
-
-                def draw(stage: str, done: int, total: int) -> None:
-                    if stage not in tasks:
-                        tasks[stage] = bars.add_task(stage, total=total)
-                    bars.update(tasks[stage], completed=done, total=total)
-
-                yield draw
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TextColumn("{task.fields[steps]}"),
+                TimeRemainingColumn(elapsed_when_finished=True),
+            )
+            with Bars(*columns, console=self._terminal, transient=True) as bars:
+                yield _Drawing(bars)
         else:
             yield _Lines(self)
+
+
+class _Drawing:
+    """Progress as bars with the time left; one without end moves while no stage reports."""
+
+    def __init__(self, bars: Bars) -> None:
+        self._bars = bars
+        self._lock = threading.Lock()
+        self._tasks: dict[str, TaskID] = {}
+        self._between = bars.add_task("working", total=None, steps="")
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        with self._lock:
+            if stage not in self._tasks:
+                self._tasks[stage] = self._bars.add_task(stage, total=total, steps="")
+            steps = f"{done}/{total}"
+            self._bars.update(self._tasks[stage], completed=done, total=total, steps=steps)
+            self._bars.update(self._between, visible=done >= total)
 
 
 class _Lines:
@@ -103,15 +125,54 @@ class _Lines:
     def __init__(self, messages: Messages) -> None:
         self._messages = messages
         self._lock = threading.Lock()
-        self._last = time.monotonic()
+        self._said = ""
+        self._stage = ""
+        self._begun = self._due = 0.0
+        self._begin("", time.monotonic())
+
+    def _begin(self, stage: str, now: float) -> None:
+        self._stage, self._begun, self._due = stage, now, now + SECONDS_TO_FIRST_LINE
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         with self._lock:
             now = time.monotonic()
-            if done < total and now - self._last < SECONDS_BETWEEN_LINES:
+            if stage != self._stage:
+                self._begin(stage, self._begun if not self._stage else now)
+            text = f"{stage}: {done} of {total}"
+            if done < total:
+                if now < self._due:
+                    return
+                self._due = now + SECONDS_BETWEEN_LINES
+                if done:
+                    left = (now - self._begun) * (total - done) / done
+                    text += f", about {duration(left)} left"
+            else:
+                self._begin("", now)
+            if text == self._said:  # a stage that is run again has said so already
                 return
-            self._last = now
-        self._messages.notify(f"{stage}: {done} of {total}")
+            self._said = text
+        self._messages.notify(text)
+
+
+def duration(seconds: float) -> str:
+    """Write a time as people say it.
+
+    Parameters
+    ----------
+    seconds : float
+        Not negative.
+
+    Returns
+    -------
+    str
+        ``"8 s"``, ``"3 min"`` or ``"2 h 5 min"``.
+    """
+    if seconds < 100:
+        return f"{math.ceil(seconds)} s"
+    minutes = math.ceil(seconds / 60)
+    if minutes < 100:
+        return f"{minutes} min"
+    return f"{minutes // 60} h {minutes % 60} min"
 
 
 def _ignore(stage: str, done: int, total: int) -> None:

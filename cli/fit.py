@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -30,10 +30,14 @@ if TYPE_CHECKING:
 
 FLAGGED = 3
 ROWS_SHOWN = 20
+GAP = 3  # characters between the columns of a table on a terminal
 
 EXAMPLE = """Example: 200 frames before the particles bound, the rest after.
 
     iscat fit movie.tif --mode mass --config setup.toml --background 0:200
+
+Exit status: 0 done; 1 the data cannot be analysed; 2 usage or configuration;
+3 done, but something is flagged and --strict was given; 130 interrupted.
 """
 
 
@@ -160,10 +164,15 @@ def _advise(messages: Messages, flagged: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
+    from rich.console import Console
+
     from iscat_analysis.records import FREE_PARAMETERS
 
     if rows:
-        print_result(events_table(rows[:ROWS_SHOWN], FREE_PARAMETERS[analysis.mode]))
+        console = Console()
+        width = console.width if console.is_terminal else None
+        free = FREE_PARAMETERS[analysis.mode]
+        print_result(events_table(rows[:ROWS_SHOWN], free, width=width))
     if len(rows) > ROWS_SHOWN:
         print_result(f"… and {len(rows) - ROWS_SHOWN} more")
     counts = Counter(str(row["status"]) for row in rows)
@@ -172,7 +181,9 @@ def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: 
     print_result(f"{len(rows)} {kind}{': ' if verdict else ''}{verdict}; results in {folder}")
 
 
-def events_table(rows: Sequence[Mapping[str, Any]], free: Sequence[str]) -> Table:
+def events_table(
+    rows: Sequence[Mapping[str, Any]], free: Sequence[str], *, width: int | None = None
+) -> Table:
     """Tabulate fitted events: every parameter ± σ, and the bounds of z and mass where free.
 
     Parameters
@@ -181,6 +192,8 @@ def events_table(rows: Sequence[Mapping[str, Any]], free: Sequence[str]) -> Tabl
         Rows of ``fits.csv``.
     free : sequence of str
         Names of the free parameters.
+    width : int, optional
+        Characters there is room for; what fits least is left out.  Default all there are.
 
     Returns
     -------
@@ -188,28 +201,55 @@ def events_table(rows: Sequence[Mapping[str, Any]], free: Sequence[str]) -> Tabl
         One row per event.
     """
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
-    bounded = [name for name in ("z_nm", "mass_kda") if name in free]
-    table = Table(box=box.SIMPLE_HEAD if Console().is_terminal else None, pad_edge=False)
-    for heading in ("event", "frame", "x ± σ [nm]", "y ± σ [nm]", "z ± σ [nm]", "mass ± σ [kDa]"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for name in bounded:
-        symbol, unit = {"z_nm": ("z", "nm"), "mass_kda": ("mass", "kDa")}[name]
-        table.add_column(f"CRB {symbol} [{unit}]", justify="right", no_wrap=True)
-        table.add_column(f"QCRB {symbol} [{unit}]", justify="right", no_wrap=True)
-    table.add_column("status", no_wrap=True)
-    for row in rows:
-        cells = [str(row["event"]), str(row["frame"])]
-        cells += [
-            _with_spread(row[name], row[f"sigma_{name}"])
-            for name in ("x_nm", "y_nm", "z_nm", "mass_kda")
-        ]
-        for name in bounded:
-            cells += [_short(row[f"crb_{name}"]), _short(row[f"qcrb_{name}"])]
-        table.add_row(*cells, str(row["status"]))
+    columns = _columns(free, compact=width is not None)
+    cells = {heading: [cell(row) for row in rows] for heading, cell in columns.items()}
+    if width is not None:
+        spare = [heading for heading in _SPARE if heading in cells]
+        while spare and sum(_widest(h, cells[h]) + GAP for h in cells) > width:
+            del cells[spare.pop(0)]
+    table = Table(box=box.SIMPLE_HEAD if width is not None else None, pad_edge=False)
+    for heading in cells:
+        table.add_column(heading, justify="left" if heading == "status" else "right", no_wrap=True)
+    for line in zip(*cells.values(), strict=True):
+        table.add_row(*line)
     return table
+
+
+_SYMBOLS = {"x_nm": ("x", "nm"), "y_nm": ("y", "nm"), "z_nm": ("z", "nm")}
+_SYMBOLS["mass_kda"] = ("mass", "kDa")
+
+_SPARE = ("QCRB\nz", "CRB\nz", "QCRB\nmass", "CRB\nmass", "frame", "y ± σ\n[nm]", "x ± σ\n[nm]")
+"""What a narrow terminal does without, first to go first."""
+
+
+def _columns(
+    free: Sequence[str], *, compact: bool
+) -> dict[str, Callable[[Mapping[str, Any]], str]]:
+    """Give heading → cell; compact, what is not free is left out and headings have two lines."""
+    columns: dict[str, Callable[[Mapping[str, Any]], str]] = {
+        "event": lambda row: str(row["event"]),
+        "frame": lambda row: str(row["frame"]),
+    }
+    for name, (symbol, unit) in _SYMBOLS.items():
+        if name in free or not compact:
+            heading = f"{symbol} ± σ{chr(10) if compact else ' '}[{unit}]"
+            columns[heading] = lambda row, name=name: _with_spread(  # type: ignore[misc]
+                row[name], row[f"sigma_{name}"]
+            )
+    for name in ("z_nm", "mass_kda"):
+        symbol, unit = _SYMBOLS[name]
+        for kind in ("crb", "qcrb") if name in free else ():
+            title = kind.upper()
+            heading = f"{title}\n{symbol}" if compact else f"{title} {symbol} [{unit}]"
+            columns[heading] = lambda row, key=f"{kind}_{name}": _short(row[key])  # type: ignore[misc]
+    columns["status"] = lambda row: str(row["status"])
+    return columns
+
+
+def _widest(heading: str, cells: Sequence[str]) -> int:
+    return max(map(len, [*heading.splitlines(), *cells]))
 
 
 def _with_spread(value: float, sigma: float | None) -> str:

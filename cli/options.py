@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 
@@ -17,6 +17,30 @@ class Mode(StrEnum):
     LOCALIZE = "localize"
     JOINT = "joint"
     TRACK = "track"
+
+
+def complete_setting(incomplete: str) -> list[str]:
+    """Offer keys of the configuration to the shell.
+
+    Parameters
+    ----------
+    incomplete : str
+        What stands there already.
+
+    Returns
+    -------
+    list of str
+        ``"section.key="`` for every key that begins so.
+    """
+    from iscat_analysis.config import Config
+
+    found = []
+    for section, field in Config.model_fields.items():
+        # [calibration] may be absent: its annotation is a union with None
+        models = [part for part in (field.annotation, *get_args(field.annotation)) if part]
+        keys = next(m.model_fields for m in models if hasattr(m, "model_fields"))
+        found += [f"{section}.{key}=" for key in keys if f"{section}.{key}" != "simulation.events"]
+    return [name for name in found if name.startswith(incomplete)]
 
 
 ModeOption = Annotated[
@@ -45,14 +69,17 @@ SetOption = Annotated[
     typer.Option(
         "--set",
         metavar="section.key=value",
-        help="Change one key of the configuration; may be repeated.",
+        help="Change one key of the configuration, as in optics.na=1.42; may be repeated.",
         show_default=False,
+        autocompletion=complete_setting,
     ),
 ]
 
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace earlier output.")]
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object instead of a table.")
+]
 
 QuietOption = Annotated[
     bool, typer.Option("--quiet", help="No progress and no messages; errors are still shown.")

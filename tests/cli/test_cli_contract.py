@@ -27,6 +27,7 @@ from iscat_analysis.config import load_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import EVENT_COLUMNS
 from iscat_cli import main, main_fit
+from iscat_cli.app import COMMANDS
 from iscat_cli.options import Mode
 
 Library = Callable[..., Any]
@@ -232,6 +233,7 @@ def test_debug_shows_the_traceback(library, capsys, error) -> None:
         (["fit", "m.tif", "--mdoe", "mass"], "--mode"),
         (["fit", "m.tif", "--overwite"], "--overwrite"),
         (["fit", "m.tif", "--mode", "mas"], "'mass', 'localize', 'joint', 'track'"),
+        (["fit", "m.tif", "--mode", "mas"], "did you mean 'mass'?"),
         (["fit", "m.tif", "--workers", "0"], "--workers"),
         (["fit", "m.tif", "--workers", "two"], "--workers"),
         (["fit", "m.tif", "--frames", "5"], "--frames 5: write it as A:B"),
@@ -302,39 +304,18 @@ def test_simulate_makes_one_call(monkeypatch, capsys, tmp_path) -> None:
     assert json.loads(capsys.readouterr().out)["events"] == [{"x_px": 1.5}, {"x_px": None}]
 
 
-REPORT = {
-    "at": {},
-    "n_scattered": {"camera": 1234.5, "collected": 2000.0},
-    "per_photon": {
-        "crb_single": {"x_nm": 75.6, "z_nm": 17.82, "mass_rel": 0.5},
-        "crb_joint": {"x_nm": 75.7, "z_nm": float("nan")},
-        "qcrb": {"x_nm": 71.0, "z_nm": 17.0, "mass_rel": 0.5, "z_nm_phase_free": 40.0},
-    },
-    "actual": {"crb_single": {"x_nm": 1.0, "mass_kda": 5.0}},
-    "fisher": np.eye(2),
-}
-
-
-def test_bounds_prints_tables_or_json(monkeypatch, capsys) -> None:
-    seen: list[Any] = []
-
-    def bounds_report(config: Any) -> dict[str, Any]:
-        seen.append(config)
-        return REPORT
-
-    stand_in = SimpleNamespace(bounds_report=bounds_report)
-    monkeypatch.setitem(sys.modules, "iscat_analysis.bounds", stand_in)
-    assert main(["bounds", "--mode", "joint", "--set", "particle.mass_kda=1000"]) == 0
-    assert seen[0].fit.mode == "joint"
-    assert seen[0].particle.mass_kda == 1000
+def test_bounds_prints_tables_or_json(capsys) -> None:
+    arguments = ["bounds", "--mode", "joint", "--set", "camera.pixel_size_nm=84.4"]
+    arguments += ["--set", "particle.mass_kda=1000", "--set", "bounds.pixels=31"]
+    assert main(arguments) == 0
     out = capsys.readouterr().out
-    assert "1234" in out
-    rows = {line.split()[0]: line.split()[1:] for line in out.splitlines() if line.strip()}
-    assert rows["z_nm"] == ["17.82", "–", "17"]
-    assert rows["z_nm_phase_free"] == ["–", "–", "40"]
-    assert main(["bounds", "--json"]) == 0
+    assert all(word in out for word in ("per photon", "CRB joint", "QCRB", "mass_kda"))
+    assert main([*arguments, "--json"]) == 0
     result = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
-    assert result["fisher"] == [[1.0, 0.0], [0.0, 1.0]]
+    assert result["at"]["mode"] == "joint"
+    assert result["at"]["mass_kda"] == 1000
+    assert main([*arguments, "--json", "--mode", "mass"]) == 0
+    result = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert result["per_photon"]["crb_joint"]["z_nm"] is None
 
 
@@ -348,24 +329,37 @@ def test_config_prints_a_file_that_reads_back(capsys, tmp_path) -> None:
 # ---- help ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", ["fit", "simulate", "bounds", "config"])
+COMMAND_NAMES = [command.__name__ for command, _ in COMMANDS]
+
+
+@pytest.mark.parametrize("command", COMMAND_NAMES)
 def test_help_ends_with_a_worked_example(command: str, capsys) -> None:
     assert main([command, "--help"]) == 0
-    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if line.strip()]
-    assert lines[-1].startswith(f"iscat {command} ")
-    assert "Example" in lines[-2]
+    out = capsys.readouterr().out
+    _, _, ending = out.partition("Example: ")
+    assert f"\n      iscat {command}" in ending
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMAND_NAMES)])
+def test_help_fits_a_terminal_of_80_columns(command: list[str], capsys, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main([*command, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert [line for line in out.splitlines() if len(line) > 80] == []
+    assert "..." not in out.partition("\n")[2]
 
 
 def test_iscat_fit_calls_itself_by_its_name(capsys) -> None:
     assert main_fit(["--help"]) == 0
-    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if line.strip()]
-    assert lines[-1].startswith("iscat-fit movie.tif")
+    out = capsys.readouterr().out
+    assert "\n      iscat-fit movie.tif" in out
+    assert "iscat fit" not in out
 
 
 def test_without_a_command_there_is_help(capsys) -> None:
     assert main([]) == 0
     out = capsys.readouterr().out
-    assert all(command in out for command in ("fit", "simulate", "bounds", "config"))
+    assert all(command in out for command in COMMAND_NAMES)
     assert "--install-completion" in out
 
 
