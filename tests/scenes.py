@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.background import start_power
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.records import Windows
 from iscat_analysis.simulate import Movie
@@ -60,47 +61,51 @@ class Stack:
         return self.counts[start:stop]
 
 
-def draw_windows(
-    movie: Movie,
-    rng: np.random.Generator,
-    *,
-    landing: int,
-    read_noise_e: float = 0.0,
-    power_ratio: float | None = None,
-) -> Windows:
-    """Draw the sums before and after landing: sums of Poisson counts are Poisson themselves."""
-    expected = list(movie.expected_frames())
-    before, after = sum(expected[:landing]), sum(expected[landing:])
-    n_before, n_after = landing, len(expected) - landing
-    counts = [rng.poisson(light).astype(float) for light in (before, after)]
-    variances = [np.full(before.shape, n * read_noise_e**2) for n in (n_before, n_after)]
-    for k in range(2):
-        counts[k] += np.sqrt(variances[k]) * rng.standard_normal(before.shape)
-    nothing = np.zeros(before.shape, dtype=bool)
-    if power_ratio is None:
-        power_ratio = float(movie.power[landing:].sum() / movie.power[:landing].sum())
-    return Windows(
-        before_e=counts[0],
-        after_e=counts[1],
-        n_before=n_before,
-        n_after=n_after,
-        power_ratio=power_ratio,
-        read_variance_before_e2=variances[0],
-        read_variance_after_e2=variances[1],
-        masked=nothing,
-        saturated=nothing,
-        frames_before=(0, landing),
-        frames_after=(landing, landing + n_after),
-        power=movie.power,
-    )
+@dataclass(frozen=True)
+class Light:
+    """Expected photoelectrons before and after landing, and how many frames each holds."""
 
+    before: Array
+    after: Array
+    landing: int
+    power: Array
 
-def blank(windows: Windows, rng: np.random.Generator) -> Windows:
-    """Draw both sums anew from a flat background without particles."""
-    level = float(windows.before_e.mean())
-    shape = windows.before_e.shape
-    return replace(
-        windows,
-        before_e=rng.poisson(level, shape).astype(float),
-        after_e=rng.poisson(windows.power_ratio * level, shape).astype(float),
-    )
+    @classmethod
+    def of(cls, movie: Movie, landing: int) -> Light:
+        """Add up the frames of a movie."""
+        frames = list(movie.expected_frames())
+        return cls(
+            np.sum(frames[:landing], axis=0), np.sum(frames[landing:], axis=0), landing, movie.power
+        )
+
+    def draw(
+        self, rng: np.random.Generator, *, read_noise_e: float = 0.0, gain: float = 1.0
+    ) -> Windows:
+        """Draw the sums, which are Poisson as the frames are; ρ is measured as the job does.
+
+        A wrong `gain` is one that was told to the job: what it takes for photoelectrons is `gain`
+        times as many.
+        """
+        sizes = (self.landing, self.power.size - self.landing)
+        sums = []
+        for light, frames in zip((self.before, self.after), sizes, strict=True):
+            noise = read_noise_e * np.sqrt(frames) * rng.standard_normal(light.shape)
+            sums.append(gain * (rng.poisson(light) + noise))
+        nothing = np.zeros(self.before.shape, dtype=bool)
+        variances = [np.full(nothing.shape, n * (gain * read_noise_e) ** 2) for n in sizes]
+        return start_power(
+            Windows(
+                before_e=sums[0],
+                after_e=sums[1],
+                n_before=sizes[0],
+                n_after=sizes[1],
+                power_ratio=sizes[1] / sizes[0],
+                read_variance_before_e2=variances[0],
+                read_variance_after_e2=variances[1],
+                masked=nothing,
+                saturated=nothing,
+                frames_before=(0, self.landing),
+                frames_after=(self.landing, self.power.size),
+                power=self.power,
+            )
+        )
