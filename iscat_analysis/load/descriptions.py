@@ -14,6 +14,7 @@ from iscat_analysis.load.hints import LENGTH_NM, TIME_S, Hints, inverse, positiv
 
 _IMAGEJ_AXES = {"channels": "C", "slices": "Z", "frames": "T"}
 _SHAPED = re.compile(r'^\{\s*"shape"\s*:')
+_MOST_DIGITS = 20  # any count of more digits is beyond every file, and stays so when cut
 _INCH, _CENTIMETRE = 2, 3
 _RESOLUTION_UNIT_NM = {_INCH: LENGTH_NM["inch"], _CENTIMETRE: LENGTH_NM["cm"]}
 _PLAUSIBLE_PIXEL_NM = (5.0, 5000.0)  # outside: a printer's 72 or 300 dpi, not a microscope
@@ -169,7 +170,9 @@ def _imagej_fields(text: str) -> dict[str, str]:
 
 def _count(fields: Mapping[str, str], key: str) -> int:
     value = fields.get(key, "1")
-    return max(1, int(value)) if value.isascii() and value.isdigit() else 1
+    if not (value.isascii() and value.isdigit()):
+        return 1
+    return max(1, int(value[:_MOST_DIGITS]))
 
 
 def _shaped(text: str, rows: int, columns: int, path: Path) -> Described | None:

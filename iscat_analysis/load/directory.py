@@ -54,6 +54,8 @@ _MOST_TAGS = 4096  # BigTIFF allows 2⁶⁴; real directories hold tens
 _KIND = {1: "u", 2: "i", 3: "f", 4: "u"}
 _PACKED_BITS = (10, 12, 14)
 _LARGEST_FRAME_BYTES = 2**31  # 32 768 × 32 768 pixels of 16 bits, beyond any camera
+_OVERLAP = 2  # header bytes read over the size of the file; each lies in it once
+_OVERLAP_BYTES = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,6 +222,7 @@ class DirectoryReader:
         self._dialect = _Dialect(order, big)
         self._entry = self._dialect.entry
         self._layouts: dict[Layout, Layout] = {}
+        self._header_bytes = 0
 
     @property
     def byte_order(self) -> Literal["<", ">"]:
@@ -328,7 +331,13 @@ class DirectoryReader:
         -------
         str
             Up to the first NUL.
+
+        Raises
+        ------
+        DataError
+            More text was read than the file holds.
         """
+        self._charge(extent[1])
         raw = self._data[extent[0] : extent[0] + extent[1]].partition(b"\0")[0]
         try:
             return raw.decode("utf-8-sig").strip()
@@ -445,6 +454,7 @@ class DirectoryReader:
         if kind is None or tag[1] == 0:
             raise self._damaged(f"image {index} has a number of unknown type {tag[0]}")
         offset, length = self._extent(tag, index)
+        self._charge(length)
         raw = np.frombuffer(self._data[offset : offset + length], self._dialect.order + kind)
         # A value beyond any file would wrap around as int64; held at 2⁶², it is found too large.
         largest = np.asarray(min(2**62, np.iinfo(raw.dtype).max), raw.dtype)
@@ -466,6 +476,12 @@ class DirectoryReader:
                 f"the header of image {index} should reach byte {offset + length} of {self._size}"
             )
         return offset, length
+
+    def _charge(self, length: int) -> None:
+        """Book header bytes: images that share one long list would cost its length each time."""
+        self._header_bytes += length
+        if self._header_bytes > _OVERLAP * self._size + _OVERLAP_BYTES:
+            raise self._damaged("the headers of its images overlap")
 
     def _list_cut_short(self, index: int) -> DataError:
         return self._cut_short(f"its list of frames breaks off after {index} of them")

@@ -44,7 +44,11 @@ _Decoder = Callable[[bytes, int, int], bytes]
 
 def _inflate(raw: bytes, size: int, itemsize: int) -> bytes:
     del itemsize
-    return zlib.decompressobj().decompress(raw, size)
+    stream = zlib.decompressobj()
+    found = stream.decompress(raw, size + 1)
+    if len(found) == size and not stream.eof:
+        raise ValueError("its checksum is missing")
+    return found
 
 
 def _unshuffle(raw: bytes, size: int, itemsize: int) -> bytes:
@@ -200,7 +204,8 @@ class StoredArray:
         except (ValueError, TypeError, RuntimeError, MemoryError, zlib.error) as error:
             raise self._undecodable(number, str(error) or type(error).__name__) from None
         if len(raw) != expected:
-            raise self._undecodable(number, f"{len(raw)} of {expected} bytes")
+            how = "more than" if len(raw) > expected else f"{len(raw)} of"
+            raise self._undecodable(number, f"it holds {how} {expected} bytes")
         return np.frombuffer(raw, self._stored).reshape(self._chunk)
 
     def _undecodable(self, number: int, how: str) -> DataError:

@@ -27,9 +27,9 @@ PIXEL_NM = {"Refeyn OneMP": 19.3, "Refeyn TwoMP": 11.8}
 """Side of an unbinned pixel by instrument [nm]; the files do not store it."""
 
 _DIFFERENCES = "TIME_DIFFERENCE"
-_BLOCK_BYTES = 16_000_000
+_BLOCK_BYTES = 64_000_000
 _ANCHOR_BYTES = 64_000_000  # of decoded frames kept, from which later ones are reached
-_LARGEST_FRAME_BYTES = 2**31
+_FRAME_BOMB_RATIO = 100  # of one decoded frame over the file
 
 
 @dataclass(frozen=True)
@@ -313,8 +313,12 @@ def _open(reader: Hdf5Reader, path: Path) -> RefeynFrames:
         raise DataError(
             f"{path}: holds a single frame; a movie needs frames before and after a particle binds"
         )
-    if rows * columns * stored.dtype.itemsize > _LARGEST_FRAME_BYTES:
-        raise DataError(f"{path}: is damaged (it declares {rows} x {columns} pixels)")
+    frame_bytes = rows * columns * stored.dtype.itemsize
+    if frame_bytes > max(_BLOCK_BYTES, _FRAME_BOMB_RATIO * len(reader.data)):
+        raise DataError(
+            f"{path}: a frame of {rows} x {columns} pixels would be {frame_bytes} bytes, from a "
+            f"file of {len(reader.data)}; the file is damaged, export it again"
+        )
     hints, notes = _hints(reader, dialect)
     metadata = merge([hints], path)
     if stored.dtype.kind == "u" and dialect.keyframes is not None:

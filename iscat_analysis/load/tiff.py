@@ -35,7 +35,8 @@ _LOSSLESS = {1, 5, 8, 32773, 32946, 34925, 50000}
 """No compression, LZW, Deflate, PackBits, old Deflate, LZMA, Zstandard."""
 
 _BOMB_RATIO = 2000  # Deflate reaches 1032, on constant images only
-_BOMB_BYTES = 64_000_000  # a frame smaller than this is harmless whatever its ratio
+_FRAME_BOMB_RATIO = 100  # of one frame, which is held in memory whole
+_BOMB_BYTES = 64_000_000  # smaller than this, anything is harmless whatever its ratio
 
 
 class TiffFrames:
@@ -246,6 +247,13 @@ def _open_mapped(data: mmap.mmap, path: Path) -> TiffFrames:
             f"{path}: holds a single frame; a movie needs frames before and after a particle binds"
         )
 
+    total = n_frames * layout.frame_bytes
+    if frames[0].start is None and total > max(_BOMB_BYTES, _BOMB_RATIO * len(data)):
+        raise DataError(
+            f"{path}: would grow from {len(data)} to {total} bytes, which no recording does; "
+            "the file is damaged, export it again"
+        )
+
     hints += _micro_manager(reader, frames, path, check_axes=ome_text is None)
     resolution = directories[0].resolution
     hints += [imagej_hints(text, resolution) for text in texts if text.startswith("ImageJ=")]
@@ -302,7 +310,7 @@ def _common_layout(frames: Sequence[Directory], path: Path) -> Layout:
                 "export the frames of one movie to a file of their own"
             )
         stored = int(frame.byte_counts.sum())
-        if layout.frame_bytes > max(_BOMB_BYTES, _BOMB_RATIO * stored):
+        if layout.frame_bytes > max(_BOMB_BYTES, _FRAME_BOMB_RATIO * stored):
             raise DataError(
                 f"{path}: image {number} would grow from {stored} to {layout.frame_bytes} bytes, "
                 "which no recording does; the file is damaged, export it again"
@@ -342,7 +350,7 @@ def _micro_manager(
     try:
         with path.open("rb") as file:
             found = tifffile.read_micromanager_metadata(file, {"Summary"}).get("Summary")
-    except (ValueError, OSError):  # an older file, or one that was edited: frames still tell
+    except (ValueError, OSError, RecursionError):  # older or edited: the frames still tell
         found = None
     summary = found if isinstance(found, dict) else {}
     if check_axes:

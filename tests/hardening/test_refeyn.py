@@ -1,0 +1,266 @@
+"""Refeyn movies and event tables, of every generation, give back what was put in."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hardening.samples import (
+    BLOSC,
+    CALIBRATION,
+    EVENTS,
+    LZ4,
+    ZSTANDARD,
+    masses,
+    write_events,
+    write_one_mp,
+    write_two_mp,
+)
+from numpy.typing import NDArray
+from tiff_files import movie
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.events import TABLE_COLUMNS, StoredCalibration, read_events, stored_calibration
+from iscat_analysis.load import open_stack
+from iscat_analysis.load import refeyn as refeyn_module
+
+ENCODED = {"differences": True, "encoding": "TIME_DIFFERENCE"}
+
+
+def wrapping(frames: int = 40, dtype: str = "u2") -> NDArray:
+    """Make a movie whose differences wrap around in both directions."""
+    rng = np.random.default_rng(1)
+    return rng.integers(0, np.iinfo(dtype).max, (frames, 12, 14), dtype, endpoint=True)
+
+
+def assert_same(path: Path, expected: NDArray) -> None:
+    with open_stack(path) as stack:
+        assert stack.shape == expected.shape
+        assert stack.dtype == expected.dtype
+        np.testing.assert_array_equal(stack.read(5, 9), expected[5:9])
+        np.testing.assert_array_equal(stack.read(0, len(expected)), expected)
+        np.testing.assert_array_equal(stack.read(7, 8), expected[7:8])
+        assert stack.read(3, 3).shape == (0, *expected.shape[1:])
+
+
+# ---- movies --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"chunks": (1, 12, 14)},
+        {"chunks": (7, 5, 14), "compression": "gzip", "shuffle": True},
+        {"chunks": (3, 12, 5), "compression": "lzf"},
+        {"chunks": (40, 12, 14), "compression": "gzip"},
+    ],
+)
+@pytest.mark.parametrize("dtype", ["u1", "u2", ">u2", "i4", "f4"])
+def test_one_mp(tmp_path: Path, dtype: str, options: dict) -> None:
+    frames = movie(40, 12, 14, dtype)
+    path = write_one_mp(tmp_path / "m.mp", frames, **options)
+    assert_same(path, frames.astype(np.dtype(dtype).newbyteorder("=")))
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "u4"])
+@pytest.mark.parametrize("filter_number", [None, ZSTANDARD, LZ4, BLOSC])
+def test_two_mp_as_differences(tmp_path: Path, dtype: str, filter_number: int | None) -> None:
+    frames = wrapping(dtype=dtype)
+    path = write_two_mp(tmp_path / "m.mp", frames, filter_number=filter_number, **ENCODED)
+    assert_same(path, frames)
+
+
+def test_plain_and_differences_are_told_apart_without_a_word(tmp_path: Path) -> None:
+    frames = wrapping()
+    for differences in (True, False):
+        path = write_two_mp(tmp_path / "m.mp", frames, differences=differences)
+        assert_same(path, frames)
+    path = write_two_mp(tmp_path / "m.mp", frames, keyframes=False)
+    assert_same(path, frames)
+
+
+def test_a_wrong_sum_is_refused(tmp_path: Path) -> None:
+    path = write_two_mp(tmp_path / "m.mp", wrapping(), **ENCODED)
+    with h5py.File(path, "r+") as file:
+        file["movie/frame"][3, 2, 1] += 1
+    with open_stack(path) as stack, pytest.raises(DataError, match="do not add up"):
+        stack.read(0, 40)
+    with h5py.File(path, "r+") as file:
+        del file["movie/frame"].attrs["encoding"]
+    with pytest.raises(DataError, match="do not add up"):
+        open_stack(path)
+
+
+def test_an_unknown_encoding_is_refused(tmp_path: Path) -> None:
+    path = write_two_mp(tmp_path / "m.mp", wrapping(), encoding="SOMETHING")
+    with pytest.raises(DataError, match="'SOMETHING', which is not known"):
+        open_stack(path)
+
+
+def test_differences_are_summed_once_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = wrapping(200)
+    path = write_two_mp(tmp_path / "m.mp", frames, **ENCODED)
+    monkeypatch.setattr(refeyn_module, "_ANCHOR_BYTES", 10 * frames[0].nbytes)
+    read: list[int] = []
+    original = refeyn_module.StoredArray.read
+
+    def counted(self: object, start: int, stop: int) -> NDArray:
+        read.append(stop - start)
+        return original(self, start, stop)  # type: ignore[arg-type]
+
+    with open_stack(path) as stack:
+        monkeypatch.setattr(refeyn_module.StoredArray, "read", counted)
+        for number in range(200):
+            np.testing.assert_array_equal(stack.read(number, number + 1)[0], frames[number])
+        assert sum(read) == 200
+        read.clear()
+        np.testing.assert_array_equal(stack.read(133, 134)[0], frames[133])
+        assert sum(read) <= 20  # from the nearest of ten remembered frames
+
+
+def test_threads_share_a_movie(tmp_path: Path) -> None:
+    frames = wrapping(120)
+    path = write_two_mp(tmp_path / "m.mp", frames, **ENCODED)
+    order = np.random.default_rng(2).permutation(120)
+    with open_stack(path) as stack, ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda n: stack.read(int(n), int(n) + 1)[0], order))
+    np.testing.assert_array_equal(found, frames[order])
+
+
+def test_metadata_of_both_instruments(tmp_path: Path) -> None:
+    with open_stack(write_one_mp(tmp_path / "m.mp", movie())) as stack:
+        metadata, notes = stack.metadata, stack.notes
+    assert metadata.source == "refeyn"
+    assert metadata.pixel_size_nm == pytest.approx(19.3 * 4)
+    assert metadata.frame_rate_hz == pytest.approx(1000 / 5)
+    assert metadata.exposure_ms == pytest.approx(0.95 * 5)
+    assert notes[0].startswith("the pixel size is taken to be 77.2 nm, as for every Refeyn OneMP")
+    assert "the file does not store it" in notes[0]
+    with open_stack(write_two_mp(tmp_path / "m.mp", movie())) as stack:
+        assert stack.metadata.pixel_size_nm == pytest.approx(11.8 * 6)
+        assert stack.metadata.frame_rate_hz == pytest.approx(250)
+        assert stack.metadata.exposure_ms == pytest.approx(3.8)
+        assert "Refeyn TwoMP" in stack.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("instrument", "pixel"), [(None, None), ("Refeyn OneMP", 19.3 * 6), ("Another", None)]
+)
+def test_the_instrument_decides_where_it_is_named(
+    tmp_path: Path, instrument: str | None, pixel: float | None
+) -> None:
+    path = write_two_mp(tmp_path / "m.mp", movie(), old_names=True, instrument=instrument)
+    with open_stack(path) as stack:
+        assert stack.metadata.pixel_size_nm == (None if pixel is None else pytest.approx(pixel))
+        assert bool(stack.notes) == (pixel is not None)
+        assert stack.metadata.frame_rate_hz == pytest.approx(250)
+
+
+@pytest.mark.parametrize("shape", [(1, 12, 14), (12, 14), (2, 3, 12, 14), (0, 12, 14)])
+def test_what_is_no_movie_is_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    path = tmp_path / "m.mp"
+    with h5py.File(path, "w") as file:
+        file["frame"] = np.zeros(shape, "u2")
+    with pytest.raises(DataError, match=r"single frame|has the shape"):
+        open_stack(path)
+
+
+def test_an_event_table_is_no_movie(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="not a Refeyn movie"):
+        open_stack(write_events(tmp_path / "events.h5", "2021"))
+    with pytest.raises(DataError, match="without an event table"):
+        read_events(write_one_mp(tmp_path / "m.mp", movie()))
+
+
+# ---- event tables --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dialect", ["2021", "2024", "mpr", "one movie", "csv"])
+def test_every_dialect_of_events(tmp_path: Path, dialect: str) -> None:
+    table = read_events(write_events(tmp_path / "events", dialect))
+    assert tuple(table.columns) == TABLE_COLUMNS
+    assert table["frame"].dtype == np.int64
+    for column, name in zip(TABLE_COLUMNS, EVENTS, strict=False):
+        np.testing.assert_array_equal(table[column], EVENTS[name])
+    np.testing.assert_allclose(table["mass_kda"], masses(), rtol=1e-14)
+    calibration = stored_calibration(table)
+    if dialect == "csv":
+        assert calibration is None
+        return
+    assert calibration is not None
+    assert (calibration.gradient_per_kda, calibration.offset) == CALIBRATION
+    if dialect == "2021":
+        assert calibration.standard_masses_kda == (66.0, 480.0)
+
+
+def test_the_calibration_is_odd() -> None:
+    calibration = StoredCalibration(*CALIBRATION)
+    contrast = np.linspace(-0.1, 0.1, 41)
+    mass = calibration.mass_kda(contrast)
+    np.testing.assert_array_equal(mass, -calibration.mass_kda(-contrast))
+    slope, offset = CALIBRATION
+    away = np.abs(contrast) > 2 * offset
+    np.testing.assert_allclose((slope * mass + np.sign(mass) * offset)[away], contrast[away])
+
+
+def test_a_table_survives_parquet_with_its_calibration(tmp_path: Path) -> None:
+    import pandas as pd
+
+    table = read_events(write_events(tmp_path / "events.h5", "2021"))
+    table.to_parquet(tmp_path / "events.parquet")
+    again = pd.read_parquet(tmp_path / "events.parquet")
+    pd.testing.assert_frame_equal(again, table)
+    assert stored_calibration(again) == stored_calibration(table)
+
+
+def test_missing_values_are_nan(tmp_path: Path) -> None:
+    path = tmp_path / "events.csv"
+    path.write_text(
+        "contrasts,frame_indices,x_coords,y_coords,calibrated_values\n"
+        f"-0.1,3,1,2,{np.finfo(float).max}\n-0.2,4,,nan,7\n\n# a\n# b\n"
+    )
+    table = read_events(path)
+    assert table["frame"].tolist() == [3, 4]
+    assert table["contrast"].tolist() == [-0.1, -0.2]
+    assert np.isnan(table["mass_kda"][0])
+    assert table["mass_kda"][1] == 7
+    assert table[["x_px", "y_px"]].isna().iloc[1].all()
+
+
+def test_the_events_of_several_movies_are_not_mixed(tmp_path: Path) -> None:
+    path = write_events(tmp_path / "events.h5", "one movie")
+    with h5py.File(path, "r+") as file:
+        file.copy("per_movie_events/0", "per_movie_events/1")
+    with pytest.raises(DataError, match="events of 2 movies"):
+        read_events(path)
+
+
+def test_columns_of_different_length_are_refused(tmp_path: Path) -> None:
+    path = write_events(tmp_path / "events.h5", "2021")
+    with h5py.File(path, "r+") as file:
+        del file["x_coords"]
+        file["x_coords"] = [1.0, 2.0]
+    with pytest.raises(DataError, match=r"differ in length .*x_coords 2"):
+        read_events(path)
+
+
+def test_the_measured_table_is_reproduced_to_the_last_bit(data_dir: Path) -> None:
+    path = data_dir / "refeyn_events_2.4.2.h5"
+    if not path.is_file():
+        pytest.skip(f"no measured event table: {path} is absent")
+    table = read_events(path)
+    assert len(table) == 2069
+    assert (table["mass_kda"] < 0).sum() == 641
+    calibration = stored_calibration(table)
+    assert calibration is not None
+    contrast = table["contrast"].to_numpy()
+    np.testing.assert_array_equal(calibration.mass_kda(contrast), table["mass_kda"])
+    line = (contrast - calibration.offset) / calibration.gradient_per_kda
+    error = np.abs(line - table["mass_kda"])[contrast > 0]
+    np.testing.assert_allclose(error, 2 * abs(calibration.offset / calibration.gradient_per_kda))
