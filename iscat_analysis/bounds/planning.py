@@ -120,13 +120,14 @@ def optimize(
         )
     best = int(np.nanargmin(score))
     scale = calibrated_scale(config)
+    out_of_reach = 10 * float(score[best])
 
     def bound(value: float) -> float:
         experiment = plan(changed(config, line, value), scale=scale)
         if experiment.peak_e >= well:
-            return math.inf
+            return out_of_reach
         found = experiment.bounds(coarse.free).crb_joint[PARAMETERS.index(parameter)]
-        return float(found) if math.isfinite(found) else math.inf
+        return float(found) if math.isfinite(found) else out_of_reach
 
     value, smallest = float(grid[best]), float(score[best])
     if 0 < best < grid.size - 1:

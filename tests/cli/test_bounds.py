@@ -1,0 +1,125 @@
+"""`iscat bounds` as a user meets it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from iscat_analysis.bounds import paper
+from iscat_analysis.report.bounds import PAPER_FILES
+from iscat_cli import main
+
+SETUP = ["bounds", "--set", "camera.pixel_size_nm=84.4", "--set", "bounds.pixels=25"]
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    status = main([*SETUP, *arguments])
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+def test_point(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = run(capsys, "--mode", "joint")
+    assert status == 0
+    assert "CRB joint" in out
+    assert "information used" in out
+    assert err == ""
+
+
+def test_json_is_one_object_with_scan(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "--json", "--quiet", "--scan", "z=0:100:50")
+    report = json.loads(out)
+    assert status == 0
+    assert report["scan"]["columns"]["z"] == [0, 50, 100]
+    assert report["per_photon"]["crb_joint"]["z_nm"] is None  # not free in mode mass
+
+
+def test_scan_writes_table_and_figure(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / "focus"
+    status, _, _ = run(capsys, "--mode", "joint", "--scan", "focus=-400:400:200", "--out", str(out))
+    assert status == 0
+    assert {p.name for p in out.iterdir()} == {"bounds.json", "scan.csv", "scan.png", "scan.svg"}
+    table = pd.read_csv(out / "scan.csv")
+    assert list(table["focus"]) == [-400, -200, 0, 200, 400]
+    assert "configured: −300" in (out / "scan.svg").read_text(encoding="utf-8")
+    status, _, err = run(capsys, "--scan", "focus=0:1:1", "--out", str(out))
+    assert status == 1
+    assert "--overwrite" in err
+
+
+def test_optimize_and_target(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "--mode", "joint", "--optimize", "focus", "--for", "mass")
+    assert status == 0
+    assert "best" in out
+    assert "configured" in out
+    status, out, _ = run(capsys, "--mode", "joint", "--target", "mass=5kDa")
+    assert status == 0
+    for word in ("frames after", "never enough", "shot noise", "finite background", "read noise"):
+        assert word in out
+    assert "samples_per_pixel" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "bounds.photons_per_pixel=0"], "photons_per_pixel: input should be greater"),
+        (["--set", "optics.na=1.6"], "lower na"),
+        (["--set", "optics.n_sample=0"], "optics.n_sample"),
+        (["--set", "optics.attenuation=-0.1"], "optics.attenuation"),
+        (["--set", "bounds.z_nm=-1"], "bounds.z_nm"),
+        (["--set", "particle.height_nm=-1"], "particle.height_nm"),
+        (["--set", "bounds.pixels=0"], "bounds.pixels"),
+        (["--scan", "z=0-100"], "start:stop:step"),
+        (["--scan", "depth=0:1:1"], "NAME one of z, focus"),
+        (["--optimize", "focus"], "go together"),
+        (["--for", "mass"], "go together"),
+        (["--scan", "z=0:1:1", "--target", "mass=5"], "choose one of"),
+        (["--preset", "dong2021"], "needs --out DIR"),
+        (["--preset", "dong2021", "--out", "x"], "leave --config, --set and --mode away"),
+        (["--target", "mass=none"], "mass=5kDa"),
+    ],
+)
+def test_bad_input_gets_one_line(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    status, out, err = run(capsys, *arguments)
+    assert status == 2
+    assert out == ""
+    assert message in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_unidentifiable_directions_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(
+        capsys, "--mode", "joint", "--set", "bounds.pixels=2",
+        "--set", "camera.pixel_size_nm=150",
+    )  # fmt: skip
+    assert status == 0
+    assert "unidentifiable: z_nm–mass_kda" in out
+
+
+def test_the_paper_whole(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(paper, "HEIGHTS_NM", np.array([0.0, 500.0, 1000.0]))
+    monkeypatch.setattr(paper, "FOCI_NM", np.array([-1000.0, 0.0, 1000.0]))
+    out = tmp_path / "paper"
+    status = main(["bounds", "--preset", "dong2021", "--out", str(out)])
+    said = capsys.readouterr()
+    assert status == 0
+    assert "114" in said.out
+    assert {p.name for p in out.iterdir()} == PAPER_FILES
+    table = pd.read_csv(out / "comparison.csv").set_index("quantity")
+    assert table.loc["z_cobri", "printed"] == 114
+    assert table.loc["z_cobri", "exact"] == pytest.approx(92.0265, abs=1e-3)
+    curves = pd.read_csv(out / "fig_2e.csv")
+    assert set(curves["scheme"]) == {"iscat", "cobri", "darkfield"}
+    assert set(curves["convention"]) == {"dong2021", "exact"}
+    page = (out / "comparison.html").read_text(encoding="utf-8")
+    for text in ("113.7", "114.1", "92.03", "Figure 4d", "data:image/png;base64"):
+        assert text in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
