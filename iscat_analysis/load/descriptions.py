@@ -97,7 +97,18 @@ def imagej_hints(text: str, resolution: tuple[float, float, int] | None) -> Hint
 
 
 def micro_manager_axes(summary: Mapping[str, Any]) -> dict[str, int]:
-    """Planned lengths of Micro-Manager's axes, from its summary."""
+    """Planned lengths of Micro-Manager's axes, from its summary.
+
+    Parameters
+    ----------
+    summary : mapping
+        Of the acquisition; may be empty.
+
+    Returns
+    -------
+    dict of str to int
+        Length of each axis; 1 where the summary is silent.
+    """
     names = {"Frames": "T", "Slices": "Z", "Channels": "C", "Positions": "P"}
     return {axis: int(_mm_number(summary.get(name)) or 1) for name, axis in names.items()}
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import mmap
+import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -36,8 +37,11 @@ _BOMB_BYTES = 64_000_000  # an array smaller than this is harmless whatever its 
 _CACHE_BYTES = 64_000_000
 _WHAT_IT_RAISES = (
     OSError, RuntimeError, ValueError, TypeError, KeyError, AttributeError, OverflowError,
-    MemoryError, SystemError,
+    MemoryError, SystemError, struct.error,
 )  # fmt: skip
+
+_HEAP = struct.Struct("<4s4xQ")  # signature, version, size of the whole
+_HEAP_OBJECT = struct.Struct("<H6xQ")  # index, then references and reserved bytes, size
 
 _Decoder = Callable[[bytes, int, int], bytes]
 
@@ -299,20 +303,36 @@ class Hdf5Reader:
         """Read a dataset of one text; None where there is none, or it is something else."""
         with self._believing_nothing():
             dataset = self._dataset(name)
-            if dataset is None or not _is_text(dataset.dtype) or not _single(dataset):
+            start = None if dataset is None else dataset.id.get_offset()
+            if dataset is None or start is None or not _single(dataset):
                 return None
-            return _decoded_text(dataset[()])
+            kind = h5py.check_string_dtype(dataset.dtype)
+            if kind is None:
+                return None
+            if kind.length is None:
+                return _heap_text(self.data, start)
+            return _decoded_text(self.data[start : start + min(kind.length, _LARGEST_TEXT_BYTES)])
 
-    def attribute(self, name: str, key: str) -> str | None:
-        """Read a text attached to a dataset; None where there is none, or it is something else."""
+    def has_attribute(self, name: str, key: str) -> bool:
+        """Whether something of this name is attached to a dataset.
+
+        What it says is not read: the texts that h5py writes lie in a heap, in which libhdf5 runs
+        in circles where a damaged file tells it to.
+        """
+        with self._believing_nothing():
+            dataset = self._dataset(name)
+            return dataset is not None and key in dataset.attrs
+
+    def numbers(self, name: str, key: str) -> list[int] | None:
+        """Read a list of integers attached to a dataset; None where there is no such thing."""
         with self._believing_nothing():
             dataset = self._dataset(name)
             if dataset is None or key not in dataset.attrs:
                 return None
             attribute = dataset.attrs.get_id(key)
-            if attribute.shape != () or not _is_text(attribute.dtype):
+            if attribute.dtype.kind not in "iu" or len(attribute.shape) != 1:
                 return None
-            return _decoded_text(dataset.attrs[key])
+            return [int(value) for value in dataset.attrs[key]]
 
     @contextmanager
     def _believing_nothing(self) -> Iterator[None]:
@@ -455,11 +475,27 @@ def _single(dataset: h5py.Dataset) -> bool:
     return bool(inside and dataset.size == 1)
 
 
-def _is_text(dtype: np.dtype[Any]) -> bool:
-    return h5py.check_string_dtype(dtype) is not None and dtype.itemsize <= _LARGEST_TEXT_BYTES
+def _heap_text(data: mmap.mmap, start: int) -> str | None:
+    """Read a text of variable length: here its length and place, there a heap that holds it.
+
+    Specification, sections III.E (global heap) and IV.A.2.d (variable-length datatype), for files
+    with offsets of eight bytes.
+    """
+    length, heap, number = struct.unpack_from("<IQI", data, start)
+    if heap + _HEAP.size > len(data) or length > _LARGEST_TEXT_BYTES:
+        return None
+    signature, size = _HEAP.unpack_from(data, heap)
+    position, end = heap + _HEAP.size, min(heap + size, len(data))
+    while signature == b"GCOL" and position + _HEAP_OBJECT.size <= end:
+        index, held = _HEAP_OBJECT.unpack_from(data, position)
+        position += _HEAP_OBJECT.size
+        if index == number:
+            return _decoded_text(data[position : position + min(length, held)])
+        if index == 0:  # the free space, which comes last
+            return None
+        position += -(-held // 8) * 8
+    return None
 
 
-def _decoded_text(value: object) -> str:
-    if isinstance(value, np.ndarray):
-        value = value.reshape(-1)[0]
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+def _decoded_text(raw: bytes) -> str:
+    return raw.partition(b"\0")[0].decode("utf-8", "replace")

@@ -98,7 +98,18 @@ def positive(value: object, factor: float = 1.0) -> float | None:
 
 
 def inverse(value: float | None) -> float | None:
-    """Turn an interval into a rate, or back; None stays None."""
+    """Turn an interval into a rate, or back.
+
+    Parameters
+    ----------
+    value : float or None
+        Positive.
+
+    Returns
+    -------
+    float or None
+        Its inverse; None stays None.
+    """
     return None if value is None else positive(1 / value)
 
 

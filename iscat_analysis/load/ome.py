@@ -39,7 +39,18 @@ class OmeMovie:
 
 
 def is_ome(text: str) -> bool:
-    """Whether a description is OME-XML."""
+    """Whether a description is OME-XML.
+
+    Parameters
+    ----------
+    text : str
+        The description.
+
+    Returns
+    -------
+    bool
+        True for anything that looks like an XML document with an ``OME`` element.
+    """
     return text.startswith("<") and _OME_ROOT.search(text) is not None
 
 

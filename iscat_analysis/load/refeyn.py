@@ -4,7 +4,8 @@ The layouts are not published; they are read as other open software found them. 
 ``frame`` with ``configuration/Devices/AcqCam``; TwoMP, format 3: ``movie/frame`` with
 ``movie/configuration/acq_camera``; between the two lies a format 3 with OneMP's names.
 In a compressed movie frame 0 is plain and every later one is what must be added, modulo the range
-of the type, to the one before; ``movie/keyframe`` repeats some frames in full, the last included.
+of the type, to the one before; ``movie/keyframe`` repeats some frames in full: those that its
+attribute ``indices`` names, or else the last one at its end.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ from iscat_analysis.records import StackMetadata
 PIXEL_NM = {"Refeyn OneMP": 19.3, "Refeyn TwoMP": 11.8}
 """Side of an unbinned pixel by instrument [nm]; the files do not store it."""
 
-_DIFFERENCES = "TIME_DIFFERENCE"
 _BLOCK_BYTES = 64_000_000
 _ANCHOR_BYTES = 64_000_000  # of decoded frames kept, from which later ones are reached
 _FRAME_BOMB_RATIO = 100  # of one decoded frame over the file
@@ -170,10 +170,18 @@ class DifferenceFrames(RefeynFrames):
 
     Parameters
     ----------
-    stored, reader, path, metadata, notes
-        As in `RefeynFrames`; `stored` holds unsigned integers.
-    last : ndarray, shape (y, x), or None
-        What the last frame must sum to.
+    stored : StoredArray
+        Differences, unsigned integers.
+    reader : Hdf5Reader
+        As in `RefeynFrames`.
+    path : Path
+        What messages call the file.
+    metadata : StackMetadata
+        What the file says of itself.
+    notes : tuple of str
+        What a user should know about it.
+    known : (int, ndarray of shape (y, x)) or None
+        Number of a frame, and what it must sum to.
     """
 
     def __init__(
@@ -184,10 +192,10 @@ class DifferenceFrames(RefeynFrames):
         *,
         metadata: StackMetadata,
         notes: tuple[str, ...],
-        last: NDArray[Any] | None,
+        known: tuple[int, NDArray[Any]] | None,
     ) -> None:
         super().__init__(stored, reader, path, metadata=metadata, notes=notes)
-        self._last = last
+        self._known = known
         frame_bytes = self._shape[1] * self._shape[2] * stored.dtype.itemsize
         kept = max(1, min(self._shape[0], _ANCHOR_BYTES // frame_bytes))
         self._spacing = -(-self._shape[0] // kept)
@@ -212,7 +220,7 @@ class DifferenceFrames(RefeynFrames):
         Raises
         ------
         DataError
-            The last frame is not the sum of the differences.
+            A frame that the file gives in full is not the sum of the differences.
         """
         refuse_changed(self._path, self._data)
         block = np.empty((stop - start, *self._shape[1:]), dtype=self.dtype)
@@ -236,16 +244,6 @@ class DifferenceFrames(RefeynFrames):
                 first = end
         return block
 
-    def verify(self) -> None:
-        """Sum the whole movie; wrong for a movie that is not stored as differences.
-
-        Raises
-        ------
-        DataError
-            The last frame is not the sum of the differences.
-        """
-        self.read(self._shape[0] - 1, self._shape[0])
-
     def _nearest(self, start: int) -> tuple[int, NDArray[Any] | None]:
         """Find the last remembered frame before `start`; −1 and None where there is none."""
         before = [number for number in self._anchors if number < start]
@@ -259,8 +257,9 @@ class DifferenceFrames(RefeynFrames):
         for number in range(-(-first // self._spacing) * self._spacing, end, self._spacing):
             self._anchors.setdefault(number, part[number - first].copy())
         self._newest = (end - 1, part[-1].copy())
-        wrong = self._last is not None and not np.array_equal(part[-1], self._last)
-        if end == self._shape[0] and wrong:
+        if self._known is None or not first <= self._known[0] < end:
+            return
+        if not np.array_equal(part[self._known[0] - first], self._known[1]):
             raise DataError(
                 f"{self._path}: its frames do not add up to its last keyframe; "
                 "copy the file again or export it again"
@@ -336,30 +335,47 @@ def _differences(
     metadata: StackMetadata,
     notes: tuple[str, ...],
 ) -> DifferenceFrames | None:
-    """Decide how the frames are encoded; None for plain ones."""
-    encoding = reader.attribute(dialect.frames, "encoding") or ""
-    if encoding not in ("", _DIFFERENCES):
-        raise DataError(
-            f"{path}: {dialect.frames} is encoded as {encoding[:40]!r}, which is not known; "
-            "export the movie as TIFF"
-        )
-    keyframes = reader.array(dialect.keyframes or "")
-    last = None
-    if keyframes is not None and keyframes.shape[0]:
-        if keyframes.shape[1:] != stored.shape[1:]:
-            raise DataError(
-                f"{path}: its keyframes have the shape {keyframes.shape[1:]} but its frames "
-                f"{stored.shape[1:]}; export it again"
-            )
-        last = keyframes.read(keyframes.shape[0] - 1, keyframes.shape[0])[0]
-    if not encoding:
-        n = stored.shape[0]
-        if last is None or np.array_equal(stored.read(n - 1, n)[0], last):
-            return None
-    frames = DifferenceFrames(stored, reader, path, metadata=metadata, notes=notes, last=last)
-    if not encoding:  # nothing but the sum itself can tell
-        frames.verify()
+    """Decide how the frames are encoded; None for plain ones.
+
+    The last keyframe decides: it is among plain frames as it is, and differences must add up to
+    it.  Without keyframes, an attribute ``encoding`` marks differences.
+    """
+    known = _last_keyframe(reader, dialect.keyframes or "", stored, path)
+    if known is not None and np.array_equal(stored.read(known[0], known[0] + 1)[0], known[1]):
+        return None
+    if known is None and not reader.has_attribute(dialect.frames, "encoding"):
+        return None
+    frames = DifferenceFrames(stored, reader, path, metadata=metadata, notes=notes, known=known)
+    if known is not None:
+        frames.read(known[0], known[0] + 1)
     return frames
+
+
+def _last_keyframe(
+    reader: Hdf5Reader, name: str, stored: StoredArray, path: Path
+) -> tuple[int, NDArray[Any]] | None:
+    """Which frame the last keyframe repeats, and its pixels; None where that tells nothing."""
+    keyframes = reader.array(name)
+    if keyframes is None or not keyframes.shape[0]:
+        return None
+    if keyframes.shape[1:] != stored.shape[1:]:
+        raise DataError(
+            f"{path}: its keyframes have the shape {keyframes.shape[1:]} but its frames "
+            f"{stored.shape[1:]}; export it again"
+        )
+    indices = reader.numbers(name, "indices")
+    number = indices[-1] if indices else stored.shape[0] - 1
+    if not 0 <= number < stored.shape[0]:
+        raise DataError(
+            f"{path}: its last keyframe should be frame {number} of {stored.shape[0]}; "
+            "the recording or the copy was interrupted: export it again"
+        )
+    if number == 0:  # stored in full either way
+        return None
+    last = len(indices) - 1 if indices else keyframes.shape[0] - 1
+    if last >= keyframes.shape[0]:
+        raise DataError(f"{path}: lacks some of its keyframes; export it again")
+    return number, keyframes.read(last, last + 1)[0]
 
 
 def _hints(reader: Hdf5Reader, dialect: _Dialect) -> tuple[Hints, tuple[str, ...]]:

@@ -59,7 +59,7 @@ def write_two_mp(
     *,
     differences: bool = False,
     encoding: str | None = None,
-    keyframes: bool = True,
+    keyframes: bool | int = True,
     old_names: bool = False,
     instrument: str | None = None,
     filter_number: int | None = None,
@@ -78,8 +78,11 @@ def write_two_mp(
             dataset = _by_hand(file.create_group("movie"), stored, filter_number)
         if encoding is not None:
             dataset.attrs["encoding"] = encoding
-        if keyframes:
+        if keyframes is True:
             file["movie/keyframe"] = frames[[0, -1]]
+        elif keyframes:  # one every so many frames, as .mpr files have them
+            file["movie/keyframe"] = frames[::keyframes]
+            file["movie/keyframe"].attrs["indices"] = np.arange(0, len(frames), keyframes)
         if old_names:
             camera = file.create_group("movie/configuration/Devices/AcqCam")
             camera["Height"], camera["Width"] = frames.shape[1:]
@@ -189,7 +192,7 @@ def samples(folder: Path) -> dict[str, list[bytes]]:
                 path, smooth, differences=True, encoding="TIME_DIFFERENCE", filter_number=number
             ),
         )
-    take("mp", write_two_mp(path, smooth, differences=True, chunks=(4, 12, 7), old_names=True))
+    take("mp", write_two_mp(path, smooth, differences=True, keyframes=4, old_names=True))
     for dialect in ("2021", "2024", "mpr", "one movie"):
         take("h5", write_events(path, dialect))
     take("csv", write_events(path, "csv"))
