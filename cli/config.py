@@ -32,8 +32,8 @@ def config(context: typer.Context, *, mode: ModeOption = None, debug: DebugOptio
 
 
 _INTRODUCTION = """\
-# Lengths are nm, masses kDa, counts photoelectrons; ranges are half-open, [start, stop) frames.
-# A line that begins with # is unset.  Relative paths are relative to this file.
+# Lengths are nm, masses kDa, counts photoelectrons; ranges are [start, stop).
+# A line that begins with # is unset.  Paths are relative to this file.
 
 """
 

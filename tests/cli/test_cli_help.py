@@ -1,0 +1,234 @@
+"""What help, completion and progress promise: every example runs, every shell is served."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from iscat_analysis.config import Config, config_to_toml, load_config
+from iscat_cli import console, main, main_fit
+from iscat_cli.app import COMMANDS
+from iscat_cli.console import Messages, duration
+
+PROGRAMS = {"iscat": main, "iscat-fit": main_fit}
+SHELLS = ["bash", "zsh", "fish"]
+
+# What keeps an example short without changing what it shows.
+SMALL = [
+    "simulation.frames=60",
+    "simulation.shape=[64, 64]",
+    "simulation.events=[{frame=30, x_px=31.2, y_px=30.8, mass_kda=900.0}]",
+    "background.frames=[0, 30]",
+    "fit.frames=[30, 60]",
+    "posterior.enabled=false",
+    "bounds.pixels=41",
+]
+
+
+def _examples() -> list[str]:
+    return [
+        line.strip()
+        for _, example in COMMANDS
+        for line in example.splitlines()
+        if line.startswith("    iscat")
+    ]
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory: pytest.TempPathFactory, sample_configs) -> Path:
+    """Make a folder with the files that the examples name."""
+    folder = tmp_path_factory.mktemp("laboratory")
+    (folder / "sample_configs").mkdir()
+    for name, path in sample_configs.items():
+        shutil.copy(path, folder / "sample_configs" / f"{name}.toml")
+    small = _small(folder / "sample_configs" / "mass.toml")
+    (folder / "setup.toml").write_text(small, encoding="utf-8")
+    return folder
+
+
+def _small(path: Path) -> str:
+    return config_to_toml(load_config(path, SMALL))
+
+
+def test_every_command_has_an_example() -> None:
+    shown = _examples()
+    for command, _ in COMMANDS:
+        assert any(example.startswith(f"iscat {command.__name__}") for example in shown)
+
+
+@pytest.mark.parametrize("example", _examples())
+def test_every_example_runs(
+    example: str, laboratory: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    for source in laboratory.iterdir():
+        (shutil.copytree if source.is_dir() else shutil.copy)(source, tmp_path / source.name)
+    monkeypatch.chdir(tmp_path)
+    program, *arguments = shlex.split(example)
+    redirected: Path | None = None
+    if ">" in arguments:
+        arguments, redirected = arguments[:-2], Path(arguments[-1])
+    if "movie.tif" in arguments and "--out" not in arguments:
+        assert main(["simulate", "--config", "setup.toml", "--out", "movie.tif"]) == 0
+        arguments = [a.replace("0:200", "0:30") for a in arguments]
+    if "simulate" in arguments:
+        arguments += [f"--set={change}" for change in SMALL]
+    if "benchmark" in arguments:
+        arguments.append("--no-posterior")
+        if "--trials" in arguments:
+            arguments[arguments.index("--trials") + 1] = "20"
+    capsys.readouterr()
+    assert PROGRAMS[program](arguments) == 0
+    out = capsys.readouterr().out
+    assert out.strip()
+    if redirected is not None:
+        redirected.write_text(out, encoding="utf-8")
+        load_config(redirected)
+
+
+# ---- the configuration -----------------------------------------------------------------------
+
+
+def test_the_configuration_is_complete_and_explained(capsys) -> None:
+    assert main(["config"]) == 0
+    out = capsys.readouterr().out
+    for section, field in Config.model_fields.items():
+        assert f"[{section}]" in out
+        keys = _keys(field.annotation)
+        assert keys
+        block = out.split(f"[{section}]", 1)[1]
+        for key, described in keys.items():
+            if key == "events":
+                assert "[[simulation.events]]" in out
+                continue
+            line = re.search(rf"^(?:# )?{key} = .*?# (.+)$|^# {key} = +# (.+)$", block, re.M)
+            assert line is not None, f"{section}.{key}"
+            assert described.description
+    assert [line for line in out.splitlines() if len(line) > 80] == []
+
+
+def _keys(annotation: object) -> dict:
+    from typing import get_args
+
+    for part in (annotation, *get_args(annotation)):
+        if hasattr(part, "model_fields"):
+            return part.model_fields
+    return {}
+
+
+def test_every_line_of_the_configuration_can_be_used(capsys, tmp_path) -> None:
+    """Take the # away from a key without a value, fill it in, and the file is read."""
+    main(["config"])
+    text = capsys.readouterr().out
+    for key, value in {"pixel_size_nm": "84.4", "mass_kda": "480.0", "level_e": "1e4"}.items():
+        text, count = re.subn(rf"^# {key} = ", f"{key} = {value} ", text, count=1, flags=re.M)
+        assert count == 1
+    text = text.replace("# [[simulation.events]]", "[[simulation.events]] #")
+    for key, value in {"frame": "3", "x_px": "20.0", "y_px": "20.0"}.items():
+        text, count = re.subn(rf"^# {key} = ", f"{key} = {value} ", text, count=1, flags=re.M)
+        assert count == 1
+    path = tmp_path / "setup.toml"
+    path.write_text(text, encoding="utf-8")
+    config = load_config(path)
+    assert config.camera.pixel_size_nm == 84.4
+    assert config.simulation.events[0].x_px == 20.0
+
+
+# ---- completion ------------------------------------------------------------------------------
+
+
+def _complete(program: str, words: str, shell: str = "bash", **more: str) -> str:
+    name = program.upper().replace("-", "_")
+    environment = os.environ | {f"_{name}_COMPLETE": f"complete_{shell}", **more}
+    environment |= {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+    environment |= {"_TYPER_COMPLETE_ARGS": words, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+    function = "main_fit" if program == "iscat-fit" else "main"
+    code = f"import sys, iscat_cli; sys.argv = [{program!r}]; sys.exit(iscat_cli.{function}())"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stderr == ""
+    return done.stdout
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+@pytest.mark.parametrize("program", list(PROGRAMS))
+def test_completion_scripts_are_written(program: str, shell: str) -> None:
+    name = program.upper().replace("-", "_")
+    code = f"import sys, iscat_cli; sys.argv = [{program!r}]; "
+    code += f"sys.exit(iscat_cli.{'main_fit' if program == 'iscat-fit' else 'main'}())"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {f"_{name}_COMPLETE": f"source_{shell}"},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert program in done.stdout
+    assert f"_{name}_COMPLETE=complete_{shell}" in done.stdout
+    if shutil.which(shell):
+        options = ["--no-execute"] if shell == "fish" else ["-n"]
+        subprocess.run([shell, *options], input=done.stdout, text=True, check=True)
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_the_shell_is_offered_commands(shell: str) -> None:
+    offered = _complete("iscat", "iscat si", shell)
+    assert "simulate" in offered
+    assert "bounds" not in offered
+
+
+def test_the_shell_is_offered_options_modes_and_keys() -> None:
+    assert "--background" in _complete("iscat-fit", "iscat-fit movie.tif --ba").split()
+    assert _complete("iscat-fit", "iscat-fit movie.tif --mode jo").split() == ["joint"]
+    assert "optics.na=" in _complete("iscat", "iscat fit movie.tif --set optics.n").split()
+    assert "calibration.offset=" in _complete("iscat", "iscat fit --set calibration.o").split()
+
+
+# ---- progress --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [(0.2, "1 s"), (8, "8 s"), (99.5, "100 s"), (130, "3 min"), (7500, "2 h 5 min")],
+)
+def test_durations_are_said_as_people_do(seconds: float, said: str) -> None:
+    assert duration(seconds) == said
+
+
+@pytest.fixture
+def clock(monkeypatch) -> Callable[[float], None]:
+    """Put a clock that is set by hand in the place of time."""
+    now = [100.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: now[0])
+
+    def advance(seconds: float) -> None:
+        now[0] += seconds
+
+    return advance
+
+
+def test_plain_progress_tells_the_time_left_and_is_no_flood(clock, capsys) -> None:
+    with Messages("iscat-fit").progress() as progress:
+        for done in range(1, 1001):
+            clock(0.125)
+            progress("fit", done, 1000)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "iscat-fit: fit: 16 of 1000, about 3 min left"
+    assert lines[1] == "iscat-fit: fit: 96 of 1000, about 2 min left"
+    assert lines[-1] == "iscat-fit: fit: 1000 of 1000"
+    assert len(lines) == 14
+
+
+def test_short_stages_say_one_line_each_and_repeat_nothing(clock, capsys) -> None:
+    with Messages("iscat-fit").progress() as progress:
+        for _ in range(50):
+            for stage in ("detect", "detect"):
+                clock(0.01)
+                progress(stage, 1, 1)
+    assert capsys.readouterr().err == "iscat-fit: detect: 1 of 1\n"
