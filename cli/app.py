@@ -13,6 +13,8 @@ from typing import Annotated
 
 import typer
 
+from iscat_cli.benchmark import EXAMPLE as BENCHMARK_EXAMPLE
+from iscat_cli.benchmark import benchmark
 from iscat_cli.bounds import EXAMPLE as BOUNDS_EXAMPLE
 from iscat_cli.bounds import bounds
 from iscat_cli.config import EXAMPLE as CONFIG_EXAMPLE
@@ -28,6 +30,7 @@ COMMANDS = (
     (fit, FIT_EXAMPLE),
     (simulate, SIMULATE_EXAMPLE),
     (bounds, BOUNDS_EXAMPLE),
+    (benchmark, BENCHMARK_EXAMPLE),
     (config, CONFIG_EXAMPLE),
 )
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betainc, chdtrc, gammainc, gammaincc, ndtr, ndtri, pdtr, pdtrc
+from scipy.special import betainc, gammainc, gammaincc, ndtr, ndtri, pdtr, pdtrc
 
 from iscat_analysis._kernels.score_test import score_statistic
 from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR
@@ -42,6 +42,7 @@ MANY_COUNTS = 1e6
 """Counts above which tails are normal: 5 σ out to a few per cent."""
 
 _TESTS = 3
+_NARROWEST = 0.1  # variance of a sum of squares over that of normal residuals, at least
 _SUSPECTS = 8  # largest residuals whose exact tail is looked up
 _DEPENDENT = 1e-8  # share of a mode outside the fitted directions that counts as none
 _FINEST = 1e-11  # tail below which whole counts are not told from continuous ones
@@ -175,8 +176,10 @@ def _look(likelihood: Likelihood, theta: FloatArray) -> _View:
         residual = (c0 - rate) * share / np.maximum(weight, FLOOR)
         relative = 1 / bright
     else:
+        # A background of read noise alone may be measured below zero.
+        rate = np.maximum(level * (c1 + c2 * s) + c3, FLOOR)
         light = np.maximum(level * (c1 + c2 * s), FLOOR)
-        rate, total, share = light + c3, None, np.ones(s.size)
+        total, share = None, np.ones(s.size)
         weight = light / np.sqrt(rate)
         residual = (c0 - rate) / np.sqrt(rate)
         relative = c2 * level / light
@@ -188,19 +191,29 @@ def _scatter(view: _View, free: BoolArray) -> tuple[float, float]:
     freedom = residual.size - int(np.count_nonzero(free))
     if freedom <= 0:
         return math.nan, math.nan
-    chi2 = float(residual @ residual)
-    spread = 1 + float(kurtosis.mean()) / 2  # of χ², over that of normal residuals
-    above = float(gammaincc(freedom / spread / 2, chi2 / spread / 2))
+    chi2 = float(np.sum(residual**2))
+    above = _gamma_above(chi2, freedom, float(kurtosis.mean()))
     return chi2 / freedom, 2 * min(above, 1 - above)
+
+
+def _gamma_above(chi2: float, freedom: float, excess: float) -> float:
+    """Upper tail of a sum of squares of variance (2 + excess)·freedom."""
+    spread = max(1 + excess / 2, _NARROWEST)
+    return float(gammaincc(freedom / spread / 2, chi2 / spread / 2))
+
+
+def _kurtosis(view: _View) -> FloatArray:
+    """Excess kurtosis of each pixel's counts."""
+    if view.total is None:
+        return 1 / view.rate
+    p = view.rate / view.total
+    return view.share * (1 / np.maximum(view.rate * (1 - p), 1.0) - 6 / view.total)
 
 
 def _cells(view: _View) -> tuple[FloatArray, FloatArray]:
     """Residuals in standard deviations and their excess kurtosis, cells of few counts pooled."""
     if view.total is not None:
-        p = view.rate / view.total
-        return view.residual, view.share * (
-            1 / np.maximum(view.rate * (1 - p), 1.0) - 6 / view.total
-        )
+        return view.residual, _kurtosis(view)
     rate, excess = view.rate, view.observed - view.rate
     few = rate < POOLED_COUNTS
     if np.any(few):
@@ -219,8 +232,11 @@ def _structure(likelihood: Likelihood, theta: FloatArray, free: BoolArray, view:
     fitted = np.concatenate([view.gradient * view.relative, level])[np.asarray(free, dtype=bool)]
     modes = _modes(likelihood, theta)[:, view.used]
     vectors = np.concatenate([fitted, modes]) * view.weight
-    chi2, freedom = score_statistic(vectors, len(fitted), view.residual, _DEPENDENT)
-    return float(chdtrc(freedom, chi2)) if freedom else 1.0
+    leverage = np.empty(view.rate.size)
+    chi2, freedom = score_statistic(vectors, len(fitted), view.residual, _DEPENDENT, leverage)
+    if not freedom:
+        return 1.0
+    return _gamma_above(chi2, freedom, float(np.sum(_kurtosis(view) * leverage**2)) / freedom)
 
 
 def _outlier(view: _View) -> float:

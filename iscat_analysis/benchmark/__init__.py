@@ -8,7 +8,43 @@
 from __future__ import annotations
 
 from iscat_analysis.benchmark.baselines import Baselines
+from iscat_analysis.benchmark.calibration import Calibration, calibrate_posterior
+from iscat_analysis.benchmark.scores import (
+    Score,
+    gaussian_posterior,
+    pull_histogram,
+    rank_test,
+    score,
+    spread_error,
+    spread_interval,
+    van_trees,
+)
 from iscat_analysis.benchmark.setting import Setting, make_setting
+from iscat_analysis.benchmark.study import (
+    check_benchmark_output,
+    run_benchmark,
+    write_benchmark,
+)
 from iscat_analysis.benchmark.trials import Trials, run_trials, trial_generator
 
-__all__ = ["Baselines", "Setting", "Trials", "make_setting", "run_trials", "trial_generator"]
+__all__ = [
+    "Baselines",
+    "Calibration",
+    "Score",
+    "Setting",
+    "Trials",
+    "calibrate_posterior",
+    "check_benchmark_output",
+    "gaussian_posterior",
+    "make_setting",
+    "pull_histogram",
+    "rank_test",
+    "run_benchmark",
+    "run_trials",
+    "score",
+    "spread_error",
+    "spread_interval",
+    "trial_generator",
+    "van_trees",
+    "write_benchmark",
+]

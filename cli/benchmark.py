@@ -1,0 +1,138 @@
+"""`iscat benchmark`: what the fits achieve, beside what can be achieved."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from iscat_cli.console import Messages, failures, print_json, print_result
+from iscat_cli.options import (
+    DebugOption,
+    JsonOption,
+    OverwriteOption,
+    QuietOption,
+    SetOption,
+)
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+EXAMPLE = """Example: a thousand repetitions of one experiment.
+
+    iscat benchmark --config setup.toml --out benchmark --trials 1000
+"""
+
+MODES = ("mass", "localize", "joint")
+
+
+def benchmark(
+    context: typer.Context,
+    *,
+    config: Annotated[
+        Path,
+        typer.Option(metavar="C.toml", help="Configuration; [bounds] describes the experiment."),
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Output folder.")],
+    trials: Annotated[
+        int, typer.Option(min=20, metavar="N", help="Repetitions in each mode.")
+    ] = 1000,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Same seed, same numbers.")] = 1,
+    settings: SetOption = None,
+    posterior: Annotated[
+        bool,
+        typer.Option(
+            "--posterior/--no-posterior", help="Sample a posterior for one in 20 repetitions."
+        ),
+    ] = True,
+    workers: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Threads.", show_default=False)
+    ] = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Measure spread, bias and coverage of the fits against CRB and QCRB.
+
+    Draws synthetic shot noise, fits it in modes mass, localize and joint, and writes
+    benchmark.json, benchmark.html and figures to the output folder.
+    """
+    messages = Messages(context.command_path, quiet=quiet)
+    with failures(messages, debug=debug):
+        from iscat_analysis.config import load_config
+
+        resolved = load_config(config, settings or ())
+
+        from iscat_analysis.benchmark import (
+            check_benchmark_output,
+            run_benchmark,
+            write_benchmark,
+        )
+
+        check_benchmark_output(out, overwrite)
+        with messages.progress() as progress:
+            study = run_benchmark(
+                resolved,
+                trials=trials,
+                seed=seed,
+                workers=workers,
+                posterior=posterior,
+                command=context.obj,
+                progress=progress,
+            )
+        write_benchmark(study, out, overwrite=overwrite)
+        if as_json:
+            print_json(study)
+        else:
+            print_result(benchmark_table(study))
+            print_result(f"report: {out / 'benchmark.html'}")
+
+
+def benchmark_table(study: Mapping[str, Any]) -> Table:
+    """Tabulate a study: one row per mode and parameter.
+
+    Parameters
+    ----------
+    study : mapping
+        What benchmark.json holds.
+
+    Returns
+    -------
+    rich.table.Table
+        Spread, bounds and their ratios.
+    """
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD if Console().is_terminal else None, pad_edge=False)
+    table.add_column("mode", no_wrap=True)
+    table.add_column("parameter", no_wrap=True)
+    for heading in (
+        "bias", "spread", "CRB", "QCRB", "spread/CRB", "95 % interval", "coverage 68 %", "failed",
+    ):  # fmt: skip
+        table.add_column(heading, justify="right", no_wrap=True)
+    for mode in MODES:
+        entry = study[mode]
+        for name, values in entry.items():
+            if not isinstance(values, Mapping) or "spread_over_crb" not in values:
+                continue
+            low, high = values["spread_over_crb_ci95"]
+            table.add_row(
+                mode,
+                name,
+                *(_short(values[key]) for key in ("bias", "spread", "crb", "qcrb")),
+                _short(values["spread_over_crb"]),
+                f"{_short(low)}–{_short(high)}",
+                _short(values["coverage68"]),
+                f"{entry['failed']} of {entry['trials']}",
+            )
+    return table
+
+
+def _short(value: float | None) -> str:
+    return "–" if value is None or not math.isfinite(value) else f"{value:.3g}"

@@ -1,0 +1,283 @@
+"""Estimates beside the bounds: bias, spread, coverage, pulls, each with its uncertainty.
+
+Small pure functions on arrays; no trial is left out silently: callers choose the trials and report
+how many they left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.records import FloatArray
+
+MIN_TRIALS = 8
+"""Fewer trials have no spread worth stating."""
+
+PULL_EDGES = np.linspace(-5, 5, 41)
+"""Bins of the pull histograms; the outer ones take what lies beyond."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """One parameter of one mode, estimated again and again.
+
+    Attributes
+    ----------
+    bias, bias_se : float
+        Mean error and its standard error.
+    spread : float
+        Standard deviation of the estimates.
+    spread_ci95 : (float, float)
+        Its 95 % confidence interval, see `spread_interval`.
+    spread_robust : float
+        From the quartiles, for a normal distribution.
+    crb, qcrb : float
+        Joint Cramér–Rao bound over the free parameters, and quantum bound for the collected light.
+    spread_over_crb, spread_over_qcrb : float
+        Ratios.
+    spread_over_crb_ci95, spread_over_qcrb_ci95 : (float, float)
+        Their intervals.
+    coverage68, coverage95 : float
+        Share of trials whose truth lies within one and two stated σ (68.27 % and 95.45 %).
+    pull_mean, pull_std : float
+        Of (estimate − truth)/σ.
+    """
+
+    bias: float
+    bias_se: float
+    spread: float
+    spread_ci95: tuple[float, float]
+    spread_robust: float
+    crb: float
+    qcrb: float
+    spread_over_crb: float
+    spread_over_crb_ci95: tuple[float, float]
+    spread_over_qcrb: float
+    spread_over_qcrb_ci95: tuple[float, float]
+    coverage68: float
+    coverage95: float
+    pull_mean: float
+    pull_std: float
+
+    def plain(self) -> dict[str, Any]:
+        """As nested plain values, for JSON."""
+        return asdict(self)
+
+
+def score(error: FloatArray, sigma: FloatArray, crb: float, qcrb: float) -> Score:
+    """Set one parameter's estimates beside its bounds.
+
+    Parameters
+    ----------
+    error : ndarray, shape (n,)
+        Estimate minus truth; NaN is left out.
+    sigma : ndarray, shape (n,)
+        Stated standard deviations; NaN where the estimator states none.
+    crb, qcrb : float
+        Bounds, in the same unit.
+
+    Returns
+    -------
+    Score
+        NaN throughout for fewer than `MIN_TRIALS` trials.
+    """
+    kept = np.isfinite(error)
+    error, sigma = error[kept], sigma[kept]
+    n = error.size
+    if n < MIN_TRIALS:
+        nothing, none = math.nan, (math.nan, math.nan)
+        return Score(
+            nothing, nothing, nothing, none, nothing, crb, qcrb, nothing, none, nothing, none,
+            nothing, nothing, nothing, nothing,
+        )  # fmt: skip
+    spread = float(np.std(error, ddof=1))
+    interval = spread_interval(error)
+    quartiles = np.quantile(error, [0.25, 0.75])
+    pull = (error / sigma)[np.isfinite(sigma)]
+    inside = [float(np.mean(np.abs(pull) < k)) if pull.size else math.nan for k in (1, 2)]
+    return Score(
+        bias=float(np.mean(error)),
+        bias_se=spread / math.sqrt(n),
+        spread=spread,
+        spread_ci95=interval,
+        spread_robust=float((quartiles[1] - quartiles[0]) / (2 * norm.ppf(0.75))),
+        crb=crb,
+        qcrb=qcrb,
+        spread_over_crb=_ratio(spread, crb),
+        spread_over_crb_ci95=(_ratio(interval[0], crb), _ratio(interval[1], crb)),
+        spread_over_qcrb=_ratio(spread, qcrb),
+        spread_over_qcrb_ci95=(_ratio(interval[0], qcrb), _ratio(interval[1], qcrb)),
+        coverage68=inside[0],
+        coverage95=inside[1],
+        pull_mean=float(np.mean(pull)) if pull.size else math.nan,
+        pull_std=float(np.std(pull, ddof=1)) if pull.size > 1 else math.nan,
+    )
+
+
+def spread_error(error: FloatArray) -> float:
+    """Relative standard error of a standard deviation.
+
+    Parameters
+    ----------
+    error : ndarray, shape (n,)
+        A sample of any distribution with a fourth moment.
+
+    Returns
+    -------
+    float
+        √[(κ − 1)/4n] with κ the sample's kurtosis; 1/√(2n) for a normal distribution.
+    """
+    centred = error - np.mean(error)
+    second = float(np.mean(centred**2))
+    if second == 0:
+        return math.nan
+    kurtosis = float(np.mean(centred**4)) / second**2
+    return math.sqrt((kurtosis - 1) / (4 * error.size))
+
+
+def spread_interval(error: FloatArray, level: float = 0.95) -> tuple[float, float]:
+    """Confidence interval of a standard deviation.
+
+    Parameters
+    ----------
+    error : ndarray, shape (n,)
+        Sample.
+    level : float
+        Probability.
+
+    Returns
+    -------
+    low, high : float
+        Symmetric in the logarithm, with the sample's own kurtosis in place of the normal one
+        (D. G. Bonett, Comput. Stat. Data Anal. 50, 775, 2006).
+    """
+    spread = float(np.std(error, ddof=1))
+    reach = float(norm.ppf(0.5 + level / 2)) * spread_error(error)
+    if not math.isfinite(reach):
+        return spread, spread
+    return spread * math.exp(-reach), spread * math.exp(reach)
+
+
+def pull_histogram(pull: FloatArray) -> dict[str, list[float]]:
+    """Histogram of pulls beside the normal expectation.
+
+    Parameters
+    ----------
+    pull : ndarray, shape (n,)
+        (estimate − truth)/σ; NaN is left out.
+
+    Returns
+    -------
+    dict
+        ``edges``, ``counts``, ``expected``.
+    """
+    finite = pull[np.isfinite(pull)]
+    counts = np.histogram(np.clip(finite, PULL_EDGES[0], PULL_EDGES[-1]), PULL_EDGES)[0]
+    within = norm.cdf(PULL_EDGES)
+    within[0], within[-1] = 0.0, 1.0
+    return {
+        "edges": PULL_EDGES.tolist(),
+        "counts": counts.tolist(),
+        "expected": (finite.size * np.diff(within)).tolist(),
+    }
+
+
+def rank_test(ranks: NDArray[np.int64], possible: int, bins: int = 20) -> tuple[float, FloatArray]:
+    """Test whether ranks are uniform.
+
+    Parameters
+    ----------
+    ranks : ndarray of int, shape (n,)
+        0 … possible − 1.
+    possible : int
+        Number of possible ranks, a multiple of `bins`.
+    bins : int
+        Cells of the χ² test.
+
+    Returns
+    -------
+    p_value : float
+        Of Pearson's χ² for equal cells.
+    counts : ndarray, shape (bins,)
+        Ranks in each cell.
+
+    Raises
+    ------
+    ConfigError
+        `possible` is not a multiple of `bins`.
+
+    Notes
+    -----
+    S. Talts et al., arXiv:1804.06788 (2018).
+    """
+    if possible % bins:
+        raise ConfigError(f"possible = {possible} ranks do not fall evenly into bins = {bins}")
+    counts = np.bincount(np.asarray(ranks) // (possible // bins), minlength=bins).astype(float)
+    expected = counts.sum() / bins
+    statistic = float(np.sum((counts - expected) ** 2) / expected) if expected else 0.0
+    return float(chi2.sf(statistic, bins - 1)), counts
+
+
+def van_trees(information: FloatArray, prior: FloatArray) -> FloatArray:
+    """Bound on the error of any estimator, biased ones too, when there is prior knowledge.
+
+    Parameters
+    ----------
+    information : ndarray, shape (k, k)
+        Fisher information of the data, averaged over the prior.
+    prior : ndarray, shape (k, k)
+        Information of the prior, the mean of −∂² ln π; the inverse covariance of a normal one.
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        Root-mean-square error at least.
+
+    Raises
+    ------
+    ConfigError
+        Data and prior together leave a direction undetermined.
+
+    Notes
+    -----
+    H. L. Van Trees, *Detection, Estimation, and Modulation Theory* I (1968), section 2.4.
+    """
+    total = np.asarray(information, dtype=float) + np.asarray(prior, dtype=float)
+    values, vectors = np.linalg.eigh(total)
+    if not values[0] > 1e-14 * max(values[-1], 1e-300):
+        raise ConfigError("neither the data nor the prior determine every parameter")
+    bound: FloatArray = np.sqrt(np.sum(vectors**2 / values, axis=1))
+    return bound
+
+
+def gaussian_posterior(
+    estimate: FloatArray, sigma: FloatArray, centre: float, width: float
+) -> tuple[FloatArray, FloatArray]:
+    """Join estimates with a normal prior.
+
+    Parameters
+    ----------
+    estimate, sigma : ndarray, shape (n,)
+        Maximum-likelihood estimates and their standard deviations.
+    centre, width : float
+        Mean and standard deviation of the prior.
+
+    Returns
+    -------
+    mean, sigma : ndarray, shape (n,)
+        Of the posterior where the likelihood is normal.
+    """
+    weight = 1 / sigma**2
+    known = 1 / width**2
+    return (estimate * weight + centre * known) / (weight + known), 1 / np.sqrt(weight + known)
+
+
+def _ratio(value: float, bound: float) -> float:
+    return value / bound if math.isfinite(bound) and bound > 0 else math.nan

@@ -1,0 +1,378 @@
+"""Page and figures of `iscat benchmark`: what was achieved, beside what can be.
+
+Everything arrives as the content of ``benchmark.json``; nothing is computed here but what is shown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from iscat_analysis.records import FREE_PARAMETERS
+from iscat_analysis.report.context import LABELS, UNITS
+from iscat_analysis.report.figures import _STYLE, BLUE, INK, VERMILLION, _figure, _save
+from iscat_analysis.report.page import render_page
+
+BENCHMARK_NAMES = frozenset({"benchmark.json", "benchmark.html", "config.toml", "figures"})
+"""Everything `write_benchmark` leaves in its folder."""
+
+MODES = ("mass", "localize", "joint")
+
+_TITLES = {
+    "mass": "Mass: position and mass, height known",
+    "localize": "Localize: position in three dimensions, mass known",
+    "joint": "Joint: position in three dimensions and mass",
+}
+_SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "dark field"}
+_BASELINES = {"gaussian": "Gaussian least squares", "peak": "peak contrast"}
+_AXES = {
+    "photons": ("collected scattered photons", "log"),
+    "z": ("height [nm]", "linear"),
+}
+
+
+def render_benchmark(study: Mapping[str, Any]) -> str:
+    """Make the page of a study.
+
+    Parameters
+    ----------
+    study : mapping
+        What ``benchmark.json`` holds.
+
+    Returns
+    -------
+    str
+        HTML that needs no other file.
+    """
+    sections = [_summary(study)]
+    sections += [_mode_section(study, mode) for mode in MODES if mode in study]
+    sections.append(
+        {
+            "id": "how",
+            "title": "How this was measured",
+            "notes": [
+                "Photoelectrons of the fitted region are drawn from the expected images with "
+                "Poisson statistics and read noise, before and after landing, and fitted by the "
+                "code that fits movies, from starts up to a pixel off, at any height of the range "
+                "and with a mass up to half as large again. The spread is over fits that neither "
+                "failed nor were flagged for an ambiguous height.",
+                "The Cramér–Rao bound (CRB) holds for the same free parameters, frames, camera "
+                "noise and measured background; the quantum bound (QCRB) for the collected "
+                "scattered light and any measurement of it.",
+                "Confidence intervals are 95 %. Gaussian least squares and peak contrast see the "
+                "contrast image; their masses are calibrated on the noiseless particle itself.",
+            ],
+            "tables": [
+                {
+                    "caption": "Versions",
+                    "columns": ["package", "version"],
+                    "rows": [list(pair) for pair in study["versions"].items()],
+                }
+            ],
+            "code": f"{study['command']}\n\n{study['config']}",
+        }
+    )
+    scheme = _SCHEMES.get(study["scheme"], study["scheme"])
+    return render_page(
+        "document.html",
+        {
+            "title": "Estimators beside their bounds",
+            "subtitle": f"{scheme}: {study['trials']} repetitions of one experiment in each mode, "
+            f"seed {study['seed']}",
+            "sections": sections,
+            "nav": [(s["id"], s.get("short", s["title"])) for s in sections],
+            "footer": f"iscat-analysis {study['versions']['iscat-analysis']}",
+        },
+    )
+
+
+def _summary(study: Mapping[str, Any]) -> dict[str, Any]:
+    facts = []
+    for mode in MODES:
+        if mode not in study:
+            continue
+        ratios = [study[mode][name]["spread_over_crb"] for name in FREE_PARAMETERS[mode]]
+        finite = [r for r in ratios if math.isfinite(r)]
+        low, high = (min(finite), max(finite)) if finite else (math.nan, math.nan)
+        facts.append(
+            {
+                "label": f"spread / CRB, {mode}",
+                "value": f"{low:.2f}–{high:.2f}" if finite else "—",
+                "note": f"over {', '.join(LABELS[n] for n in FREE_PARAMETERS[mode])}; "
+                f"{study[mode]['failed']} of {study[mode]['trials']} fits failed",
+            }
+        )
+    rows = []
+    for mode in MODES:
+        for name in FREE_PARAMETERS[mode] if mode in study else ():
+            entry = study[mode][name]
+            baselines = entry.get("baselines", {})
+            rows.append(
+                [
+                    mode,
+                    f"{LABELS[name]} [{UNITS[name]}]",
+                    _with(entry["spread_over_crb"], entry["spread_over_crb_ci95"]),
+                    _plain(entry["spread_over_qcrb"]),
+                    *(
+                        _plain(baselines[b]["rmse_over_crb"]) if b in baselines else "—"
+                        for b in _BASELINES
+                    ),
+                ]
+            )
+    return {
+        "id": "summary",
+        "title": "Summary",
+        "lead": "A ratio of 1 to the CRB means that no unbiased estimator can do better with these "
+        "counts. The last columns show what other estimators make of the same counts: "
+        "root-mean-square error over the CRB.",
+        "facts": facts,
+        "tables": [
+            {
+                "caption": "Every free parameter in every mode",
+                "columns": [
+                    "mode",
+                    "parameter",
+                    _number("spread / CRB", "with its 95 % confidence interval"),
+                    _number("spread / QCRB"),
+                    *(_number(f"{label} / CRB") for label in _BASELINES.values()),
+                ],
+                "rows": rows,
+            }
+        ],
+    }
+
+
+def _mode_section(study: Mapping[str, Any], mode: str) -> dict[str, Any]:
+    entry, at = study[mode], study[mode]["at"]
+    names = FREE_PARAMETERS[mode]
+    charts = [
+        *(_curve_chart(study, mode, axis, name) for axis in _AXES for name in names),
+        *(_pull_chart(study, mode, name) for name in names),
+        *(_rank_chart(study, mode, name) for name in names if study["histograms"]["ranks"][mode]),
+    ]
+    flags = ", ".join(f"{n} {flag}" for flag, n in entry["flagged"].items() if n) or "none flagged"
+    return {
+        "id": mode,
+        "short": mode.capitalize(),
+        "title": _TITLES[mode],
+        "lead": f"{at['mass_kda']:.4g} kDa at z = {at['z_nm']:.4g} nm, focus {at['focus_nm']:.4g} "
+        f"nm; {at['n_scattered']['collected']:.3g} scattered photons collected; "
+        f"{at['pixels']} × {at['pixels']} pixels of {at['pixel_size_nm']:.4g} nm; "
+        f"{at['n_before']} frames before and {at['n_after']} after landing. "
+        f"{entry['fits_per_second']:.0f} fits per second and thread; {flags}.",
+        "tables": [
+            {
+                "caption": "Achieved and possible",
+                "columns": [
+                    "parameter",
+                    _number("truth"),
+                    _number("bias"),
+                    _number("spread"),
+                    _number("CRB"),
+                    _number("QCRB"),
+                    _number("coverage 68 %", "share of truths within one stated σ"),
+                    _number("95 %", "share of truths within two stated σ"),
+                    _number("pull mean"),
+                    _number("pull σ"),
+                    _number("posterior 68 %", "share of truths inside the credible interval"),
+                    _number("95 %", "share of truths inside the credible interval"),
+                ],
+                "rows": [_row(entry, at, name) for name in names],
+            }
+        ],
+        "charts": charts,
+    }
+
+
+def _row(entry: Mapping[str, Any], at: Mapping[str, Any], name: str) -> list[Any]:
+    e = entry[name]
+    return [
+        f"{LABELS[name]} [{UNITS[name]}]",
+        at[name],
+        f"{_plain(e['bias'], 2)} ± {_plain(e['bias_se'], 2)}",
+        _with(e["spread"], e["spread_ci95"]),
+        _plain(e["crb"]),
+        _plain(e["qcrb"]),
+        _percent(e["coverage68"]),
+        _percent(e["coverage95"]),
+        _plain(e["pull_mean"], 2),
+        _plain(e["pull_std"]),
+        _percent(e.get("posterior_coverage68")),
+        _percent(e.get("posterior_coverage95")),
+    ]
+
+
+def _curve_chart(study: Mapping[str, Any], mode: str, axis: str, name: str) -> dict[str, Any]:
+    curve = study["curves"][axis][mode]
+    label, scale = _AXES[axis]
+    line, x = curve[name], curve["at"]
+    y_axis = {"label": f"σ of {LABELS[name]} [{UNITS[name]}]", "scale": "log"}
+    series: list[dict[str, Any]] = [
+        {"kind": "line", "name": "CRB", "color": "crb", "x": x, "y": line["crb"]},
+        {"kind": "line", "name": "QCRB", "color": "qcrb", "x": x, "y": line["qcrb"], "dash": True},
+        {"kind": "points", "name": "spread", "color": "sigma", "x": x, "y": line["spread"]},
+    ]
+    along = "photons" if axis == "photons" else "height"
+    return {
+        "id": f"{mode}-{axis}-{name}",
+        "title": f"{LABELS[name]} against {along}",
+        "caption": None,
+        "spec": {"x": {"label": label, "scale": scale}, "y": y_axis, "series": series},
+        "wide": False,
+    }
+
+
+def _pull_chart(study: Mapping[str, Any], mode: str, name: str) -> dict[str, Any]:
+    bins = study["histograms"]["pulls"][mode][name]
+    edges = np.asarray(bins["edges"])
+    middle = ((edges[1:] + edges[:-1]) / 2).tolist()
+    return {
+        "id": f"{mode}-pull-{name}",
+        "title": f"Pull of {LABELS[name]}",
+        "caption": None,
+        "spec": {
+            "x": {"label": "(estimate − truth) / σ", "scale": "linear"},
+            "y": {"label": "fits", "scale": "linear", "zero": True},
+            "series": [
+                {"kind": "bars", "name": "fits", "color": "sigma", "edges": bins["edges"],
+                 "counts": bins["counts"]},
+                {"kind": "line", "name": "normal", "color": "crb", "x": middle,
+                 "y": bins["expected"]},
+            ],
+        },
+        "wide": False,
+    }  # fmt: skip
+
+
+def _rank_chart(study: Mapping[str, Any], mode: str, name: str) -> dict[str, Any]:
+    bins = study["histograms"]["ranks"][mode][name]
+    counts = bins["counts"]
+    edges = np.linspace(0, bins["possible"], len(counts) + 1).tolist()
+    mean = sum(counts) / len(counts)
+    return {
+        "id": f"{mode}-rank-{name}",
+        "title": f"Rank of the true {LABELS[name]}",
+        "caption": f"among the draws of its posterior; uniform with p = {bins['p_value']:.2g}",
+        "spec": {
+            "x": {"label": "rank", "scale": "linear"},
+            "y": {"label": "posteriors", "scale": "linear", "zero": True},
+            "series": [
+                {"kind": "bars", "name": "posteriors", "color": "qcrb", "edges": edges,
+                 "counts": counts},
+                {"kind": "rule", "name": "uniform", "color": "crb", "axis": "y", "value": mean},
+            ],
+        },
+        "wide": False,
+    }  # fmt: skip
+
+
+def draw_benchmark(study: Mapping[str, Any], folder: Path) -> None:
+    """Draw the figures, each as PNG and SVG.
+
+    ``photons_MODE``, ``heights_MODE`` (spread, CRB and QCRB), ``pulls_MODE`` and ``ranks_MODE``.
+
+    Parameters
+    ----------
+    study : mapping
+        What ``benchmark.json`` holds.
+    folder : Path
+        Made if absent.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with mpl.rc_context(_STYLE):
+        for mode in MODES:
+            if mode not in study:
+                continue
+            for axis, stem in (("photons", "photons"), ("z", "heights")):
+                curve = study["curves"][axis][mode]
+                _panels(folder / f"{stem}_{mode}", mode, partial(_draw_curve, axis, curve))
+            for kind, draw in (("pulls", _draw_pulls), ("ranks", _draw_ranks)):
+                bins = study["histograms"][kind][mode]
+                if bins:
+                    _panels(folder / f"{kind}_{mode}", mode, partial(draw, bins))
+
+
+def _panels(stem: Path, mode: str, draw: Callable[[Axes, str], None]) -> None:
+    names = FREE_PARAMETERS[mode]
+    figure = _figure(2.9 * len(names), 2.9, layout="constrained")
+    for position, name in enumerate(names):
+        axes = figure.add_subplot(1, len(names), position + 1)
+        draw(axes, name)
+        axes.set_title(f"{LABELS[name]} [{UNITS[name]}]")
+        if position == 0:
+            axes.legend(loc="best", fontsize=8)
+        else:
+            axes.set_ylabel("")
+    _save(figure, stem)
+
+
+def _draw_curve(axis: str, curve: Mapping[str, Any], axes: Axes, name: str) -> None:
+    label, scale = _AXES[axis]
+    x, line = np.asarray(curve["at"], float), curve[name]
+    axes.plot(x, _floats(line["crb"]), color=INK, label="CRB")
+    axes.plot(x, _floats(line["qcrb"]), color=BLUE, linestyle="--", label="QCRB")
+    spread = _floats(line["spread"])
+    ends = np.array([_floats(pair) for pair in line["spread_ci95"]]).T
+    reach = np.maximum(np.stack([spread - ends[0], ends[1] - spread]), 0)
+    axes.errorbar(x, spread, reach, color=VERMILLION, fmt="o", markersize=4, label="spread")
+    axes.set_xscale(scale)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(10, subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel(label)
+    axes.set_ylabel("standard deviation")
+
+
+def _draw_pulls(found: Mapping[str, Any], axes: Axes, name: str) -> None:
+    bins = found[name]
+    edges = np.asarray(bins["edges"], float)
+    axes.stairs(_floats(bins["counts"]), edges, fill=True, color=VERMILLION, label="fits")
+    axes.plot((edges[1:] + edges[:-1]) / 2, _floats(bins["expected"]), color=INK, label="normal")
+    axes.set_xlabel("(estimate − truth) / σ")
+    axes.set_ylabel("fits")
+
+
+def _draw_ranks(found: Mapping[str, Any], axes: Axes, name: str) -> None:
+    bins = found[name]
+    counts = _floats(bins["counts"])
+    edges = np.linspace(0, bins["possible"], counts.size + 1)
+    axes.stairs(counts, edges, fill=True, color=BLUE, label="posteriors")
+    axes.axhline(float(counts.mean()), color=INK, linewidth=1, label="uniform")
+    axes.text(0.98, 0.03, f"p = {bins['p_value']:.2g}", transform=axes.transAxes, ha="right",
+              color="white", fontweight="bold", fontsize=8)  # fmt: skip
+    axes.set_xlabel("rank of the truth")
+    axes.set_ylabel("posteriors")
+
+
+def _floats(values: Sequence[float | None]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.array([math.nan if v is None else v for v in values], dtype=float)
+
+
+def _number(label: str, title: str | None = None) -> dict[str, Any]:
+    return {"label": label, "numeric": True, "title": title}
+
+
+def _plain(value: float | None, digits: int = 3) -> str:
+    if value is None or not math.isfinite(value):
+        return "—"
+    if value == 0 or 1e-3 <= abs(value) < 1e5:
+        size = 0 if value == 0 else math.floor(math.log10(abs(value)))
+        return f"{value:.{max(0, digits - 1 - size)}f}".replace("-", "−")
+    return f"{value:.{digits}g}".replace("-", "−")
+
+
+def _percent(value: float | None) -> str:
+    return "—" if value is None or not math.isfinite(value) else f"{100 * value:.1f} %"
+
+
+def _with(value: float, interval: Sequence[float]) -> str:
+    return f"{_plain(value)} [{_plain(interval[0])}, {_plain(interval[1])}]"
