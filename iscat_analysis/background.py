@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, uniform_filter
 
 from iscat_analysis.camera import Camera
 from iscat_analysis.errors import DataError
@@ -27,7 +27,8 @@ DEFECT_SIGMAS = 6.0
 
 _BLOCK_BYTES = 16 * 2**20
 _CLIP_SIGMAS = 3.0
-_LEAST_TOTAL_E = 1e4  # fewer background photoelectrons say too little about the power
+_NEIGHBOURHOOD = 7  # pixels, on which a faint background is averaged for the weights
+_LEAST_TOTAL_E = 1e6  # fewer background photoelectrons leave the power uncertain by over 0.1 %
 
 Check = Callable[[NDArray[Any], int], None]
 
@@ -102,7 +103,9 @@ def measure_windows(
         n_before = start = before[1] - before[0]
         first = _sum_frames(stack, camera, before, check, progress, 0, total)
         if method == "median":
-            first = replace(first, total_e=n_before * _median(stack, camera, before))
+            totals = first.frame_totals_e
+            level = totals / totals.mean() if power_normalization and totals.min() > 0 else None
+            first = replace(first, total_e=n_before * _median(stack, camera, before, level))
     second = _sum_frames(stack, camera, after, check, progress, start, total)
     saturated = first.saturated | second.saturated
     masked = saturated | _defects(first.total_e, n_before * variance)
@@ -202,6 +205,43 @@ def refine_power(windows: Windows, explained: FloatArray, *, additive: bool) -> 
     return replace(windows, power_ratio=float(ratio))
 
 
+def smooth_background(
+    before_e: FloatArray, variance_e2: FloatArray, masked: BoolArray
+) -> FloatArray:
+    """Smooth a background where its own counts are too few to tell it pixel by pixel.
+
+    Weights made of a pixel's own fluctuating background favour the pixels that happened to be dark
+    before, and those seem to have brightened.
+
+    Parameters
+    ----------
+    before_e : ndarray, shape (y, x)
+        Summed background [e].
+    variance_e2 : ndarray, shape (y, x)
+        Variance of its noise besides its shot noise [e²].
+    masked : ndarray of bool, shape (y, x)
+        Pixels whose counts say nothing.
+
+    Returns
+    -------
+    ndarray, shape (y, x)
+        Local mean, and beside it the structure that exceeds the noise twice, ≥ 0.
+
+    Notes
+    -----
+    The adaptive filter of J. S. Lee, IEEE Trans. Pattern Anal. 2, 165 (1980).
+    """
+    used = (~masked).astype(np.float64)
+    share = np.maximum(uniform_filter(used, _NEIGHBOURHOOD, mode="nearest"), 1e-3)
+    mean = uniform_filter(before_e * used, _NEIGHBOURHOOD, mode="nearest") / share
+    apart = (before_e - mean) * used
+    spread = uniform_filter(apart**2, _NEIGHBOURHOOD, mode="nearest") / share
+    noise = np.maximum(mean, 0.0) + variance_e2
+    structure = np.clip(1 - 2 * noise / np.maximum(spread, 1e-300), 0.0, 1.0)
+    smooth: FloatArray = np.maximum(mean + structure * apart, 0.0)
+    return smooth
+
+
 def _check_ranges(
     stack: FrameSource, before: tuple[int, int] | None, after: tuple[int, int]
 ) -> None:
@@ -255,26 +295,33 @@ def _sum_frames(
     return _Sum(sum_e, np.concatenate(totals), saturated)
 
 
-def _median(stack: FrameSource, camera: Camera, span: tuple[int, int]) -> FloatArray:
-    """Per-pixel median over the frames, a band of rows at a time."""
+def _median(
+    stack: FrameSource, camera: Camera, span: tuple[int, int], power: FloatArray | None
+) -> FloatArray:
+    """Per-pixel median over the frames, a band of rows at a time, each frame over its power."""
     _, rows, columns = stack.shape
     frames = span[1] - span[0]
     band = max(1, _BLOCK_BYTES // (8 * frames * columns))
+    level = (np.ones(frames) if power is None else power)[:, None, None]
     out = np.empty((rows, columns))
     for top in range(0, rows, band):
-        counts = [
-            stack.read(start, stop)[:, top : top + band]
+        electrons = [
+            camera.to_electrons(stack.read(start, stop))[:, top : top + band]
             for start, stop in _blocks(stack.shape, span)
         ]
-        out[top : top + band] = np.median(np.concatenate(counts), axis=0)
-    return camera.to_electrons(out)
+        out[top : top + band] = np.median(np.concatenate(electrons) / level, axis=0)
+    return out
 
 
 def _defects(before_e: FloatArray, read_variance_e2: FloatArray) -> BoolArray:
     local = np.maximum(median_filter(before_e, size=5, mode="nearest"), 0.0)
     off = (before_e < DEAD * local) | (before_e > HOT * local)
-    noise = np.sqrt(np.maximum(local, 1.0) + read_variance_e2)
-    return np.asarray(off & (np.abs(before_e - local) > DEFECT_SIGMAS * noise), dtype=bool)
+    # Anscombe's transform makes the noise 1 at every level, a few counts included.
+    steady, expected = (
+        2 * np.sqrt(np.maximum(counts + 0.375 + read_variance_e2, 0.0))
+        for counts in (before_e, local)
+    )
+    return np.asarray(off & (np.abs(steady - expected) > DEFECT_SIGMAS), dtype=bool)
 
 
 def _frame_power(before_e: FloatArray, after_e: FloatArray) -> FloatArray:

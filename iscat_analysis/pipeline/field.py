@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.background import refine_power
+from iscat_analysis.background import refine_power, smooth_background
 from iscat_analysis.config import Config
 from iscat_analysis.detect import Templates, find_particles, make_templates
 from iscat_analysis.errors import ConfigError
@@ -275,9 +275,11 @@ def region_likelihood(
             masked=masked,
         )  # fmt: skip
     measured = {"mean": 1.0, "median": math.pi / 2, "none": 0.0}[config.background.method]
-    extra = windows.read_variance_after_e2[cut] + ratio**2 * (
-        measured * before + windows.read_variance_before_e2[cut]
-    )
+    read = windows.read_variance_before_e2[cut]
+    steady = smooth_background(before, read, masked) if measured else before
+    # The expected variance is that of the smooth background; the excess is that over the own one.
+    extra = windows.read_variance_after_e2[cut] + ratio**2 * (measured * steady + read)
+    extra = extra + ratio * (steady - before)
     background = ratio * before
     if scene.additive:
         scale = photons_scale(scene, windows)

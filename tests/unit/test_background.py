@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import Stack
 
-from iscat_analysis.background import measure_windows, refine_power
+from iscat_analysis.background import measure_windows, refine_power, smooth_background
 from iscat_analysis.camera import Camera
 from iscat_analysis.errors import DataError
 
@@ -133,11 +133,26 @@ def test_without_normalisation_the_frames_are_counted() -> None:
 def test_the_median_forgets_a_visitor() -> None:
     stack, _ = _movie(4, power_noise=0.0)
     stack.counts[5:11, 20:24, 20:24] *= 3
-    windows = measure_windows(stack, Camera(offset_adu=7.0), BEFORE, AFTER, method="median")
+    camera = Camera(offset_adu=7.0)
+    windows = measure_windows(
+        stack, camera, BEFORE, AFTER, method="median", power_normalization=False
+    )
     expected = 30 * (np.median(stack.counts[:30], axis=0) - 7.0)
     np.testing.assert_allclose(windows.before_e, expected)
-    mean = measure_windows(stack, Camera(offset_adu=7.0), BEFORE, AFTER)
+    mean = measure_windows(stack, camera, BEFORE, AFTER)
     assert mean.before_e[22, 22] > 1.2 * windows.before_e[22, 22]
+
+
+@pytest.mark.parametrize("power_noise", [0.0, 0.05])
+def test_the_median_scatters_as_a_median_of_shot_noise(power_noise: float) -> None:
+    """Whatever the laser does: variance π/2 times that of the mean, and no bias."""
+    stack, power = _movie(5, power_noise=power_noise)
+    windows = measure_windows(stack, Camera(), BEFORE, AFTER, method="median")
+    light = 2e3 * np.random.default_rng(2).uniform(0.7, 1.3, SHAPE) * power[:30].sum()
+    pulls = (windows.before_e - light) / np.sqrt(light * np.pi / 2)
+    # The median of 30 is not yet that of infinitely many: 2 % less.
+    assert pulls.std() == pytest.approx(1, abs=0.02 + SIGMAS / np.sqrt(2 * pulls.size))
+    assert abs(pulls.mean()) < SIGMAS / np.sqrt(pulls.size) + 0.03
 
 
 def test_a_known_background_needs_no_frames() -> None:
@@ -192,6 +207,23 @@ def test_the_noise_of_a_dark_background_is_no_defect(level: float, read_noise_e:
     camera = Camera(read_noise_e=read_noise_e)
     windows = measure_windows(Stack(frames), camera, BEFORE, AFTER)
     assert np.argwhere(windows.masked).tolist() == [[30, 31]]
+
+
+def test_a_faint_background_is_averaged_and_a_bright_one_kept() -> None:
+    rng = np.random.default_rng(8)
+    nothing = np.zeros(SHAPE)
+    masked = np.zeros(SHAPE, dtype=bool)
+    masked[10, 20] = True
+    faint = rng.poisson(3.0, SHAPE).astype(float)
+    faint[10, 20] = 1e6
+    smooth = smooth_background(faint, nothing, masked)
+    assert np.abs(smooth - 3).max() < 2.5
+    assert smooth.std() < 0.25 * np.sqrt(3)
+    read = 5.0 * rng.standard_normal(SHAPE)
+    assert (smooth_background(read, np.full(SHAPE, 25.0), ~masked) >= 0).all()
+    bright = rng.poisson(1e6 * rng.uniform(0.7, 1.3, SHAPE)).astype(float)
+    kept = smooth_background(bright, nothing, masked)
+    np.testing.assert_allclose(kept[~masked], bright[~masked], rtol=1e-3)
 
 
 # ---- ranges ----------------------------------------------------------------------------------
