@@ -140,6 +140,7 @@ def plan(
         optics = config if scale is None else config.model_copy(update={"calibration": None})
         highest = max(height, config.particle.height_nm)
         model = forward_model(optics, reach, z_max_nm=highest, like=like)
+        model = replace(model, z_range_nm=(height, height))  # one height needs no more
         model = model if scale is None else replace(model, scale=scale)
     mass = model.material.mass_kda
     theta = np.array([at.x_nm, at.y_nm, height, model.scale.amplitude(mass), 0.0])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -282,6 +282,7 @@ def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress =
         reach = max(_reach(one) for one in plans)
         heights = [_height(one) for one in plans]
         model = forward_model(config, reach, z_max_nm=max(*heights, config.particle.height_nm))
+        model = replace(model, z_range_nm=(min(heights), max(heights)))
 
     def stretch(part: list[Config]) -> list[dict[str, Any]]:
         found, like = [], None

@@ -256,3 +256,15 @@ def test_saturation_and_coarse_sampling_are_said() -> None:
 def test_plan_says_what_is_missing(sections: dict[str, dict[str, object]], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         plan(protein(**sections))
+
+
+def test_heights_outside_the_range_of_the_fit_are_exact() -> None:
+    """`fit.z_range_nm` bounds a fit, not what may be planned."""
+    wide = protein(particle={"height_nm": 500.0}, bounds={"z_nm": 20.0})
+    narrow = protein(
+        particle={"height_nm": 500.0}, bounds={"z_nm": 20.0}, fit={"z_range_nm": (400.0, 600.0)}
+    )
+    a, b = (bounds_report(config)["actual"]["crb_joint"] for config in (wide, narrow))
+    assert list(a.values()) == pytest.approx(list(b.values()), rel=1e-9)
+    found = scan(narrow, *parse_scan("z=20,800")).table
+    assert found["crb_joint_z_nm"][0] == pytest.approx(a["z_nm"], rel=1e-7)
