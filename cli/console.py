@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import signal
 import sys
 import threading
 import time
@@ -13,6 +14,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
@@ -212,7 +214,7 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
         where = f" ({category.__name__}, {Path(filename).name}:{lineno})" if debug else ""
         messages.notify(f"warning: {message}{where}")
 
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _termination_interrupts():
         warnings.showwarning = show
         try:
             yield
@@ -228,6 +230,30 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
             line, status = _verdict(error, debug=debug)
             messages.error(line)
             raise typer.Exit(status) from error
+
+
+@contextmanager
+def _termination_interrupts() -> Iterator[None]:
+    """Let a request to end (SIGTERM, SIGHUP) end the command as Ctrl-C does: tidied up."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        del frame
+        raise KeyboardInterrupt(f"by {signal.Signals(number).name}")
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    ours = [
+        number
+        for number in numbers
+        if threading.current_thread() is threading.main_thread()
+        and signal.getsignal(number) is signal.SIG_DFL  # SIGHUP is ignored under nohup
+    ]
+    for number in ours:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _verdict(error: Exception, *, debug: bool) -> tuple[str, int]:
@@ -253,7 +279,7 @@ def print_result(result: RenderableType) -> None:
         console = Console(
             highlight=False, markup=False, emoji=False, width=PLAIN_WIDTH, no_color=True
         )
-    with console.capture() as captured:
+    with _failing_once(sys.stdout), console.capture() as captured:
         console.print(result, soft_wrap=isinstance(result, str))
     _write(sys.stdout, "".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))
 
@@ -287,15 +313,31 @@ def _plain(value: Any) -> Any:
     return None if value != value else str(value)  # pandas' own missing values
 
 
-def _write(stream: TextIO, text: str) -> None:
-    try:
+def _write(stream: TextIO | None, text: str) -> None:
+    if stream is None:  # closed before the command began
+        return
+    with _failing_once(stream):
         stream.write(text)
         stream.flush()
-    except BrokenPipeError:
-        # The reader has left.  The work goes on, and later writes must not fail again.
+
+
+@contextmanager
+def _failing_once(stream: TextIO) -> Iterator[None]:
+    """Let a stream that cannot be written swallow what comes later, Python's last flush included.
+
+    A reader who has left is no failure, and there is nowhere to say that stderr fails.
+    """
+    try:
+        yield
+    except OSError as error:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
         os.close(nowhere)
+        if isinstance(error, BrokenPipeError) or stream is sys.stderr:
+            return
+        from iscat_analysis.errors import DataError
+
+        raise DataError(f"the results cannot be printed ({error.strerror})") from None
 
 
 def _one_line(text: str) -> str:

@@ -35,7 +35,8 @@ from iscat_analysis.records import (
     Windows,
     silent,
 )
-from iscat_analysis.report import check_output, write_report
+from iscat_analysis.report import write_report
+from iscat_analysis.report.output import claim_output
 
 DEPENDENCIES = (
     "numpy", "scipy", "numba", "tifffile", "emcee", "arviz", "pandas", "pyarrow", "matplotlib",
@@ -95,10 +96,10 @@ def fit_stack(
         The user stopped it; what was finished is in the folder.
     """
     folder = stack.with_suffix(".iscat") if out is None else out
-    check_output(folder, overwrite)
-    with open_stack(stack) as movie:
-        analysis = analyse(movie, config, progress=progress, notify=notify, command=command)
-    write_report(analysis, folder, overwrite=overwrite)
+    with claim_output(folder, overwrite):
+        with open_stack(stack) as movie:
+            analysis = analyse(movie, config, progress=progress, notify=notify, command=command)
+        write_report(analysis, folder, overwrite=overwrite)
     if analysis.summary["interrupted"]:
         notify(f"interrupted; what was finished is in {folder}")
         raise KeyboardInterrupt
@@ -137,8 +138,9 @@ def analyse(
         warnings.append(text)
         notify(text)
 
+    implied = movie.notes if config.camera.pixel_size_nm is None else ()
     config, notes = resolve_metadata(config, movie.metadata)
-    for note in notes:
+    for note in (*implied, *notes):
         tell(note)
     shape = (movie.shape[1], movie.shape[2])
     camera = camera_from_config(config.camera, shape, movie.dtype)

@@ -1,8 +1,18 @@
-"""An output folder that appears whole or not at all, and never eats what it did not write."""
+"""An output folder that appears whole or not at all, and never eats what it did not write.
+
+The folder is filled under a hidden name beside its own and renamed when it is complete.  One
+process at a time may do so: it holds a lock that the system releases however the process ends.
+Whoever holds the lock next removes what a killed process left, and puts back an earlier result
+that it had set aside.
+"""
 
 from __future__ import annotations
 
+import errno
+import hashlib
+import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -24,6 +34,10 @@ OUTPUT_NAMES = frozenset(
 """Everything `write_report` may leave in its folder."""
 
 _LITTER = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
+_BUILDING, _EARLIER, _LOCK = ".iscat-building.", ".iscat-earlier.", ".iscat-lock."
+_LONGEST_NAME = 200  # bytes; longer ones leave no room for the words above
+_NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
+_LOCK_ATTEMPTS = 100
 
 
 def check_output(
@@ -47,12 +61,13 @@ def check_output(
         The folder is a file, holds an earlier result and `overwrite` is false, or holds something
         else.
     """
+    target = _resolved(folder)
     try:
-        if not folder.exists():
+        if not target.exists():
             return
-        if not folder.is_dir():
+        if not target.is_dir():
             raise DataError(f"{folder}: is a file, not a folder; choose another --out")
-        entries = sorted(entry.name for entry in folder.iterdir() if entry.name not in _LITTER)
+        entries = sorted(entry.name for entry in target.iterdir() if entry.name not in _LITTER)
     except OSError as error:
         raise DataError(f"{folder}: cannot be read ({error.strerror})") from None
     foreign = [name for name in entries if name not in known]
@@ -66,6 +81,52 @@ def check_output(
             f"{folder}: holds an earlier result; add --overwrite to replace it, or choose "
             "another --out"
         )
+
+
+@contextmanager
+def claim_output(
+    folder: Path, overwrite: bool = False, *, known: Collection[str] = OUTPUT_NAMES
+) -> Iterator[None]:
+    """Hold an output folder for this process, before any work is done.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the results shall go; its parents are made.
+    overwrite : bool
+        Whether an earlier result there may be replaced.
+    known : collection of str
+        As in `check_output`.
+
+    Yields
+    ------
+    None
+
+    Raises
+    ------
+    DataError
+        As in `check_output`, or another run is about to write there, or the disk refuses.
+    """
+    check_output(folder, overwrite, known=known)
+    target = _resolved(folder)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        # What the lock file is called must not depend on who may write into the folder itself.
+        lock = target.parent / f"{_LOCK}{_short(target)}"
+        held = _acquire(lock, folder)
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be made ({error.strerror}); choose another --out"
+        ) from None
+    try:
+        if held is not None:
+            _recover(target)
+        check_output(folder, overwrite, known=known)
+        yield
+    finally:
+        if held is not None:
+            lock.unlink(missing_ok=True)  # while it is held, so that nobody waits for a dead name
+            os.close(held)
 
 
 @contextmanager
@@ -93,24 +154,99 @@ def atomic_folder(
     DataError
         As in `check_output`, or the disk refuses.
     """
-    check_output(folder, overwrite, known=known)
-    target = folder.resolve()
+    with claim_output(folder, overwrite, known=known):
+        target = _resolved(folder)
+        try:
+            building = _hidden(_BUILDING, target)
+        except OSError as error:
+            raise DataError(
+                f"{folder}: cannot be made ({error.strerror}); choose another --out"
+            ) from None
+        try:
+            yield building
+            _like_an_ordinary_folder(building)
+            check_output(folder, overwrite, known=known)
+            _swap(building, target)
+        except OSError as error:
+            raise DataError(f"{folder}: cannot be written ({error.strerror or error})") from error
+        finally:
+            shutil.rmtree(building, ignore_errors=True)
+
+
+def _resolved(folder: Path) -> Path:
+    """Find the real place: ``new/..`` is the folder it names, whether ``new`` exists or not."""
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        building = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-    except OSError as error:
-        raise DataError(
-            f"{folder}: cannot be made ({error.strerror}); choose another --out"
-        ) from None
-    try:
-        yield building
-        _like_an_ordinary_folder(building)
-        check_output(folder, overwrite, known=known)
-        _swap(building, target)
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be written ({error.strerror or error})") from error
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
+        return folder.resolve()
+    except (OSError, RuntimeError) as error:  # RuntimeError: links in a circle, before 3.13
+        raise DataError(f"{folder}: cannot be found ({error}); choose another --out") from None
+
+
+def _short(target: Path) -> str:
+    """Name of the target, or a number in its place where hidden names would become too long."""
+    raw = os.fsencode(target.name)
+    return target.name if len(raw) <= _LONGEST_NAME else hashlib.sha256(raw).hexdigest()
+
+
+def _hidden(kind: str, target: Path) -> Path:
+    return Path(tempfile.mkdtemp(prefix=kind, suffix=f".{_short(target)}", dir=target.parent))
+
+
+if sys.platform == "win32":  # no lock there: two runs into one folder race for the last rename
+
+    def _acquire(lock: Path, folder: Path) -> int | None:
+        del lock, folder
+        return None
+
+else:
+    import fcntl
+
+    def _acquire(lock: Path, folder: Path) -> int | None:
+        """Take the lock; None where this process has it already, or the disk knows no locks."""
+        for _ in range(_LOCK_ATTEMPTS):
+            handle = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                owner = os.read(handle, 20).decode("ascii", "replace").strip()
+                os.close(handle)
+                if owner == str(os.getpid()):
+                    return None
+                who = f" (process {owner})" if owner else ""
+                raise DataError(
+                    f"{folder}: another run{who} is about to write there; wait for it, or choose "
+                    "another --out"
+                ) from None
+            except OSError as error:
+                os.close(handle)
+                if error.errno in _NO_LOCKS:
+                    return None
+                raise
+            if _is_still(lock, handle):
+                os.ftruncate(handle, 0)
+                os.write(handle, str(os.getpid()).encode())
+                return handle
+            os.close(handle)  # its last owner removed it between our two steps
+        raise DataError(f"{folder}: other runs keep writing there; choose another --out")
+
+    def _is_still(lock: Path, handle: int) -> bool:
+        try:
+            return os.path.samestat(lock.stat(), os.fstat(handle))
+        except FileNotFoundError:
+            return False
+
+
+def _recover(target: Path) -> None:
+    """Remove what a killed run left beside the target, and put an earlier result back."""
+    end = f".{_short(target)}"
+    for entry in list(target.parent.iterdir()):
+        for kind in (_BUILDING, _EARLIER):
+            middle = entry.name.removeprefix(kind).removesuffix(end)
+            if entry.name != f"{kind}{middle}{end}" or not middle or "." in middle:
+                continue
+            kept = entry / target.name
+            if kind == _EARLIER and kept.is_dir() and not target.exists():
+                kept.rename(target)
+            shutil.rmtree(entry, ignore_errors=True)
 
 
 def _like_an_ordinary_folder(folder: Path) -> None:
@@ -122,16 +258,17 @@ def _like_an_ordinary_folder(folder: Path) -> None:
 
 
 def _swap(building: Path, target: Path) -> None:
+    """Put a complete folder in place; an interrupt at any point loses neither result."""
     if not target.exists():
         building.rename(target)
         return
-    earlier = Path(tempfile.mkdtemp(prefix=f".{target.name}.earlier.", dir=target.parent))
+    earlier = _hidden(_EARLIER, target)
+    kept = earlier / target.name
     try:
-        target.rename(earlier / target.name)
-        try:
-            building.rename(target)
-        except OSError:
-            (earlier / target.name).rename(target)
-            raise
+        target.rename(kept)
+        building.rename(target)
     finally:
-        shutil.rmtree(earlier, ignore_errors=True)
+        if kept.exists() and not target.exists():
+            kept.rename(target)
+        if target.exists():
+            shutil.rmtree(earlier, ignore_errors=True)
