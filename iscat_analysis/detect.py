@@ -29,6 +29,9 @@ SIDELOBE = 0.5
 """A weaker peak inside the fitted region of a stronger one waits until that one is subtracted,
 unless it reaches this share of it."""
 
+FAR_LOBE = 0.05
+"""The same beyond the region, where the rings go on: 3 % of the peak at 3 µm."""
+
 
 @dataclass(frozen=True)
 class Templates:
@@ -167,8 +170,8 @@ def find_particles(
 ) -> tuple[Candidate, ...]:
     """Peaks of the matched filter above the threshold, strongest first.
 
-    A peak inside the region of a much stronger one may be its side lobe and is held back; call
-    again with the strong one explained.
+    A peak much weaker than another may be its side lobe and is held back, a little weaker inside
+    its region, far weaker anywhere; call again with the strong one explained.
 
     Parameters
     ----------
@@ -204,8 +207,13 @@ def find_particles(
     for row, column in zip(rows[strongest_first], columns[strongest_first], strict=True):
         height = best[row, column]
         shadowed = any(
-            max(abs(column - other.x_px), abs(row - other.y_px)) < roi_px
-            and height < SIDELOBE * abs(other.snr)
+            height
+            < abs(other.snr)
+            * (
+                SIDELOBE
+                if max(abs(column - other.x_px), abs(row - other.y_px)) < roi_px
+                else FAR_LOBE
+            )
             for other in found
         ) or any(math.hypot(column - other.x_px, row - other.y_px) < roi_px / 6 for other in found)
         if shadowed:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -109,3 +109,14 @@ class Light:
                 power=self.power,
             )
         )
+
+
+def blank(windows: Windows, rng: np.random.Generator) -> Windows:
+    """Draw both sums anew from a flat background without particles."""
+    level = float(windows.before_e.mean())
+    shape = windows.before_e.shape
+    return replace(
+        windows,
+        before_e=rng.poisson(level, shape).astype(float),
+        after_e=rng.poisson(windows.power_ratio * level, shape).astype(float),
+    )
