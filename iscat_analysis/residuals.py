@@ -41,6 +41,7 @@ POOLED_COUNTS = 5.0
 MANY_COUNTS = 1e6
 """Counts above which tails are normal: 5 σ out to a few per cent."""
 
+_DARK = 1e-100  # expected light below which a pixel knows nothing of relative changes
 _TESTS = 3
 _NARROWEST = 0.1  # variance of a sum of squares over that of normal residuals, at least
 _SUSPECTS = 8  # largest residuals whose exact tail is looked up
@@ -182,7 +183,7 @@ def _look(likelihood: Likelihood, theta: FloatArray) -> _View:
         total, share = None, np.ones(s.size)
         weight = light / np.sqrt(rate)
         residual = (c0 - rate) / np.sqrt(rate)
-        relative = c2 * level / light
+        relative = c2 * level / np.where(light > _DARK, light, math.inf)
     return _View(c0, rate, total, share, residual, weight, relative, gradient[:, used], used)
 
 

@@ -17,8 +17,8 @@ PHOTONS = 3000.0
 ATTENUATION = {"iscat": 1.0, "cobri": 0.1, "darkfield": 1.0}
 
 
-def configuration(scheme: str = "iscat", **sections: dict[str, Any]) -> Config:
-    """Protein of 1 MDa under an oil objective; sections override key by key."""
+def configuration(scheme: str = "iscat", **sections: dict[str, Any] | None) -> Config:
+    """Protein of 1 MDa under an oil objective; sections override key by key, None drops one."""
     base: dict[str, dict[str, Any]] = {
         "optics": {
             "wavelength_nm": 525.0,
@@ -36,7 +36,10 @@ def configuration(scheme: str = "iscat", **sections: dict[str, Any]) -> Config:
     if scheme == "iscat":
         base["calibration"] = {"gradient_per_kda": -3.1e-5}
     for name, keys in sections.items():
-        base[name] = {**base.get(name, {}), **keys}
+        if keys is None:
+            base.pop(name, None)
+        else:
+            base[name] = {**base.get(name, {}), **keys}
     return parse_config(base)
 
 
@@ -45,7 +48,7 @@ def setting(
     mode: str = "joint",
     photons: float = PHOTONS,
     z_nm: float | None = None,
-    **sections: dict[str, Any],
+    **sections: dict[str, Any] | None,
 ) -> Setting:
     """One experiment with a number of collected scattered photons."""
     return make_setting(configuration(scheme, **sections), mode, collected=photons, z_nm=z_nm)

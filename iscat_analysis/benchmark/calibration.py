@@ -139,7 +139,7 @@ def calibrate_posterior(
         fisher = likelihood.score_fisher(theta)[2][np.ix_(index, index)]
         unit = np.where(np.array(index) == 3, abs(model.scale.slope(theta[3])), 1.0)
         widths[i] = samples.std(axis=0) / (np.sqrt(np.diag(np.linalg.inv(fisher))) * unit)
-        for band, (low, high) in enumerate(((15.8655, 84.1345), (2.275, 97.725))):
+        for band, (low, high) in enumerate(((15.8655, 84.1345), (2.5, 97.5))):
             ends = np.percentile(samples, [low, high], axis=0)
             inside[band, i] = (ends[0] <= truth[index]) & (truth[index] <= ends[1])
         return True

@@ -45,7 +45,7 @@ class Score:
     spread_over_crb_ci95, spread_over_qcrb_ci95 : (float, float)
         Their intervals.
     coverage68, coverage95 : float
-        Share of trials whose truth lies within one and two stated σ (68.27 % and 95.45 %).
+        Share of trials whose truth lies within 1 and 1.96 stated σ; 68.3 % and 95 % if σ is right.
     pull_mean, pull_std : float
         Of (estimate − truth)/σ.
     """
@@ -101,7 +101,10 @@ def score(error: FloatArray, sigma: FloatArray, crb: float, qcrb: float) -> Scor
     interval = spread_interval(error)
     quartiles = np.quantile(error, [0.25, 0.75])
     pull = (error / sigma)[np.isfinite(sigma)]
-    inside = [float(np.mean(np.abs(pull) < k)) if pull.size else math.nan for k in (1, 2)]
+    inside = [
+        float(np.mean(np.abs(pull) < k)) if pull.size else math.nan
+        for k in (1.0, float(norm.ppf(0.975)))
+    ]
     return Score(
         bias=float(np.mean(error)),
         bias_se=spread / math.sqrt(n),

@@ -39,6 +39,9 @@ PHOTONS = (100.0, 300.0, 1e3, 3e3, 1e4, 3e4)
 HEIGHTS = 9
 """Heights of the second curve, spread over ``fit.z_range_nm``."""
 
+FINE_HEIGHTS = 161
+"""Heights at which the bounds are drawn."""
+
 CURVE_SHARE = 4
 """A point of a curve has this many times fewer trials than the table."""
 
@@ -134,9 +137,12 @@ def run_benchmark(
             name: pull_histogram(_pull(found, PARAMETERS.index(name))) for name in setting.free
         }
         histograms["ranks"][mode] = _rank_histograms(ranked)
+        faintest = make_setting(config, mode, collected=PHOTONS[0], scene=setting.scene)
+        clear = float(faintest.truth[2])  # of the range's ends, for any of the photons
         curves["photons"][mode] = _curve(
             list(PHOTONS),
-            [make_setting(config, mode, collected=n, scene=setting.scene) for n in PHOTONS],
+            [make_setting(config, mode, collected=n, z_nm=clear, scene=setting.scene)
+             for n in PHOTONS],
             fewer, seed, stream + 10, threads, tally,
         )  # fmt: skip
         heights = _heights(config)
@@ -145,6 +151,7 @@ def run_benchmark(
             [make_setting(config, mode, z_nm=z, scene=setting.scene) for z in heights],
             fewer, seed, stream + 40, threads, tally,
         )  # fmt: skip
+        curves["z"][mode]["bounds"] = _bounds_along(config, setting)
     return {
         **study,
         "curves": curves,
@@ -300,6 +307,23 @@ def _curve(
             line["crb"].append(float(bounds.crb_joint[k]))
             line["qcrb"].append(float(bounds.qcrb[k]))
     return {**out, **lines}
+
+
+def _bounds_along(config: Config, setting: Setting) -> dict[str, Any]:
+    """Tabulate the bounds between the heights of the curve: fringes are narrower than its steps."""
+    heights = np.linspace(*config.fit.z_range_nm, FINE_HEIGHTS)
+    bounds = [
+        make_setting(config, setting.mode, z_nm=float(z), scene=setting.scene).bounds
+        for z in heights
+    ]
+    lines = {
+        name: {
+            "crb": [float(b.crb_joint[PARAMETERS.index(name)]) for b in bounds],
+            "qcrb": [float(b.qcrb[PARAMETERS.index(name)]) for b in bounds],
+        }
+        for name in setting.free
+    }
+    return {"at": heights.tolist(), **lines}
 
 
 def _heights(config: Config) -> list[float]:

@@ -158,16 +158,22 @@ def _mode_section(study: Mapping[str, Any], mode: str) -> dict[str, Any]:
         *(_pull_chart(study, mode, name) for name in names),
         *(_rank_chart(study, mode, name) for name in names if study["histograms"]["ranks"][mode]),
     ]
-    flags = ", ".join(f"{n} {flag}" for flag, n in entry["flagged"].items() if n) or "none flagged"
+    flags = (
+        ", ".join(f"{n} {flag.replace('_', ' ')}" for flag, n in entry["flagged"].items() if n)
+        or "none"
+    )
+    lead = (
+        f"{at['mass_kda']:,.0f} kDa at z = {at['z_nm']:.3g} nm, focus at {at['focus_nm']:.0f} nm; "
+        f"{at['n_scattered']['collected']:,.0f} scattered photons collected; "
+        f"{at['pixels']} × {at['pixels']} pixels of {at['pixel_size_nm']:.4g} nm; "
+        f"{at['n_before']} frames before and {at['n_after']} after landing. "
+        f"{entry['fits_per_second']:.0f} fits per second of processor time; flagged: {flags}."
+    )
     return {
         "id": mode,
         "short": mode.capitalize(),
         "title": _TITLES[mode],
-        "lead": f"{at['mass_kda']:.4g} kDa at z = {at['z_nm']:.4g} nm, focus {at['focus_nm']:.4g} "
-        f"nm; {at['n_scattered']['collected']:.3g} scattered photons collected; "
-        f"{at['pixels']} × {at['pixels']} pixels of {at['pixel_size_nm']:.4g} nm; "
-        f"{at['n_before']} frames before and {at['n_after']} after landing. "
-        f"{entry['fits_per_second']:.0f} fits per second and thread; {flags}.",
+        "lead": lead.replace("-", "−"),
         "tables": [
             {
                 "caption": "Achieved and possible",
@@ -179,7 +185,7 @@ def _mode_section(study: Mapping[str, Any], mode: str) -> dict[str, Any]:
                     _number("CRB"),
                     _number("QCRB"),
                     _number("coverage 68 %", "share of truths within one stated σ"),
-                    _number("95 %", "share of truths within two stated σ"),
+                    _number("95 %", "share of truths within 1.96 stated σ"),
                     _number("pull mean"),
                     _number("pull σ"),
                     _number("posterior 68 %", "share of truths inside the credible interval"),
@@ -214,10 +220,18 @@ def _curve_chart(study: Mapping[str, Any], mode: str, axis: str, name: str) -> d
     curve = study["curves"][axis][mode]
     label, scale = _AXES[axis]
     line, x = curve[name], curve["at"]
+    fine = curve.get("bounds", curve)
     y_axis = {"label": f"σ of {LABELS[name]} [{UNITS[name]}]", "scale": "log"}
     series: list[dict[str, Any]] = [
-        {"kind": "line", "name": "CRB", "color": "crb", "x": x, "y": line["crb"]},
-        {"kind": "line", "name": "QCRB", "color": "qcrb", "x": x, "y": line["qcrb"], "dash": True},
+        {"kind": "line", "name": "CRB", "color": "crb", "x": fine["at"], "y": fine[name]["crb"]},
+        {
+            "kind": "line",
+            "name": "QCRB",
+            "color": "qcrb",
+            "x": fine["at"],
+            "y": fine[name]["qcrb"],
+            "dash": True,
+        },
         {"kind": "points", "name": "spread", "color": "sigma", "x": x, "y": line["spread"]},
     ]
     along = "photons" if axis == "photons" else "height"
@@ -317,8 +331,10 @@ def _panels(stem: Path, mode: str, draw: Callable[[Axes, str], None]) -> None:
 def _draw_curve(axis: str, curve: Mapping[str, Any], axes: Axes, name: str) -> None:
     label, scale = _AXES[axis]
     x, line = np.asarray(curve["at"], float), curve[name]
-    axes.plot(x, _floats(line["crb"]), color=INK, label="CRB")
-    axes.plot(x, _floats(line["qcrb"]), color=BLUE, linestyle="--", label="QCRB")
+    fine = curve.get("bounds", curve)
+    at = np.asarray(fine["at"], float)
+    axes.plot(at, _floats(fine[name]["crb"]), color=INK, label="CRB")
+    axes.plot(at, _floats(fine[name]["qcrb"]), color=BLUE, linestyle="--", label="QCRB")
     spread = _floats(line["spread"])
     ends = np.array([_floats(pair) for pair in line["spread_ci95"]]).T
     reach = np.maximum(np.stack([spread - ends[0], ends[1] - spread]), 0)
@@ -337,6 +353,7 @@ def _draw_pulls(found: Mapping[str, Any], axes: Axes, name: str) -> None:
     edges = np.asarray(bins["edges"], float)
     axes.stairs(_floats(bins["counts"]), edges, fill=True, color=VERMILLION, label="fits")
     axes.plot((edges[1:] + edges[:-1]) / 2, _floats(bins["expected"]), color=INK, label="normal")
+    axes.set_ylim(0, 1.25 * max(_floats(bins["counts"]).max(), 1.0))
     axes.set_xlabel("(estimate − truth) / σ")
     axes.set_ylabel("fits")
 
@@ -347,8 +364,8 @@ def _draw_ranks(found: Mapping[str, Any], axes: Axes, name: str) -> None:
     edges = np.linspace(0, bins["possible"], counts.size + 1)
     axes.stairs(counts, edges, fill=True, color=BLUE, label="posteriors")
     axes.axhline(float(counts.mean()), color=INK, linewidth=1, label="uniform")
-    axes.text(0.98, 0.03, f"p = {bins['p_value']:.2g}", transform=axes.transAxes, ha="right",
-              color="white", fontweight="bold", fontsize=8)  # fmt: skip
+    axes.set_title(f"p = {bins['p_value']:.2g}", loc="right", fontsize=8)
+    axes.set_ylim(0, 1.25 * max(counts.max(), 1.0))
     axes.set_xlabel("rank of the truth")
     axes.set_ylabel("posteriors")
 
