@@ -8,18 +8,29 @@ import io
 import os
 import pkgutil
 import re
+import shutil
+import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+
 import iscat_analysis
-from iscat_analysis.config import config_to_toml, load_config
+from iscat_analysis.schemas import schema, schema_names
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE))
+
+from blocks import blocks_of, prepare, run_page  # noqa: E402
 
 project = "iscat-analysis"
 author = "The iscat-analysis developers"
 copyright = author
 version = release = importlib.metadata.version("iscat-analysis")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build"]
 myst_enable_extensions = ["dollarmath", "deflist"]
@@ -33,21 +44,61 @@ suppress_warnings = ["ref.python"]
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 html_theme = "alabaster"
-html_theme_options = {"description": "Position, mass and their bounds", "page_width": "1080px"}
+html_static_path = ["static"]
+html_css_files = ["manual.css"]
+html_math_renderer = "mathml"
+html_show_sourcelink = False
+html_sidebars = {"**": ["about.html", "searchbox.html", "navigation.html"]}
+html_theme_options = {
+    "description": "Position, mass and their bounds",
+    "page_width": "1080px",
+    "sidebar_width": "240px",
+    "fixed_sidebar": True,
+    "show_powered_by": False,
+}
 
-GENERATED = Path(__file__).parent / "_build" / "generated"
+GENERATED = HERE / "_build" / "generated"
+PROGRAMS = Path(sys.executable).parent
 
 
 def _write_reference() -> None:
     GENERATED.mkdir(parents=True, exist_ok=True)
-    (GENERATED / "configuration.toml").write_text(config_to_toml(load_config()), encoding="utf-8")
+    _write_configuration()
+    _write_library()
+    _write_commands()
+    _write_schemas()
 
+
+def _said(*arguments: str) -> str:
+    from iscat_cli import main
+
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        main(list(arguments))
+    return "\n".join(line.rstrip() for line in said.getvalue().splitlines()).strip("\n") + "\n"
+
+
+def _write_configuration() -> None:
+    (GENERATED / "configuration.toml").write_text(_said("config"), encoding="utf-8")
+
+
+def _write_library() -> None:
+    public = [name for name in iscat_analysis.__all__ if callable(getattr(iscat_analysis, name))]
+    public.sort(key=lambda name: list(iscat_analysis._HOME).index(name))
+    blocks = [
+        "The public list\n---------------\n\n.. automodule:: iscat_analysis\n",
+        ".. list-table::\n   :widths: 25 75\n\n"
+        + "\n".join(
+            f"   * - `{name}`\n     - {(getattr(iscat_analysis, name).__doc__ or '').splitlines()[0]}"
+            for name in public
+        ),
+    ]
     modules = sorted(
         info.name
         for info in pkgutil.iter_modules(iscat_analysis.__path__, "iscat_analysis.")
         if not info.name.split(".")[-1].startswith("_")
     )
-    blocks = []
+    modules.sort(key=lambda name: name != "iscat_analysis.notebook")
     for name in modules:
         title = f"``{name}``"
         members = "   :members:\n   :show-inheritance:\n"
@@ -56,16 +107,63 @@ def _write_reference() -> None:
         blocks.append(f"{title}\n{'-' * len(title)}\n\n.. automodule:: {name}\n{members}")
     (GENERATED / "library.rst").write_text("\n\n".join(blocks), encoding="utf-8")
 
-    from iscat_cli import main
+
+def _write_commands() -> None:
     from iscat_cli.app import COMMANDS
 
-    os.environ["TERMINAL_WIDTH"] = os.environ["COLUMNS"] = "96"
-    for command, _ in COMMANDS:
-        said = io.StringIO()
-        with contextlib.redirect_stdout(said):
-            main([command.__name__, "--help"])
-        text = "\n".join(line.rstrip() for line in said.getvalue().splitlines()).strip("\n")
-        (GENERATED / f"{command.__name__}.txt").write_text(text + "\n", encoding="utf-8")
+    os.environ["TERMINAL_WIDTH"] = os.environ["COLUMNS"] = "84"
+    pages = [
+        f"## iscat {command.__name__}\n\n```none\n{_said(command.__name__, '--help')}```\n"
+        for command, _ in COMMANDS
+    ]
+    (GENERATED / "commands.md").write_text("\n".join(pages), encoding="utf-8")
+
+
+def _write_schemas() -> None:
+    pages = []
+    for name in schema_names():
+        text = schema(name)
+        pages.append(f"## {text['title']}\n\n{text['description']}\n")
+        pages.append("| key | type | meaning |\n|---|---|---|")
+        for key, about in text["properties"].items():
+            kind = about.get("type", "one of a list" if "enum" in about else "any")
+            kind = " or ".join(kind) if isinstance(kind, list) else kind
+            missing = "" if key in text.get("required", ()) else "; may be absent"
+            pages.append(f"| `{key}` | {kind}{missing} | {about.get('description', '')} |")
+        pages.append("")
+    (GENERATED / "schemas.md").write_text("\n".join(pages), encoding="utf-8")
+
+
+def _run_pages() -> None:
+    """Run the pages that show what their blocks print or draw."""
+    for page in sorted(HERE.rglob("*.md")):
+        if "_build" in page.parts or not any(block.keep for block in blocks_of(page)):
+            continue
+        target = GENERATED / page.stem
+        shutil.rmtree(target, ignore_errors=True)
+        target.mkdir(parents=True)
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            prepare(HERE.parent, folder)
+            for outcome in run_page(page, folder, PROGRAMS):
+                if outcome.failed:
+                    raise RuntimeError(f"{page}:{outcome.block.line}: {outcome.failed}")
+                if outcome.block.keep:
+                    kept = target / f"{outcome.block.keep}.txt"
+                    kept.write_text(outcome.out, encoding="utf-8")
+            for pattern in ("*.png", "*.iscat/figures/*.png", "scan/**/*.png"):
+                for picture in folder.glob(pattern):
+                    shutil.copy(picture, target / picture.name)
+
+
+def _inline_math(self: Any, node: nodes.math) -> None:
+    self.body.append(tex2mathml(node.astext(), as_block=False))
+    raise nodes.SkipNode
+
+
+def _display_math(self: Any, node: nodes.math_block) -> None:
+    self.body.append(f"<div class='math'>{tex2mathml(node.astext(), as_block=True)}</div>")
+    raise nodes.SkipNode
 
 
 LITERAL_OR_EMPHASIS = re.compile(
@@ -84,6 +182,8 @@ def _escape(_app: Any, _what: str, _name: str, _obj: Any, _options: Any, lines: 
 
 def setup(app: Any) -> None:
     """Write the generated pages and hook into autodoc."""
+    app.add_html_math_renderer("mathml", (_inline_math, None), (_display_math, None))
     _write_reference()
+    _run_pages()
     # Before napoleon, which adds markup of its own that must stay.
     app.connect("autodoc-process-docstring", _escape, priority=100)

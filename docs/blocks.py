@@ -1,0 +1,223 @@
+"""The manual's code blocks: found, run in order, and their output kept.
+
+A page's ``console`` blocks (lines that begin with ``$``) and ``python`` blocks are run one after
+the other in one folder, the Python blocks in one interpreter.  Comments in the page steer it:
+
+``<!-- not run: REASON -->``
+    before a block that needs what is not there.
+``<!-- first: COMMAND -->``
+    before a block: a command that is run and not shown.
+``<!-- keep: NAME -->``
+    before a block whose output the manual shows, as ``_build/generated/PAGE/NAME.txt``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+FENCE = re.compile(r"^(?P<indent> *)(?P<ticks>```+)(?P<language>[^`]*?)\s*$")
+COMMENT = re.compile(r"^ *<!-- (?P<kind>not run|first|keep): (?P<text>.*?) -->$")
+RUNNABLE = ("console", "python")
+
+
+@dataclass(frozen=True)
+class Block:
+    """One fenced block of a page."""
+
+    line: int
+    language: str
+    text: str
+    first: tuple[str, ...] = ()
+    not_run: str | None = None
+    keep: str | None = None
+
+    @property
+    def commands(self) -> list[str]:
+        """What a shell is given: the lines after ``$``, continued where they end in a backslash."""
+        found: list[str] = []
+        going_on = False
+        for line in self.text.splitlines():
+            if going_on:
+                found[-1] += "\n" + line
+            elif line.startswith("$ "):
+                found.append(line[2:])
+            else:
+                continue
+            going_on = line.endswith("\\")
+        return found
+
+
+@dataclass
+class Outcome:
+    """What a block printed."""
+
+    block: Block
+    out: str = ""
+    failed: str | None = None
+
+
+def blocks_of(page: Path) -> Iterator[Block]:
+    """Find the blocks of a page that could be run."""
+    lines = iter(enumerate(page.read_text(encoding="utf-8").splitlines(), start=1))
+    first: list[str] = []
+    not_run: str | None = None
+    keep: str | None = None
+    for number, line in lines:
+        comment, fence = COMMENT.match(line), FENCE.match(line)
+        if comment and comment["kind"] == "first":
+            first.append(comment["text"])
+        elif comment and comment["kind"] == "keep":
+            keep = comment["text"]
+        elif comment:
+            not_run = comment["text"]
+        elif fence:
+            body = []
+            for _, inner in lines:
+                if inner.strip() == fence["ticks"]:
+                    break
+                body.append(inner.removeprefix(fence["indent"]))
+            if fence["language"] in RUNNABLE:
+                text = "\n".join(body)
+                yield Block(number, fence["language"], text, tuple(first), not_run, keep)
+            first, not_run, keep = [], None, None
+
+
+def run_page(page: Path, folder: Path, bin_folder: Path) -> list[Outcome]:
+    """Run a page's blocks in a folder and stop at the first that fails.
+
+    Parameters
+    ----------
+    page : Path
+        Markdown.
+    folder : Path
+        Where; it should hold what the page takes for granted.
+    bin_folder : Path
+        Where `iscat` and `python` are.
+
+    Returns
+    -------
+    list of Outcome
+        One for each block that was run.
+    """
+    environment = os.environ | {
+        "PATH": f"{bin_folder}{os.pathsep}{os.environ['PATH']}",
+        "MPLBACKEND": "Agg",
+        "COLUMNS": "100",
+        "PYTHONWARNINGS": "error",
+    }
+    outcomes = []
+    with _Interpreter(bin_folder / "python", folder, environment) as interpreter:
+        for block in blocks_of(page):
+            if block.not_run is not None:
+                continue
+            outcome = Outcome(block)
+            outcomes.append(outcome)
+            shown = block.commands if block.language == "console" else []
+            for command in (*block.first, *shown):
+                done = subprocess.run(
+                    ["bash", "-e", "-o", "pipefail", "-c", command],
+                    cwd=folder, env=environment, text=True, check=False,
+                    stdin=subprocess.DEVNULL, capture_output=True,
+                )  # fmt: skip
+                outcome.out += done.stdout if command in shown else ""
+                if done.returncode:
+                    outcome.failed = f"{command}\n{done.stdout}{done.stderr}"
+                    return outcomes
+            if block.language == "python":
+                outcome.out, outcome.failed = interpreter.run(block.text)
+                if outcome.failed:
+                    return outcomes
+    return outcomes
+
+
+class _Interpreter:
+    """One Python process that runs snippet after snippet."""
+
+    LOOP = """
+import contextlib, io, json, sys, traceback
+names = {"__name__": "__main__"}
+for line in sys.stdin:
+    said, failed = io.StringIO(), None
+    with contextlib.redirect_stdout(said):
+        try:
+            exec(compile(json.loads(line), "<block>", "exec"), names)
+        except BaseException:
+            failed = traceback.format_exc()
+    print(json.dumps([said.getvalue(), failed]), flush=True)
+"""
+
+    def __init__(self, python: Path, folder: Path, environment: dict[str, str]) -> None:
+        self._arguments = ([str(python), "-c", self.LOOP], folder, environment)
+        self._process: subprocess.Popen[str] | None = None
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed with the interpreter
+
+    def __enter__(self) -> _Interpreter:
+        return self
+
+    def run(self, text: str) -> tuple[str, str | None]:
+        """Run a snippet; its output, and the traceback if it failed."""
+        if self._process is None:
+            arguments, folder, environment = self._arguments
+            self._process = subprocess.Popen(
+                arguments, cwd=folder, env=environment, text=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
+            )  # fmt: skip
+        process = self._process
+        if process.stdin is None or process.stdout is None:
+            raise RuntimeError("the interpreter has no pipes")
+        process.stdin.write(json.dumps(text) + "\n")
+        process.stdin.flush()
+        answer = process.stdout.readline()
+        if not answer:
+            self._errors.seek(0)
+            return "", self._errors.read() or "the interpreter ended"
+        out, failed = json.loads(answer)
+        return out, failed
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None:
+            self._process.communicate(timeout=60)
+        self._errors.close()
+
+
+def main() -> None:
+    """Run the pages named on the command line, each in a folder of its own, and say how it went."""
+    import shutil
+
+    root = Path(__file__).resolve().parent.parent
+    failures = 0
+    for name in sys.argv[1:]:
+        with tempfile.TemporaryDirectory() as folder:
+            prepare(root, Path(folder))
+            for outcome in run_page(Path(name), Path(folder), Path(sys.executable).parent):
+                head = f"{name}:{outcome.block.line}"
+                sys.stdout.write(f"== {head}\n{outcome.out}{outcome.failed or ''}\n")
+                failures += outcome.failed is not None
+            if kept := os.environ.get("KEEP"):
+                shutil.copytree(folder, kept, dirs_exist_ok=True)
+    raise SystemExit(failures)
+
+
+def prepare(root: Path, folder: Path) -> None:
+    """Put into a folder what every page takes for granted: the samples of the checkout."""
+    for name in ("sample_configs", "docs/tutorial.toml"):
+        source, target = root / name, folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_dir():
+            target.mkdir(exist_ok=True)
+            for path in source.glob("*.toml"):
+                (target / path.name).write_bytes(path.read_bytes())
+        else:
+            target.write_bytes(source.read_bytes())
+
+
+if __name__ == "__main__":
+    main()
