@@ -9,6 +9,7 @@ the stage when the particle moves, and are per collected photon, as the quantum 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -104,7 +105,7 @@ def paper_config(
     z_nm: float = HEIGHT_NM,
     focus_nm: float = 0.0,
     attenuation: float | None = None,
-    **optics: Any,  # keys of [optics], validated there
+    optics: Mapping[str, Any] | None = None,
 ) -> Config:
     """Set up D21's microscope.
 
@@ -118,7 +119,7 @@ def paper_config(
         Height and focus [nm].
     attenuation : float, optional
         Default that of Figs. 2 and 3.
-    **optics
+    optics : mapping, optional
         Further keys of ``[optics]``.
 
     Returns
@@ -133,7 +134,7 @@ def paper_config(
         {
             "optics": {
                 **OPTICS, "scheme": scheme, "focus_nm": focus_nm, "attenuation": attenuation,
-                "convention": convention, "axial": "refocus" if authors else "stage", **optics,
+                "convention": convention, "axial": "refocus" if authors else "stage", **(optics or {}),
             },
             "camera": {"pixel_size_nm": FIELD_NM / (PIXELS - 1 if authors else PIXELS)},
             "particle": {**PARTICLE, "height_nm": z_nm},
@@ -324,8 +325,8 @@ def _intensity(scheme: str, z_nm: float) -> FloatArray:
     return model.reference**2 * (1 + signal) if model.rho else signal
 
 
-def _model(scheme: str, **optics: Any) -> ForwardModel:  # as in paper_config
-    return forward_model(paper_config(scheme, **optics), 1.0)
+def _model(scheme: str, emission: str = "dong2021") -> ForwardModel:
+    return forward_model(paper_config(scheme, optics={"emission": emission}), 1.0)
 
 
 def table1() -> pd.DataFrame:

@@ -110,7 +110,9 @@ def test_the_authors_rule_counts_one_azimuth_twice() -> None:
 )
 def test_energy_conserving_bounds_at_na_142(scheme: str, index: int, value: float) -> None:
     config = paper_config(
-        scheme, z_nm=0.0, na=1.42, n_immersion=1.515, n_glass=1.515, emission="reciprocal"
+        scheme,
+        z_nm=0.0,
+        optics={"na": 1.42, "n_immersion": 1.515, "n_glass": 1.515, "emission": "reciprocal"},
     )
     model = forward_model(config, 100.0)
     single, _ = quantum_bounds(quantum_information(model, 0.0))
