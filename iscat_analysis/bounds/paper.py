@@ -134,7 +134,8 @@ def paper_config(
         {
             "optics": {
                 **OPTICS, "scheme": scheme, "focus_nm": focus_nm, "attenuation": attenuation,
-                "convention": convention, "axial": "refocus" if authors else "stage", **(optics or {}),
+                "convention": convention, "axial": "refocus" if authors else "stage",
+                **(optics or {}),
             },
             "camera": {"pixel_size_nm": FIELD_NM / (PIXELS - 1 if authors else PIXELS)},
             "particle": {**PARTICLE, "height_nm": z_nm},
