@@ -100,7 +100,7 @@ class MassScale:
         if self.calibration is None:
             return mass_kda
         line = self.calibration
-        contrast = line.gradient_per_kda * mass_kda + math.copysign(line.offset, mass_kda)
+        contrast = line.gradient_per_kda * mass_kda + math.copysign(1.0, mass_kda) * line.offset
         root = math.sqrt(max(self.linear**2 + 4 * self.quadratic * contrast, 0.0))
         return 2 * contrast / (self.linear + math.copysign(root, self.linear))
 
