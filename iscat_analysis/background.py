@@ -108,7 +108,7 @@ def measure_windows(
             first = replace(first, total_e=n_before * _median(stack, camera, before, level))
     second = _sum_frames(stack, camera, after, check, progress, start, total)
     saturated = first.saturated | second.saturated
-    masked = saturated | _defects(first.total_e, n_before * variance)
+    masked = saturated | find_defects(first.total_e, n_before * variance)
     windows = Windows(
         before_e=first.total_e,
         after_e=second.total_e,
@@ -313,7 +313,21 @@ def _median(
     return out
 
 
-def _defects(before_e: FloatArray, read_variance_e2: FloatArray) -> BoolArray:
+def find_defects(before_e: FloatArray, read_variance_e2: FloatArray) -> BoolArray:
+    """Dead and hot pixels: far from their neighbours' median, and not by noise.
+
+    Parameters
+    ----------
+    before_e : ndarray, shape (y, x)
+        Summed photoelectrons [e].
+    read_variance_e2 : ndarray, shape (y, x)
+        Read-noise variance of the sums [e²].
+
+    Returns
+    -------
+    ndarray of bool, shape (y, x)
+        The pixels to leave out.
+    """
     local = np.maximum(median_filter(before_e, size=5, mode="nearest"), 0.0)
     off = (before_e < DEAD * local) | (before_e > HOT * local)
     # Anscombe's transform makes the noise 1 at every level, a few counts included.

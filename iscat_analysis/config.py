@@ -168,7 +168,13 @@ class Particle(Section):
 class BackgroundConfig(Section):
     """The image without particles."""
 
-    frames: Frames | None = Field(None, description="pre-binding frames [start, stop)")
+    frames: Frames | None = Field(
+        None, description="pre-binding frames [start, stop); absent in landing movies"
+    )
+    window_frames: Annotated[int, Field(ge=4)] | None = Field(
+        None,
+        description="landing movies: frames before and after each step; absent: from the noise",
+    )
     method: Literal["mean", "median", "none"] = Field(
         "mean", description='"mean" | "median" | "none" (then level_e gives the known level)'
     )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.likelihood import Likelihood
+from iscat_analysis.likelihood import LEVEL, Likelihood
 from iscat_analysis.records import PARAMETERS
 
 FloatArray = NDArray[np.float64]
@@ -96,6 +96,7 @@ def event_bounds(
     collected: float,
     *,
     quantum: ComplexArray | None = None,
+    level: bool = False,
 ) -> EventBounds:
     """Classical and quantum bounds of one particle.
 
@@ -111,6 +112,8 @@ def event_bounds(
         Scattered photons that the pupil collects in all frames.
     quantum : complex ndarray, shape (4, 4), optional
         `quantum_information` of one photon at this height, where it is known already.
+    level : bool
+        Whether a common background level is fitted as well, as a nuisance.
 
     Returns
     -------
@@ -131,7 +134,10 @@ def event_bounds(
     slope = abs(model.scale.slope(theta[3]))
     relative = abs(theta[3]) * slope  # mass for a relative step of 1 [kDa]
     to_kda = np.array([1.0, 1.0, 1.0, 1 / slope])
-    fisher = likelihood.score_fisher(theta)[2][:4, :4] * np.outer(to_kda, to_kda)
+    whole = likelihood.score_fisher(theta)[2]
+    if level and whole[LEVEL, LEVEL] > 0:  # what is left once the level is fitted: Schur complement
+        whole = whole - np.outer(whole[:, LEVEL], whole[LEVEL]) / whole[LEVEL, LEVEL]
+    fisher = whole[:4, :4] * np.outer(to_kda, to_kda)
     per_kda = np.array([1.0, 1.0, 1.0, 1 / relative]) if relative else np.array([1.0] * 3 + [0.0])
     light = collected * quantum.real * np.outer(per_kda, per_kda)
     return bounds_from_matrices(fisher, light, free)

@@ -24,11 +24,14 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.likelihood import compile_kernels
 from iscat_analysis.load import Stack, open_stack
 from iscat_analysis.pipeline.field import Scene, field_likelihood, fit_field, make_scene
+from iscat_analysis.pipeline.landing import analyse_landings, has_landings
 from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
+from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
 from iscat_analysis.pipeline.tracking import track_particles
 from iscat_analysis.posterior import sample_posterior
 from iscat_analysis.records import (
     Analysis,
+    FloatArray,
     PosteriorResult,
     Progress,
     Provenance,
@@ -96,9 +99,17 @@ def fit_stack(
         The user stopped it; what was finished is in the folder.
     """
     folder = stack.with_suffix(".iscat") if out is None else out
+    overwrite = overwrite or is_resumable(folder)
     with claim_output(folder, overwrite):
         with open_stack(stack) as movie:
-            analysis = analyse(movie, config, progress=progress, notify=notify, command=command)
+            analysis = analyse(
+                movie,
+                config,
+                progress=progress,
+                notify=notify,
+                command=command,
+                partial=partial_folder(folder),
+            )
         write_report(analysis, folder, overwrite=overwrite)
     if analysis.summary["interrupted"]:
         notify(f"interrupted; what was finished is in {folder}")
@@ -113,6 +124,7 @@ def analyse(
     progress: Progress = silent,
     notify: Notify = _quiet,
     command: str = "",
+    partial: Path | None = None,
 ) -> Analysis:
     """Analyse an open movie.
 
@@ -124,6 +136,9 @@ def analyse(
         What to do.
     progress, notify, command
         As in `fit_stack`.
+    partial : Path, optional
+        Folder that keeps the finished chunks of a landing movie, so that an interrupted run can be
+        resumed; without it nothing is kept.
 
     Returns
     -------
@@ -144,52 +159,42 @@ def analyse(
         tell(note)
     shape = (movie.shape[1], movie.shape[2])
     camera = camera_from_config(config.camera, shape, movie.dtype)
-    before, after = frame_ranges(movie, config)
-    searches = after[1] - after[0] if config.fit.mode == "track" else 1
-    scene = make_scene(config, shape, searches=searches)
-    _warm_up(scene, notify)
-    clock.lap("model")
-
-    def check(counts: NDArray[Any], first: int) -> None:
-        check_counts(counts, first, movie.name, camera=camera)
-
-    windows = measure_windows(
-        movie,
-        camera,
-        before,
-        after,
-        method=config.background.method,
-        level_e=config.background.level_e,
-        power_normalization=config.background.power_normalization,
-        check=check,
-        progress=progress,
-    )
-    for text in _camera_warnings(movie, camera, windows):
-        tell(text)
-    clock.lap("background")
-    with ThreadPoolExecutor(config.compute.workers) as pool:
-        if scene.mode == "track":
-            found = track_particles(
-                scene, movie, camera, windows, check=check, pool=pool, progress=progress
-            )
-        else:
-            found = _bound_particles(scene, windows, clock, pool=pool, progress=progress)
+    hashing = ThreadPoolExecutor(1)
+    digest = hashing.submit(movie.sha256)
+    hashing.shutdown(wait=False)
+    further: dict[str, Any] = {}
+    if has_landings(config):
+        result = analyse_landings(
+            movie,
+            config,
+            camera,
+            tell=tell,
+            progress=progress,
+            prepare=lambda scene: _warm_up(scene, notify),
+            partial=partial,
+            identity=fingerprint(movie.path) if partial else "",
+        )
+        scene, image, further = result.scene, result.image, {"landing": result.summary}
+        found = Found(result.table, result.views, result.windows, result.interrupted)
+        config = scene.config
+        clock.lap("landing")
+    else:
+        scene, found, image = _measured_background(
+            movie, config, camera, clock, tell=tell, notify=notify, progress=progress
+        )
     windows = found.windows
-    image = field_likelihood(scene, windows).measured_signal()
-    if scene.additive:
-        image = windows.after_e - windows.power_ratio * windows.before_e
-    clock.lap("results")
     summary = summary_of(scene, found.table, windows, clock.seconds)
     sampled = config.posterior.enabled and scene.mode != "track"
     provenance = Provenance(
         command=command or "iscat_analysis.pipeline.analyse",
         input_path=str(movie.path),
-        input_sha256=movie.sha256(),
+        input_sha256=digest.result(),
         versions=_versions(),
         seed=config.simulation.seed if sampled else None,
         started=started,
     )
     summary |= {
+        **further,
         "input": {"path": provenance.input_path, "sha256": provenance.input_sha256},
         "seed": provenance.seed,
         "versions": dict(provenance.versions),
@@ -254,6 +259,56 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
             f"{start} of them, so none is left to fit; change background.frames"
         )
     return before, after
+
+
+def _measured_background(
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    clock: _Clock,
+    *,
+    tell: Notify,
+    notify: Notify,
+    progress: Progress,
+) -> tuple[Scene, Found, FloatArray]:
+    """Find particles against frames before they bound, or against a known background."""
+    shape = (movie.shape[1], movie.shape[2])
+    before, after = frame_ranges(movie, config)
+    searches = after[1] - after[0] if config.fit.mode == "track" else 1
+    scene = make_scene(config, shape, searches=searches)
+    _warm_up(scene, notify)
+    clock.lap("model")
+
+    def check(counts: NDArray[Any], first: int) -> None:
+        check_counts(counts, first, movie.name, camera=camera)
+
+    windows = measure_windows(
+        movie,
+        camera,
+        before,
+        after,
+        method=config.background.method,
+        level_e=config.background.level_e,
+        power_normalization=config.background.power_normalization,
+        check=check,
+        progress=progress,
+    )
+    for text in _camera_warnings(movie, camera, windows):
+        tell(text)
+    clock.lap("background")
+    with ThreadPoolExecutor(config.compute.workers) as pool:
+        if scene.mode == "track":
+            found = track_particles(
+                scene, movie, camera, windows, check=check, pool=pool, progress=progress
+            )
+        else:
+            found = _bound_particles(scene, windows, clock, pool=pool, progress=progress)
+    windows = found.windows
+    image = field_likelihood(scene, windows).measured_signal()
+    if scene.additive:
+        image = windows.after_e - windows.power_ratio * windows.before_e
+    clock.lap("results")
+    return scene, found, image
 
 
 def _bound_particles(

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.bounds import EventBounds, event_bounds
+from iscat_analysis.likelihood import LEVEL
 from iscat_analysis.pipeline.field import Event, Scene, photons_scale
 from iscat_analysis.records import (
     EVENT_COLUMNS,
@@ -107,7 +108,9 @@ def table_of(scene: Scene, rows: Sequence[Row]) -> pd.DataFrame:
 def _record(scene: Scene, row: Row) -> dict[str, Any]:
     fit, windows = row.event.fit, row.windows
     collected = collected_photons(scene, windows, row.event)
-    bounds: EventBounds = event_bounds(row.event.likelihood, fit.theta, fit.free, collected)
+    bounds: EventBounds = event_bounds(
+        row.event.likelihood, fit.theta, fit.free, collected, level=bool(fit.box.free[LEVEL])
+    )
     record: dict[str, Any] = {
         "event": row.number,
         "frame": windows.frames_after[0],

@@ -30,7 +30,8 @@ def event_table(analysis: Analysis) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        Columns `EVENT_COLUMNS` in that order; flags joined by ``;``, status as text.
+        Columns `EVENT_COLUMNS` in that order, then those that only some analyses have; flags
+        joined by ``;``, status as text.
 
     Raises
     ------
@@ -40,7 +41,8 @@ def event_table(analysis: Analysis) -> pd.DataFrame:
     missing = [name for name in EVENT_COLUMNS if name not in analysis.table.columns]
     if missing and len(analysis.table):
         raise ValueError(f"analysis.table lacks the columns {', '.join(missing)}")
-    table = analysis.table.reindex(columns=list(EVENT_COLUMNS)).reset_index(drop=True)
+    further = [name for name in analysis.table.columns if name not in EVENT_COLUMNS]
+    table = analysis.table.reindex(columns=[*EVENT_COLUMNS, *further]).reset_index(drop=True)
     for name in ("event", "frame", "n_before", "n_after"):
         table[name] = table[name].astype("int64")
     for name in EVENT_COLUMNS[4:-2]:

@@ -155,7 +155,7 @@ def test_fewer_frames_than_the_background_wants(span: str, refused: Run, movie: 
 
 
 def test_no_background_named(refused: Run, movie: Path) -> None:
-    line = refused(movie, status=USAGE, options=GOOD[:2])
+    line = refused(movie, options=GOOD[:2])  # too short for windows that slide
     assert "--background" in line
 
 

@@ -1,0 +1,212 @@
+"""Sums over frames and peaks of a sliding statistic: one pass over the counts, no copies."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+MapArray = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def block_sums(
+    counts: NDArray[Any],
+    good: BoolArray,
+    total: NDArray[Any],
+    sums: FloatArray,
+    highest: NDArray[Any],
+) -> None:
+    """Sum a block of frames.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Stored counts.
+    good : ndarray of bool, shape (t,)
+        Frames to take.
+    total : ndarray, shape (y, x)
+        Scratch in a type that holds a block's sum exactly.
+    sums : ndarray, shape (y, x)
+        Filled with the sum of the good frames.
+    highest : ndarray, shape (y, x)
+        Updated with the highest count of every pixel in the good frames.
+    """
+    frames, rows, columns = counts.shape
+    total[:] = 0
+    for t in range(frames):
+        if not good[t]:
+            continue
+        for i in range(rows):
+            for j in range(columns):
+                c = counts[t, i, j]
+                total[i, j] += c
+                highest[i, j] = max(highest[i, j], c)
+    for i in range(rows):
+        for j in range(columns):
+            sums[i, j] = total[i, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def frame_totals(counts: NDArray[Any], zero: Any, out: NDArray[Any], same: BoolArray) -> None:
+    """Sum every frame, and see whether it repeats the one before it.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Stored counts.
+    zero : int or float
+        0 in the type to sum in.
+    out : ndarray, shape (t,)
+        Filled with the sums.
+    same : ndarray of bool, shape (t,)
+        Filled; the first frame has none before it.
+    """
+    frames, rows, columns = counts.shape
+    for t in range(frames):
+        total = zero
+        for i in range(rows):
+            for j in range(columns):
+                total += counts[t, i, j]
+        out[t] = total
+        same[t] = False
+        if t > 0 and out[t - 1] == total:
+            same[t] = True
+            for i in range(rows):
+                for j in range(columns):
+                    if counts[t, i, j] != counts[t - 1, i, j]:
+                        same[t] = False
+                        break
+                if not same[t]:
+                    break
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def region_sum(
+    counts: NDArray[Any], good: BoolArray, row: int, column: int, out: FloatArray
+) -> None:
+    """Add a region of the good frames to `out`.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Stored counts.
+    good : ndarray of bool, shape (t,)
+        Frames to take.
+    row, column : int
+        First pixel of the region.
+    out : ndarray, shape (ny, nx)
+        Added to.
+    """
+    for t in range(counts.shape[0]):
+        if good[t]:
+            for i in range(out.shape[0]):
+                for j in range(out.shape[1]):
+                    out[i, j] += counts[t, row + i, column + j]
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def region_scores(
+    counts: NDArray[Any], row: int, column: int, weights: FloatArray, out: FloatArray
+) -> None:
+    """Weighted sum of a region of every frame.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Stored counts.
+    row, column : int
+        First pixel of the region.
+    weights : ndarray, shape (ny, nx)
+        Of the region's pixels.
+    out : ndarray, shape (t,)
+        Filled.
+    """
+    for t in range(counts.shape[0]):
+        total = 0.0
+        for i in range(weights.shape[0]):
+            for j in range(weights.shape[1]):
+                total += weights[i, j] * counts[t, row + i, column + j]
+        out[t] = total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def contrast_map(before: FloatArray, after: FloatArray, weight: MapArray, out: MapArray) -> float:
+    """Weighted contrast of two sums over the field, with its weighted mean taken off.
+
+    Parameters
+    ----------
+    before, after : ndarray, shape (y, x)
+        Photoelectrons.
+    weight : ndarray, shape (y, x)
+        Information of a pixel; 0 where it is not used.
+    out : ndarray, shape (y, x) or larger
+        Its corner is filled with weight·contrast.
+
+    Returns
+    -------
+    float
+        Power after over power before.
+    """
+    rows, columns = before.shape
+    total_before = 0.0
+    total_after = 0.0
+    for i in range(rows):
+        for j in range(columns):
+            if weight[i, j] > 0:
+                total_before += before[i, j]
+                total_after += after[i, j]
+    ratio = total_after / total_before
+    for i in range(rows):
+        for j in range(columns):
+            if weight[i, j] > 0:
+                out[i, j] = weight[i, j] * (after[i, j] / (ratio * before[i, j]) - 1.0)
+            else:
+                out[i, j] = 0.0
+    return ratio
+
+
+@njit(cache=True, nogil=True)
+def step_peaks(maps: MapArray, threshold: float, polarity: int) -> NDArray[np.int64]:
+    """Local extremes of a stack of maps.
+
+    Parameters
+    ----------
+    maps : ndarray, shape (k, y, x)
+        Signal-to-noise ratios.
+    threshold : float
+        Least magnitude.
+    polarity : int
+        1 or −1 for one sign, 0 for both.
+
+    Returns
+    -------
+    ndarray of int, shape (n, 3)
+        Index (k, y, x) of each value that no neighbour of its sign exceeds.
+    """
+    found = []
+    depth, rows, columns = maps.shape
+    for k in range(depth):
+        for i in range(rows):
+            for j in range(columns):
+                value = maps[k, i, j]
+                if abs(value) <= threshold or value * polarity < 0:
+                    continue
+                sign = 1.0 if value > 0 else -1.0
+                top = sign * value
+                highest = True
+                for kk in range(max(k - 1, 0), min(k + 2, depth)):
+                    for ii in range(max(i - 1, 0), min(i + 2, rows)):
+                        for jj in range(max(j - 1, 0), min(j + 2, columns)):
+                            if sign * maps[kk, ii, jj] > top:
+                                highest = False
+                if highest:
+                    found.append((k, i, j))
+    out = np.empty((len(found), 3), dtype=np.int64)
+    for n in range(len(found)):
+        out[n, 0], out[n, 1], out[n, 2] = found[n]
+    return out

@@ -1,0 +1,333 @@
+"""Chunks of a landing movie: read once, cut so that they fit into memory, and joined again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis.background import find_defects
+from iscat_analysis.camera import Camera, check_counts
+from iscat_analysis.config import Config
+from iscat_analysis.errors import DataError
+from iscat_analysis.pipeline.field import Scene
+from iscat_analysis.pipeline.results import table_of
+from iscat_analysis.records import (
+    BoolArray,
+    EventView,
+    FloatArray,
+    FrameSource,
+    Windows,
+)
+from iscat_analysis.sliding import (
+    SHORTEST_MOVIE,
+    Chunk,
+    NoiseCurve,
+    choose_window,
+    longest_window,
+    make_chunk,
+    measure_drift,
+    measure_frames,
+    measure_noise,
+)
+
+HALO = 3
+"""Windows on either side of a chunk's core: a step, its neighbours, and theirs."""
+
+VIEWS = 1000
+"""Events whose images are kept for the report."""
+
+FRAME_COLUMN = "frame_ci95"
+"""Column after `EVENT_COLUMNS`: half-width of the 95 % interval of ``frame`` [frames]."""
+
+_MEMORY_SHARE = 0.35  # of compute.memory_limit_mb that the stored counts may take
+_PIECE_BYTES = 32 * 2**20
+_NOISE_FRAMES = 800  # on which the windows are chosen
+_SEAM_PX = 2.0  # two chunks' estimates of one step are nearer than this
+
+
+class Frames(FrameSource, Protocol):
+    """A movie and the type of its numbers."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored counts."""
+
+
+class Reader:
+    """Frames in memory, from one chunk to the next without reading any twice."""
+
+    def __init__(self, movie: Frames, camera: Camera, first: int, last: int) -> None:
+        self._movie = movie
+        self._camera = camera
+        self.first, self.last = first, last
+        self.shape = (movie.shape[1], movie.shape[2])
+        self.frame_bytes = math.prod(self.shape) * movie.dtype.itemsize
+        self._buffer = np.empty((0, *self.shape), dtype=movie.dtype)
+        self._held = (first, first)
+        self._light: FloatArray = np.empty(0)
+        self._repeats: BoolArray = np.empty(0, dtype=np.bool_)
+
+    @property
+    def name(self) -> str:
+        """What messages call the movie."""
+        return self._movie.name
+
+    def reserve(self, frames: int) -> None:
+        """Make room for so many frames."""
+        if frames > len(self._buffer):
+            kept = self._held[1] - self._held[0]
+            larger = np.empty((frames, *self.shape), dtype=self._movie.dtype)
+            larger[:kept] = self._buffer[:kept]
+            self._buffer = larger
+
+    def counts(self, start: int, stop: int) -> tuple[NDArray[Any], BoolArray, FloatArray]:
+        """Frames [start, stop), which of them are good, and their light [e per pixel]."""
+        low, high = self._held
+        kept = 0
+        if low <= start < high:
+            kept = min(high, stop) - start
+            if start > low:
+                self._buffer[:kept] = self._buffer[start - low : start - low + kept]
+            self._light = self._light[start - low : start - low + kept]
+            self._repeats = self._repeats[start - low : start - low + kept]
+        else:
+            self._light, self._repeats = np.empty(0), np.empty(0, dtype=np.bool_)
+        self.reserve(stop - start)
+        self._held = (start, start + kept)
+        step = max(1, _PIECE_BYTES // self.frame_bytes)
+        for begin in range(start + kept, stop, step):
+            self._append(begin, min(begin + step, stop))
+        good = np.isfinite(self._light) & ~self._repeats
+        return self._buffer[: stop - start], good, self._light
+
+    def _append(self, begin: int, end: int) -> None:
+        start = self._held[0]
+        at = begin - start
+        self._buffer[at : at + end - begin] = self._movie.read(begin, end)
+        ahead = 1 if at else 0  # so that a piece's first frame is compared with the one before it
+        part = self._buffer[at - ahead : at + end - begin]
+        light, repeats = measure_frames(part, self._camera)
+        fresh = part[ahead:]
+        lit = np.isfinite(light[ahead:])
+        for run in _runs(lit):
+            check_counts(fresh[run], begin + run.start, self.name, camera=self._camera)
+        self._light = np.concatenate([self._light, light[ahead:]])
+        self._repeats = np.concatenate([self._repeats, repeats[ahead:]])
+        self._held = (start, end)
+
+    def chunk(self, span: tuple[int, int], stride: int, pool: ThreadPoolExecutor) -> Chunk:
+        """Frames of a span, summed in blocks."""
+        counts, good, light = self.counts(*span)
+        if not good.any():
+            raise DataError(
+                f"{self.name}: frames {span[0]}:{span[1]} hold no light that changes; every frame "
+                "is zero or repeats the one before it"
+            )
+        return make_chunk(
+            span[0], counts, good, light, self._camera,
+            stride=stride, defects=find_defects, mapper=pool.map,
+        )  # fmt: skip
+
+    def noise(self, longest: int) -> NoiseCurve:
+        """Noise against averaging in the first frames."""
+        stop = min(self.last, self.first + _NOISE_FRAMES)
+        counts, good, _ = self.counts(self.first, stop)
+        used = counts if good.all() else counts[good]
+        if len(used) < 2:
+            raise DataError(f"{self.name}: has no two frames that differ; export it again")
+        return measure_noise(used, self._camera, longest)
+
+
+def _runs(flags: BoolArray) -> Iterator[slice]:
+    """Yield stretches of true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    for start, stop in edges.reshape(-1, 2):
+        yield slice(int(start), int(stop))
+
+
+def choose_windows(reader: Reader, config: Config) -> tuple[NoiseCurve, int]:
+    """Noise curve, and frames before and after each step."""
+    frames = reader.last - reader.first
+    given = config.background.window_frames
+    needed = 2 * given if given else SHORTEST_MOVIE
+    if frames < needed:
+        windows = (
+            f"two windows of background.window_frames = {given}" if given else "sliding windows"
+        )
+        raise DataError(
+            f"{reader.name}: has {frames} frames, but {windows} before and after each landing take "
+            f"{needed}: record longer"
+            + (", or lower background.window_frames" if given else "")
+            + "; or give the frames before the particles bind as --background 0:N"
+        )
+    curve = reader.noise(min(given or longest_window(frames), _NOISE_FRAMES // 4))
+    return curve, given or choose_window(curve, frames)
+
+
+def plan_chunks(
+    reader: Reader, config: Config, window: int, stride: int
+) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """Cores and the spans around them; block edges fall on the same frames in every chunk."""
+    first, last = reader.first, reader.last
+    halo = math.ceil(HALO * window / stride) * stride
+    budget = int(_MEMORY_SHARE * config.compute.memory_limit_mb * 1e6)
+    # beside its counts, a block holds its sum and its map, and the field some images in doubles
+    pixels = math.prod(reader.shape)
+    per_frame = reader.frame_bytes + 20 * pixels // stride
+    room = (budget - 40 * pixels) // per_frame
+    if room >= last - first:
+        return [((first, last), (first, last))]
+    core = (room - 2 * halo) // stride * stride
+    if core < stride:
+        least = math.ceil((40 * pixels + per_frame * (2 * halo + stride)) / _MEMORY_SHARE / 1e6)
+        raise DataError(
+            f"{reader.name}: windows of {window} frames of {reader.shape[1]} x {reader.shape[0]} "
+            f"pixels need compute.memory_limit_mb = {least}; raise it, or lower "
+            "background.window_frames"
+        )
+    count = math.ceil((last - first) / core)
+    core = math.ceil((last - first) / count / stride) * stride  # of equal length
+    reader.reserve(min(core + 2 * halo, last - first))
+    return [
+        (
+            (begin, min(begin + core, last)),
+            (max(begin - halo, first), min(begin + core + halo, last)),
+        )
+        for begin in range(first, last, core)
+    ]
+
+
+@dataclass(frozen=True)
+class Done:
+    """What is kept of a finished chunk."""
+
+    core: tuple[int, int]
+    table: pd.DataFrame
+    views: tuple[EventView, ...]
+    good: BoolArray  # of the core
+    light: FloatArray
+    masked: BoolArray
+    saturated: BoolArray
+    strongest: FloatArray
+    mean_e: FloatArray
+    gain_message: str = ""
+    sampled: int = field(default=0)
+
+
+class Merged:
+    """Finished chunks, in order."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._done: list[Done] = []
+        self._strongest = np.zeros((2, *shape))
+        self.sampled = 0
+        self.gain_message = ""
+
+    def add(self, done: Done) -> None:
+        """Take one more."""
+        stronger = done.strongest[0] > self._strongest[0]
+        self._strongest = np.where(stronger, done.strongest, self._strongest)
+        self.sampled += done.sampled
+        self.gain_message = self.gain_message or done.gain_message
+        # the images are merged; holding them for every chunk would grow with the movie
+        first = not self._done
+        small = np.empty((2, 0, 0))
+        kept = done.views if sum(len(d.views) for d in self._done) < 2 * VIEWS else ()
+        self._done.append(replace(done, strongest=small, views=kept))
+        if not first and len(self._done) > 2:
+            middle = self._done[-2]
+            self._done[-2] = replace(middle, mean_e=np.empty((0, 0)))
+
+    @property
+    def image(self) -> FloatArray:
+        """Amplitude of the strongest step of each pixel."""
+        image: FloatArray = self._strongest[1]
+        return image
+
+    def result(self, scene: Scene) -> tuple[pd.DataFrame, tuple[EventView, ...]]:
+        """Events of all chunks, each once, numbered in order of frame."""
+        tables, homes = [], []
+        for index, done in enumerate(self._done):
+            tables.append(done.table)
+            homes += [(index, row) for row in range(len(done.table))]
+        if not homes:
+            empty = table_of(scene, [])
+            empty[FRAME_COLUMN] = np.empty(0, dtype=np.int64)
+            return empty, ()
+        table = pd.concat([t for t in tables if len(t)], ignore_index=True)
+        cores = np.array([self._done[i].core for i, _ in homes])
+        frame = table["frame"].to_numpy()
+        own = (frame >= cores[:, 0]) & (frame < cores[:, 1])
+        kept = [int(i) for i in np.flatnonzero(own)]
+        for stranger in (int(i) for i in np.flatnonzero(~own)):
+            covered = any(d.core[0] <= frame[stranger] < d.core[1] for d in self._done)
+            if covered and not any(_same(table, stranger, other) for other in kept):
+                kept.append(stranger)
+        order = sorted(kept, key=lambda i: (frame[i], table["y_nm"].iloc[i], table["x_nm"].iloc[i]))
+        result = table.iloc[order].reset_index(drop=True)
+        result["event"] = np.arange(len(result), dtype=np.int64)
+        views = []
+        for number, i in enumerate(order[:VIEWS]):
+            index, row = homes[i]
+            if row < len(self._done[index].views):
+                views.append(replace(self._done[index].views[row], event=number))
+        return result, tuple(views)
+
+    def windows(self, shape: tuple[int, int], span: tuple[int, int]) -> tuple[Windows, FloatArray]:
+        """Masks and power of the frames that are done."""
+        nothing = np.zeros(shape)
+        masked = np.zeros(shape, dtype=np.bool_)
+        saturated = np.zeros(shape, dtype=np.bool_)
+        for done in self._done:
+            masked |= done.masked
+            saturated |= done.saturated
+        light = np.concatenate([np.empty(0), *(d.light for d in self._done)])
+        power = light / np.nanmean(light) if np.isfinite(light).any() else light
+        windows = Windows(
+            before_e=nothing, after_e=nothing, n_before=0, n_after=light.size, power_ratio=1.0,
+            read_variance_before_e2=nothing, read_variance_after_e2=nothing,
+            masked=masked, saturated=saturated, frames_before=(0, 0),
+            frames_after=(span[0], span[0] + light.size), power=power,
+        )  # fmt: skip
+        return windows, light
+
+    def left_out(self) -> int:
+        """Frames that are zero or repeat the one before."""
+        return int(sum(np.count_nonzero(~d.good) for d in self._done))
+
+    def repeats(self) -> NDArray[np.int64]:
+        """Frames left out, counted from the first of the movie's part that was read."""
+        good = np.concatenate([np.empty(0, dtype=np.bool_), *(d.good for d in self._done)])
+        return np.flatnonzero(~good.astype(np.bool_))
+
+    def drift(self) -> list[float] | None:
+        """Shift (y, x) of the fixed pattern from the first chunk to the last [px]."""
+        if len(self._done) < 2:
+            return None
+        dy, dx = measure_drift(self._done[0].mean_e, self._done[-1].mean_e)
+        return [dy, dx] if math.isfinite(dy) and math.isfinite(dx) else None
+
+    def masks(self) -> tuple[int, int]:
+        """Defective and saturated pixels."""
+        if not self._done:
+            return 0, 0
+        masked = np.any([d.masked for d in self._done], axis=0)
+        saturated = np.any([d.saturated for d in self._done], axis=0)
+        return int(np.sum(masked & ~saturated)), int(saturated.sum())
+
+
+def _same(table: pd.DataFrame, one: int, two: int) -> bool:
+    """Whether two chunks' rows describe one step."""
+    a, b = table.iloc[one], table.iloc[two]
+    return bool(
+        abs(a["frame"] - b["frame"]) <= max(2, a[FRAME_COLUMN] + b[FRAME_COLUMN])
+        and math.hypot(a["x_px"] - b["x_px"], a["y_px"] - b["y_px"]) < _SEAM_PX
+        and a["mass_kda"] * b["mass_kda"] > 0
+    )

@@ -1,0 +1,379 @@
+"""Landing movies: particles land and leave at unknown times and places, and the windows slide.
+
+The movie is read once, in chunks that fit into memory.  A chunk has a core, whose steps are its
+own, and three windows of frames on either side, so that every step in the core is seen with all
+its neighbours.  A step on the seam may be dated on either side of it: both chunks report what lies
+near it, and the one whose core holds it is believed.  Chunks depend on the movie and the
+configuration alone, so a finished one can be kept on disk and a resumed run gives the same result.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis.calibrate import diagnose_gain
+from iscat_analysis.camera import Camera
+from iscat_analysis.config import Config
+from iscat_analysis.detect import make_templates
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.fit import window_nm
+from iscat_analysis.forward import forward_model
+from iscat_analysis.pipeline.chunks import (
+    FRAME_COLUMN,
+    VIEWS,
+    Done,
+    Frames,
+    Merged,
+    Reader,
+    choose_windows,
+    plan_chunks,
+)
+from iscat_analysis.pipeline.field import Scene
+from iscat_analysis.pipeline.results import Row, table_of, view_of
+from iscat_analysis.pipeline.resume import Store
+from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
+from iscat_analysis.posterior import sample_posterior
+from iscat_analysis.records import EventView, FloatArray, Progress, Windows
+from iscat_analysis.sliding import STRIDES, Chunk
+
+POSTERIORS = 20
+"""Events whose posterior is sampled, where the configuration asks for it."""
+
+JUMP = 0.1
+"""Relative change of the light from one frame to the next that is reported."""
+
+_GAIN_FRAMES = 64
+_DRIFT_PX = 0.02  # shift of the fixed pattern below which it is not worth a line
+
+Tell = Callable[[str], None]
+
+
+def _nothing(scene: Scene) -> None:
+    """Do nothing."""
+
+
+@dataclass(frozen=True)
+class LandingResult:
+    """What was found in a landing movie.
+
+    Attributes
+    ----------
+    table : pandas.DataFrame
+        One row per step, in order of frame: columns `EVENT_COLUMNS` and `FRAME_COLUMN`.
+    views : tuple of EventView
+        Images of the first `VIEWS` events.
+    windows : Windows
+        Masks and the power of every frame; its sums are empty.
+    image : ndarray, shape (y, x)
+        Contrast of the strongest step that each pixel saw, by the matched filter.
+    scene : Scene
+        Models and threshold.
+    summary : dict
+        What ``summary.json`` adds under ``"landing"``.
+    interrupted : bool
+        Whether the user stopped it; the chunks that were finished are kept.
+    """
+
+    table: pd.DataFrame
+    views: tuple[EventView, ...]
+    windows: Windows
+    image: FloatArray
+    scene: Scene
+    summary: dict[str, Any]
+    interrupted: bool
+
+
+def has_landings(config: Config) -> bool:
+    """Whether a configuration describes a movie in which the windows slide."""
+    return (
+        config.background.frames is None
+        and config.background.method == "mean"
+        and config.optics.scheme != "darkfield"
+        and config.fit.mode != "track"
+        and config.fit.likelihood != "poisson"
+    )
+
+
+def analyse_landings(
+    movie: Frames,
+    config: Config,
+    camera: Camera,
+    *,
+    tell: Tell,
+    progress: Progress,
+    prepare: Callable[[Scene], None] = _nothing,
+    partial: Path | None = None,
+    identity: str = "",
+) -> LandingResult:
+    """Find and fit every particle that lands or leaves.
+
+    Parameters
+    ----------
+    movie : Frames
+        The movie.
+    config : Config
+        Resolved; `has_landings` holds.
+    camera : Camera
+        Counts → photoelectrons.
+    tell : callable
+        Told what the user should know, one line each.
+    progress : Progress
+        Told how many frames are done.
+    prepare : callable
+        Given the models before the first fit.
+    partial : Path, optional
+        Folder that keeps finished chunks until the whole is done.
+    identity : str
+        What tells the movie's content from another's; finished chunks of another are not used.
+
+    Returns
+    -------
+    LandingResult
+        Everything found.
+
+    Raises
+    ------
+    DataError
+        The movie is shorter than two windows, a frame is impossible, or the chunks do not fit into
+        ``compute.memory_limit_mb``.
+    """
+    first, last = config.fit.frames or (0, movie.shape[0])
+    if last > movie.shape[0]:
+        raise DataError(
+            f"{movie.name}: has {movie.shape[0]} frames, but fit.frames asks for {first}:{last}; "
+            "change fit.frames"
+        )
+    reader = Reader(movie, camera, first, last)
+    curve, window = choose_windows(reader, config)
+    stride = max(1, window // STRIDES)
+    count = max(math.ceil((last - first) / stride) - 1, 1)
+    posterior = _posterior_wanted(config)
+    sampling = config.posterior.model_copy(update={"enabled": posterior})
+    config = config.model_copy(update={"posterior": sampling})
+    scene = make_landing_scene(config, reader.shape, searches=count)
+    prepare(scene)
+    plan = plan_chunks(reader, config, window, stride)
+    store = Store(partial, config, identity, reader.shape, (first, last))
+    merged = Merged(reader.shape)
+    interrupted = False
+    with ThreadPoolExecutor(config.compute.workers) as pool:
+        try:
+            for number, (core, span) in enumerate(plan):
+                done = None if posterior else store.load(number)
+                if done is None:
+                    chunk = reader.chunk(span, stride, pool)
+                    budget = POSTERIORS - merged.sampled if posterior else 0
+                    done = _analyse_chunk(scene, chunk, core, window, pool, budget)
+                    store.save(number, done)
+                merged.add(done)
+                progress("landing", core[1] - first, last - first)
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            interrupted = True
+    table, views = merged.result(scene)
+    windows, light = merged.windows(reader.shape, (first, last))
+    for text in _warnings(movie.name, merged, light, first, window):
+        tell(text)
+    message = merged.gain_message
+    if message:
+        tell(message)
+    if not interrupted:
+        store.clear()
+    found = table["mass_kda"] < 0
+    summary = {
+        "window_frames": window,
+        "stride_frames": stride,
+        "boundaries_searched": count,
+        "landings": int((~found).sum()),
+        "leavings": int(found.sum()),
+        "shot_noise_limited_frames": curve.shot_limited,
+        "noise_frames": list(curve.frames),
+        "noise_variance_over_shot": list(curve.variance_over_shot),
+        "frames_left_out": merged.left_out(),
+        "drift_px": merged.drift(),
+        "chunks": len(plan),
+    }
+    strongest = scene.model.peak_contrast(scene.model.height_nm, scene.model.material.mass_kda)
+    amplitude = scene.model.scale.amplitude(scene.model.material.mass_kda)
+    return LandingResult(
+        table=table,
+        views=views,
+        windows=windows,
+        image=merged.image * strongest / amplitude,
+        scene=scene,
+        summary=summary,
+        interrupted=interrupted,
+    )
+
+
+def make_landing_scene(config: Config, field_px: tuple[int, int], *, searches: int) -> Scene:
+    """Build the models and the matched filter, at the particles' nominal height.
+
+    Parameters
+    ----------
+    config : Config
+        With a pixel size.
+    field_px : (int, int)
+        Rows and columns.
+    searches : int
+        Boundaries that will be searched; they share the expected false alarms.
+
+    Returns
+    -------
+    Scene
+        Its `wide` model reaches one region beyond a step's own.
+
+    Raises
+    ------
+    ConfigError
+        The region is larger than the field, or the calibration has the wrong sign.
+    """
+    pixel = config.camera.pixel_size_nm
+    if pixel is None:
+        raise ConfigError(
+            "camera.pixel_size_nm is needed: set it, as in --set camera.pixel_size_nm=84.4"
+        )
+    roi_px = max(5, round(config.fit.roi_nm / pixel))
+    if roi_px > min(field_px):
+        raise ConfigError(
+            f"fit.roi_nm = {config.fit.roi_nm:g} is {roi_px} pixels, more than the field of "
+            f"{field_px[0]} x {field_px[1]}: lower fit.roi_nm or check camera.pixel_size_nm"
+        )
+    model = forward_model(config, math.sqrt(2) * (roi_px * pixel / 2 + window_nm(pixel) + pixel))
+    alarms = config.detection.false_alarms_per_movie / searches
+    return Scene(
+        config=config,
+        model=model,
+        wide=forward_model(config, math.sqrt(2) * (roi_px + 2) * pixel),
+        templates=make_templates(
+            model,
+            config.detection.model_copy(update={"false_alarms_per_movie": alarms}),
+            pixel_nm=pixel,
+            roi_nm=config.fit.roi_nm,
+            z_range_nm=None,
+            field_px=field_px,
+        ),
+        mode=config.fit.mode,
+    )
+
+
+def _analyse_chunk(
+    scene: Scene,
+    chunk: Chunk,
+    core: tuple[int, int],
+    window: int,
+    pool: ThreadPoolExecutor,
+    posteriors: int,
+) -> Done:
+    fitter = ChunkFitter(scene, chunk, window, pool)
+    steps = fitter.run()
+    seam = max(1, window // 2)
+    steps = [s for s in steps if core[0] - seam <= s.step.at.frame < core[1] + seam]
+    rows = list(pool.map(_row, range(len(steps)), steps))
+    sampled = 0
+    for i, row in enumerate(rows):
+        if sampled >= posteriors or not core[0] <= steps[i].step.at.frame < core[1]:
+            continue
+        settings = scene.config.posterior
+        chain = sample_posterior(
+            row.event.likelihood, row.event.fit, walkers=settings.walkers, steps=settings.steps,
+            seed=scene.config.simulation.seed + steps[i].step.at.frame,
+        )  # fmt: skip
+        rows[i] = replace(row, posterior=chain)
+        sampled += 1
+    records = list(pool.map(lambda row: table_of(scene, [row]), rows))
+    table = pd.concat(records, ignore_index=True) if records else table_of(scene, [])
+    table["frame"] = [s.step.at.frame for s in steps]
+    table["n_before"] = [s.n_before for s in steps]
+    table["n_after"] = [s.n_after for s in steps]
+    sign = np.array([s.step.sign for s in steps], dtype=float)
+    table["mass_kda"] *= sign
+    table["contrast"] *= sign
+    table[FRAME_COLUMN] = [s.step.at.half_width for s in steps]
+    inside = slice(core[0] - chunk.first, core[1] - chunk.first)
+    light = np.where(chunk.good, chunk.power, np.nan) * float(chunk.mean_e.mean())
+    message = ""
+    used = chunk.counts[chunk.good][:_GAIN_FRAMES] if core[0] == chunk.first else chunk.counts[:0]
+    if len(used) >= 2:
+        message = diagnose_gain(used, chunk.camera, masked=~chunk.usable).message or ""
+    return Done(
+        core=core,
+        table=table,
+        views=tuple(_view(row, step) for row, step in zip(rows, steps, strict=True))[:VIEWS],
+        good=chunk.good[inside].copy(),
+        light=light[inside],
+        masked=~chunk.usable,
+        saturated=chunk.saturated,
+        strongest=fitter.strongest,
+        mean_e=chunk.mean_e,
+        gain_message=message,
+        sampled=sampled,
+    )
+
+
+def _row(number: int, step: FittedStep) -> Row:
+    return Row(number, step.event, step.windows)
+
+
+def _view(row: Row, step: FittedStep) -> EventView:
+    view = view_of(row)
+    return replace(view, row_px=step.region.rows[0], column_px=step.region.columns[0])
+
+
+def _posterior_wanted(config: Config) -> bool:
+    """Whether the configuration itself asks: sampling hundreds of events takes hours."""
+    return config.posterior.enabled and "enabled" in config.posterior.model_fields_set
+
+
+def _warnings(
+    name: str, merged: Merged, light: FloatArray, first: int, window: int
+) -> Iterator[str]:
+    """Say what is odd about the frames."""
+    missing = merged.repeats() + first
+    if missing.size:
+        verb = "is" if missing.size == 1 else "are"
+        yield (
+            f"{name}: {_frames(missing)} {verb} zero throughout or the same as the frame before "
+            "(dropped or stuck in the camera); left out, the other frames are used"
+        )
+    known = np.flatnonzero(np.isfinite(light))
+    change = light[known][1:] / light[known][:-1] - 1
+    if change.size:
+        usual = 1.4826 * float(np.median(np.abs(change)))
+        jumps = known[1:][np.abs(change) > max(JUMP, 8 * usual)] + first
+        if jumps.size:
+            largest = 100 * float(change[np.argmax(np.abs(change))])
+            yield (
+                f"{name}: the brightness jumps at {_frames(jumps)} by up to {largest:+.0f} %; "
+                "it is divided out, but look at the laser and at events in these frames"
+            )
+    defects, burnt = merged.masks()
+    if defects:
+        yield f"{defects} dead or hot pixels are left out"
+    if burnt:
+        yield (
+            f"{burnt} pixels are saturated in some frame and left out; "
+            "lower the exposure or the laser power"
+        )
+    drift = merged.drift()
+    if drift is not None and math.hypot(*drift) > _DRIFT_PX * max(light.size / window / 2, 1.0):
+        yield (
+            f"{name}: the fixed pattern moved by {drift[1]:+.2f} pixels in x and "
+            f"{drift[0]:+.2f} in y; it is not corrected: shorter windows "
+            "(background.window_frames) suffer less"
+        )
+
+
+def _frames(frames: NDArray[np.int64]) -> str:
+    shown = ", ".join(str(f) for f in frames[:4])
+    more = f" and {frames.size - 4} more" if frames.size > 4 else ""
+    return f"frame{'' if frames.size == 1 else 's'} {shown}{more}"

@@ -1,0 +1,148 @@
+"""Finished chunks on disk, so that an interrupted run can go on where it stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.config import Config, config_to_toml
+from iscat_analysis.pipeline.chunks import Done
+from iscat_analysis.records import EventView
+
+
+class Store:
+    """Finished chunks on disk, until the whole is done."""
+
+    def __init__(
+        self,
+        folder: Path | None,
+        config: Config,
+        identity: str,
+        shape: tuple[int, int],
+        span: tuple[int, int],
+    ) -> None:
+        self._folder = folder if identity else None
+        settings = config.model_copy(
+            update={"compute": config.compute.model_copy(update={"workers": 1})}
+        )
+        text = json.dumps(
+            [version("iscat-analysis"), identity, shape, span, config_to_toml(settings)]
+        )
+        self._key = hashlib.sha256(text.encode()).hexdigest()[:32]
+
+    def load(self, number: int) -> Done | None:
+        """Give a finished chunk, or None."""
+        if self._folder is None:
+            return None
+        table_path, path = self._paths(number)
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                table = pd.read_parquet(table_path)
+                images = data["images"]
+                corners = data["corners"]
+                sizes = data["sizes"]
+                views, at = [], 0
+                for i, (row, column) in enumerate(corners):
+                    rows, columns = (int(n) for n in sizes[i])
+                    stack = images[:, at : at + rows * columns].reshape(3, rows, columns)
+                    at += rows * columns
+                    views.append(EventView(i, int(row), int(column), stack[0], stack[1], stack[2]))
+                low, high = (int(n) for n in data["core"])
+                return Done(
+                    core=(low, high),
+                    table=table,
+                    views=tuple(views),
+                    good=data["good"],
+                    light=data["light"],
+                    masked=data["masked"],
+                    saturated=data["saturated"],
+                    strongest=data["strongest"],
+                    mean_e=data["mean_e"],
+                    gain_message=str(data["gain_message"]),
+                )
+        except (OSError, ValueError, KeyError, EOFError):
+            return None  # never finished, or cut short
+
+    def save(self, number: int, done: Done) -> None:
+        """Keep a finished chunk; a full disk costs the resumption, not the run."""
+        if self._folder is None:
+            return
+        table_path, path = self._paths(number)
+        flat = [np.stack([v.contrast, v.model, v.residual]).reshape(3, -1) for v in done.views] or [
+            np.empty((3, 0))
+        ]
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            done.table.to_parquet(table_path, index=False)
+            building = path.with_suffix(".tmp")
+            with building.open("wb") as file:
+                np.savez(
+                    file,
+                    core=np.array(done.core),
+                    images=np.concatenate(flat, axis=1),
+                    corners=np.array([(v.row_px, v.column_px) for v in done.views]).reshape(-1, 2),
+                    sizes=np.array([v.contrast.shape for v in done.views]).reshape(-1, 2),
+                    good=done.good,
+                    light=done.light,
+                    masked=done.masked,
+                    saturated=done.saturated,
+                    strongest=done.strongest,
+                    mean_e=done.mean_e,
+                    gain_message=np.array(done.gain_message),
+                )
+            building.replace(path)
+        except OSError:
+            self._folder = None
+
+    def clear(self) -> None:
+        """Remove what is no longer needed."""
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _paths(self, number: int) -> tuple[Path, Path]:
+        folder = self._folder or Path()
+        stem = f"{self._key}-{number:05d}"
+        return folder / f"{stem}.parquet", folder / f"{stem}.npz"
+
+
+def partial_folder(folder: Path) -> Path:
+    """Where the finished chunks of an output folder are kept: hidden, beside it."""
+    return folder.with_name(f".{folder.name}.partial")
+
+
+def is_resumable(folder: Path) -> bool:
+    """Whether a folder holds what an interrupted run left, and its chunks are still there."""
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        return bool(summary["interrupted"]) and partial_folder(folder).is_dir()
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def fingerprint(path: Path) -> str:
+    """Tell a movie's content from another's without reading all of it.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    str
+        Hash of its size, its time of change and its two ends.
+    """
+    with path.open("rb") as file:
+        state = os.fstat(file.fileno())
+        digest = hashlib.sha256(f"{state.st_size} {state.st_mtime_ns}".encode())
+        digest.update(file.read(2**20))
+        file.seek(max(state.st_size - 2**20, 0))
+        digest.update(file.read(2**20))
+    return digest.hexdigest()
