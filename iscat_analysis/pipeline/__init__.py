@@ -186,8 +186,8 @@ def analyse(
     summary = summary_of(scene, found.table, windows, clock.seconds)
     sampled = config.posterior.enabled and scene.mode != "track"
     provenance = Provenance(
-        command=command or "iscat_analysis.pipeline.analyse",
-        input_path=str(movie.path),
+        command=_printable(command) or "iscat_analysis.pipeline.analyse",
+        input_path=_printable(str(movie.path)),
         input_sha256=digest.result(),
         versions=_versions(),
         seed=config.simulation.seed if sampled else None,
@@ -387,6 +387,11 @@ def _warm_up(scene: Scene, notify: Notify) -> None:
         compile_kernels(scene.model)
     finally:
         timer.cancel()
+
+
+def _printable(text: str) -> str:
+    """Escape the bytes of a file name that are not text, which no file in UTF-8 can hold."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 class _Clock:

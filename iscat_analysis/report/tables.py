@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import importlib
+import io
 import json
 import math
-import warnings
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from iscat_analysis.records import EVENT_COLUMNS, Analysis, EventView
 
 CSV_DIGITS = 9
 """Significant digits in ``fits.csv``: 0.1 pm in a field of 100 µm, with no digits of pure noise."""
+
+
+_Variable = tuple[tuple[str, ...], NDArray[Any], Mapping[str, str]]
+"""Axes, values and attributes of a variable in ``posterior.nc``."""
 
 
 def event_table(analysis: Analysis) -> pd.DataFrame:
@@ -135,12 +142,6 @@ def write_posterior(analysis: Analysis, path: Path) -> bool:
     usable = [view for view in sampled if view.posterior is not None and view.posterior.converged]
     if not usable:
         return False
-    with warnings.catch_warnings():
-        # ArviZ announces its next major version on import, once a day.
-        warnings.simplefilter("ignore", FutureWarning)
-        import arviz
-        import xarray
-
     posteriors = [view.posterior for view in usable if view.posterior is not None]
     names = posteriors[0].names
     n_chain = min(p.samples.shape[0] for p in posteriors)
@@ -148,9 +149,14 @@ def write_posterior(analysis: Analysis, path: Path) -> bool:
     samples = np.stack([p.samples[:n_chain, -n_draw:] for p in posteriors], axis=2)
     log_likelihood = np.stack([p.log_likelihood[:n_chain, -n_draw:] for p in posteriors], axis=2)
     chain, event = ("chain", "draw", "event"), [int(view.event) for view in usable]
-    coords = {"chain": np.arange(n_chain), "draw": np.arange(n_draw), "event": event}
-    diagnostics = {
-        name: (("event", "parameter"), np.stack([getattr(p, name) for p in posteriors]))
+    coords = {
+        "chain": np.arange(n_chain),
+        "draw": np.arange(n_draw),
+        "event": np.array(event),
+        "parameter": np.array(names, dtype=object),
+    }
+    diagnostics: dict[str, _Variable] = {
+        name: (("event", "parameter"), np.stack([getattr(p, name) for p in posteriors]), {})
         for name in ("tau", "r_hat", "ess_bulk", "ess_tail")
     }
     refused = [v for v in sampled if v.posterior is not None and not v.posterior.converged]
@@ -162,24 +168,39 @@ def write_posterior(analysis: Analysis, path: Path) -> bool:
         "reasons_not_converged": json.dumps([_reason(view) for view in refused]),
         "draws_before_cutting": json.dumps([int(p.samples.shape[1]) for p in posteriors]),
     }
-    data = arviz.InferenceData(
-        posterior=xarray.Dataset(
-            {name: (chain, samples[..., i], _unit(name)) for i, name in enumerate(names)},
-            coords=coords,
-            attrs=attributes,
-        ),
-        sample_stats=xarray.Dataset(
-            {
-                "log_likelihood": (chain, log_likelihood),
-                "acceptance": (("event",), [p.acceptance for p in posteriors]),
-                **diagnostics,
-            },
-            coords={**coords, "parameter": list(names)},
-            attrs=attributes,
-        ),
-    )
-    data.to_netcdf(str(path), engine="h5netcdf")
+    statistics: dict[str, _Variable] = {
+        "log_likelihood": (chain, log_likelihood, {}),
+        "acceptance": (("event",), np.array([p.acceptance for p in posteriors]), {}),
+        **diagnostics,
+    }
+    groups: dict[str, dict[str, _Variable]] = {
+        "posterior": {name: (chain, samples[..., i], _unit(name)) for i, name in enumerate(names)},
+        "sample_stats": statistics,
+    }
+    # In memory: where the disk is full, libhdf5 does not fail but crashes.
+    buffer = io.BytesIO()
+    h5netcdf: Any = importlib.import_module("h5netcdf")  # it has no types
+    with h5netcdf.File(buffer, "w") as file:
+        for name, variables in groups.items():
+            _write_group(file.create_group(name), variables, coords, attributes)
+    path.write_bytes(buffer.getbuffer())
     return True
+
+
+def _write_group(
+    group: Any,
+    variables: Mapping[str, _Variable],
+    coords: Mapping[str, NDArray[Any]],
+    attributes: Mapping[str, str],
+) -> None:
+    """Write one group of an InferenceData file, as xarray lays it out."""
+    used = [name for name in coords if any(name in axes for axes, _, _ in variables.values())]
+    group.dimensions = {name: len(coords[name]) for name in used}
+    labels: dict[str, _Variable] = {name: ((name,), coords[name], {}) for name in used}
+    for name, (axes, values, units) in {**labels, **variables}.items():
+        kind = h5py.string_dtype() if values.dtype == object else values.dtype
+        group.create_variable(name, axes, kind, data=values).attrs.update(units)
+    group.attrs.update(attributes)
 
 
 def _unit(name: str) -> dict[str, str]:

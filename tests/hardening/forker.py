@@ -1,0 +1,127 @@
+"""A process that has everything imported and compiled, and forks a child for each order it reads.
+
+Orders are lines of JSON on stdin, answers lines of JSON on stdout.  An order is one run or several
+at the same time, each ``{"run": [argument, …], "cwd": folder}``, with ``"kill": [signal, share]``
+to be ended after that share of an undisturbed run's duration, ``"limit": bytes`` for the largest
+file it may write, and ``"die": [word, number]`` to end by SIGKILL ``before`` or ``after`` its so
+manieth renaming.  The answer is a list of ``{"status": …, "out": …, "err": …}``; a signal's
+status is negative.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import resource
+import signal
+import sys
+import threading
+import time
+from typing import Any
+
+from iscat_cli import main
+
+
+def _run(order: dict[str, Any]) -> int:
+    os.chdir(order["cwd"])
+    if "limit" in order:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
+    if "die" in order:
+        _die_while_renaming(*order["die"])
+    status = main(order["run"])
+    sys.stdout.flush()
+    sys.stderr.flush()
+    return status
+
+
+def _die_while_renaming(word: str, number: int) -> None:
+    rename = pathlib.Path.rename
+    count = 0
+
+    def deadly(self: pathlib.Path, target: Any) -> Any:
+        nonlocal count
+        count += 1
+        if count == number and word == "before":
+            os.kill(os.getpid(), signal.SIGKILL)
+        done = rename(self, target)
+        if count == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return done
+
+    pathlib.Path.rename = deadly  # type: ignore[method-assign]
+
+
+def _start(order: dict[str, Any], duration: float) -> tuple[int, int, int]:
+    out, err = (os.memfd_create(name) for name in ("out", "err"))
+    child = os.fork()
+    if child == 0:
+        status = 70
+        try:
+            os.dup2(out, 1)
+            os.dup2(err, 2)
+            status = _run(order)
+        finally:
+            os._exit(status)
+    if "kill" in order:
+        number, share = order["kill"]
+        timer = threading.Timer(share * duration, _signal, [child, number])
+        timer.start()
+    return child, out, err
+
+
+def _signal(child: int, number: int) -> None:
+    try:
+        os.kill(child, number)  # not yet waited for, so its number is nobody else's
+    except ProcessLookupError:
+        return
+
+
+def _finish(child: int, out: int, err: int) -> dict[str, Any]:
+    # Without collecting the status, so that a late signal meets the dead child and no stranger.
+    os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
+    for thread in threading.enumerate():
+        if isinstance(thread, threading.Timer):
+            thread.join()
+    _, status = os.waitpid(child, 0)
+    answer: dict[str, Any] = {"status": os.waitstatus_to_exitcode(status)}
+    for name, file in (("out", out), ("err", err)):
+        with os.fdopen(file, "rb") as stream:
+            stream.seek(0)
+            answer[name] = stream.read().decode("utf-8", "backslashreplace")
+    return answer
+
+
+def serve() -> None:
+    """Answer until stdin ends; the first order is run twice, to be ready and to be timed."""
+    duration = None
+    for line in sys.stdin:
+        orders = json.loads(line)
+        if duration is None:
+            _quietly(orders[0])
+            begin = time.perf_counter()
+            answer = _finish(*_start(orders[0], 0.0))
+            duration = time.perf_counter() - begin
+            answers = [answer]
+        else:
+            answers = [_finish(*started) for started in [_start(o, duration) for o in orders]]
+        sys.stdout.write(json.dumps(answers) + "\n")
+        sys.stdout.flush()
+
+
+def _quietly(order: dict[str, Any]) -> None:
+    """Run in this process: kernels, fonts and figures are then ready in every child."""
+    here, kept = pathlib.Path.cwd(), [os.dup(1), os.dup(2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+    try:
+        _run(order)
+    finally:
+        os.chdir(here)
+        for number, saved in zip((1, 2), kept, strict=True):
+            os.dup2(saved, number)
+
+
+if __name__ == "__main__":
+    serve()

@@ -1,0 +1,434 @@
+"""Whatever ends a run, the output folder is absent or whole, and the next run is undisturbed."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet
+import pytest
+from report_factory import make_analysis
+
+from iscat_analysis.config import load_config
+from iscat_analysis.errors import DataError
+from iscat_analysis.records import EVENT_COLUMNS
+from iscat_analysis.report import write_report
+from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output, claim_output
+from iscat_analysis.simulate import write_stack
+
+KILLS = 50
+REQUIRED = OUTPUT_NAMES - {"posterior.nc"}
+SETUP = """
+[optics]
+na = 1.3
+attenuation = 0.1
+[camera]
+pixel_size_nm = 84.4
+frame_rate_hz = 200.0
+exposure_ms = 5.0
+[background]
+frames = [0, 20]
+[fit]
+roi_nm = 1300.0
+[posterior]
+enabled = false
+[compute]
+workers = 1
+[simulation]
+shape = [48, 48]
+frames = 40
+events = [{frame = 20, x_px = 23.2, y_px = 24.4, mass_kda = 3000.0}]
+"""
+FIT = ["fit", "movie.tif", "--config", "setup.toml", "--out", "result", "--overwrite"]
+
+
+class Forker:
+    """Speaks with `forker.py`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.bench = folder
+        script = Path(__file__).with_name("forker.py")
+        environment = {**os.environ, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"}
+        self.process = subprocess.Popen(
+            [sys.executable, str(script)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        (first,) = self.run({"run": FIT, "cwd": str(folder)})
+        assert first["status"] == 0, first["err"]
+
+    def run(self, *orders: dict[str, Any]) -> list[dict[str, Any]]:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps(orders) + "\n")
+        self.process.stdin.flush()
+        answer = self.process.stdout.readline()
+        assert answer, "the forking process has died"
+        return json.loads(answer)
+
+    def close(self) -> None:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.close()
+        self.process.wait(timeout=60)
+        self.process.stdout.close()
+
+
+@pytest.fixture(scope="module")
+def forker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Forker]:
+    bench = tmp_path_factory.mktemp("bench")
+    (bench / "setup.toml").write_text(SETUP)
+    write_stack(load_config(bench / "setup.toml"), bench / "movie.tif")
+    forker = Forker(bench)
+    yield forker
+    forker.close()
+
+
+@pytest.fixture
+def place(forker: Forker, tmp_path: Path) -> Path:
+    """Return a folder with the movie and its configuration."""
+    for name in ("movie.tif", "setup.toml"):
+        shutil.copy(forker.bench / name, tmp_path)
+    return tmp_path
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def assert_whole(result: Path) -> None:
+    """Every file is there and complete."""
+    assert REQUIRED <= set(names(result)) <= OUTPUT_NAMES
+    table = pd.read_csv(result / "fits.csv")
+    assert tuple(table.columns) == EVENT_COLUMNS
+    assert len(pd.read_parquet(result / "fits.parquet")) == len(table)
+    summary = json.loads((result / "summary.json").read_text(encoding="utf-8"))
+    assert summary["events"] == len(table)
+    load_config(result / "config.toml")
+    assert (result / "report.html").read_text(encoding="utf-8").rstrip().endswith("</html>")
+    assert all(path.stat().st_size for path in (result / "figures").iterdir())
+
+
+def one_line(answer: dict[str, Any]) -> str:
+    lines = answer["err"].splitlines()
+    assert "Traceback" not in answer["err"]
+    errors = [line for line in lines if ": error: " in line]
+    assert len(errors) == 1, answer["err"]
+    return errors[0]
+
+
+def contents(result: Path) -> dict[str, bytes]:
+    """All files, without the fields that say when and how fast.
+
+    These are, and nothing else is, allowed to differ between two runs: ``seconds`` in
+    ``summary.json``; the rows *Started* and *seconds…* of the tables in ``report.html``.
+    """
+    files = {}
+    for path in sorted(result.rglob("*")):
+        if path.is_dir():
+            continue
+        data = path.read_bytes()
+        if path.name == "summary.json":
+            summary = json.loads(data)
+            assert summary.pop("seconds")
+            data = json.dumps(summary).encode()
+        if path.name == "report.html":
+            row = rb"<div><dt>(?:[Ss]tarted|seconds\.\w+)</dt><dd>[^<]*</dd></div>"
+            data, count = re.subn(row, b"", data)
+            assert count
+        files[str(path.relative_to(result))] = data
+    return files
+
+
+def test_killed_at_random_moments(forker: Forker, place: Path) -> None:
+    rng = np.random.default_rng()
+    seen = set()
+    expected = contents(forker.bench / "result")
+    result = place / "result"
+    for number in range(KILLS):
+        if rng.random() < 0.5:
+            shutil.rmtree(result, ignore_errors=True)
+        order = {
+            "run": FIT,
+            "cwd": str(place),
+            "kill": [signal.SIGKILL, float(rng.uniform(0, 1.1))],
+        }
+        (answer,) = forker.run(order)
+        assert answer["status"] in (0, -signal.SIGKILL)
+        hidden = [name for name in names(place) if name.startswith(".iscat-")]
+        assert len(hidden) <= 3  # what the last run left; what earlier ones left is gone
+        seen.add((answer["status"], result.exists()))
+        if result.exists():
+            assert_whole(result)
+        if number % 10 == 9:
+            (again,) = forker.run({"run": FIT, "cwd": str(place)})
+            assert again["status"] == 0, again["err"]
+            found = contents(result)
+            assert found.keys() == expected.keys()
+            assert [name for name in found if found[name] != expected[name]] == []
+            assert names(place) == ["movie.tif", "result", "setup.toml"]
+    assert (-signal.SIGKILL, False) in seen
+    assert (-signal.SIGKILL, True) in seen
+
+
+@pytest.mark.parametrize("word", ["before", "after"])
+@pytest.mark.parametrize("number", [1, 2])
+def test_killed_between_two_renamings(forker: Forker, place: Path, word: str, number: int) -> None:
+    """The one moment at which neither result has the final name: the next run puts one back."""
+    shutil.copytree(forker.bench / "result", place / "result")
+    (place / "result" / "summary.json").write_text('{"earlier": true}')
+    (answer,) = forker.run({"run": FIT, "cwd": str(place), "die": [word, number]})
+    assert answer["status"] == -signal.SIGKILL
+    refused = {"run": [*FIT[:-1]], "cwd": str(place)}  # without --overwrite
+    (again,) = forker.run(refused)
+    assert again["status"] == 1
+    assert "holds an earlier result" in one_line(again)
+    summary = json.loads((place / "result" / "summary.json").read_text())
+    assert ("earlier" in summary) == ((word, number) != ("after", 2))
+    (again,) = forker.run({"run": FIT, "cwd": str(place)})
+    assert again["status"] == 0
+    assert_whole(place / "result")
+    assert names(place) == ["movie.tif", "result", "setup.toml"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_asked_to_end(forker: Forker, place: Path, number: int) -> None:
+    rng = np.random.default_rng()
+    for _ in range(5):
+        order = {"run": FIT, "cwd": str(place), "kill": [number, float(rng.uniform(0, 1))]}
+        (answer,) = forker.run(order)
+        assert answer["status"] in (0, 130, -number)  # the last before the command has begun
+        assert names(place) in (
+            ["movie.tif", "setup.toml"],
+            ["movie.tif", "result", "setup.toml"],
+        )
+        if answer["status"] == 130:
+            assert "interrupted" in one_line(answer)
+        if (place / "result").exists():
+            assert_whole(place / "result")
+
+
+def test_two_runs_into_one_folder(forker: Forker, place: Path) -> None:
+    for options in (FIT, FIT[:-1]):
+        shutil.rmtree(place / "result", ignore_errors=True)
+        answers = forker.run(*[{"run": options, "cwd": str(place)}] * 3)
+        statuses = sorted(answer["status"] for answer in answers)
+        assert statuses[0] == 0
+        assert set(statuses) <= {0, 1}
+        for answer in answers:
+            if answer["status"]:
+                assert re.search("another run|earlier result", one_line(answer))
+        assert_whole(place / "result")
+        assert names(place) == ["movie.tif", "result", "setup.toml"]
+
+
+def test_a_run_that_is_under_way_is_respected(forker: Forker, place: Path) -> None:
+    with claim_output(place / "result"):
+        with claim_output(place / "result"):  # the same process may: it is the same run
+            pass
+        (answer,) = forker.run({"run": FIT, "cwd": str(place)})
+    assert answer["status"] == 1
+    expected = f"result: another run (process {os.getpid()}) is about to write there"
+    assert expected in one_line(answer)
+    assert not (place / "result").exists()
+    (answer,) = forker.run({"run": FIT, "cwd": str(place)})
+    assert answer["status"] == 0
+
+
+# ---- disks ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("limit", [400, 8_000, 40_000])
+def test_a_file_that_cannot_grow(forker: Forker, place: Path, limit: int) -> None:
+    (answer,) = forker.run({"run": FIT, "cwd": str(place), "limit": limit})
+    assert answer["status"] == 1
+    assert re.search(r"result: cannot be written \(.*File too large\)", one_line(answer))
+    assert names(place) == ["movie.tif", "setup.toml"]
+
+
+def test_a_simulated_movie_that_cannot_grow(forker: Forker, place: Path) -> None:
+    run = ["simulate", "--config", "setup.toml", "--out", "new.tif"]
+    (answer,) = forker.run({"run": run, "cwd": str(place), "limit": 50_000})
+    assert answer["status"] == 1
+    assert "new.tif: cannot be written" in one_line(answer)
+    assert names(place) == ["movie.tif", "setup.toml"]
+
+
+@pytest.fixture
+def mount(tmp_path: Path) -> Iterator[Path]:
+    """Return a small disk of its own, where this user may mount one."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    program = shutil.which("mount")
+    if os.geteuid() != 0 or program is None:
+        pytest.skip("only root can mount a small disk")
+    made = subprocess.run(
+        [program, "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(disk)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if made.returncode:
+        pytest.skip(f"no disk can be mounted here: {made.stderr.strip()}")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_full_disk(mount: Path) -> None:
+    analysis = make_analysis(3, "joint", posteriors=2)
+    earlier = mount / "result"
+    earlier.mkdir()
+    (earlier / "fits.csv").write_text("event\n")
+    ballast = mount / "ballast"
+    for kilobytes in (390, 370, 350, 320, 290, 250, 200, 150):
+        ballast.write_bytes(bytes(kilobytes * 1000))
+        with pytest.raises(DataError, match=r"cannot be (written|made) \(.*\S"):
+            write_report(analysis, earlier, overwrite=True)
+        assert names(mount) == ["ballast", "result"]
+        assert names(earlier) == ["fits.csv"]
+
+
+def test_a_read_only_disk(mount: Path, forker: Forker) -> None:
+    shutil.copy(forker.bench / "movie.tif", mount)
+    shutil.copy(forker.bench / "setup.toml", mount)
+    subprocess.run(["mount", "-o", "remount,ro", str(mount)], check=True)
+    run = ["fit", "movie.tif", "--config", "setup.toml"]
+    (answer,) = forker.run({"run": run, "cwd": str(mount)})
+    assert answer["status"] == 1
+    assert "movie.iscat: cannot be made (Read-only file system); choose another --out" in one_line(
+        answer
+    )
+    assert "background" not in answer["err"]  # found out before the work, not after
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write into any folder")
+def test_a_read_only_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "locked"
+    folder.mkdir()
+    folder.chmod(0o555)
+    with pytest.raises(DataError, match="cannot be made"), atomic_folder(folder / "result"):
+        pass
+    folder.chmod(0o755)
+
+
+# ---- names ---------------------------------------------------------------------------------------
+
+NAMES = [
+    "with several  spaces",
+    "Ünïcödé – 粒子 🔬 \u202eabc",
+    "-n",
+    "a\nb\tc",
+    "'quotes\" and $HOME `id` {x} %s <b>",
+    "x" * 240,
+    os.fsdecode(b"not \xff\xfe text"),
+]
+
+
+@pytest.mark.parametrize("name", NAMES, ids=range(len(NAMES)))
+def test_names(forker: Forker, tmp_path: Path, name: str) -> None:
+    folder = tmp_path / (name if len(name) < 200 else "y" * 200)
+    folder.mkdir()
+    shutil.copy(forker.bench / "movie.tif", folder / f"{name}.tif")
+    shutil.copy(forker.bench / "setup.toml", folder / f"{name}.toml")
+    config = f"--config={name}.toml"
+    (answer,) = forker.run({"run": ["fit", config, "--", f"{name}.tif"], "cwd": str(folder)})
+    assert answer["status"] == 0, answer["err"]
+    assert_whole(folder / f"{name}.iscat")
+    assert names(folder) == sorted(f"{name}.{end}" for end in ("tif", "toml", "iscat"))
+    (answer,) = forker.run({"run": ["fit", config, "--", f"{name}.tif"], "cwd": str(folder)})
+    assert answer["status"] == 1
+    assert "holds an earlier result" in one_line(answer)
+
+
+def test_a_name_that_is_too_long_is_refused_early(forker: Forker, place: Path) -> None:
+    run = ["fit", "movie.tif", "--config", "setup.toml", "--out", "z" * 300]
+    (answer,) = forker.run({"run": run, "cwd": str(place)})
+    assert answer["status"] == 1
+    assert "File name too long" in one_line(answer)
+
+
+@pytest.mark.parametrize("detour", ["new/..", "new/../../{}", "."])
+def test_a_detour_never_replaces_a_folder_of_other_things(tmp_path: Path, detour: str) -> None:
+    """`new` does not exist, so that only the resolved path says which folder is meant."""
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "thesis.tex").write_text("years of work")
+    with pytest.raises(DataError, match=r"thesis\.tex"):
+        check_output(home / detour.format("home"), overwrite=True)
+    with (
+        pytest.raises(DataError, match=r"thesis\.tex"),
+        atomic_folder(home / detour.format("home"), overwrite=True) as building,
+    ):
+        (building / "fits.csv").write_text("")
+    assert names(tmp_path) == ["home"]
+    assert names(home) == ["thesis.tex"]
+
+
+def test_links_in_a_circle_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to(tmp_path / "b")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    with (
+        pytest.raises(DataError, match="out: cannot be found"),
+        atomic_folder(tmp_path / "a" / "out"),
+    ):
+        pass
+
+
+def test_neighbours_with_similar_names_are_left_alone(tmp_path: Path) -> None:
+    for name in (".iscat-building.abc.out.other", ".iscat-building.a.b.out", ".out", "out.old"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "file").write_text("")
+    before = names(tmp_path)
+    stale = tmp_path / ".iscat-building.abcdefgh.out"
+    stale.mkdir()
+    (stale / "fits.csv").write_text("half")
+    with atomic_folder(tmp_path / "out") as building:
+        (building / "fits.csv").write_text("event\n")
+    assert names(tmp_path) == sorted([*before, "out"])
+    assert all((tmp_path / name / "file").exists() for name in before)
+
+
+# ---- read back -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["mass", "localize", "joint", "track"])
+def test_tables_read_back_by_their_own_libraries(tmp_path: Path, mode: str) -> None:
+    out = write_report(make_analysis(7, mode), tmp_path / "out")
+    text = pd.read_csv(out / "fits.csv", keep_default_na=True)
+    frame = pd.read_parquet(out / "fits.parquet")
+    table = pyarrow.parquet.read_table(out / "fits.parquet")
+    assert tuple(text.columns) == tuple(frame.columns) == EVENT_COLUMNS
+    assert tuple(table.column_names) == EVENT_COLUMNS
+    assert table.num_rows == len(text) == len(frame) == 7
+    for name in EVENT_COLUMNS[:-2]:
+        np.testing.assert_allclose(text[name], frame[name], rtol=1e-8, atol=0)
+    assert text["status"].tolist() == frame["status"].tolist()
+    assert text["flags"].fillna("").tolist() == frame["flags"].tolist()
+
+
+def test_posteriors_read_back_by_arviz(tmp_path: Path) -> None:
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # of arviz, on import, once a day
+        import arviz
+
+    out = write_report(make_analysis(4, "joint", posteriors=3), tmp_path / "out")
+    data = arviz.from_netcdf(out / "posterior.nc")
+    try:
+        summary = arviz.summary(data.posterior.sel(event=data.posterior["event"].values[0]))
+        assert {"x_nm", "y_nm", "z_nm", "mass_kda"} <= set(summary.index)
+        assert np.isfinite(summary["mean"]).all()
+        assert data.posterior["z_nm"].attrs["units"] == "nm"
+    finally:
+        data.close()
