@@ -1,0 +1,76 @@
+"""Every code block of the manual and of README runs, page by page, in a folder of its own."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted(
+    [ROOT / "README.md", *(p for p in (ROOT / "docs").rglob("*.md") if "_build" not in p.parts)]
+)
+
+
+def _load_blocks() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("blocks", ROOT / "docs" / "blocks.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["blocks"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+BLOCKS = _load_blocks()
+WITH_BLOCKS = [page for page in PAGES if list(BLOCKS.blocks_of(page))]
+
+
+def _name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", WITH_BLOCKS, ids=_name)
+def test_every_block_runs(page: Path, tmp_path: Path) -> None:
+    BLOCKS.prepare(ROOT, tmp_path)
+    outcomes = BLOCKS.run_page(page, tmp_path, Path(sys.executable).parent)
+    for outcome in outcomes:
+        assert outcome.failed is None, f"{_name(page)}:{outcome.block.line}\n{outcome.failed}"
+    runnable = [block for block in BLOCKS.blocks_of(page) if block.not_run is None]
+    assert len(outcomes) == len(runnable)
+
+
+def test_a_block_that_is_not_run_says_why_and_few_are() -> None:
+    blocks = [block for page in PAGES for block in BLOCKS.blocks_of(page)]
+    left_out = [block for block in blocks if block.not_run is not None]
+    assert all(len(block.not_run.split()) > 3 for block in left_out)
+    assert len(left_out) <= 6
+    assert len(blocks) > 40
+
+
+def test_no_shell_block_hides_under_another_name() -> None:
+    for page in PAGES:
+        fences = re.findall(r"^ *```+([\w-]*)$", page.read_text(encoding="utf-8"), re.M)
+        assert set(fences) <= {"", "console", "python", "toml", "text", "none"}, page
+
+
+def test_the_runner_finds_fails_and_stops(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "<!-- first: echo hidden > a.txt -->\n<!-- keep: said -->\n"
+        "```console\n$ cat a.txt\nhidden\n$ echo one \\\n   two\n```\n\n"
+        "```{literalinclude} x y\n```\n"
+        "```python\nx = 1\nprint(x)\n```\n"
+        "<!-- not run: this would do harm -->\n```console\n$ false\n```\n"
+        "```python\nprint(x + 1)\n```\n```python\nraise ValueError('oh')\n```\n"
+        "```python\nprint('never')\n```\n",
+        encoding="utf-8",
+    )
+    outcomes = BLOCKS.run_page(page, tmp_path, Path(sys.executable).parent)
+    assert [outcome.out for outcome in outcomes] == ["hidden\none two\n", "1\n", "2\n", ""]
+    assert outcomes[0].block.keep == "said"
+    assert "ValueError: oh" in outcomes[-1].failed
