@@ -135,14 +135,16 @@ def spread_error(error: FloatArray) -> float:
     Returns
     -------
     float
-        √[(κ − 1)/4n] with κ the sample's kurtosis; 1/√(2n) for a normal distribution.
+        √[(κ − 1)/4n] with κ the sample's unbiased kurtosis; 1/√(2n) for a normal distribution.
     """
+    n = error.size
     centred = error - np.mean(error)
     second = float(np.mean(centred**2))
-    if second == 0:
+    if second == 0 or n < MIN_TRIALS:
         return math.nan
-    kurtosis = float(np.mean(centred**4)) / second**2
-    return math.sqrt((kurtosis - 1) / (4 * error.size))
+    excess = float(np.mean(centred**4)) / second**2 - 3
+    unbiased = (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * excess + 6)
+    return math.sqrt(max(2 + unbiased, 0.1) / (4 * (n - 1)))
 
 
 def spread_interval(error: FloatArray, level: float = 0.95) -> tuple[float, float]:

@@ -1,0 +1,50 @@
+"""`iscat benchmark` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from iscat_cli import main
+
+SMALL = ["--set", "fit.roi_nm=900", "--set", "fit.z_range_nm=[0,300]", "--no-posterior"]
+
+
+@pytest.mark.parametrize("scheme", ["iscat", "darkfield"])
+def test_benchmark(
+    scheme: str, sample_configs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "c.toml"
+    text = sample_configs["joint"].read_text(encoding="utf-8")
+    if scheme == "darkfield":
+        head, _, rest = text.partition("[calibration]")
+        text = head + "[bounds]" + rest.partition("[bounds]")[2]
+        text = text.replace('"iscat"', '"darkfield"').replace(
+            "photons_per_pixel = 1e4", "photons_per_pixel = 50"
+        )
+    config.write_text(text, encoding="utf-8")
+    out = tmp_path / "out"
+    arguments = ["benchmark", "--config", str(config), "--out", str(out), "--trials", "20", *SMALL]
+    as_json = ["--json"] if scheme == "iscat" else []
+    assert main([*arguments, *as_json]) == 0
+    printed = capsys.readouterr().out
+    written = json.loads((out / "benchmark.json").read_text(encoding="utf-8"))
+    if as_json:
+        assert json.loads(printed) == written
+    else:
+        assert "spread/CRB" in printed
+    assert written["scheme"] == scheme
+    assert (out / "benchmark.html").stat().st_size > 10_000
+    assert main(arguments) == 1
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_benchmark_refuses_too_few_trials(
+    sample_configs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--config", str(sample_configs["mass"]), "--out", str(tmp_path / "out")]
+    assert main(["benchmark", *arguments, "--trials", "3"]) == 2
+    assert "--trials" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,123 @@
+"""Posteriors are right: calibrated, as wide as the bound, skewed or bimodal where that is so."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from microscopes import setting
+from scipy.stats import skew
+
+from iscat_analysis.benchmark import (
+    Calibration,
+    Setting,
+    calibrate_posterior,
+    gaussian_posterior,
+    run_trials,
+    trial_generator,
+    van_trees,
+)
+from iscat_analysis.fit import fit_particle
+from iscat_analysis.posterior import sample_posterior
+from iscat_analysis.records import PARAMETERS, FloatArray, PosteriorResult, Status
+
+SEED = 12
+DRAWS = 40
+BINS = 5
+SURPRISE = 1e-4
+SMALL = {"roi_nm": 1350.0}
+
+
+def _calibrated(gain: float) -> Calibration:
+    experiment = setting("iscat", "joint", fit=SMALL)
+    width = np.array([100.0, 100.0, 12.0, 0.0])
+    lower, upper = experiment.truth - width, experiment.truth + width
+    lower[3], upper[3] = 500.0, 2000.0
+    return calibrate_posterior(
+        experiment, DRAWS, lower=lower, upper=upper, seed=SEED, workers=2, gain=gain
+    )
+
+
+def test_ranks_are_uniform_and_widths_are_the_bound() -> None:
+    found = _calibrated(1.0)
+    assert found.refused < DRAWS / 5
+    assert min(found.p_values(BINS).values()) > SURPRISE
+    widths = found.width_over_crb[found.kept]
+    error = widths.std(axis=0) / math.sqrt(len(widths))
+    # the flat prior on z ends within a few σ of some particles, which narrows those posteriors
+    assert np.all(np.abs(np.median(widths, axis=0) - 1) < 4 * error + 0.02)
+
+
+def test_ranks_reveal_a_wrong_likelihood() -> None:
+    """With counts scaled to a tenth, noise is overstated and truths crowd the middle ranks."""
+    found = _calibrated(0.1)
+    assert min(found.p_values(BINS).values()) < SURPRISE
+
+
+def _sampled(experiment: Setting, truth: FloatArray, trial: int) -> tuple[PosteriorResult, object]:
+    random = trial_generator(SEED, 3, trial)
+    likelihood = experiment.likelihood(experiment.draw(truth, random))
+    start = experiment.start(truth, random)
+    fit = fit_particle(likelihood, start, experiment.mode, experiment.config.fit.z_range_nm)
+    return sample_posterior(likelihood, fit, walkers=32, steps=1000, seed=trial), fit
+
+
+def test_a_height_between_two_fringes_has_two_peaks() -> None:
+    experiment = setting("iscat", "localize", photons=150.0, z_nm=500.0, fit=SMALL)
+    fringe = experiment.scene.model.fringe_nm
+    for trial in range(100):
+        random = trial_generator(SEED, 3, trial)
+        likelihood = experiment.likelihood(experiment.draw(experiment.truth, random))
+        fit = fit_particle(
+            likelihood, experiment.start(experiment.truth, random), "localize", (0.0, 1000.0)
+        )
+        if fit.alternatives and fit.alternatives[0].log_likelihood_gap < 1:
+            break
+    else:
+        pytest.fail("no data set with two likely heights")
+    assert Status.AMBIGUOUS_Z in fit.flags
+    posterior, _ = _sampled(experiment, experiment.truth, trial)
+    assert posterior.converged, posterior.message
+    z = posterior.samples[..., posterior.names.index("z_nm")].ravel()
+    other = fit.alternatives[0].z_nm
+    here, there = (np.mean(np.abs(z - peak) < fringe / 4) for peak in (fit.z_nm, other))
+    assert min(here, there) > 0.1
+    # odds of the peaks: likelihood gap and the heights' own widths, known to a factor
+    assert 0.2 < (here / there) / math.exp(fit.alternatives[0].log_likelihood_gap) < 5
+
+
+def test_a_mass_near_zero_is_skewed_against_its_bound() -> None:
+    """Where z is free the amplitude keeps its sign, and a faint particle's mass piles up at 0."""
+    experiment = setting("iscat", "joint", fit={**SMALL, "z_range_nm": [0.0, 150.0]}, z_nm=60.0)
+    truth = experiment.truth * [1, 1, 1, 0] + [0, 0, 0, experiment.bounds.crb_joint[3]]
+    posterior, fit = _sampled(experiment, truth, 1)
+    mass = posterior.samples[..., posterior.names.index("mass_kda")].ravel()
+    assert np.all(mass >= 0)
+    assert skew(mass) > 0.3
+    bright, _ = _sampled(experiment, experiment.truth, 1)
+    assert bright.converged, bright.message
+    assert abs(skew(bright.samples[..., 3].ravel())) < 0.2
+    del fit
+
+
+@pytest.mark.parametrize("relative", [0.5, 2.0])
+def test_van_trees_bound_is_reached_with_an_informative_prior(relative: float) -> None:
+    """Masses drawn from a normal prior: the posterior mean has the least possible error."""
+    trials = 400
+    experiment = setting("iscat", "mass", fit=SMALL)
+    crb = experiment.bounds.crb_joint[3]
+    width = relative * crb
+    truths = np.tile(experiment.truth, (trials, 1))
+    truths[:, 3] += np.random.default_rng(SEED).normal(0, width, trials)
+    found = run_trials(experiment, trials, seed=SEED, stream=9, truths=truths)
+    k = PARAMETERS.index("mass_kda")
+    mean, _ = gaussian_posterior(
+        found.estimate[:, k], found.sigma[:, k], experiment.truth[k], width
+    )
+    error = mean - truths[:, k]
+    bound = float(van_trees(np.array([[1 / crb**2]]), np.array([[1 / width**2]]))[0])
+    assert bound < crb
+    distance = math.log(math.sqrt(np.mean(error**2)) / bound) * math.sqrt(2 * trials)
+    assert abs(distance) < 4
+    assert np.sqrt(np.mean((found.estimate[:, k] - truths[:, k]) ** 2)) > bound

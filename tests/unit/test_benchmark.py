@@ -1,0 +1,197 @@
+"""The statistics of a study on numbers whose answer is known, and its files."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from microscopes import configuration, setting
+
+from iscat_analysis.benchmark import (
+    Baselines,
+    gaussian_posterior,
+    make_setting,
+    pull_histogram,
+    rank_test,
+    run_benchmark,
+    score,
+    spread_error,
+    spread_interval,
+    van_trees,
+    write_benchmark,
+)
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.records import FREE_PARAMETERS, Candidate
+from iscat_analysis.report.benchmark import BENCHMARK_NAMES
+
+FIELDS = {
+    "bias", "bias_se", "spread", "spread_ci95", "crb", "qcrb", "spread_over_crb",
+    "spread_over_crb_ci95", "spread_over_qcrb", "coverage68", "coverage95", "pull_mean", "pull_std",
+}  # fmt: skip
+SMALL = {"fit": {"roi_nm": 900.0, "z_range_nm": [0.0, 300.0]}}
+
+
+@pytest.fixture(scope="module")
+def study() -> dict[str, object]:
+    return run_benchmark(configuration(**SMALL), trials=20, seed=3, workers=2, posterior=False)
+
+
+# ---- statistics ------------------------------------------------------------------------------
+
+
+def test_score_of_a_normal_sample() -> None:
+    error = np.random.default_rng(1).normal(0.5, 2.0, 20_000)
+    found = score(error, np.full(error.size, 2.0), 2.0, 1.0)
+    assert abs(found.bias - 0.5) < 4 * found.bias_se
+    assert found.bias_se == pytest.approx(found.spread / math.sqrt(error.size))
+    assert found.spread_ci95[0] < 2.0 < found.spread_ci95[1]
+    assert found.spread_over_crb == pytest.approx(found.spread / 2)
+    assert found.spread_over_qcrb == pytest.approx(found.spread)
+    assert found.spread_robust == pytest.approx(found.spread, rel=0.03)
+    assert found.pull_mean == pytest.approx(found.bias / 2)
+    assert found.coverage95 == pytest.approx(0.943, abs=0.01)
+
+
+def test_score_leaves_out_nan_and_refuses_few() -> None:
+    error = np.array([1.0, -1.0] * 10 + [np.nan])
+    assert score(error, np.ones(21), 1.0, 1.0).bias == 0.0
+    assert math.isnan(score(error[:4], np.ones(4), 1.0, 1.0).spread)
+    assert math.isnan(score(error, np.full(21, np.nan), 1.0, 1.0).coverage68)
+    assert math.isnan(score(error, np.ones(21), math.nan, 1.0).spread_over_crb)
+
+
+def test_interval_knows_the_kurtosis() -> None:
+    rng = np.random.default_rng(2)
+    normal, heavy = rng.normal(size=50_000), rng.laplace(size=50_000)
+    assert spread_error(normal) == pytest.approx(1 / math.sqrt(2 * normal.size), rel=0.05)
+    assert spread_error(heavy) == pytest.approx(math.sqrt(5 / 4 / heavy.size), rel=0.1)
+    covered = 0
+    for _ in range(400):
+        low, high = spread_interval(rng.normal(size=200))
+        covered += low < 1 < high
+    assert covered > 362  # 380 expected, 4 standard errors fewer at most
+    assert spread_interval(np.ones(10)) == (0.0, 0.0)
+
+
+def test_rank_test_accepts_uniform_and_rejects_others() -> None:
+    rng = np.random.default_rng(3)
+    p_value, counts = rank_test(rng.integers(0, 100, 1000), 100)
+    assert p_value > 1e-3
+    assert counts.sum() == 1000
+    centred = (100 * rng.beta(2, 2, 1000)).astype(int)
+    assert rank_test(centred, 100)[0] < 1e-6
+    with pytest.raises(ConfigError, match="evenly"):
+        rank_test(centred, 100, bins=7)
+
+
+def test_pull_histogram_keeps_every_pull() -> None:
+    bins = pull_histogram(np.array([-9.0, 0.1, 0.2, 7.0, np.nan]))
+    assert sum(bins["counts"]) == 4
+    assert sum(bins["expected"]) == pytest.approx(4)
+    assert bins["counts"][0] == bins["counts"][-1] == 1
+
+
+def test_van_trees_adds_information() -> None:
+    data = np.array([[4.0, 1.0], [1.0, 2.0]])
+    nothing = np.zeros((2, 2))
+    alone = np.sqrt(np.diag(np.linalg.inv(data)))
+    assert van_trees(data, nothing) == pytest.approx(alone)
+    assert np.all(van_trees(data, np.eye(2)) < alone)
+    assert van_trees(nothing, 4 * np.eye(2)) == pytest.approx([0.5, 0.5])
+    with pytest.raises(ConfigError, match="determine"):
+        van_trees(np.diag([1.0, 0.0]), nothing)
+
+
+def test_gaussian_posterior_weighs_by_precision() -> None:
+    mean, sigma = gaussian_posterior(np.array([2.0]), np.array([1.0]), 0.0, 1.0)
+    assert mean == pytest.approx([1.0])
+    assert sigma == pytest.approx([math.sqrt(0.5)])
+
+
+# ---- settings ----------------------------------------------------------------------------------
+
+
+def test_a_setting_has_the_photons_that_were_asked_for() -> None:
+    for scheme in ("iscat", "cobri", "darkfield"):
+        made = setting(scheme, "joint", photons=1234.0)
+        assert made.experiment.collected == pytest.approx(1234.0)
+        assert made.described()["scheme"] == scheme
+
+
+def test_the_height_is_moved_off_the_ends_only_where_it_is_free_and_not_given() -> None:
+    assert setting("iscat", "mass").truth[2] == 5.0
+    assert setting("iscat", "joint", photons=100.0).truth[2] > 5.0
+    assert setting("iscat", "joint", z_nm=5.0).truth[2] == 5.0
+    assert setting("iscat", "joint", bounds={"z_nm": 7.0}).truth[2] == 7.0
+
+
+def test_expected_counts_give_back_the_truth() -> None:
+    made = make_setting(configuration(**SMALL), "joint")
+    likelihood = made.likelihood(made.draw(made.truth, None))
+    theta = np.array([*made.truth[:3], likelihood.model.scale.amplitude(made.truth[3]), 0.0])
+    score_vector = likelihood.score_fisher(theta)[1]
+    sigma = 1 / np.sqrt(np.diag(likelihood.score_fisher(theta)[2]))
+    assert np.abs(score_vector * sigma)[:4].max() < 1e-6
+
+
+def test_baselines_are_exact_without_noise() -> None:
+    made = setting("iscat", "mass")
+    likelihood = made.likelihood(made.draw(made.truth, None))
+    baselines = Baselines.calibrated(made)
+    pixel = made.scene.pixel_nm
+    start = Candidate(made.truth[0] / pixel, made.truth[1] / pixel, 5.0, made.truth[3], 0.0)
+    gauss, peak = baselines.measure(likelihood, start)
+    assert gauss[3] == pytest.approx(made.truth[3], rel=1e-6)
+    assert peak[3] == pytest.approx(made.truth[3], rel=1e-9)
+    assert np.hypot(*(gauss[:2] - made.truth[:2])) < 5.0
+
+
+# ---- the study and its files ---------------------------------------------------------------------
+
+
+def test_study_has_the_promised_fields(study: dict[str, dict[str, object]]) -> None:
+    for mode in ("mass", "localize", "joint"):
+        entry = study[mode]
+        assert {"trials", "failed", "fits_per_second", "seed"} <= set(entry)
+        for name in FREE_PARAMETERS[mode]:
+            assert set(entry[name]) >= FIELDS
+
+
+def test_study_repeats_itself_with_any_number_of_workers(study: dict[str, object]) -> None:
+    again = run_benchmark(configuration(**SMALL), trials=20, seed=3, workers=1, posterior=False)
+    for mode in ("mass", "localize", "joint"):
+        for name in FREE_PARAMETERS[mode]:
+            assert _text(study[mode][name]) == _text(again[mode][name])
+    assert _text(study["curves"]) == _text(again["curves"])
+    other = run_benchmark(configuration(**SMALL), trials=20, seed=4, workers=2, posterior=False)
+    assert _text(other["curves"]) != _text(study["curves"])
+
+
+def _text(value: object) -> str:
+    return json.dumps(value, sort_keys=True, default=float)
+
+
+def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
+    folder = write_benchmark(study, tmp_path / "out")
+    assert {entry.name for entry in folder.iterdir()} == set(BENCHMARK_NAMES)
+    plain = json.loads((folder / "benchmark.json").read_text(encoding="utf-8"))
+    assert plain["mass"]["x_nm"]["crb"] == pytest.approx(study["mass"]["x_nm"]["crb"])
+    drawn = {path.name for path in (folder / "figures").iterdir()}
+    assert {
+        "photons_joint.png",
+        "photons_joint.svg",
+        "heights_mass.png",
+        "pulls_joint.svg",
+    } <= drawn
+    page = (folder / "benchmark.html").read_text(encoding="utf-8")
+    assert "spread / CRB" in page
+    with pytest.raises(DataError, match="overwrite"):
+        write_benchmark(study, folder)
+    write_benchmark(study, folder, overwrite=True)
+
+
+def test_too_few_trials_are_refused() -> None:
+    with pytest.raises(ConfigError, match="at least 20"):
+        run_benchmark(configuration(**SMALL), trials=5)
