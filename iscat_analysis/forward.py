@@ -8,7 +8,7 @@ the contrast C in the interferometric schemes and |E_sca|² for unit incident am
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,8 +20,12 @@ from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil, rec
 from iscat_analysis._kernels.radial import STEP, AxialTable, bessel_table, radial_profile
 from iscat_analysis.config import Calibration, Config, Optics
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.grid import PixelGrid
 from iscat_analysis.materials import Material, material
+from iscat_analysis.scale import MassScale
 from iscat_analysis.units import KILODALTON_KG, NM
+
+__all__ = ["ForwardModel", "MassScale", "PixelGrid", "forward_model"]
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -31,95 +35,6 @@ NEAR_CRITICAL = 0.98
 
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
-
-
-@dataclass(frozen=True)
-class PixelGrid:
-    """Pixel centres on a regular grid; x along columns, y down the rows.
-
-    Attributes
-    ----------
-    x_nm, y_nm : ndarray, shape (nx,), (ny,)
-        Centres [nm].
-    pixel_nm : float
-        Side of a pixel [nm].
-    """
-
-    x_nm: FloatArray
-    y_nm: FloatArray
-    pixel_nm: float
-
-    @classmethod
-    def region(cls, rows: tuple[int, int], columns: tuple[int, int], pixel_nm: float) -> PixelGrid:
-        """Half-open ranges of full-frame pixels; pixel (0, 0) has its centre at (0, 0) nm."""
-        x, y = (np.arange(*span, dtype=np.float64) * pixel_nm for span in (columns, rows))
-        return cls(x, y, pixel_nm)
-
-    @classmethod
-    def centred(cls, pixels: int, pixel_nm: float) -> PixelGrid:
-        """Return a square field with centres (i − (n−1)/2)·pixel."""
-        axis = (np.arange(pixels, dtype=np.float64) - (pixels - 1) / 2) * pixel_nm
-        return cls(axis, axis, pixel_nm)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows, columns."""
-        return self.y_nm.size, self.x_nm.size
-
-    @property
-    def diagonal_nm(self) -> float:
-        """Largest distance inside the grid, pixel edges included [nm]."""
-        return math.hypot(
-            self.x_nm[-1] - self.x_nm[0] + self.pixel_nm,
-            self.y_nm[-1] - self.y_nm[0] + self.pixel_nm,
-        )
-
-
-@dataclass(frozen=True)
-class MassScale:
-    """The map between mass and the amplitude a of the model's field.
-
-    Without a calibration a is the mass in kDa.  With one, the signed peak contrast
-    C = L·a + Q·a² of the model at the calibration height equals gradient·m + sign(m)·offset, which
-    replaces the model's absolute scale.
-
-    Attributes
-    ----------
-    calibration : Calibration or None
-        The line.
-    linear, quadratic : float
-        L and Q, per unit amplitude.
-    """
-
-    calibration: Calibration | None = None
-    linear: float = 0.0
-    quadratic: float = 0.0
-
-    def amplitude(self, mass_kda: float) -> float:
-        """Amplitude a of a particle of a given mass [kDa]."""
-        if self.calibration is None:
-            return mass_kda
-        line = self.calibration
-        contrast = line.gradient_per_kda * mass_kda + math.copysign(1.0, mass_kda) * line.offset
-        root = math.sqrt(max(self.linear**2 + 4 * self.quadratic * contrast, 0.0))
-        return 2 * contrast / (self.linear + math.copysign(root, self.linear))
-
-    def mass(self, amplitude: FloatArray) -> FloatArray:
-        """Mass [kDa] of amplitudes of any shape; the inverse of `amplitude`."""
-        amplitude = np.asarray(amplitude, dtype=float)
-        if self.calibration is None:
-            return amplitude
-        line = self.calibration
-        contrast = self.linear * amplitude + self.quadratic * amplitude**2
-        sign = np.sign(contrast * line.gradient_per_kda)
-        return (contrast - sign * line.offset) / line.gradient_per_kda
-
-    def slope(self, amplitude: float) -> float:
-        """Return dm/da [kDa per unit amplitude]."""
-        if self.calibration is None:
-            return 1.0
-        rise = self.linear + 2 * self.quadratic * amplitude
-        return rise / self.calibration.gradient_per_kda
 
 
 @dataclass(frozen=True)
@@ -171,7 +86,7 @@ class ForwardModel:
     step_nm: float
     z_range_nm: tuple[float, float]
     samples: tuple[FloatArray, FloatArray]
-    scale: MassScale = MassScale()
+    scale: MassScale = field(default_factory=MassScale)
 
     @property
     def wavenumber(self) -> float:

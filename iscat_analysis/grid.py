@@ -1,0 +1,53 @@
+"""Where images are evaluated: pixel centres, x along columns, y down the rows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PixelGrid:
+    """Pixel centres on a regular grid; x along columns, y down the rows.
+
+    Attributes
+    ----------
+    x_nm, y_nm : ndarray, shape (nx,), (ny,)
+        Centres [nm].
+    pixel_nm : float
+        Side of a pixel [nm].
+    """
+
+    x_nm: FloatArray
+    y_nm: FloatArray
+    pixel_nm: float
+
+    @classmethod
+    def region(cls, rows: tuple[int, int], columns: tuple[int, int], pixel_nm: float) -> PixelGrid:
+        """Half-open ranges of full-frame pixels; pixel (0, 0) has its centre at (0, 0) nm."""
+        x, y = (np.arange(*span, dtype=np.float64) * pixel_nm for span in (columns, rows))
+        return cls(x, y, pixel_nm)
+
+    @classmethod
+    def centred(cls, pixels: int, pixel_nm: float) -> PixelGrid:
+        """Return a square field with centres (i − (n−1)/2)·pixel."""
+        axis = (np.arange(pixels, dtype=np.float64) - (pixels - 1) / 2) * pixel_nm
+        return cls(axis, axis, pixel_nm)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows, columns."""
+        return self.y_nm.size, self.x_nm.size
+
+    @property
+    def diagonal_nm(self) -> float:
+        """Largest distance inside the grid, pixel edges included [nm]."""
+        return math.hypot(
+            self.x_nm[-1] - self.x_nm[0] + self.pixel_nm,
+            self.y_nm[-1] - self.y_nm[0] + self.pixel_nm,
+        )
