@@ -7,7 +7,7 @@ import io
 import re
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from typing import Annotated
 
@@ -17,6 +17,8 @@ from iscat_cli.benchmark import EXAMPLE as BENCHMARK_EXAMPLE
 from iscat_cli.benchmark import benchmark
 from iscat_cli.bounds import EXAMPLE as BOUNDS_EXAMPLE
 from iscat_cli.bounds import bounds
+from iscat_cli.calibrate import CAMERA_EXAMPLE, MASS_EXAMPLE, camera, mass
+from iscat_cli.calibrate import SUMMARY as CALIBRATE_SUMMARY
 from iscat_cli.config import EXAMPLE as CONFIG_EXAMPLE
 from iscat_cli.config import config
 from iscat_cli.console import INTERRUPTED, Messages
@@ -34,6 +36,9 @@ COMMANDS = (
     (config, CONFIG_EXAMPLE),
 )
 
+# A command with commands of its own: its name, what it is for, and they.
+GROUPS = (("calibrate", CALIBRATE_SUMMARY, ((camera, CAMERA_EXAMPLE), (mass, MASS_EXAMPLE))),)
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `iscat`.
@@ -49,7 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
-    return _run(_umbrella(), "iscat", given or ["--help"])
+    if not given or (len(given) == 1 and given[0] in [name for name, _, _ in GROUPS]):
+        given.append("--help")
+    return _run(_umbrella(), "iscat", given)
 
 
 def main_fit(arguments: Sequence[str] | None = None) -> int:
@@ -73,10 +80,18 @@ def main_fit(arguments: Sequence[str] | None = None) -> int:
 def _umbrella() -> typer.Typer:
     app = _empty()
     app.callback()(_iscat)
-    for command, example in COMMANDS:
+    _add(app, COMMANDS)
+    for name, summary, commands in GROUPS:
+        group = _empty()
+        _add(group, commands)
+        app.add_typer(group, name=name, help=summary)
+    return app
+
+
+def _add(app: typer.Typer, commands: Sequence[tuple[Callable[..., None], str]]) -> None:
+    for command, example in commands:
         summary = (command.__doc__ or "").partition("\n")[0]
         app.command(epilog=_as_written(example), short_help=summary)(command)
-    return app
 
 
 def _empty() -> typer.Typer:

@@ -1,0 +1,231 @@
+"""`iscat calibrate`: the camera from its own noise, mass from standards."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from iscat_cli.console import Messages, failures, print_json, print_result
+from iscat_cli.options import DebugOption, JsonOption, OverwriteOption, QuietOption
+
+if TYPE_CHECKING:
+    from iscat_analysis.mass_calibration import MassCalibration
+    from iscat_analysis.photon_transfer import CameraCalibration, Estimate
+
+SUMMARY = "Calibrate the camera, or contrast against mass."
+
+CAMERA_EXAMPLE = """Example: gain, offset and read noise from a movie and a dark.
+
+    iscat calibrate camera movie.tif --dark dark.tif --out camera
+"""
+
+MASS_EXAMPLE = """Example: three standards in a measured table of events.
+
+    iscat calibrate mass standards.iscat/fits.csv --standards 66,146,480
+"""
+
+
+class LandingSign(StrEnum):
+    """What a particle that lands does to its place."""
+
+    DARK = "dark"
+    BRIGHT = "bright"
+
+
+def camera(
+    context: typer.Context,
+    stacks: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[STACK]...",
+            help="Flats at one or several levels, or the movie itself.",
+            show_default=False,
+        ),
+    ] = None,
+    *,
+    dark: Annotated[
+        Path | None,
+        typer.Option(metavar="STACK", help="Frames without light.", show_default=False),
+    ] = None,
+    offset: Annotated[
+        float | None,
+        typer.Option(
+            metavar="COUNTS", help="The offset, known without a dark.", show_default=False
+        ),
+    ] = None,
+    maps: Annotated[
+        bool, typer.Option("--maps", help="Write maps, one number per pixel, as TIFF.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Output folder; default the first stack's name with .camera.",
+            show_default=False,
+        ),
+    ] = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Measure gain, offset and read noise, and how far averaging lowers the noise.
+
+    Writes camera.json, camera.toml (a section to paste), camera.html and, with --maps, TIFF maps.
+    """
+    messages = Messages(context.command_path, quiet=quiet)
+    with failures(messages, debug=debug):
+        from iscat_analysis.errors import ConfigError
+        from iscat_analysis.pipeline.calibrations import camera_calibration
+
+        given = [*(stacks or ()), *([dark] if dark is not None else [])]
+        if not given:
+            raise ConfigError("give a flat, the movie, or --dark")
+        if dark is not None and offset is not None:
+            raise ConfigError("--dark measures the offset: leave --offset out")
+        folder = out if out is not None else given[0].with_suffix(".camera")
+        with messages.progress() as progress:
+            found = camera_calibration(
+                stacks or (),
+                folder,
+                dark=dark,
+                offset_adu=offset,
+                maps=maps,
+                overwrite=overwrite,
+                progress=progress,
+                notify=messages.notify,
+            )
+        if as_json:
+            print_json({**found.to_dict(), "out": str(folder)})
+        else:
+            _print_camera(found)
+        messages.notify(f"wrote {folder}; open {folder / 'camera.html'}")
+
+
+def mass(
+    context: typer.Context,
+    events: Annotated[
+        Path,
+        typer.Argument(
+            metavar="EVENTS", help="fits.csv, or an event table of Refeyn's, h5 or csv."
+        ),
+    ],
+    *,
+    standards: Annotated[
+        str,
+        typer.Option(
+            metavar="KDA,KDA,...",
+            help="Masses of the standards; 66:0.5 gives one its standard error, otherwise 1 %.",
+            show_default=False,
+        ),
+    ],
+    landing: Annotated[
+        LandingSign | None,
+        typer.Option(
+            help="What landing does; default what the table's masses say, or dark.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Output folder; default the table's name with .calibration.",
+            show_default=False,
+        ),
+    ] = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Fit the line between contrast and mass through the peaks of standards.
+
+    Writes calibration.json, calibration.toml (a section to paste) and calibration.html.
+    """
+    messages = Messages(context.command_path, quiet=quiet)
+    with failures(messages, debug=debug):
+        masses, errors = _standards(standards)
+
+        from iscat_analysis.pipeline.calibrations import mass_calibration
+
+        folder = out if out is not None else events.with_suffix(".calibration")
+        found = mass_calibration(
+            events,
+            masses,
+            folder,
+            standards_se_kda=errors,
+            landing=landing.value if landing is not None else None,
+            overwrite=overwrite,
+            notify=messages.notify,
+        )
+        if as_json:
+            print_json({**found.to_dict(), "out": str(folder)})
+        else:
+            _print_mass(found)
+        messages.notify(f"wrote {folder}; open {folder / 'calibration.html'}")
+
+
+def _standards(text: str) -> tuple[list[float], list[float]]:
+    """Read ``66,146:1.5,480``."""
+    from iscat_analysis.errors import ConfigError
+    from iscat_analysis.mass_calibration import STANDARD_ERROR
+
+    masses, errors = [], []
+    for part in text.split(","):
+        value, colon, error = part.partition(":")
+        try:
+            masses.append(float(value))
+            errors.append(float(error) if colon else STANDARD_ERROR * abs(masses[-1]))
+        except ValueError:
+            raise ConfigError(
+                f"--standards {text}: {part.strip()!r} is not a mass in kDa; write it as 66,146,480"
+            ) from None
+    return masses, errors
+
+
+def _print_camera(found: CameraCalibration) -> None:
+    table = _table("camera")
+    for name in ("value", "95 % low", "95 % high"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for label, estimate in (
+        ("gain [e/count]", found.gain_e_per_adu),
+        ("offset [counts]", found.offset_adu),
+        ("read noise [counts]", found.read_noise_adu),
+        ("read noise [e]", found.read_noise_e),
+    ):
+        table.add_row(label, *_cells(estimate))
+    print_result(table)
+    if found.read_noise_below_e is not None:
+        print_result(f"read noise below {found.read_noise_below_e:.3g} e (95 %)")
+    print_result(found.verdict)
+
+
+def _cells(estimate: Estimate | None) -> list[str]:
+    if estimate is None:
+        return ["–", "–", "–"]
+    return [f"{value:.5g}" for value in (estimate.value, *estimate.ci95)]
+
+
+def _print_mass(found: MassCalibration) -> None:
+    table = _table("standard [kDa]")
+    for name in ("contrast", "± ", "by the line [kDa]", "95 % low", "95 % high", "residual [%]"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in found.standards.to_dict("records"):
+        names = ("contrast", "contrast_se", "found_kda", "low_kda", "high_kda", "residual_percent")
+        table.add_row(f"{row['mass_kda']:g}", *(f"{row[name]:.4g}" for name in names))
+    print_result(table)
+    print_result(found.to_toml())
+
+
+def _table(title: str) -> Any:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD if Console().is_terminal else None, pad_edge=False)
+    table.add_column(title, no_wrap=True)
+    return table

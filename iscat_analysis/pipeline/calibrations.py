@@ -1,0 +1,244 @@
+"""The two calibrations, from files to a folder: the camera from its noise, mass from standards."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import tifffile
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.events import read_events
+from iscat_analysis.load import open_stack
+from iscat_analysis.mass_calibration import Landing, MassCalibration, calibrate_mass
+from iscat_analysis.photon_transfer import CameraCalibration, measure_camera
+from iscat_analysis.records import Progress, Status, silent
+from iscat_analysis.report import atomic_folder, check_output, jsonable
+from iscat_analysis.report.calibration import camera_page, mass_page
+
+CAMERA_FILES = frozenset(
+    {
+        "camera.json",
+        "camera.toml",
+        "camera.html",
+        "gain_e_per_adu.tif",
+        "offset_adu.tif",
+        "read_noise_e.tif",
+        "masked.tif",
+    }
+)
+"""Everything a camera calibration may leave in its folder."""
+
+MASS_FILES = frozenset({"calibration.json", "calibration.toml", "calibration.html"})
+"""Everything a mass calibration may leave in its folder."""
+
+_BINS = 120
+
+
+def camera_calibration(
+    stacks: Sequence[Path],
+    out: Path,
+    *,
+    dark: Path | None = None,
+    offset_adu: float | None = None,
+    maps: bool = False,
+    overwrite: bool = False,
+    progress: Progress = silent,
+    notify: Callable[[str], None] | None = None,
+) -> CameraCalibration:
+    """Calibrate a camera from recordings and write what was found.
+
+    Parameters
+    ----------
+    stacks : sequence of Path
+        Flats, or the movie itself; may be empty where `dark` is given.
+    out : Path
+        Folder for camera.json, camera.toml, camera.html and the maps.
+    dark : Path, optional
+        Frames without light.
+    offset_adu : float, optional
+        The offset, where it is known and there is no dark [counts].
+    maps : bool
+        Write TIFF maps, and name them in camera.toml.
+    overwrite : bool
+        Whether an earlier result may be replaced.
+    progress : Progress
+        Told how many frames are done.
+    notify : callable, optional
+        Given each note, a sentence.
+
+    Returns
+    -------
+    CameraCalibration
+        What was found.
+
+    Raises
+    ------
+    DataError
+        A recording cannot be used, or the folder may not be written.
+    """
+    check_output(out, overwrite, known=CAMERA_FILES)
+    with ExitStack() as opened:
+        light = [opened.enter_context(open_stack(path)) for path in stacks]
+        shade = opened.enter_context(open_stack(dark)) if dark is not None else None
+        found = measure_camera(
+            light, dark=shade, offset_adu=offset_adu, maps=maps, progress=progress
+        )
+    for note in found.notes:
+        if notify is not None:
+            notify(note)
+    names = {key: f"{key}.tif" for key in found.maps}
+    title = ", ".join(path.name for path in (*stacks, *([dark] if dark else [])))
+    contents = {"recordings": [str(p) for p in stacks], "dark": str(dark) if dark else None}
+    contents |= found.to_dict()
+    toml = found.to_toml(names)
+    with atomic_folder(out, overwrite, known=CAMERA_FILES) as folder:
+        _write_json(contents, folder / "camera.json")
+        (folder / "camera.toml").write_text(toml, encoding="utf-8")
+        for key, values in found.maps.items():
+            tifffile.imwrite(folder / names[key], values.astype(np.float32))
+        if maps:
+            masked = np.logical_or.reduce(list(found.masked.values()))
+            tifffile.imwrite(folder / "masked.tif", masked.astype(np.uint8))
+        page = camera_page(title, jsonable(contents), toml)
+        (folder / "camera.html").write_text(page, encoding="utf-8")
+    return found
+
+
+def mass_calibration(
+    events: Path,
+    standards_kda: Sequence[float],
+    out: Path,
+    *,
+    standards_se_kda: Sequence[float] | None = None,
+    landing: Landing | None = None,
+    overwrite: bool = False,
+    notify: Callable[[str], None] | None = None,
+) -> MassCalibration:
+    """Calibrate contrast against standards and write what was found.
+
+    Parameters
+    ----------
+    events : Path
+        ``fits.csv``, or an event table of Refeyn's programs.
+    standards_kda : sequence of float
+        Masses of the standards [kDa].
+    out : Path
+        Folder for calibration.json, calibration.toml and calibration.html.
+    standards_se_kda : sequence of float, optional
+        Their standard errors [kDa].
+    landing : {"dark", "bright"}, optional
+        What landing does; by default what the table's own masses say, or dark.
+    overwrite : bool
+        Whether an earlier result may be replaced.
+    notify : callable, optional
+        Given each note, a sentence.
+
+    Returns
+    -------
+    MassCalibration
+        What was found.
+
+    Raises
+    ------
+    ConfigError
+        The standards are impossible.
+    DataError
+        The table cannot be read, has no such peaks, or the folder may not be written.
+    """
+    check_output(out, overwrite, known=MASS_FILES)
+    table = read_contrasts(events)
+    contrast = table["contrast"].to_numpy(float)
+    if landing is None:
+        landing = _landing(contrast, table["mass_kda"].to_numpy(float))
+    sigma = table["sigma_contrast"].to_numpy(float) if "sigma_contrast" in table else None
+    found = calibrate_mass(
+        contrast,
+        standards_kda,
+        standards_se_kda=standards_se_kda,
+        sigmas=sigma,
+        landing=landing,
+        name=str(events),
+    )
+    for note in found.notes:
+        if notify is not None:
+            notify(note)
+    direction = -1.0 if found.landing == "dark" else 1.0
+    size = direction * contrast[direction * contrast > 0]
+    top = 1.25 * max(peak.contrast for peak in found.peaks)
+    counts, edges = np.histogram(size, bins=_BINS, range=(0.0, top))
+    contents = {
+        "source": str(events),
+        **found.to_dict(),
+        "histogram": {"edges": edges.tolist(), "counts": counts.tolist()},
+    }
+    toml = found.to_toml()
+    with atomic_folder(out, overwrite, known=MASS_FILES) as folder:
+        _write_json(contents, folder / "calibration.json")
+        (folder / "calibration.toml").write_text(toml, encoding="utf-8")
+        page = mass_page(events.name, jsonable(contents), toml)
+        (folder / "calibration.html").write_text(page, encoding="utf-8")
+    return found
+
+
+def read_contrasts(path: Path) -> pd.DataFrame:
+    """Read contrasts and masses from a table of this package or of Refeyn's programs.
+
+    Parameters
+    ----------
+    path : Path
+        ``fits.csv`` (its rows with status ok), or what `read_events` takes.
+
+    Returns
+    -------
+    pandas.DataFrame
+        contrast and mass_kda [kDa]; for ``fits.csv`` also sigma_contrast.
+
+    Raises
+    ------
+    DataError
+        The file cannot be read as either.
+    """
+    try:
+        with path.open("rb") as file:
+            first = file.readline(4096)
+    except OSError:
+        return read_events(path)  # says what is wrong with it
+    names = first.decode("utf-8", errors="replace").lstrip("\ufeff").strip().split(",")
+    if not {"event", "contrast", "mass_kda", "status"} <= set(names):
+        return read_events(path)
+    try:
+        table = pd.read_csv(path)
+        good = table[table["status"] == Status.OK.value]
+        columns = good[["contrast", "mass_kda", "sigma_mass_kda"]].astype(float)
+    except (ValueError, KeyError, UnicodeDecodeError) as error:
+        raise DataError(
+            f"{path}: cannot be read as fits.csv ({error}); run the fit again"
+        ) from None
+    relative = columns["sigma_mass_kda"] / columns["mass_kda"].abs()
+    columns["sigma_contrast"] = relative * columns["contrast"].abs()
+    if columns.empty or not np.isfinite(columns["contrast"]).any():
+        raise DataError(
+            f"{path}: holds no event with status ok and a contrast; a calibration needs landing "
+            "events of the standards"
+        )
+    if not np.isfinite(columns["sigma_contrast"]).any():
+        columns = columns.drop(columns="sigma_contrast")
+    return columns
+
+
+def _landing(contrast: np.ndarray[Any, Any], mass: np.ndarray[Any, Any]) -> Landing:
+    """Read the sign of landing off the masses that the table has; dark where it has none."""
+    product = contrast * mass
+    product = product[np.isfinite(product)]
+    return "bright" if product.size and float(np.median(product)) > 0 else "dark"
+
+
+def _write_json(contents: Any, path: Path) -> None:
+    text = json.dumps(jsonable(contents), indent=2, ensure_ascii=False, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")
