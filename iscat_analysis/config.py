@@ -39,7 +39,23 @@ PIXEL_NM = (1.0, 2000.0)
 
 
 def plausible_pixel(size_nm: float) -> float:
-    """Return a pixel size in the sample plane [nm], unless no microscope has it."""
+    """Return a pixel size, unless no microscope has it.
+
+    Parameters
+    ----------
+    size_nm : float
+        In the sample plane [nm].
+
+    Returns
+    -------
+    float
+        The same.
+
+    Raises
+    ------
+    ValueError
+        It lies outside `PIXEL_NM`.
+    """
     low, high = PIXEL_NM
     if not low <= size_nm <= high:
         raise ValueError(

@@ -76,8 +76,6 @@ def test_the_mass_of_a_sphere() -> None:
 
 
 def test_custom_particles_give_everything() -> None:
-    found = material(
-        Particle(kind="custom", index=1.5, density_kg_m3=1200.0, mass_kda=70.0), 525.0
-    )
+    found = material(Particle(kind="custom", index=1.5, density_kg_m3=1200.0, mass_kda=70.0), 525.0)
     assert found.permittivity == pytest.approx(2.25)
     assert (found.density_kg_m3, found.mass_kda) == (1200.0, 70.0)
