@@ -360,9 +360,14 @@ def _sampled(
 def _camera_warnings(movie: Stack, camera: Camera, windows: Windows) -> Iterator[str]:
     """Say what the background frames reveal about the camera."""
     start, stop = windows.frames_before
-    if stop - start >= 2:
+    used = ~windows.masked
+    light, read = windows.before_e[used], windows.read_variance_before_e2[used]
+    if stop - start >= 2 and light.sum() > read.sum():  # else there is no shot noise to look at
         frames = movie.read(start, min(stop, start + _GAIN_FRAMES))
-        message = diagnose_gain(frames, camera, masked=windows.masked).message
+        try:
+            message = diagnose_gain(frames, camera, masked=windows.masked).message
+        except DataError:
+            message = None  # too dark to tell
         if message:
             yield message
     defects = int(np.sum(windows.masked & ~windows.saturated))

@@ -247,6 +247,7 @@ def test_dark_field(level_e: float | None, camera: dict, tmp_path: Path) -> None
     )
     analysis, truth = _run(config, tmp_path)
     assert analysis.summary["masked_pixels"] == 0
+    assert not analysis.warnings  # nothing is said of a gain that no light shows
     _assert_true(analysis.table, truth, "mass")
     assert analysis.table["contrast"].isna().all()
 
