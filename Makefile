@@ -5,19 +5,21 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
+LOWEST := $(VENV)/lowest
 
 DEMO_CONFIG := sample_configs/mass.toml
 DEMO        := demo
 
-.PHONY: help install demo test lint bench docs clean
+.PHONY: help install demo test test-lowest lint bench docs clean
 
 help:
-	@echo "make demo    simulate a movie, fit it, say where the report is"
-	@echo "make test    style, types, architecture, docstrings, tests with coverage"
-	@echo "make lint    the same without the tests"
-	@echo "make bench   speed and efficiency, against peers"
-	@echo "make docs    the manual, in docs/_build/html"
-	@echo "make clean   remove what these made, the environment included"
+	@echo "make demo         simulate a movie, fit it, say where the report is"
+	@echo "make test         style, types, architecture, docstrings, tests with coverage"
+	@echo "make test-lowest  the quick tests with the lowest versions that pyproject.toml admits"
+	@echo "make lint         the same without the tests"
+	@echo "make bench        speed and efficiency, against peers"
+	@echo "make docs         the manual, in docs/_build/html"
+	@echo "make clean        remove what these made, the environment included"
 
 install: $(STAMP)
 
@@ -47,6 +49,18 @@ lint: $(STAMP)
 
 test: lint
 	$(BIN)/pytest --cov --cov-fail-under=90
+
+# Old libraries may use what new ones deprecate, so that warnings are errors above but not here.
+test-lowest: $(LOWEST)/.installed
+	$(LOWEST)/bin/python -m pytest -q -p no:cacheprovider tests/unit tests/physics \
+	    -W default::DeprecationWarning -W default::PendingDeprecationWarning -W default::FutureWarning
+
+$(LOWEST)/.installed: pyproject.toml .ci/lowest.py
+	$(PYTHON) -m venv --clear $(LOWEST)
+	$(PYTHON) .ci/lowest.py test > $(LOWEST)/constraints.txt
+	$(LOWEST)/bin/python -m pip install --quiet --prefer-binary \
+	    --constraint $(LOWEST)/constraints.txt --editable ".[test]"
+	@touch $@
 
 bench: $(STAMP)
 	$(BIN)/python benchmarks/run.py

@@ -86,13 +86,11 @@ def _write_configuration() -> None:
 def _write_library() -> None:
     public = [name for name in iscat_analysis.__all__ if callable(getattr(iscat_analysis, name))]
     public.sort(key=lambda name: list(iscat_analysis._HOME).index(name))
+    lines = {name: _first_line(getattr(iscat_analysis, name)) for name in public}
     blocks = [
         "The public list\n---------------\n\n.. automodule:: iscat_analysis\n",
         ".. list-table::\n   :widths: 25 75\n\n"
-        + "\n".join(
-            f"   * - `{name}`\n     - {_first_line(getattr(iscat_analysis, name))}"
-            for name in public
-        ),
+        + "\n".join(f"   * - `{name}`\n     - {line}" for name, line in lines.items()),
     ]
     modules = sorted(
         info.name

@@ -4,7 +4,7 @@ The flow of a measurement, each step a name of this package::
 
     import iscat_analysis as ia
 
-    setup = ia.configure("setup.toml", settings={"optics.na": 1.42})   # a Config, validated
+    setup = ia.configure("setup.toml", settings={"optics.na": 1.42})
     result = ia.fit_movie("movie.tif", config=setup, background=(0, 200))
     result                      # summary and table; in a notebook, drawn as HTML
     result.table                # pandas.DataFrame, one row per event

@@ -1,0 +1,121 @@
+"""What the commands print with --json, and the JSON they write, against the published schemas."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+from iscat_analysis.config import config_to_toml, load_config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.records import EVENT_COLUMNS, Status
+from iscat_analysis.schemas import schema, schema_names
+from iscat_cli import main, main_fit
+
+SMALL = [
+    "simulation.frames=60",
+    "simulation.shape=[64, 64]",
+    "simulation.events=[{frame=30, x_px=31.2, y_px=30.8, mass_kda=900.0}]",
+    "background.frames=[0, 30]",
+    "fit.frames=[30, 60]",
+    "posterior.enabled=false",
+    "bounds.pixels=41",
+]
+
+
+def _check(value: Any, name: str) -> None:
+    jsonschema.Draft202012Validator(schema(name)).validate(value)
+
+
+@pytest.fixture(scope="module")
+def setup(tmp_path_factory, sample_configs) -> Path:
+    """Write a small configuration."""
+    path = tmp_path_factory.mktemp("json") / "setup.toml"
+    path.write_text(config_to_toml(load_config(sample_configs["mass"], SMALL)), encoding="utf-8")
+    return path
+
+
+def _printed(capsys, *arguments: str) -> Any:
+    capsys.readouterr()
+    assert main([*arguments, "--json", "--quiet"]) == 0
+    return json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+
+
+def test_schemas_are_schemas() -> None:
+    assert set(schema_names()) == {"benchmark", "bounds", "fit", "simulate", "summary"}
+    for name in schema_names():
+        jsonschema.Draft202012Validator.check_schema(schema(name))
+    with pytest.raises(ConfigError, match="there are benchmark, bounds"):
+        schema("fits")
+
+
+def test_the_schema_of_an_event_is_the_table() -> None:
+    event = schema("fit")["properties"]["events"]["items"]
+    assert event["required"] == list(EVENT_COLUMNS)
+    assert event["properties"]["status"]["enum"] == [str(status) for status in Status]
+    assert all(column["description"] for column in event["properties"].values())
+
+
+@pytest.mark.parametrize("mode", ["mass", "localize", "joint"])
+def test_simulate_fit_and_summary(mode: str, setup, capsys, tmp_path) -> None:
+    movie = tmp_path / "movie.tif"
+    written = _printed(capsys, "simulate", "--config", str(setup), "--out", str(movie))
+    _check(written, "simulate")
+    found = _printed(capsys, "fit", str(movie), "--config", str(setup), "--mode", mode)
+    _check(found, "fit")
+    assert len(found["events"]) == 1
+    summary = json.loads((tmp_path / "movie.iscat" / "summary.json").read_text(encoding="utf-8"))
+    _check(summary, "summary")
+    empty = found | {"events": [], "status": {}}
+    _check(empty, "fit")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        [],
+        ["--mode", "joint"],
+        ["--set", "bounds.n_before=0"],
+        ["--scan", "focus=-200:200:200"],
+        ["--optimize", "focus", "--for", "mass"],
+        ["--target", "mass=5kDa"],
+        ["--set", "optics.scheme=cobri"],
+    ],
+)
+def test_bounds(options: list[str], setup, capsys) -> None:
+    _check(_printed(capsys, "bounds", "--config", str(setup), *options), "bounds")
+
+
+def test_benchmark(setup, capsys, tmp_path) -> None:
+    arguments = ["benchmark", "--config", str(setup), "--out", str(tmp_path / "study")]
+    printed = _printed(capsys, *arguments, "--trials", "20", "--no-posterior")
+    _check(printed, "benchmark")
+    written = json.loads((tmp_path / "study" / "benchmark.json").read_text(encoding="utf-8"))
+    _check(written, "benchmark")
+
+
+def test_the_schemas_refuse_what_is_wrong(setup, capsys, tmp_path) -> None:
+    """A schema that accepts everything would pass all of the above."""
+    movie = tmp_path / "movie.tif"
+    main(["simulate", "--config", str(setup), "--out", str(movie), "--quiet"])
+    capsys.readouterr()
+    assert main_fit([str(movie), "--config", str(setup), "--json", "--quiet"]) == 0
+    good = json.loads(capsys.readouterr().out)
+    for change in (
+        lambda fit: fit.pop("versions"),
+        lambda fit: fit["events"][0].pop("crb_x_nm"),
+        lambda fit: fit["events"][0].update(status="good"),
+        lambda fit: fit["events"][0].update(p_value=1.5),
+        lambda fit: fit["events"][0].update(sigma_x_nm=-1.0),
+        lambda fit: fit["events"][0].update(unknown=1),
+        lambda fit: fit.update(events=1),
+        lambda fit: fit["input"].update(sha256="abc"),
+    ):
+        bad = copy.deepcopy(good)
+        change(bad)
+        with pytest.raises(jsonschema.ValidationError):
+            _check(bad, "fit")

@@ -1,0 +1,235 @@
+"""The public list: complete, quick to import, documented, and pleasant in a notebook."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+import iscat_analysis as ia
+from iscat_analysis import notebook
+from iscat_analysis.report.pictures import draw
+
+SMALL = {
+    "simulation.frames": 120,
+    "simulation.shape": [72, 72],
+    "simulation.events": [
+        {"frame": 60, "x_px": 20.2, "y_px": 22.8, "mass_kda": 900.0},
+        {"frame": 60, "x_px": 50.9, "y_px": 47.1, "mass_kda": 1500.0},
+    ],
+    "background.frames": (0, 60),
+    "fit.frames": (60, 120),
+    "posterior.enabled": False,
+    "bounds.pixels": 41,
+}
+
+
+@pytest.fixture(scope="module")
+def config(sample_configs) -> ia.Config:
+    return ia.configure(sample_configs["mass"], settings=SMALL)
+
+
+@pytest.fixture(scope="module")
+def movie(config, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("public") / "movie.tif"
+    truth = ia.simulate_movie(config, str(path), seed=3)
+    assert len(truth) == 2
+    return path
+
+
+@pytest.fixture(scope="module")
+def result(movie, config) -> ia.Result:
+    return ia.fit_movie(
+        str(movie), config=config, posterior=True, settings={"posterior.steps": 1000}
+    )
+
+
+def _in_a_new_process(code: str) -> str:
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True
+    ).stdout
+
+
+def test_importing_the_package_imports_nothing_heavy() -> None:
+    code = "import sys, iscat_analysis; print(sorted({m.split('.')[0] for m in sys.modules}))"
+    loaded = _in_a_new_process(code)
+    assert not any(f"'{name}'" in loaded for name in ("numpy", "pandas", "numba", "matplotlib"))
+
+
+def test_every_public_name_is_there_and_documented() -> None:
+    assert set(ia.__all__) == set(ia._HOME)
+    assert set(ia.__all__) <= set(dir(ia))
+    for name in ia.__all__:
+        assert getattr(ia, name).__doc__
+        assert name in {*ia.__dir__()}
+    with pytest.raises(AttributeError, match="no attribute 'fit_stakc'"):
+        _ = ia.fit_stakc  # type: ignore[attr-defined]
+
+
+def test_stages_do_not_hide_public_names() -> None:
+    """A submodule of the same name would take its place once something imports it."""
+    modules = {path.stem for path in Path(ia.__file__).parent.iterdir()}
+    assert not modules & set(ia.__all__)
+
+
+def test_the_docstring_walks_the_flow_with_names_that_exist() -> None:
+    assert ia.__doc__ is not None
+    used = {word.split("(")[0] for word in ia.__doc__.split("ia.")[1:]}
+    assert {name for name in used if name.isidentifier()} <= set(ia.__all__)
+
+
+# ---- configuration -----------------------------------------------------------------------------
+
+
+def test_configure_changes_removes_and_keeps(config) -> None:
+    changed = ia.configure(config, settings={"optics.na": 1.3, "camera.well_depth_e": None})
+    assert changed.optics.na == 1.3
+    assert changed.camera.well_depth_e is None
+    assert config.optics.na == 1.42
+    assert ia.configure(config) is config
+    assert ia.configure() == ia.load_config()
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"optics.nna": 1}, "did you mean na?"),
+        ({"optic.na": 1}, "did you mean optics?"),
+        ({"na": 1}, 'write "na" as "section.key"'),
+        ({"optics.na": 2.0}, "must be below n_immersion"),
+    ],
+)
+def test_configure_names_the_nearest_key(settings, said) -> None:
+    with pytest.raises(ia.ConfigError, match=said.replace("?", r"\?")):
+        ia.configure(settings=settings)
+
+
+def test_a_configuration_may_be_a_path_as_text(sample_configs) -> None:
+    assert ia.configure(str(sample_configs["joint"])).fit.mode == "joint"
+
+
+# ---- fitting -----------------------------------------------------------------------------------
+
+
+def test_two_arguments_are_enough_where_the_movie_tells_the_rest(movie) -> None:
+    found = ia.fit_movie(movie, background=(0, 60), posterior=False)
+    assert len(found) == 2
+    assert found.mode == "mass"
+
+
+def test_named_arguments_win(movie, config) -> None:
+    found = ia.fit_movie(
+        movie, config=config, mode="joint", frames=(60, 100), workers=1, posterior=False,
+        settings={"fit.mode": "mass", "fit.roi_nm": 2000.0, "optics.focus_nm": -300.0},
+    )  # fmt: skip
+    assert found.mode == "joint"
+    assert found.summary["frames_after"] == [60, 100]
+    assert "roi_nm = 2000.0" in found.config_toml
+
+
+def test_the_table_is_a_frame(result) -> None:
+    assert isinstance(result.table, pd.DataFrame)
+    assert tuple(result.table.columns) == ia.EVENT_COLUMNS
+    assert len(result) == len(result.table) == 2
+
+
+def test_the_text_says_what_was_found(result) -> None:
+    text = repr(result)
+    assert text.startswith("Result: 2 events in movie.tif, mode mass")
+    assert "2 ok" in text
+    assert "CRB" in text
+    assert "kDa" in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_the_notebook_table_is_escaped_and_short(result, monkeypatch) -> None:
+    page = result._repr_html_()
+    assert page.count("<tr") > 4
+    assert "sigma_mass_kda" in page
+    monkeypatch.setattr(notebook, "ROWS_SHOWN", 1)
+    assert "and 1 more" in result._repr_html_()
+
+
+def test_figures_are_matplotlibs_and_draw_themselves(result) -> None:
+    drawn = [result.overview(), result.view(0), result.histogram(), result.precision()]
+    for figure in [*drawn, result.corner(1), draw(result.analysis, "power")]:
+        assert isinstance(figure, Figure)
+        assert figure._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match="choose one of overview"):
+        draw(result.analysis, "pie")
+
+
+def test_pyplot_is_left_alone(movie) -> None:
+    code = (
+        f"import sys, iscat_analysis as ia; r = ia.fit_movie({str(movie)!r}, background=(0, 60), "
+        "posterior=False); r.view(0); print('matplotlib.pyplot' in sys.modules)"
+    )
+    assert _in_a_new_process(code).strip() == "False"
+
+
+def test_the_posterior_is_arviz(result) -> None:
+    samples = result.posterior(0)
+    assert set(samples.groups()) == {"posterior", "sample_stats"}
+    mass = samples.posterior["mass_kda"]
+    assert mass.dims == ("chain", "draw")
+    assert mass.attrs["units"] == "kDa"
+    row = result.table.iloc[0]
+    assert abs(float(mass.mean()) - row["mass_kda"]) < row["sigma_mass_kda"]
+    assert samples.sample_stats["log_likelihood"].shape == mass.shape
+
+
+def test_images_have_one_shape(result) -> None:
+    images = result.images(0)
+    assert images.contrast.shape == images.model.shape == images.residual.shape
+    assert np.isfinite(images.residual).all()
+
+
+def test_what_is_not_there_is_said(result, movie, config) -> None:
+    with pytest.raises(ia.DataError, match="there is no event 7; it has events 0 to 1"):
+        result.view(7)
+    unsampled = ia.fit_movie(movie, config=config)
+    with pytest.raises(ia.DataError, match=r"was not sampled; fit again with posterior\.enabled"):
+        unsampled.posterior(0)
+
+
+def test_nothing_found_is_a_result(movie, config) -> None:
+    blank = ia.fit_movie(movie, config=config, background=(0, 30), frames=(30, 60))
+    assert len(blank) == 0
+    assert "0 events" in repr(blank)
+    assert "0 events" in blank._repr_html_()
+    with pytest.raises(ia.DataError, match="no event was found"):
+        blank.histogram()
+    with pytest.raises(ia.DataError, match="no event was found"):
+        blank.view(0)
+
+
+def test_saving_is_the_command_lines(result, movie, config, tmp_path) -> None:
+    folder = result.save(str(tmp_path / "kept"))
+    assert (folder / "report.html").is_file()
+    with pytest.raises(ia.DataError, match="--overwrite"):
+        result.save(folder)
+    result.save(folder, overwrite=True)
+    with pytest.raises(ia.DataError):
+        ia.fit_movie(movie, config=config, out=folder)
+
+
+# ---- bounds ------------------------------------------------------------------------------------
+
+
+def test_bounds_are_frames(config) -> None:
+    bounds = ia.compute_bounds(config, mode="joint", settings={"particle.mass_kda": 480.0})
+    actual = bounds.actual
+    assert list(actual.index) == ["x_nm", "y_nm", "z_nm", "mass_kda"]
+    assert (actual["qcrb"] < actual["crb_single"]).all()
+    assert "mass_rel" in bounds.per_photon.index
+    assert repr(bounds).startswith("Bounds: 480 kDa at z = 5 nm")
+    assert "crb_joint" in bounds._repr_html_()
+    curve = bounds.scan("focus=-200:200:200")
+    assert list(curve["focus"]) == [-200, 0, 200]
+    with pytest.raises(ia.ConfigError):
+        bounds.scan("focsu=0:1:1")
