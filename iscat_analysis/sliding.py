@@ -56,11 +56,11 @@ MOVIE_SHARE = 10
 CREDIBLE = 0.95
 """Posterior probability inside the interval of a step's frame."""
 
-SHOT_LIMITED = 1.1
+SHOT_LIMITED = 1.2
 """Noise variance over shot noise up to which averaging is called shot-noise limited."""
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
-_STRIP = 12  # rows that the noise is measured on
+_ROWS = 16  # on which the noise is measured
 _NORMAL_QUARTILE = 0.6744897501960817
 _STEEP = 4.0  # (per-frame SNR)² at which about one frame around a step is doubtful
 
@@ -118,17 +118,73 @@ class Chunk:
         """Index of frames [start, stop), clipped to those held."""
         return slice(max(start - self.first, 0), max(min(stop, self.stop) - self.first, 0))
 
-    def window(
+    def patch(
         self, start: int, stop: int, rows: tuple[int, int], columns: tuple[int, int]
-    ) -> tuple[FloatArray, int, float]:
-        """Sum a region over frames.
+    ) -> Patch:
+        """Copy a region of frames together, for all that is asked of it.
 
         Parameters
         ----------
         start, stop : int
-            Half-open range of frames.
+            Half-open range of frames, clipped to those held.
         rows, columns : (int, int)
             Half-open ranges of pixels.
+
+        Returns
+        -------
+        Patch
+            See there.
+        """
+        here, pixels = self.cut(start, stop), (slice(*rows), slice(*columns))
+        camera = self.camera
+        return Patch(
+            first=self.first + here.start,
+            counts=np.ascontiguousarray(self.counts[(here, *pixels)]),
+            good=self.good[here],
+            power=self.power[here],
+            gain=_at(camera.gain_e_per_adu, pixels),
+            offset=_at(camera.offset_adu, pixels),
+            read_noise_e=_at(camera.read_noise_e, pixels),
+            mean_e=self.mean_e[pixels],
+            usable=self.usable[pixels],
+        )
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A region of consecutive frames.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first frame.
+    counts : ndarray, shape (t, ny, nx)
+        Stored counts.
+    good, power : ndarray, shape (t,)
+        As in `Chunk`.
+    gain, offset, read_noise_e : float or ndarray, shape (ny, nx)
+        Of the camera.
+    mean_e, usable : ndarray, shape (ny, nx)
+        As in `Chunk`.
+    """
+
+    first: int
+    counts: NDArray[Any]
+    good: BoolArray
+    power: FloatArray
+    gain: float | FloatArray
+    offset: float | FloatArray
+    read_noise_e: float | FloatArray
+    mean_e: FloatArray
+    usable: BoolArray
+
+    def window(self, start: int, stop: int) -> tuple[FloatArray, int, float]:
+        """Sum frames.
+
+        Parameters
+        ----------
+        start, stop : int
+            Half-open range, clipped to those held.
 
         Returns
         -------
@@ -139,15 +195,11 @@ class Chunk:
         power : float
             Their power.
         """
-        here = self.cut(start, stop)
-        out = np.zeros((rows[1] - rows[0], columns[1] - columns[0]))
-        region_sum(self.counts[here], self.good[here], rows[0], columns[0], out)
+        here = slice(max(start - self.first, 0), max(stop - self.first, 0))
+        out = np.zeros(self.mean_e.shape)
+        region_sum(self.counts[here], self.good[here], out)
         frames = int(np.count_nonzero(self.good[here]))
-        pixels = (slice(*rows), slice(*columns))
-        gain, offset = (
-            _at(v, pixels) for v in (self.camera.gain_e_per_adu, self.camera.offset_adu)
-        )
-        return gain * (out - frames * offset), frames, float(self.power[here].sum())
+        return self.gain * (out - frames * self.offset), frames, float(self.power[here].sum())
 
 
 @dataclass(frozen=True)
@@ -205,9 +257,8 @@ def measure_noise(counts: NDArray[Any], camera: Camera, longest: int) -> NoiseCu
     D. W. Allan, Proc. IEEE 54, 221 (1966).  Variances are from the median deviation, so that
     particles, which cover few pixels at a time, do not count as noise.
     """
-    top = max((counts.shape[1] - _STRIP) // 2, 0)
-    strip = counts[:, top : top + _STRIP]
-    rows = slice(top, top + strip.shape[1])
+    rows = np.linspace(0, counts.shape[1] - 1, min(_ROWS, counts.shape[1])).astype(int)
+    strip = counts[:, rows]
     shape = (counts.shape[1], counts.shape[2])
     gain, offset = (
         np.broadcast_to(v, shape)[rows] for v in (camera.gain_e_per_adu, camera.offset_adu)
@@ -605,11 +656,8 @@ class StepFrame:
 
 
 def locate_step(
-    chunk: Chunk,
+    patch: Patch,
     image: FloatArray,
-    rows: tuple[int, int],
-    columns: tuple[int, int],
-    span: tuple[int, int],
     search: tuple[int, int],
     *,
     known: FloatArray | None = None,
@@ -618,17 +666,13 @@ def locate_step(
 
     Parameters
     ----------
-    chunk : Chunk
-        The frames.
+    patch : Patch
+        The frames; one step alone must lie in them.
     image : ndarray, shape (ny, nx)
         Contrast that appears.
-    rows, columns : (int, int)
-        Half-open ranges of the pixels of `image`.
-    span : (int, int)
-        Frames to use, half-open; one step alone must lie in them.
     search : (int, int)
         Frames that may be the first of the new state, half-open.
-    known : ndarray, shape (stop − start of span, ), optional
+    known : ndarray, shape (t,), optional
         Height that other events add to each frame, in units of `image`; from `crosstalk`.
 
     Returns
@@ -636,16 +680,13 @@ def locate_step(
     StepFrame
         The most likely frame and its interval.
     """
-    here = chunk.cut(*span)
-    start = chunk.first + here.start
-    weights, scale = _projector(chunk, image, rows, columns)
-    pixels = (slice(*rows), slice(*columns))
-    gain, offset = (_at(v, pixels) for v in (chunk.camera.gain_e_per_adu, chunk.camera.offset_adu))
-    scores = np.empty(here.stop - here.start)
-    region_scores(chunk.counts[here], rows[0], columns[0], weights * gain, scores)
-    power = chunk.power[here]
+    weights, scale = _projector(patch, image)
+    scores = np.empty(len(patch.counts))
+    region_scores(patch.counts, weights * patch.gain, scores)
+    power = patch.power
     lit = power > 0
-    heights = (scores - float(np.sum(weights * gain * offset))) / np.where(lit, power, 1.0) / scale
+    zero = float(np.sum(weights * patch.gain * patch.offset))
+    heights = (scores - zero) / np.where(lit, power, 1.0) / scale
     if known is not None:
         heights = heights - known
     weight = np.where(lit, power, 0.0) * scale
@@ -656,7 +697,7 @@ def locate_step(
     with np.errstate(divide="ignore", invalid="ignore"):
         jump = np.where(usable, (total[-1] - total[:-1]) / after - total[:-1] / before, 0.0)
     gain_in_log = 0.5 * before * after / n[-1] * jump**2 * (jump > 0)
-    frames = np.arange(start + 1, start + heights.size)
+    frames = np.arange(patch.first + 1, patch.first + heights.size)
     inside = (frames >= search[0]) & (frames < search[1]) & usable
     if not inside.any():
         middle = int(np.clip((search[0] + search[1]) // 2, frames[0], frames[-1]))
@@ -673,32 +714,23 @@ def locate_step(
     return StepFrame(int(frames[best]), half_width, height, abs(height) * math.sqrt(scale))
 
 
-def crosstalk(
-    chunk: Chunk,
-    image: FloatArray,
-    other: FloatArray,
-    rows: tuple[int, int],
-    columns: tuple[int, int],
-) -> float:
+def crosstalk(patch: Patch, image: FloatArray, other: FloatArray) -> float:
     """Height that another particle's contrast adds to a frame, in units of `image`.
 
     Parameters
     ----------
-    chunk : Chunk
+    patch : Patch
         Gives the weights.
     image, other : ndarray, shape (ny, nx)
         Contrasts.
-    rows, columns : (int, int)
-        Half-open ranges of their pixels.
 
     Returns
     -------
     float
         To be taken off in `locate_step`.
     """
-    weights, scale = _projector(chunk, image, rows, columns)
-    mean = chunk.mean_e[slice(*rows), slice(*columns)]
-    return float(np.sum(weights * mean * other)) / scale
+    weights, scale = _projector(patch, image)
+    return float(np.sum(weights * patch.mean_e * other)) / scale
 
 
 def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, float]:
@@ -739,14 +771,11 @@ def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, 
     return float(y + dy), float(x + dx)
 
 
-def _projector(
-    chunk: Chunk, image: FloatArray, rows: tuple[int, int], columns: tuple[int, int]
-) -> tuple[FloatArray, float]:
+def _projector(patch: Patch, image: FloatArray) -> tuple[FloatArray, float]:
     """Weights that measure the amplitude of an image and ignore a common level, and their scale."""
-    here = (slice(*rows), slice(*columns))
-    used = chunk.usable[here]
-    mean = np.where(used, chunk.mean_e[here], 0.0)
-    share = mean / np.where(used, mean + _at(chunk.camera.read_noise_e, here) ** 2, 1.0)
+    used = patch.usable
+    mean = np.where(used, patch.mean_e, 0.0)
+    share = mean / np.where(used, mean + np.square(patch.read_noise_e), 1.0)
     light = mean * share
     level = float(np.sum(light * image)) / max(float(light.sum()), 1e-300)
     weights = np.where(used, share * (image - level), 0.0)

@@ -86,10 +86,8 @@ def frame_totals(counts: NDArray[Any], zero: Any, out: NDArray[Any], same: BoolA
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def region_sum(
-    counts: NDArray[Any], good: BoolArray, row: int, column: int, out: FloatArray
-) -> None:
-    """Add a region of the good frames to `out`.
+def region_sum(counts: NDArray[Any], good: BoolArray, out: FloatArray) -> None:
+    """Add the good frames to `out`.
 
     Parameters
     ----------
@@ -97,32 +95,26 @@ def region_sum(
         Stored counts.
     good : ndarray of bool, shape (t,)
         Frames to take.
-    row, column : int
-        First pixel of the region.
-    out : ndarray, shape (ny, nx)
+    out : ndarray, shape (y, x)
         Added to.
     """
     for t in range(counts.shape[0]):
         if good[t]:
             for i in range(out.shape[0]):
                 for j in range(out.shape[1]):
-                    out[i, j] += counts[t, row + i, column + j]
+                    out[i, j] += counts[t, i, j]
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def region_scores(
-    counts: NDArray[Any], row: int, column: int, weights: FloatArray, out: FloatArray
-) -> None:
-    """Weighted sum of a region of every frame.
+def region_scores(counts: NDArray[Any], weights: FloatArray, out: FloatArray) -> None:
+    """Weighted sum of every frame.
 
     Parameters
     ----------
     counts : ndarray, shape (t, y, x)
         Stored counts.
-    row, column : int
-        First pixel of the region.
-    weights : ndarray, shape (ny, nx)
-        Of the region's pixels.
+    weights : ndarray, shape (y, x)
+        Of the pixels.
     out : ndarray, shape (t,)
         Filled.
     """
@@ -130,7 +122,7 @@ def region_scores(
         total = 0.0
         for i in range(weights.shape[0]):
             for j in range(weights.shape[1]):
-                total += weights[i, j] * counts[t, row + i, column + j]
+                total += weights[i, j] * counts[t, i, j]
         out[t] = total
 
 

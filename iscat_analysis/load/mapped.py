@@ -49,3 +49,19 @@ def refuse_changed(path: Path, data: mmap.mmap) -> None:
             f"{path}: shrank from {len(data)} to {size} bytes while it was open; "
             "wait until it is written, then start again"
         )
+
+
+def release(data: mmap.mmap, start: int, stop: int) -> None:
+    """Let go of pages that were copied; the system would count them as this process's memory.
+
+    Parameters
+    ----------
+    data : mmap
+        From `map_file`.
+    start, stop : int
+        Half-open range of bytes; only whole pages inside it are released.
+    """
+    first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE
+    last = stop // mmap.PAGESIZE * mmap.PAGESIZE
+    if last > first and hasattr(data, "madvise"):
+        data.madvise(mmap.MADV_DONTNEED, first, last - first)

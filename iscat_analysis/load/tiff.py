@@ -27,7 +27,7 @@ from iscat_analysis.load.descriptions import (
 )
 from iscat_analysis.load.directory import Directory, DirectoryReader, Layout
 from iscat_analysis.load.hints import Hints, merge
-from iscat_analysis.load.mapped import map_file, refuse_changed
+from iscat_analysis.load.mapped import map_file, refuse_changed, release
 from iscat_analysis.load.ome import is_ome, read_ome
 from iscat_analysis.records import StackMetadata
 
@@ -140,6 +140,7 @@ class TiffFrames:
         steps = np.diff(starts)
         if len(steps) and steps[0] > 0 and np.all(steps == steps[0]):
             block[:] = self._mapped(int(starts[0]), (int(steps[0]),), (stop - start,))
+            release(self._data, int(starts[0]), int(starts[-1]))
         else:
             for number, first in enumerate(starts):
                 block[number] = self._mapped(int(first), (), ())

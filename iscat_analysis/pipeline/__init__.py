@@ -38,12 +38,15 @@ from iscat_analysis.records import (
     Windows,
     silent,
 )
-from iscat_analysis.report import write_report
+from iscat_analysis.report import EVENT_FIGURES, write_report
 from iscat_analysis.report.output import claim_output
 
 DEPENDENCIES = (
     "numpy", "scipy", "numba", "tifffile", "emcee", "arviz", "pandas", "pyarrow", "matplotlib",
 )  # fmt: skip
+
+FEW_FIGURES = 4
+"""Events of a landing movie that are drawn for print; the page shows hundreds."""
 
 _GAIN_FRAMES = 64  # background frames that the noise is measured on
 _PATIENCE_S = 1.5  # after which a compilation is announced
@@ -108,9 +111,11 @@ def fit_stack(
                 progress=progress,
                 notify=notify,
                 command=command,
-                partial=partial_folder(folder),
+                partial=partial_folder(folder.resolve()),
             )
-        write_report(analysis, folder, overwrite=overwrite)
+        sliding = "landing" in analysis.summary
+        figures = FEW_FIGURES if sliding else EVENT_FIGURES
+        write_report(analysis, folder, overwrite=overwrite, event_figures=figures)
     if analysis.summary["interrupted"]:
         notify(f"interrupted; what was finished is in {folder}")
         raise KeyboardInterrupt

@@ -28,6 +28,7 @@ from iscat_analysis.records import (
 from iscat_analysis.sliding import (
     SHORTEST_MOVIE,
     Chunk,
+    Mapper,
     NoiseCurve,
     choose_window,
     longest_window,
@@ -37,7 +38,7 @@ from iscat_analysis.sliding import (
     measure_noise,
 )
 
-HALO = 3
+HALO = 2
 """Windows on either side of a chunk's core: a step, its neighbours, and theirs."""
 
 VIEWS = 1000
@@ -47,7 +48,7 @@ FRAME_COLUMN = "frame_ci95"
 """Column after `EVENT_COLUMNS`: half-width of the 95 % interval of ``frame`` [frames]."""
 
 _MEMORY_SHARE = 0.35  # of compute.memory_limit_mb that the stored counts may take
-_PIECE_BYTES = 32 * 2**20
+_PIECE_BYTES = 8 * 2**20
 _NOISE_FRAMES = 800  # on which the windows are chosen
 _SEAM_PX = 2.0  # two chunks' estimates of one step are nearer than this
 
@@ -87,7 +88,9 @@ class Reader:
             larger[:kept] = self._buffer[:kept]
             self._buffer = larger
 
-    def counts(self, start: int, stop: int) -> tuple[NDArray[Any], BoolArray, FloatArray]:
+    def counts(
+        self, start: int, stop: int, mapper: Mapper = map
+    ) -> tuple[NDArray[Any], BoolArray, FloatArray]:
         """Frames [start, stop), which of them are good, and their light [e per pixel]."""
         low, high = self._held
         kept = 0
@@ -101,30 +104,41 @@ class Reader:
             self._light, self._repeats = np.empty(0), np.empty(0, dtype=np.bool_)
         self.reserve(stop - start)
         self._held = (start, start + kept)
-        step = max(1, _PIECE_BYTES // self.frame_bytes)
-        for begin in range(start + kept, stop, step):
-            self._append(begin, min(begin + step, stop))
+        self._append(start + kept, stop, mapper)
         good = np.isfinite(self._light) & ~self._repeats
         return self._buffer[: stop - start], good, self._light
 
-    def _append(self, begin: int, end: int) -> None:
+    def _append(self, begin: int, end: int, mapper: Mapper) -> None:
+        if begin >= end:
+            return
         start = self._held[0]
-        at = begin - start
-        self._buffer[at : at + end - begin] = self._movie.read(begin, end)
-        ahead = 1 if at else 0  # so that a piece's first frame is compared with the one before it
-        part = self._buffer[at - ahead : at + end - begin]
-        light, repeats = measure_frames(part, self._camera)
-        fresh = part[ahead:]
+        step = max(1, _PIECE_BYTES // self.frame_bytes)
+        pieces = [(a, min(a + step, end)) for a in range(begin, end, step)]
+
+        def read(piece: tuple[int, int]) -> None:
+            self._buffer[piece[0] - start : piece[1] - start] = self._movie.read(*piece)
+
+        def check(piece: tuple[int, int]) -> None:
+            for run in _runs(lit[piece[0] - begin : piece[1] - begin]):
+                low, high = piece[0] + run.start, piece[0] + run.stop
+                frames = self._buffer[low - start : high - start]
+                check_counts(frames, low, self.name, camera=self._camera)
+
+        for _ in mapper(read, pieces):
+            pass
+        ahead = 1 if begin > start else 0  # the first new frame is compared with the last old one
+        part = self._buffer[begin - ahead - start : end - start]
+        light, repeats = measure_frames(part, self._camera, mapper=mapper)
         lit = np.isfinite(light[ahead:])
-        for run in _runs(lit):
-            check_counts(fresh[run], begin + run.start, self.name, camera=self._camera)
+        for _ in mapper(check, pieces):
+            pass
         self._light = np.concatenate([self._light, light[ahead:]])
         self._repeats = np.concatenate([self._repeats, repeats[ahead:]])
         self._held = (start, end)
 
     def chunk(self, span: tuple[int, int], stride: int, pool: ThreadPoolExecutor) -> Chunk:
         """Frames of a span, summed in blocks."""
-        counts, good, light = self.counts(*span)
+        counts, good, light = self.counts(*span, pool.map)
         if not good.any():
             raise DataError(
                 f"{self.name}: frames {span[0]}:{span[1]} hold no light that changes; every frame "
@@ -265,11 +279,13 @@ class Merged:
         cores = np.array([self._done[i].core for i, _ in homes])
         frame = table["frame"].to_numpy()
         own = (frame >= cores[:, 0]) & (frame < cores[:, 1])
-        kept = [int(i) for i in np.flatnonzero(own)]
-        for stranger in (int(i) for i in np.flatnonzero(~own)):
-            covered = any(d.core[0] <= frame[stranger] < d.core[1] for d in self._done)
-            if covered and not any(_same(table, stranger, other) for other in kept):
-                kept.append(stranger)
+        finished = np.zeros(len(table), dtype=np.bool_)
+        for done in self._done:
+            finished |= (frame >= done.core[0]) & (frame < done.core[1])
+        kept = np.flatnonzero(own)
+        for stranger in np.flatnonzero(~own & finished):
+            if not _same(table, int(stranger), kept):
+                kept = np.append(kept, stranger)
         order = sorted(kept, key=lambda i: (frame[i], table["y_nm"].iloc[i], table["x_nm"].iloc[i]))
         result = table.iloc[order].reset_index(drop=True)
         result["event"] = np.arange(len(result), dtype=np.int64)
@@ -323,11 +339,13 @@ class Merged:
         return int(np.sum(masked & ~saturated)), int(saturated.sum())
 
 
-def _same(table: pd.DataFrame, one: int, two: int) -> bool:
-    """Whether two chunks' rows describe one step."""
-    a, b = table.iloc[one], table.iloc[two]
-    return bool(
-        abs(a["frame"] - b["frame"]) <= max(2, a[FRAME_COLUMN] + b[FRAME_COLUMN])
-        and math.hypot(a["x_px"] - b["x_px"], a["y_px"] - b["y_px"]) < _SEAM_PX
-        and a["mass_kda"] * b["mass_kda"] > 0
+def _same(table: pd.DataFrame, one: int, others: NDArray[np.int64]) -> bool:
+    """Whether some other row describes the same step."""
+    frame, error, x, y, mass = (
+        table[name].to_numpy(dtype=float)
+        for name in ("frame", FRAME_COLUMN, "x_px", "y_px", "mass_kda")
     )
+    near = np.abs(frame[others] - frame[one]) <= np.maximum(2, error[others] + error[one])
+    near &= np.hypot(x[others] - x[one], y[others] - y[one]) < _SEAM_PX
+    near &= mass[others] * mass[one] > 0
+    return bool(near.any())

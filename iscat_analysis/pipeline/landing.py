@@ -275,9 +275,8 @@ def _analyse_chunk(
     posteriors: int,
 ) -> Done:
     fitter = ChunkFitter(scene, chunk, window, pool)
-    steps = fitter.run()
-    seam = max(1, window // 2)
-    steps = [s for s in steps if core[0] - seam <= s.step.at.frame < core[1] + seam]
+    seam = max(2, window // STRIDES)
+    steps = fitter.run((core[0] - seam, core[1] + seam))
     rows = list(pool.map(_row, range(len(steps)), steps))
     sampled = 0
     for i, row in enumerate(rows):
@@ -290,8 +289,7 @@ def _analyse_chunk(
         )  # fmt: skip
         rows[i] = replace(row, posterior=chain)
         sampled += 1
-    records = list(pool.map(lambda row: table_of(scene, [row]), rows))
-    table = pd.concat(records, ignore_index=True) if records else table_of(scene, [])
+    table = table_of(scene, rows, mapper=pool.map)
     table["frame"] = [s.step.at.frame for s in steps]
     table["n_before"] = [s.n_before for s in steps]
     table["n_after"] = [s.n_after for s in steps]

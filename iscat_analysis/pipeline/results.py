@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,7 +84,9 @@ def collected_photons(scene: Scene, windows: Windows, event: Event) -> float:
     return per_pixel * area / scene.pixel_nm**2
 
 
-def table_of(scene: Scene, rows: Sequence[Row]) -> pd.DataFrame:
+def table_of(
+    scene: Scene, rows: Sequence[Row], *, mapper: Callable[..., Iterable[Any]] = map
+) -> pd.DataFrame:
     """Make the table of ``fits.csv``.
 
     Parameters
@@ -93,13 +95,16 @@ def table_of(scene: Scene, rows: Sequence[Row]) -> pd.DataFrame:
         Models.
     rows : sequence of Row
         The events.
+    mapper : callable
+        `map`, or the one of a pool.
 
     Returns
     -------
     pandas.DataFrame
         Columns `EVENT_COLUMNS`.
     """
-    table = pd.DataFrame([_record(scene, row) for row in rows], columns=list(EVENT_COLUMNS))
+    records = list(mapper(lambda row: _record(scene, row), rows))
+    table = pd.DataFrame(records, columns=list(EVENT_COLUMNS))
     integers = ["event", "frame", "n_before", "n_after"]
     numbers = [c for c in EVENT_COLUMNS if c not in (*integers, "status", "flags")]
     return table.astype({**dict.fromkeys(integers, "int64"), **dict.fromkeys(numbers, "float64")})

@@ -33,6 +33,7 @@ from iscat_analysis.sliding import (
     STRIDES,
     Chunk,
     Filter,
+    Patch,
     Peak,
     StepFrame,
     crosstalk,
@@ -155,21 +156,26 @@ class ChunkFitter:
         self._window = window
         self._pool = pool
         self._strides = STRIDES
+        self._roi_px = scene.roi_px
         self._stride = int(chunk.edges[1] - chunk.edges[0])
         self._power = np.concatenate([[0.0], np.cumsum(chunk.power)])
         self.strongest = np.zeros((2, *chunk.shape))
         self.rounds = 0
 
-    def run(self) -> list[FittedStep]:
+    def run(self, keep: tuple[int, int]) -> list[FittedStep]:
         """Find and fit every step.
+
+        Parameters
+        ----------
+        keep : (int, int)
+            Frames whose steps are wanted; those outside are only seen as neighbours.
 
         Returns
         -------
         list of FittedStep
             In order of frame.
         """
-        scene, chunk = self._scene, self._chunk
-        matched = make_filter(chunk, scene.templates.images[0])
+        matched = make_filter(self._chunk, self._scene.templates.images[0])
         steps: list[Step] = []
         for self.rounds in range(1, ROUNDS + 1):
             fresh = self._search(matched, steps)
@@ -177,14 +183,22 @@ class ChunkFitter:
                 break
             known = len(steps)
             steps = steps + fresh
+            seen, bound = self._neighbourhood(steps)
             chosen = set(range(known, len(steps)))
             for _ in range(_SWEEPS):
-                steps = self._improve(steps, chosen)
-                chosen = {i for i in range(len(steps)) if self._has_neighbour(i, steps, known)}
+                steps = self._improve(steps, chosen, seen)
+                chosen = {
+                    i for i, others in enumerate(bound)
+                    if others and (i >= known or max(others) >= known)
+                }  # fmt: skip
                 if not chosen:
                     break
             steps = self._credible(steps)
-        found = list(self._pool.map(lambda i: self._finish(i, steps), range(len(steps))))
+        if not steps:
+            return []
+        seen, _ = self._neighbourhood(steps)
+        own = [i for i, s in enumerate(steps) if keep[0] <= s.at.frame < keep[1]]
+        found = self._pool.map(lambda i: self._finish(i, steps, seen), own)
         kept = [f for f in found if f is not None]
         return sorted(kept, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
 
@@ -224,7 +238,7 @@ class ChunkFitter:
             if any(self._shadows(p.x_px, p.y_px, p.frame, p.snr, peak, _SIDELOBE) for p in fresh):
                 continue
             if any(
-                math.hypot(p.x_px - peak.x_px, p.y_px - peak.y_px) < scene.roi_px / 6
+                math.hypot(p.x_px - peak.x_px, p.y_px - peak.y_px) < self._roi_px / 6
                 and abs(p.frame - peak.frame) < reach
                 for p in fresh
             ):
@@ -238,15 +252,20 @@ class ChunkFitter:
         self, x_px: float, y_px: float, frame: int, snr: float, peak: Peak, share: float
     ) -> bool:
         """Whether a peak may be nothing but the side lobe or the residue of a stronger step."""
-        near = max(abs(x_px - peak.x_px), abs(y_px - peak.y_px)) < self._scene.roi_px
         reach = (self._strides + 1) * self._stride
-        return near and abs(frame - peak.frame) <= reach and abs(peak.snr) < share * abs(snr)
+        return (
+            abs(frame - peak.frame) <= reach
+            and abs(peak.snr) < share * abs(snr)
+            and max(abs(x_px - peak.x_px), abs(y_px - peak.y_px)) < self._roi_px
+        )
 
     def _is_residue(self, step: Step, peak: Peak) -> bool:
         """Whether a peak may be what a fitted step left over: the model is never quite right."""
+        if abs(step.at.frame - peak.frame) > (self._strides + 1) * self._stride:
+            return False
         start = step.start
         distance = math.hypot(start.x_px - peak.x_px, start.y_px - peak.y_px)
-        on_top = distance < self._scene.roi_px / 6
+        on_top = distance < self._roi_px / 6
         if on_top and abs(step.at.frame - peak.frame) > self._stride:
             return False
         share = _RESIDUE if on_top else _RINGS
@@ -268,7 +287,7 @@ class ChunkFitter:
     def _with_image(self, step: Step) -> Step:
         """Draw the step's contrast anew."""
         scene, start = self._scene, step.start
-        half = scene.roi_px
+        half = self._roi_px
         spans = []
         for centre, size in zip((start.y_px, start.x_px), self._chunk.shape, strict=True):
             middle = round(centre)
@@ -303,27 +322,24 @@ class ChunkFitter:
         )
         return factor
 
-    def _neighbours(self, index: int, steps: Sequence[Step]) -> list[Step]:
-        """Other steps whose image overlaps this one's region within two windows."""
-        me, reach = steps[index], 1.5 * self._scene.roi_px + 2
-        return [
-            s
-            for i, s in enumerate(steps)
-            if i != index
-            and abs(s.at.frame - me.at.frame) < 3 * self._window
-            and max(abs(s.start.x_px - me.start.x_px), abs(s.start.y_px - me.start.y_px)) < reach
-        ]
-
-    def _has_neighbour(self, index: int, steps: Sequence[Step], known: int) -> bool:
-        """Whether another step is so near that both fits should be repeated."""
-        me, near = steps[index], self._scene.roi_px / 2
-        return any(
-            i != index
-            and (index >= known or i >= known)
-            and abs(s.at.frame - me.at.frame) < 2 * self._window
-            and math.hypot(s.start.x_px - me.start.x_px, s.start.y_px - me.start.y_px) < near
-            for i, s in enumerate(steps)
+    def _neighbourhood(self, steps: Sequence[Step]) -> tuple[list[list[int]], list[list[int]]]:
+        """For each step, others that its fit should know of, and those that it depends on."""
+        x, y, frame = (
+            np.array(values, dtype=float)
+            for values in zip(
+                *((s.start.x_px, s.start.y_px, s.at.frame) for s in steps), strict=True
+            )
         )
+        seen, bound = [], []
+        for i in range(len(steps)):
+            dt = np.abs(frame - frame[i])
+            dx, dy = np.abs(x - x[i]), np.abs(y - y[i])
+            near = (dt < 3 * self._window) & (np.maximum(dx, dy) < 1.5 * self._roi_px + 2)
+            near[i] = False
+            seen.append([int(k) for k in np.flatnonzero(near)])
+            near &= (dt < 2 * self._window) & (np.hypot(dx, dy) < self._roi_px / 2)
+            bound.append([int(k) for k in np.flatnonzero(near)])
+        return seen, bound
 
     def _shared(self, step: Step, region: Region) -> tuple[Region, FloatArray] | None:
         """Part of a step's image inside a region."""
@@ -339,14 +355,14 @@ class ChunkFitter:
 
     # ---- one step --------------------------------------------------------------------------
 
-    def _improve(self, steps: Sequence[Step], chosen: set[int]) -> list[Step]:
+    def _improve(
+        self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
+    ) -> list[Step]:
         """Fit the chosen steps, each with the others as they were."""
 
         def one(index: int) -> Step:
             step = steps[index]
-            if index not in chosen:
-                return step
-            task = self._task(index, steps)
+            task = self._task(index, steps, near)
             if task is None:
                 return step
             likelihood = task.likelihood
@@ -372,21 +388,29 @@ class ChunkFitter:
                 replace(step, at=task.at, start=moved, theta=best.theta, snr=snr)
             )
 
-        return list(self._pool.map(one, range(len(steps))))
+        improved = list(steps)
+        for index, step in zip(sorted(chosen), self._pool.map(one, sorted(chosen)), strict=True):
+            improved[index] = step
+        return improved
 
     @property
     def _quick_mode(self) -> str:
         """Where z is free it is found last, from all heights at once."""
         return "mass" if "mass_kda" in FREE_PARAMETERS[self._scene.mode] else "localize"
 
-    def _task(self, index: int, steps: Sequence[Step]) -> _Task | None:
+    def _task(
+        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]]
+    ) -> _Task | None:
         scene, chunk, step = self._scene, self._chunk, steps[index]
-        region = _region(scene, chunk.shape, step.start)
-        neighbours = self._neighbours(index, steps)
+        region = _region(self._roi_px, chunk.shape, step.start)
+        neighbours = [steps[i] for i in near[index]]
         limit_px = scene.config.detection.min_separation_nm / scene.pixel_nm
         close = [s for s in neighbours if _distance(s, step) < limit_px]
         span, crowded = self._span(step, close)
-        at = self._locate(step, neighbours, region, span)
+        patch = chunk.patch(*span, region.rows, region.columns)
+        if len(patch.counts) < 2:
+            return None
+        at = self._locate(step, neighbours, region, patch)
         if at is None:
             return None
         span, crowded = self._span(replace(step, at=at), close)
@@ -394,8 +418,10 @@ class ChunkFitter:
         begin, end = max(span[0], chunk.first), min(span[1], chunk.stop)
         first = (begin, max(at.frame - gap, begin))
         second = (min(at.frame + gap, end), end)
-        before, n_before, power_before = chunk.window(*first, region.rows, region.columns)
-        after, n_after, power_after = chunk.window(*second, region.rows, region.columns)
+        if begin < patch.first or end > patch.first + len(patch.counts):
+            patch = chunk.patch(begin, end, region.rows, region.columns)
+        before, n_before, power_before = patch.window(*first)
+        after, n_after, power_after = patch.window(*second)
         if not n_before or not n_after:
             return None
         ratio = np.full(before.shape, power_after / power_before)
@@ -455,18 +481,16 @@ class ChunkFitter:
         return (begin, end), crowded
 
     def _locate(
-        self, step: Step, neighbours: Sequence[Step], region: Region, span: tuple[int, int]
+        self, step: Step, neighbours: Sequence[Step], region: Region, patch: Patch
     ) -> StepFrame | None:
-        chunk = self._chunk
         shared = self._shared(step, region)
-        here = chunk.cut(*span)
-        if shared is None or here.stop - here.start < 2:
+        if shared is None:
             return None
         _, image = shared
         if image.shape != (region.rows[1] - region.rows[0], region.columns[1] - region.columns[0]):
             return None
-        known = np.zeros(here.stop - here.start)
-        frames = np.arange(chunk.first + here.start, chunk.first + here.stop)
+        known = np.zeros(len(patch.counts))
+        frames = np.arange(patch.first, patch.first + known.size)
         for other in neighbours:
             both = self._shared(other, region)
             if both is None or not frames[0] < other.at.frame <= frames[-1]:
@@ -477,19 +501,18 @@ class ChunkFitter:
                 part.rows[0] - region.rows[0] : part.rows[1] - region.rows[0],
                 part.columns[0] - region.columns[0] : part.columns[1] - region.columns[0],
             ] = inside
-            height = crosstalk(chunk, image, padded, region.rows, region.columns)
+            height = crosstalk(patch, image, padded)
             known += other.sign * height * (frames >= other.at.frame)
         reach = self._stride + self._stride // 2 + 1
         search = (step.at.frame - reach, step.at.frame + reach + 1)
-        return locate_step(
-            chunk, step.sign * image, region.rows, region.columns, span, search,
-            known=step.sign * known,
-        )  # fmt: skip
+        return locate_step(patch, step.sign * image, search, known=step.sign * known)
 
-    def _finish(self, index: int, steps: Sequence[Step]) -> FittedStep | None:
+    def _finish(
+        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]]
+    ) -> FittedStep | None:
         """Fit a step for good and judge it."""
         scene, step = self._scene, steps[index]
-        task = self._task(index, steps)
+        task = self._task(index, steps, near)
         if task is None:
             return None
         likelihood = task.likelihood
@@ -586,8 +609,7 @@ def _judged(scene: Scene, fit: FitResult, task: _Task) -> FitResult:
     return replace(fit, status=Status(flags[0]) if flags else Status.OK, flags=tuple(flags))
 
 
-def _region(scene: Scene, shape: tuple[int, int], start: Candidate) -> Region:
-    side = scene.roi_px
+def _region(side: int, shape: tuple[int, int], start: Candidate) -> Region:
     spans = []
     for centre, size in zip((start.y_px, start.x_px), shape, strict=True):
         first = round(centre - (side - 1) / 2)

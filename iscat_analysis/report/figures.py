@@ -41,7 +41,7 @@ EVENT_FIGURES = 50
 CORNER_FIGURES = 20
 """Posteriors drawn into the folder, at most."""
 
-NUMBERED_EVENTS = 300
+NUMBERED_EVENTS = 100
 """Events in the overview that may carry their number; the others are rings only."""
 
 DPI = 140
@@ -66,7 +66,9 @@ _STYLE: Any = {
 }
 
 
-def write_figures(analysis: Analysis, folder: Path) -> dict[str, int]:
+def write_figures(
+    analysis: Analysis, folder: Path, *, events: int = EVENT_FIGURES
+) -> dict[str, int]:
     """Draw every figure, each as PNG and SVG.
 
     ``overview`` (the field with its events), ``precision`` (achieved σ against the bounds),
@@ -79,6 +81,8 @@ def write_figures(analysis: Analysis, folder: Path) -> dict[str, int]:
         What was found.
     folder : Path
         Made if absent.
+    events : int
+        Events whose images are drawn, at most.
 
     Returns
     -------
@@ -98,7 +102,7 @@ def write_figures(analysis: Analysis, folder: Path) -> dict[str, int]:
             name = "mass_histogram" if main == "mass_kda" else "height_histogram"
             _save(_histogram(table, main), folder / name)
             _save(_precision(table, free), folder / "precision")
-        drawn = analysis.views[:EVENT_FIGURES]
+        drawn = analysis.views[:events]
         names: set[str] = set()
         for view in drawn:
             name = f"event_{view.event:04d}"
