@@ -10,7 +10,6 @@ refused.
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass
 
 import emcee
@@ -199,16 +198,14 @@ def _after_burn_in(sampler: emcee.EnsembleSampler) -> tuple[FloatArray, FloatArr
 
 
 def _diagnose(samples: FloatArray) -> _Verdict:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # about its own next version
-        import arviz  # takes seconds, and only chains need it
+    from arviz_stats.base import array_stats  # takes a second, and only chains need it
 
     draws = samples.shape[1]
     tau = emcee.autocorr.integrated_time(np.moveaxis(samples, 0, 1), tol=0, quiet=True)
-    columns = [samples[..., k] for k in range(samples.shape[2])]
-    r_hat = np.array([float(arviz.rhat(c)) for c in columns])
-    bulk = np.array([float(arviz.ess(c, method="bulk")) for c in columns])
-    tail = np.array([float(arviz.ess(c, method="tail")) for c in columns])
+    axes = {"chain_axis": 0, "draw_axis": 1}
+    r_hat = np.asarray(array_stats.rhat(samples, **axes))
+    bulk = np.asarray(array_stats.ess(samples, method="bulk", **axes))
+    tail = np.asarray(array_stats.ess(samples, method="tail", prob=(0.05, 0.95), **axes))
     complaints = []
     if not np.all(draws > MIN_TAUS * tau):
         needed = MIN_TAUS * float(tau.max())
