@@ -54,6 +54,7 @@ _EM_STEPS = 40
 _POLISHED = 2  # starts, the best after EM
 _BOOTSTRAP_TRIES = 50
 _SUPPORT_DRAWS = 20
+_RIVAL_STEPS = 40
 _BROAD = 0.4  # width over mass
 _CURVE_POINTS = 400
 _MOST_BINS = 240
@@ -335,7 +336,7 @@ def _em(events: _Events, start: _Mixture, steps: int) -> _Mixture:
     return _Mixture(weight, mean, variance)
 
 
-def _polish(events: _Events, start: _Mixture) -> _Mixture:
+def _polish(events: _Events, start: _Mixture, steps: int = 200) -> _Mixture:
     """Maximise the likelihood of the events seen, with its gradient, under τ² ≥ 0."""
     k = start.weight.size
     scale = max(float(np.median(events.sigma)), 1e-9)
@@ -389,7 +390,7 @@ def _polish(events: _Events, start: _Mixture) -> _Mixture:
     theta = np.clip(theta, [b[0] for b in bounds], [b[1] for b in bounds])
     found = minimize(
         loss, theta, jac=True, method="L-BFGS-B", bounds=bounds,
-        options={"maxiter": 200, "ftol": 1e-9, "gtol": 1e-6},
+        options={"maxiter": steps, "ftol": 1e-9, "gtol": 1e-6},
     )  # fmt: skip
     return replace(unpack(np.asarray(found.x)), log_likelihood=-float(found.fun) * n)
 
@@ -525,7 +526,7 @@ def _bootstrap(
         if number < _SUPPORT_DRAWS:
             more, fewer = _neighbours(drawn, fit.sorted())
             rivals = [
-                _polish(drawn, max(starts, key=_height(drawn)))
+                _polish(drawn, max(starts, key=_height(drawn)), _RIVAL_STEPS)
                 for starts in (more, fewer)
                 if starts
             ]

@@ -22,8 +22,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
-from scipy.signal import find_peaks
-from scipy.stats import norm
+from scipy.signal import fftconvolve, find_peaks
+from scipy.special import ndtr, ndtri
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import FloatArray
@@ -42,6 +42,7 @@ _PROMINENCE_SIGMAS = 3.0
 _LANDING_SHARE = 0.4
 _MOST_PEAKS = 10
 _GRID = 4096
+_ROOT_2PI = math.sqrt(2 * math.pi)
 
 
 def mass_from_contrast(
@@ -273,7 +274,7 @@ class MassCalibration:
         """
         if not 0 < level < 1:
             raise ValueError(f"level = {level} must lie between 0 and 1")
-        reach = float(norm.ppf((1 + level) / 2)) * self.sigma_kda(contrast, sigma_contrast)
+        reach = float(ndtri((1 + level) / 2)) * self.sigma_kda(contrast, sigma_contrast)
         mass = self.mass_kda(contrast)
         return mass - reach, mass + reach
 
@@ -451,8 +452,9 @@ def find_contrast_peaks(size: FloatArray, errors: FloatArray) -> list[Peak]:
     edges = np.concatenate([grid - (grid[1] - grid[0]) / 2, [grid[-1] + (grid[1] - grid[0]) / 2]])
     counts = np.histogram(x, edges)[0]
     reach = np.arange(-_GRID // 2, _GRID // 2) * (grid[1] - grid[0])
-    kernel = norm.pdf(reach, scale=h)
-    density = np.convolve(counts, kernel, mode="full")[_GRID // 2 : _GRID // 2 + _GRID]
+    kernel = np.exp(-0.5 * (reach / h) ** 2) / (_ROOT_2PI * h)
+    density = fftconvolve(counts, kernel)[_GRID // 2 : _GRID // 2 + _GRID]
+    density = np.maximum(density, 0.0)
     found, about = find_peaks(density, prominence=0)
     # Var Σφ_h(x − x_i) = n·f/(2√π h) for Poisson events.
     noise = np.sqrt(density[found] / (2 * math.sqrt(math.pi) * h))
@@ -501,8 +503,9 @@ def _fit_peak(
         mean = centre + width * theta[0]
         total = np.sqrt((width * math.exp(theta[1])) ** 2 + sigma**2)
         share = 1 / (1 + math.exp(-theta[2]))
-        inside = norm.cdf((high - mean) / total) - norm.cdf((low - mean) / total)
-        peak = norm.pdf((x - mean) / total) / total / np.maximum(inside, 1e-12)
+        inside = ndtr((high - mean) / total) - ndtr((low - mean) / total)
+        peak = np.exp(-0.5 * ((x - mean) / total) ** 2) / (_ROOT_2PI * total)
+        peak /= np.maximum(inside, 1e-12)
         density = share * peak + (1 - share) / (high - low)
         return -float(np.sum(np.log(np.maximum(density * (high - low), 1e-300))))
 

@@ -1,0 +1,153 @@
+"""Species from events: what the pieces promise."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import approx_fprime
+from scipy.stats import norm
+
+from iscat_analysis._kernels.mixture import mixture_em, mixture_score
+from iscat_analysis.distribution import (
+    LEAST_EVENTS,
+    SPECIES_COLUMNS,
+    Efficiency,
+    describe,
+)
+
+
+def sample(seed: int = 1, n: int = 200) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    rng = np.random.default_rng(seed)
+    sigma = rng.uniform(4, 9, n)
+    true = np.where(np.arange(n) < n // 2, 66.0, 200.0)
+    sign = np.where(np.arange(n) % 4 == 0, -1.0, 1.0)
+    return sign * rng.normal(true, sigma), sigma
+
+
+def test_the_likelihood_is_that_of_scipy_and_so_is_its_slope() -> None:
+    x, sigma = np.abs(sample()[0]), sample()[1]
+    weight, mean, variance = np.array([0.3, 0.7]), np.array([70.0, 190.0]), np.array([9.0, 100.0])
+
+    def value(theta: NDArray[np.float64]) -> float:
+        w, m, v = np.exp(theta[:2]), theta[2:4], theta[4:]
+        return float(mixture_score(x, sigma**2, w, m, v)[0])
+
+    expected = np.log(
+        sum(
+            w * norm.pdf(x, m, np.sqrt(v + sigma**2))
+            for w, m, v in zip(weight, mean, variance, strict=True)
+        )
+    ).sum()
+    found, gradient = mixture_score(x, sigma**2, weight, mean, variance)
+    assert found == pytest.approx(expected, rel=1e-12)
+    theta = np.concatenate([np.log(weight), mean, variance])
+    assert np.allclose(gradient.ravel(), approx_fprime(theta, value, 1e-6), rtol=1e-4, atol=1e-3)
+
+
+def test_em_never_goes_down() -> None:
+    x, sigma = np.abs(sample()[0]), sample()[1]
+    weight, mean, variance = np.array([0.5, 0.5]), np.array([20.0, 300.0]), np.array([900.0, 900.0])
+    values = []
+    for _ in range(30):
+        values.append(mixture_score(x, sigma**2, weight, mean, variance)[0])
+        mixture_em(x, sigma**2, weight, mean, variance, 1)
+    assert np.all(np.diff(values) > -1e-9)
+    assert weight.sum() == pytest.approx(1, rel=1e-9)
+
+
+def test_the_table_of_species() -> None:
+    mass, sigma = sample()
+    found = describe(mass, sigma, seed=1, draws=40)
+    assert list(found.species.columns) == list(SPECIES_COLUMNS)
+    assert len(found.species) == 2
+    assert found.species["mass_kda"].is_monotonic_increasing
+    assert found.species["fraction"].sum() == pytest.approx(1)
+    assert found.species["count"].sum() == pytest.approx(200)
+    assert (found.species["landing"] + found.species["leaving"]).tolist() == pytest.approx(
+        found.species["count"].tolist()
+    )
+    assert found.species["leaving"].tolist() == pytest.approx([25, 25], abs=1)
+    for name in ("mass", "width", "fraction"):
+        value = found.species["mass_kda" if name == "mass" else f"{name}_kda"
+                              if name == "width" else name]  # fmt: skip
+        assert (found.species[f"{name}_low"] <= value + 1e-6).all()
+        assert (found.species[f"{name}_high"] >= value - 1e-6).all()
+    assert found.selection["delta_bic"].min() == 0
+    assert found.support > 0.8
+
+
+def test_the_same_seed_gives_the_same_numbers() -> None:
+    mass, sigma = sample()
+    first = describe(mass, sigma, seed=3, draws=10).to_dict()
+    again = describe(mass, sigma, seed=3, draws=10).to_dict()
+    other = describe(mass, sigma, seed=4, draws=10).to_dict()
+    assert json.dumps(first) == json.dumps(again)
+    assert first["species"][0]["mass_se"] != other["species"][0]["mass_se"]
+
+
+def test_branches_take_one_side_each() -> None:
+    mass, sigma = sample()
+    both = describe(mass, sigma, seed=1, draws=0)
+    landing = describe(mass, sigma, seed=1, draws=0, branch="landing")
+    leaving = describe(mass, sigma, seed=1, draws=0, branch="leaving")
+    assert (both.events, landing.events, leaving.events) == (200, 150, 50)
+    assert landing.species["leaving"].sum() == leaving.species["landing"].sum() == 0
+
+
+def test_few_events_are_listed_and_not_described() -> None:
+    for n in (0, 1, LEAST_EVENTS - 1):
+        mass, sigma = sample(n=n)
+        found = describe(mass, sigma, seed=1)
+        assert found.species.empty
+        assert found.histogram["count"].sum() == n
+        assert any("too few" in note for note in found.notes)
+        json.dumps(found.to_dict())
+
+
+def test_missing_values_are_left_out() -> None:
+    mass, sigma = sample()
+    mass[0], sigma[1], sigma[2] = math.nan, math.nan, 0.0
+    found = describe(mass, sigma, seed=1, draws=0)
+    assert found.events == 197
+    assert any("3 events without a mass and an error" in note for note in found.notes)
+
+
+def test_impossible_options_are_refused() -> None:
+    with pytest.raises(ValueError, match="masses but"):
+        describe([1.0], [1.0, 2.0], seed=1)
+    with pytest.raises(ValueError, match="max_species = 0"):
+        describe([1.0], [1.0], max_species=0, seed=1)
+    with pytest.raises(ValueError, match="efficiency needs"):
+        Efficiency(5.0, 0.0)
+
+
+def test_curves_hold_the_events() -> None:
+    mass, sigma = sample()
+    found = describe(mass, sigma, seed=1, draws=0)
+    step = found.curves["mass_kda"][1]
+    for name in ("density", "model"):
+        assert found.curves[name].sum() * step == pytest.approx(200, rel=0.02)
+    counts = found.histogram
+    assert counts["count"].sum() == 200
+    assert (
+        (counts["count_low"] <= counts["count"]) & (counts["count"] <= counts["count_high"])
+    ).all()
+    # Garwood's interval of no events at all: 0 to −ln 0.025.
+    empty = counts[counts["count"] == 0]
+    assert empty["count_high"].tolist() == pytest.approx([-math.log(0.025)] * len(empty))
+
+
+def test_efficiency_is_half_at_the_threshold() -> None:
+    efficiency = Efficiency(5.0, 12.0)
+    assert efficiency.threshold_kda == 60
+    assert efficiency([60.0]).tolist() == [0.5]
+    assert efficiency(84.0) == pytest.approx(norm.cdf(2))
+    mass, sigma = sample()
+    found = describe(mass, np.minimum(sigma, 12.0), efficiency=efficiency, seed=1, draws=0)
+    light = found.species.iloc[0]
+    assert light["count_corrected"] == pytest.approx(light["count"] / light["efficiency"], rel=1e-3)
+    assert found.curves["efficiency"].is_monotonic_increasing

@@ -1,0 +1,244 @@
+"""Contrast against mass: the line in its standard errors, peaks from events, and clear refusals."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.events import read_events, stored_calibration
+from iscat_analysis.mass_calibration import (
+    calibrate_mass,
+    find_contrast_peaks,
+    mass_from_contrast,
+    york_line,
+)
+
+STANDARDS = (66.0, 146.0, 480.0)
+GRADIENT, OFFSET = -3.1e-5, 2e-4
+NOISE = 2.5e-4
+
+
+def events(
+    rng: np.random.Generator,
+    masses: tuple[float, ...] = STANDARDS,
+    *,
+    count: int = 150,
+    leaving: int = 20,
+    gradient: float = GRADIENT,
+    offset: float = OFFSET,
+) -> NDArray[np.float64]:
+    """Signed contrasts of landing and leaving particles."""
+    landed = np.concatenate(
+        [gradient * m + offset + NOISE * rng.standard_normal(count) for m in masses]
+    )
+    left = np.concatenate(
+        [-(gradient * m + offset) + NOISE * rng.standard_normal(leaving) for m in masses]
+    )
+    return rng.permutation(np.concatenate([landed, left]))
+
+
+def test_york_agrees_with_brute_force() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        n = 6
+        x_true = np.sort(rng.uniform(0, 10, n))
+        sx, sy = rng.uniform(0.05, 0.5, (2, n))
+        x, y = x_true + sx * rng.standard_normal(n), 2 * x_true + 1 + sy * rng.standard_normal(n)
+        line = york_line(x, sx, y, sy)
+
+        def distance(
+            theta: NDArray[np.float64],
+            x: NDArray[np.float64] = x,
+            y: NDArray[np.float64] = y,
+            sx: NDArray[np.float64] = sx,
+            sy: NDArray[np.float64] = sy,
+        ) -> float:
+            a, b, *place = theta
+            p = np.array(place)
+            return float(np.sum(((x - p) / sx) ** 2 + ((y - a * p - b) / sy) ** 2))
+
+        start = np.concatenate([[line.slope * 1.02, line.intercept - 0.1], x])
+        brute = minimize(distance, start, method="BFGS", options={"gtol": 1e-8})
+        assert line.slope == pytest.approx(brute.x[0], rel=1e-5)
+        assert line.intercept == pytest.approx(brute.x[1], abs=1e-4)
+        assert line.chi2 == pytest.approx(brute.fun, rel=1e-6)
+        assert line.dof == n - 2
+
+
+def test_york_without_errors_in_x_is_weighted_least_squares() -> None:
+    x, y, sy = [1.0, 2.0, 4.0, 7.0], [1.1, 2.3, 3.9, 7.2], [0.1, 0.2, 0.1, 0.3]
+    line = york_line(x, [0.0] * 4, y, sy)
+    design = np.stack([x, np.ones(4)], axis=1) / np.array(sy)[:, None]
+    normal = design.T @ design
+    expected = np.linalg.solve(normal, design.T @ (np.array(y) / sy))
+    assert [line.slope, line.intercept] == pytest.approx(expected.tolist(), rel=1e-10)
+    assert np.allclose(line.covariance, np.linalg.inv(normal), rtol=1e-10)
+
+
+def test_york_errors_are_those_of_repetitions() -> None:
+    rng = np.random.default_rng(2)
+    x_true, sx, sy = np.array([1.0, 3.0, 8.0]), np.full(3, 0.05), np.full(3, 0.08)
+    pulls = []
+    for _ in range(400):
+        x = x_true + sx * rng.standard_normal(3)
+        y = 2 * x_true + 1 + sy * rng.standard_normal(3)
+        line = york_line(x, sx, y, sy)
+        pulls.append(
+            [
+                (line.slope - 2) / math.sqrt(line.covariance[0, 0]),
+                (line.intercept - 1) / math.sqrt(line.covariance[1, 1]),
+            ]
+        )
+    table = np.array(pulls)
+    assert np.all(np.abs(table.mean(axis=0)) < 4 / 20)
+    assert np.all(np.abs(table.std(axis=0) - 1) < 4 / math.sqrt(800))
+
+
+def test_york_needs_a_line() -> None:
+    with pytest.raises(ValueError, match="two different x"):
+        york_line([1.0, 1.0], [0.1, 0.1], [1.0, 2.0], [0.1, 0.1])
+    with pytest.raises(ValueError, match="positive errors"):
+        york_line([1.0, 2.0], [0.1, 0.1], [1.0, 2.0], [0.1, 0.0])
+
+
+@pytest.mark.parametrize("known_errors", [False, True])
+def test_the_line_is_recovered_in_standard_errors(known_errors: bool) -> None:
+    pulls = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        truth = np.array(STANDARDS) * (1 + 0.01 * rng.standard_normal(3))
+        contrast = events(rng, tuple(truth))
+        sigmas = np.full(contrast.shape, NOISE) if known_errors else None
+        found = calibrate_mass(contrast, STANDARDS, sigmas=sigmas)
+        pulls.append(
+            [
+                (found.gradient_per_kda - GRADIENT) / math.sqrt(found.covariance[0, 0]),
+                (found.offset - OFFSET) / math.sqrt(found.covariance[1, 1]),
+            ]
+        )
+        if known_errors:
+            assert found.standards["width"].max() < 0.6 * NOISE
+        else:
+            assert abs(found.standards["width"] / NOISE - 1).max() < 0.35
+    table = np.array(pulls)
+    assert np.all(np.abs(table.mean(axis=0)) < 4 / math.sqrt(20)), table.mean(axis=0)
+    assert np.all(table.std(axis=0, ddof=1) < 1.6), table.std(axis=0)
+
+
+def test_peaks_are_unbiased_on_a_background() -> None:
+    pulls = []
+    for seed in range(20):
+        rng = np.random.default_rng(50 + seed)
+        size = np.concatenate(
+            [0.004 + NOISE * rng.standard_normal(200), rng.uniform(0.001, 0.008, 100)]
+        )
+        peaks = find_contrast_peaks(size, np.zeros(size.shape))
+        best = max(peaks, key=lambda peak: peak.count)
+        pulls.append((best.contrast - 0.004) / best.contrast_se)
+    assert abs(np.mean(pulls)) < 4 / math.sqrt(20)
+    assert np.std(pulls) < 1.6
+
+
+def test_prediction_intervals_hold_the_mass() -> None:
+    rng = np.random.default_rng(3)
+    inside = []
+    for _ in range(40):
+        truth = np.array(STANDARDS) * (1 + 0.01 * rng.standard_normal(3))
+        found = calibrate_mass(events(rng, tuple(truth), count=80, leaving=0), STANDARDS)
+        contrast = GRADIENT * 250 + OFFSET + NOISE * rng.standard_normal(20)
+        low, high = found.prediction_interval(contrast, NOISE)
+        inside.append(np.mean((low < 250) & (high > 250)))
+    share = float(np.mean(inside))
+    assert abs(share - 0.95) < 4 * float(np.std(inside)) / math.sqrt(40) + 0.005
+    with pytest.raises(ValueError, match="level"):
+        found.prediction_interval(0.01, level=1.0)
+
+
+def test_landing_and_leaving_weigh_the_same() -> None:
+    for gradient in (GRADIENT, -GRADIENT):
+        offset = math.copysign(OFFSET, -gradient)
+        landing = gradient * 146 + offset
+        assert mass_from_contrast(landing, gradient, offset) == pytest.approx(146, rel=1e-12)
+        assert mass_from_contrast(-landing, gradient, offset) == pytest.approx(-146, rel=1e-12)
+    # The control: a plain line is wrong by 2|o/s| on one branch.
+    plain = (-(GRADIENT * 146 + OFFSET) - OFFSET) / GRADIENT
+    assert abs(plain + 146) == pytest.approx(2 * abs(OFFSET / GRADIENT), rel=1e-9)
+    with pytest.raises(ConfigError, match="nothing about mass"):
+        mass_from_contrast(0.1, 0.0)
+
+
+def test_bright_landing_has_a_positive_gradient() -> None:
+    rng = np.random.default_rng(4)
+    contrast = events(rng, gradient=-GRADIENT, offset=-OFFSET)
+    found = calibrate_mass(contrast, STANDARDS, landing="bright")
+    assert abs(found.gradient_per_kda + GRADIENT) < 4 * math.sqrt(found.covariance[0, 0])
+    assert "gradient_per_kda = 3" in found.to_toml()
+
+
+def test_standards_that_do_not_match_are_one_clear_line() -> None:
+    contrast = events(np.random.default_rng(5))
+    with pytest.raises(DataError, match=r"66, 146, 300 kDa do not match the peaks .* misses"):
+        calibrate_mass(contrast, (66, 146, 300))
+    with pytest.raises(DataError, match="fewer than the 4 standards"):
+        calibrate_mass(contrast, (66, 146, 480, 900))
+    with pytest.raises(DataError, match="zero mass would have the contrast"):
+        calibrate_mass(contrast, (400, 480))
+
+
+def test_a_wrong_sign_is_one_clear_line() -> None:
+    contrast = events(np.random.default_rng(6))
+    with pytest.raises(DataError, match=r"only 60 of 510 events are bright.*wrong sign"):
+        calibrate_mass(contrast, STANDARDS, landing="bright")
+
+
+@pytest.mark.parametrize("standards", [(66.0,), (66.0, -146.0), (66.0, math.nan), (66.0, 66.0)])
+def test_impossible_standards_are_refused(standards: tuple[float, ...]) -> None:
+    with pytest.raises(ConfigError, match="--standards"):
+        calibrate_mass(events(np.random.default_rng(7)), standards)
+
+
+def test_few_events_are_refused() -> None:
+    with pytest.raises(DataError, match="holds 5 landing events"):
+        calibrate_mass([-0.01] * 5, STANDARDS)
+
+
+def test_two_standards_cannot_test_the_line() -> None:
+    found = calibrate_mass(events(np.random.default_rng(8)), (66, 146))
+    assert found.dof == 0
+    assert any("cannot test it" in note for note in found.notes)
+
+
+def test_scatter_beyond_the_errors_widens_the_line() -> None:
+    rng = np.random.default_rng(9)
+    contrast = events(rng, (66.0, 152.0, 480.0))
+    tight = [0.01, 0.01, 0.01]
+    found = calibrate_mass(contrast, STANDARDS, standards_se_kda=tight)
+    assert found.chi2 > 4
+    assert any("widened" in note for note in found.notes)
+
+
+def test_refeyns_masses_are_reproduced_exactly(data_dir: Path) -> None:
+    path = data_dir / "refeyn_events_2.4.2.h5"
+    if not path.is_file():
+        pytest.skip(f"no measured table: {path} is absent")
+    table = read_events(path)
+    stored = stored_calibration(table)
+    assert stored is not None
+    contrast, mass = table["contrast"].to_numpy(), table["mass_kda"].to_numpy()
+    assert np.array_equal(
+        mass_from_contrast(contrast, stored.gradient_per_kda, stored.offset), mass
+    )
+    plain = (contrast - stored.offset) / stored.gradient_per_kda  # the control
+    off = np.abs(plain - mass)
+    assert np.count_nonzero(off > 1) == np.count_nonzero(contrast > 0) == 641
+
+    found = calibrate_mass(contrast, STANDARDS)
+    assert found.gradient_per_kda == pytest.approx(stored.gradient_per_kda, rel=0.03)
+    assert np.allclose(found.standards["contrast"], stored.standard_contrasts, rtol=0.06)
+    assert abs(found.standards["residual_percent"]).max() < 1

@@ -1,0 +1,272 @@
+"""Photon transfer recovers a known camera, says what it cannot know, and leaves bad pixels out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.photon_transfer import CameraCalibration, Estimate, measure_camera
+
+GAIN, OFFSET, READ_E = 4.0, 100.0, 20.0
+READ_WITH_ROUNDING_E = math.hypot(READ_E, GAIN / math.sqrt(12))
+SEEDS = 12
+SHAPE = (48, 48)
+
+
+@dataclass
+class Movie:
+    counts: NDArray[Any]
+    name: str = "movie.tif"
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        t, y, x = self.counts.shape
+        return t, y, x
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        return self.counts[start:stop].copy()
+
+
+def scene(rng: np.random.Generator, level: float = 1e4, contrast: float = 0.15) -> NDArray[Any]:
+    speckle = gaussian_filter(rng.standard_normal(SHAPE), 2)
+    return level * (1 + contrast * speckle / speckle.std())
+
+
+def record(
+    light: NDArray[Any],
+    frames: int,
+    rng: np.random.Generator,
+    *,
+    power: float = 0.01,
+    read_e: float = READ_E,
+) -> Movie:
+    flicker = 1 + power * rng.standard_normal((frames, 1, 1))
+    electrons = rng.poisson(light * flicker) + read_e * rng.standard_normal((frames, *light.shape))
+    return Movie(np.clip(np.rint(electrons / GAIN + OFFSET), 0, 65535).astype(np.uint16))
+
+
+def pull(estimate: Estimate | None, truth: float) -> float:
+    assert estimate is not None
+    return (estimate.value - truth) / estimate.se
+
+
+def check_pulls(pulls: list[list[float]]) -> None:
+    """Ask for a mean within 4 standard errors of zero and a spread of one (χ² at 1e-4)."""
+    table = np.array(pulls)
+    n = len(table)
+    assert np.all(np.abs(table.mean(axis=0)) < 4 / math.sqrt(n)), table.mean(axis=0)
+    assert np.all(table.std(axis=0, ddof=1) < 1.75), table.std(axis=0)
+    assert np.all(table.std(axis=0, ddof=1) > 0.35), table.std(axis=0)
+
+
+def test_a_dark_and_a_movie_give_the_camera() -> None:
+    pulls = []
+    for seed in range(SEEDS):
+        rng = np.random.default_rng(seed)
+        light = scene(rng)
+        found = measure_camera([record(light, 120, rng)], dark=record(0 * light, 80, rng))
+        pulls.append(
+            [
+                pull(found.gain_e_per_adu, GAIN),
+                pull(found.offset_adu, OFFSET),
+                pull(found.read_noise_e, READ_WITH_ROUNDING_E),
+            ]
+        )
+        assert found.offset_from == "dark"
+    check_pulls(pulls)
+
+
+def test_a_flickering_laser_gives_the_offset_without_a_dark() -> None:
+    pulls = []
+    for seed in range(SEEDS):
+        rng = np.random.default_rng(100 + seed)
+        found = measure_camera([record(scene(rng), 200, rng, power=0.05, read_e=60.0)])
+        assert found.offset_from == "flicker"
+        truth = math.hypot(60.0, GAIN / math.sqrt(12))
+        pulls.append(
+            [
+                pull(found.gain_e_per_adu, GAIN),
+                pull(found.offset_adu, OFFSET),
+                pull(found.read_noise_e, truth),
+            ]
+        )
+    check_pulls(pulls)
+
+
+def test_levels_of_one_scene_give_the_offset() -> None:
+    pulls = []
+    for seed in range(SEEDS):
+        rng = np.random.default_rng(200 + seed)
+        light = scene(rng)
+        stacks = [record(f * light, 60, rng, power=0.0) for f in (0.2, 0.6, 1.0)]
+        found = measure_camera(stacks)
+        assert found.offset_from == "flicker"
+        pulls.append([pull(found.gain_e_per_adu, GAIN), pull(found.offset_adu, OFFSET)])
+    check_pulls(pulls)
+
+
+def test_a_steady_laser_leaves_only_where_the_line_ends() -> None:
+    pulls = []
+    for seed in range(SEEDS):
+        rng = np.random.default_rng(300 + seed)
+        found = measure_camera([record(scene(rng), 200, rng, power=0.0)])
+        assert found.offset_from == "line"
+        assert found.read_noise_e is None
+        assert any("cannot be told apart" in note for note in found.notes)
+        end = OFFSET - READ_WITH_ROUNDING_E**2 / GAIN
+        pulls.append([pull(found.gain_e_per_adu, GAIN), pull(found.offset_adu, end)])
+    check_pulls(pulls)
+
+
+def test_control_without_power_normalisation_the_gain_is_wrong() -> None:
+    rng = np.random.default_rng(1)
+    movie = record(scene(rng), 200, rng, power=0.05)
+    counts = movie.counts.astype(float)
+    mean, variance = counts.mean(axis=0).ravel(), counts.var(axis=0, ddof=1).ravel()
+    naive = float(mean.mean() - OFFSET) / float(variance.mean())
+    found = measure_camera([movie]).gain_e_per_adu
+    assert found is not None
+    assert naive < GAIN / 5
+    assert abs(found.value - GAIN) < 4 * found.se
+
+
+def test_small_read_noise_has_an_upper_limit() -> None:
+    rng = np.random.default_rng(2)
+    found = measure_camera([record(scene(rng), 200, rng, power=0.05, read_e=1.0)])
+    assert found.read_noise_e is None
+    assert found.read_noise_below_e is not None
+    assert math.hypot(1.0, GAIN / math.sqrt(12)) < found.read_noise_below_e < 50
+
+
+def test_a_flat_needs_its_offset() -> None:
+    rng = np.random.default_rng(3)
+    flat = record(np.full(SHAPE, 2e4), 100, rng, power=0.0, read_e=0.0)
+    with pytest.raises(DataError, match=r"give a dark \(--dark\), the offset \(--offset\)"):
+        measure_camera([flat])
+    found = measure_camera([flat], offset_adu=OFFSET)
+    assert abs(pull(found.gain_e_per_adu, GAIN)) < 4
+    assert found.offset_from == "given"
+
+
+def test_a_dark_alone_gives_counts_only() -> None:
+    rng = np.random.default_rng(4)
+    found = measure_camera([], dark=record(np.zeros(SHAPE), 100, rng), maps=True)
+    assert found.gain_e_per_adu is None
+    assert found.read_noise_e is None
+    assert abs(pull(found.read_noise_adu, READ_WITH_ROUNDING_E / GAIN)) < 4
+    assert "gain" not in found.to_toml()
+    assert set(found.maps) == {"offset_adu"}
+
+
+def test_bad_pixels_are_left_out_and_reported() -> None:
+    rng = np.random.default_rng(5)
+    movie = record(scene(rng), 100, rng)
+    movie.counts[50, 10, 11] = 65535
+    movie.counts[:, 20, 21] = 100
+    movie.counts[::4, 30, 31] += 4000
+    movie.counts[:, 5, 6] = 40000 + movie.counts[:, 5, 6] % 16
+    found = measure_camera([movie])
+    assert np.argwhere(found.masked["saturated"]).tolist() == [[10, 11]]
+    assert np.argwhere(found.masked["dead"]).tolist() == [[20, 21]]
+    assert np.argwhere(found.masked["hot"]).tolist() == [[5, 6], [30, 31]]
+    assert sum("left out" in note for note in found.notes) == 3
+    assert abs(pull(found.gain_e_per_adu, GAIN)) < 4
+
+
+def test_maps_show_pixels_that_differ() -> None:
+    rng = np.random.default_rng(6)
+    light = np.full(SHAPE, 2e4)
+    gain = np.where(np.arange(SHAPE[1]) < SHAPE[1] // 2, 3.0, 5.0) * np.ones(SHAPE)
+    frames = rng.poisson(light, (600, *SHAPE)) / gain + OFFSET
+    dark = record(0 * light, 100, rng)
+    movie = Movie(np.rint(frames).astype(np.uint16))
+    found = measure_camera([movie], dark=dark, maps=True)
+    values = found.maps["gain_e_per_adu"]
+    left, right = np.split(values, 2, axis=1)
+    # The dark here is another camera's, of 20 e read noise: 1 to 2 % of the variance.
+    assert abs(np.median(left) / 3 - 1) < 0.05
+    assert abs(np.median(right) / 5 - 1) < 0.05
+    assert values.min() > 0
+    assert set(found.maps) == {"gain_e_per_adu", "offset_adu", "read_noise_e"}
+    with pytest.raises(DataError, match="--maps needs 100 frames"):
+        measure_camera([Movie(movie.counts[:50])], dark=dark, maps=True)
+
+
+def verdict_of(movie: Movie) -> CameraCalibration:
+    return measure_camera([movie], offset_adu=OFFSET)
+
+
+def test_noise_falls_as_shot_noise_does() -> None:
+    rng = np.random.default_rng(7)
+    found = verdict_of(record(scene(rng), 512, rng, read_e=5.0))
+    noise = found.noise
+    assert found.shot_limited_frames == noise["n_frames"].max() == 256
+    assert np.all(np.abs(noise["excess"] - 1) < 5 * noise["excess_se"] + 0.01)
+    expected = np.sqrt(2 / (1e4 * noise["n_frames"]))
+    # The mean of 1/μ over the speckle, and the gain, are each off by a few per cent.
+    assert np.allclose(noise["shot_noise"], expected, rtol=0.06)
+
+
+def test_drift_ends_the_shot_noise_limit() -> None:
+    rng = np.random.default_rng(8)
+    light = scene(rng)
+    counts = np.concatenate(
+        [record(np.roll(light, k // 64, axis=1), 1, rng, read_e=5.0).counts for k in range(512)]
+    )
+    # Every 64 frames the speckle moves by one pixel.
+    found = verdict_of(Movie(counts))
+    assert found.shot_limited_frames is not None
+    assert 2 <= found.shot_limited_frames <= 64
+    assert "drift" in found.verdict
+
+
+def test_read_noise_ends_it_at_once() -> None:
+    rng = np.random.default_rng(9)
+    light = scene(rng, level=500.0)
+    found = measure_camera(
+        [record(light, 128, rng, read_e=30.0)], dark=record(0 * light, 64, rng, read_e=30.0)
+    )
+    assert found.shot_limited_frames == 0
+    assert found.verdict.startswith("not shot-noise limited")
+
+
+def test_a_curved_transfer_is_noticed() -> None:
+    rng = np.random.default_rng(10)
+    light = scene(rng, contrast=0.3)
+    movie = record(light, 300, rng, power=0.0)
+    bent = movie.counts * (1 - movie.counts / 16000.0)
+    found = measure_camera([Movie(bent.astype(np.float32))])
+    assert any("does not follow a straight line" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c[:4], "needs 8"),
+        (lambda c: np.full_like(c, 65535), "are saturated"),
+        (lambda c: np.broadcast_to(c[:1], c.shape), "successive frames are identical"),
+        (lambda c: np.where(np.arange(c.size).reshape(c.shape) == 7, np.nan, c), "NaN"),
+    ],
+)
+def test_what_is_no_raw_movie_is_refused(change: Any, message: str) -> None:
+    rng = np.random.default_rng(11)
+    movie = record(scene(rng), 16, rng)
+    with pytest.raises(DataError, match=message):
+        measure_camera([Movie(change(movie.counts))])
+
+
+def test_stacks_must_agree_in_shape() -> None:
+    rng = np.random.default_rng(12)
+    movie = record(scene(rng), 16, rng)
+    other = Movie(movie.counts[:, :40], "dark.tif")
+    with pytest.raises(DataError, match=r"dark.tif: is 40 x 48 pixels but movie.tif is 48 x 48"):
+        measure_camera([movie], dark=other)
+    with pytest.raises(DataError, match="no recording"):
+        measure_camera([])
