@@ -82,6 +82,16 @@ def fit(
     workers: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Threads.", show_default=False)
     ] = None,
+    inject: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Landing movies: add N known particles in a second run and report recall, bias "
+            "and spread.",
+            show_default=False,
+        ),
+    ] = None,
     overwrite: OverwriteOption = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit with status 3 if any result is flagged.")
@@ -114,6 +124,7 @@ def fit(
                 progress=progress,
                 notify=messages.notify,
                 command=context.obj,
+                inject=inject or 0,
             )
         rows: list[dict[str, Any]] = analysis.table.to_dict("records")
         if as_json:

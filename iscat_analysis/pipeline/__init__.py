@@ -24,7 +24,7 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.likelihood import compile_kernels
 from iscat_analysis.load import Stack, open_stack
 from iscat_analysis.pipeline.field import Scene, field_likelihood, fit_field, make_scene
-from iscat_analysis.pipeline.landing import analyse_landings, has_landings
+from iscat_analysis.pipeline.landing import analyse_landings, has_landings, inject_and_recover
 from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
 from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
 from iscat_analysis.pipeline.tracking import track_particles
@@ -67,6 +67,7 @@ def fit_stack(
     progress: Progress = silent,
     notify: Notify = _quiet,
     command: str = "",
+    inject: int = 0,
 ) -> Analysis:
     """Analyse a movie and write the report.
 
@@ -86,6 +87,9 @@ def fit_stack(
         Told what the user should know, one line at a time.
     command : str
         The command line, for the record.
+    inject : int
+        Known particles to add to a landing movie in a second run, which tells how many are found
+        and how well they are measured; ``summary["injection"]``.
 
     Returns
     -------
@@ -112,6 +116,7 @@ def fit_stack(
                 notify=notify,
                 command=command,
                 partial=partial_folder(folder.resolve()),
+                inject=inject,
             )
         sliding = "landing" in analysis.summary
         figures = FEW_FIGURES if sliding else EVENT_FIGURES
@@ -130,6 +135,7 @@ def analyse(
     notify: Notify = _quiet,
     command: str = "",
     partial: Path | None = None,
+    inject: int = 0,
 ) -> Analysis:
     """Analyse an open movie.
 
@@ -144,6 +150,8 @@ def analyse(
     partial : Path, optional
         Folder that keeps the finished chunks of a landing movie, so that an interrupted run can be
         resumed; without it nothing is kept.
+    inject : int
+        As in `fit_stack`.
 
     Returns
     -------
@@ -183,7 +191,17 @@ def analyse(
         found = Found(result.table, result.views, result.windows, result.interrupted)
         config = scene.config
         clock.lap("landing")
+        if inject and not result.interrupted:
+            further["injection"] = inject_and_recover(
+                movie, config, camera, result, inject, progress=progress
+            )
+            clock.lap("injection")
     else:
+        if inject:
+            raise ConfigError(
+                "--inject adds particles to a landing movie: it needs an interferometric scheme "
+                "and neither --background nor background.frames"
+            )
         scene, found, image = _measured_background(
             movie, config, camera, clock, tell=tell, notify=notify, progress=progress
         )

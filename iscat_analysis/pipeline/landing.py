@@ -38,6 +38,7 @@ from iscat_analysis.pipeline.chunks import (
     plan_chunks,
 )
 from iscat_analysis.pipeline.field import Scene
+from iscat_analysis.pipeline.injection import InjectedMovie, draw_particles, recovery
 from iscat_analysis.pipeline.results import Row, table_of, view_of
 from iscat_analysis.pipeline.resume import Store
 from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
@@ -213,6 +214,52 @@ def analyse_landings(
         summary=summary,
         interrupted=interrupted,
     )
+
+
+def inject_and_recover(
+    movie: Frames,
+    config: Config,
+    camera: Camera,
+    result: LandingResult,
+    count: int,
+    *,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Add known particles to a movie, analyse it again and compare.
+
+    Parameters
+    ----------
+    movie, config, camera, progress
+        As in `analyse_landings`.
+    result : LandingResult
+        What was found without them: their masses are drawn from it.
+    count : int
+        Particles.
+
+    Returns
+    -------
+    dict
+        From `iscat_analysis.pipeline.injection.recovery`.
+    """
+    frames = config.fit.frames or (0, movie.shape[0])
+    window = int(result.summary["window_frames"])
+    fixed = config.background.model_copy(update={"window_frames": window})
+    seed = config.simulation.seed
+    particles = draw_particles(
+        result.scene, (movie.shape[1], movie.shape[2]), frames, window, count, result.table, seed
+    )
+    again = analyse_landings(
+        InjectedMovie(movie, camera, particles, seed),
+        config.model_copy(update={"background": fixed}),
+        camera,
+        tell=_unheard,
+        progress=progress,
+    )
+    return recovery(particles, again.table, frames[1], result.scene.roi_px / 2, window)
+
+
+def _unheard(text: str) -> None:
+    """Say nothing: the user has been told already."""
 
 
 def make_landing_scene(config: Config, field_px: tuple[int, int], *, searches: int) -> Scene:

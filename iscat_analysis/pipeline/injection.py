@@ -1,0 +1,271 @@
+"""Injection and recovery: what the analysis finds of known particles added to the measured movie.
+
+A particle of contrast C multiplies the expected counts of a pixel by 1 + C.  Where it darkens,
+each photoelectron is kept with probability 1 + C, and thinned Poisson counts are Poisson counts;
+where it brightens, photoelectrons of expectation C times the counts are added, whose variance is
+too large by 2C of itself.  Both are drawn from the normal law with these two moments and rounded at
+random, so that no rounding bias remains.  Every particle lands, and leaves again three windows
+later.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis.camera import Camera
+from iscat_analysis.forward import PixelGrid
+from iscat_analysis.pipeline.chunks import FRAME_COLUMN, Frames
+from iscat_analysis.pipeline.field import Scene
+from iscat_analysis.records import FloatArray, Status
+
+STAY = 3
+"""Windows between landing and leaving."""
+
+_SAME_PX = 2.0
+_SAME_FRAMES = 4  # beside the stated interval of the frame
+
+
+@dataclass(frozen=True)
+class Injected:
+    """One particle that is added to a movie.
+
+    Attributes
+    ----------
+    frame, leave : int
+        First frame with it, and first without it again.
+    x_px, y_px : float
+        Position.
+    mass_kda : float
+        Mass.
+    corner : (int, int)
+        Row and column of the first pixel of `contrast`.
+    contrast : ndarray
+        Its image.
+    """
+
+    frame: int
+    leave: int
+    x_px: float
+    y_px: float
+    mass_kda: float
+    corner: tuple[int, int]
+    contrast: FloatArray
+
+
+class InjectedMovie:
+    """A movie with particles added as it is read.
+
+    Parameters
+    ----------
+    movie : Frames
+        The measured one.
+    camera : Camera
+        Counts → photoelectrons.
+    particles : sequence of Injected
+        What is added.
+    seed : int
+        Of the noise; a frame's does not depend on how the movie is read.
+    """
+
+    def __init__(self, movie: Frames, camera: Camera, particles: list[Injected], seed: int) -> None:
+        self._movie = movie
+        self._camera = camera
+        self._particles = particles
+        self._seed = seed
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+        return self._movie.shape
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return self._movie.name
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored counts."""
+        return self._movie.dtype
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Frames ``[start, stop)`` with the particles, shape (stop − start, y, x)."""
+        counts = np.array(self._movie.read(start, stop))
+        for number, particle in enumerate(self._particles):
+            rows = slice(particle.corner[0], particle.corner[0] + particle.contrast.shape[0])
+            columns = slice(particle.corner[1], particle.corner[1] + particle.contrast.shape[1])
+            gain, offset = (
+                v[rows, columns] if isinstance(v, np.ndarray) else v
+                for v in (self._camera.gain_e_per_adu, self._camera.offset_adu)
+            )
+            for t in range(max(start, particle.frame), min(stop, particle.leave)):
+                rng = np.random.default_rng(
+                    np.random.SeedSequence(self._seed, spawn_key=(number, t))
+                )
+                here = counts[t - start, rows, columns]
+                here[...] = _with_particle(here, particle.contrast, gain, offset, rng)
+        return counts
+
+
+def _with_particle(
+    counts: NDArray[Any],
+    contrast: FloatArray,
+    gain: float | FloatArray,
+    offset: float | FloatArray,
+    rng: np.random.Generator,
+) -> NDArray[Any]:
+    electrons = np.maximum((counts - offset) * gain, 0.0)
+    size = np.abs(contrast) * electrons
+    variance = np.where(contrast < 0, size * np.maximum(1 + contrast, 0.0), size)
+    change = np.copysign(size, contrast) + np.sqrt(variance) * rng.standard_normal(size.shape)
+    if not np.issubdtype(counts.dtype, np.integer):
+        return np.asarray(counts + change / gain, dtype=counts.dtype)
+    limits = np.iinfo(counts.dtype)
+    steps = np.floor(change / gain + rng.random(size.shape))
+    changed: NDArray[Any] = np.clip(counts + steps, limits.min, limits.max)
+    return changed.astype(counts.dtype)
+
+
+def draw_particles(
+    scene: Scene,
+    field_px: tuple[int, int],
+    frames: tuple[int, int],
+    window: int,
+    count: int,
+    table: pd.DataFrame,
+    seed: int,
+) -> list[Injected]:
+    """Choose what to add: anywhere, at any time, of masses as they were found.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    field_px : (int, int)
+        Rows and columns.
+    frames : (int, int)
+        Half-open range of the movie.
+    window : int
+        Frames before and after a step.
+    count : int
+        How many.
+    table : pandas.DataFrame
+        Events found in the movie; of those that are ok the masses are drawn.  Without any,
+        ``particle.mass_kda`` is taken.
+    seed : int
+        Of the choice.
+
+    Returns
+    -------
+    list of Injected
+        In order of landing.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**31,)))
+    good = table["mass_kda"][table["status"] == Status.OK].abs().to_numpy(dtype=float)
+    if not good.size:
+        good = np.array([scene.model.material.mass_kda])
+    margin = min(scene.roi_px / 2, (min(field_px) - 1) / 2)
+    stay = STAY * window
+    first = frames[0] + window
+    last = max(frames[1] - window - stay, first + 1)
+    landings = np.sort(rng.integers(first, last, count))
+    particles = []
+    for landing in landings:
+        x = float(rng.uniform(margin, field_px[1] - 1 - margin))
+        y = float(rng.uniform(margin, field_px[0] - 1 - margin))
+        mass = float(rng.choice(good))
+        spans = []
+        for centre, size in zip((y, x), field_px, strict=True):
+            middle, half = round(centre), scene.roi_px
+            spans.append((max(middle - half, 0), min(middle + half + 1, size)))
+        grid = PixelGrid.region(spans[0], spans[1], scene.pixel_nm)
+        image = scene.wide.image(
+            grid, x * scene.pixel_nm, y * scene.pixel_nm, scene.config.particle.height_nm, mass
+        )
+        frame = int(landing)
+        leave = min(frame + stay, frames[1])
+        particles.append(Injected(frame, leave, x, y, mass, (spans[0][0], spans[1][0]), image))
+    return particles
+
+
+def recovery(
+    particles: list[Injected], found: pd.DataFrame, last: int, separation_px: float, window: int
+) -> dict[str, Any]:
+    """Compare what was found with what was added.
+
+    Parameters
+    ----------
+    particles : list of Injected
+        What was added.
+    found : pandas.DataFrame
+        Events of the movie with them.
+    last : int
+        One past its last frame.
+    separation_px : float
+        Steps farther from every other one than this, or than a window in time, are isolated.
+    window : int
+        Frames before and after a step.
+
+    Returns
+    -------
+    dict
+        ``added``, ``recovered``, ``recall``; of the isolated ones ``isolated``,
+        ``recall_isolated``, ``bias_rel`` and ``bias_rel_se`` (mass), ``spread_over_crb`` with its
+        standard error, ``pull_std``, ``frame_within_1``, ``frame_in_interval``.
+    """
+    steps = [(p.frame, 1, p) for p in particles]
+    steps += [(p.leave, -1, p) for p in particles if p.leave < last]
+    frame, x, y, mass, error = (
+        found[name].to_numpy(dtype=float)
+        for name in ("frame", "x_px", "y_px", "mass_kda", FRAME_COLUMN)
+    )
+    rows: list[tuple[int, bool, int, Any]] = []
+    for when, sign, p in steps:
+        close = np.hypot(x - p.x_px, y - p.y_px)
+        near = (close < _SAME_PX) & (mass * sign > 0)
+        near &= np.abs(frame - when) <= error + _SAME_FRAMES
+        best = int(np.argmin(np.where(near, close, np.inf))) if near.any() else -1
+        others = (close < separation_px) & (np.abs(frame - when) < 2 * window)
+        if best >= 0:
+            others[best] = False
+        alone = not others.any() and not any(
+            math.hypot(q.x_px - p.x_px, q.y_px - p.y_px) < separation_px
+            and abs(t - when) < 2 * window
+            for t, s, q in steps
+            if q is not p or s != sign
+        )
+        rows.append((best, alone, when, p))
+    chosen = [(best, when, p) for best, alone, when, p in rows if alone and best >= 0]
+    isolated = sum(alone for _, alone, _, _ in rows)
+    recovered = sum(best >= 0 for best, _, _, _ in rows)
+    result: dict[str, Any] = {
+        "added": len(rows),
+        "recovered": recovered,
+        "recall": recovered / len(rows) if rows else None,
+        "isolated": isolated,
+        "recall_isolated": len(chosen) / isolated if isolated else None,
+    }
+    if len(chosen) < 2:
+        return result
+    index = [best for best, _, _ in chosen]
+    truth = np.array([p.mass_kda for _, _, p in chosen])
+    late = np.abs(frame[index] - np.array([when for _, when, _ in chosen]))
+    off = np.abs(mass[index]) - truth
+    over_crb = off / found["crb_mass_kda"].to_numpy(dtype=float)[index]
+    pulls = off / found["sigma_mass_kda"].to_numpy(dtype=float)[index]
+    n = len(chosen)
+    return result | {
+        "bias_rel": float(np.mean(off / truth)),
+        "bias_rel_se": float(np.std(off / truth, ddof=1) / math.sqrt(n)),
+        "spread_over_crb": float(np.std(over_crb, ddof=1)),
+        "spread_over_crb_se": float(np.std(over_crb, ddof=1) / math.sqrt(2 * (n - 1))),
+        "pull_std": float(np.std(pulls, ddof=1)),
+        "frame_within_1": float(np.mean(late <= 1)),
+        "frame_in_interval": float(np.mean(late <= error[index])),
+    }

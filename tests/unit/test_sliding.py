@@ -1,0 +1,249 @@
+"""Sliding sums against plain ones, the step's frame, the noise curve, drift."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from iscat_analysis.background import find_defects
+from iscat_analysis.camera import Camera
+from iscat_analysis.sliding import (
+    Chunk,
+    NoiseCurve,
+    choose_window,
+    crosstalk,
+    find_steps,
+    locate_step,
+    longest_window,
+    make_chunk,
+    make_filter,
+    measure_drift,
+    measure_frames,
+    measure_noise,
+    sliding_maps,
+)
+
+SHAPE = (40, 44)
+SIGMAS = 4.0
+
+
+def _spot(y: float, x: float, depth: float = 1.0, shape: tuple[int, int] = SHAPE) -> np.ndarray:
+    rows, columns = np.indices(shape)
+    r = np.hypot(rows - y, columns - x)
+    return depth * np.cos(r / 1.5) * np.exp(-((r / 3) ** 2))
+
+
+TEMPLATE = _spot(6, 6, shape=(13, 13))
+
+
+def _movie(
+    frames: int, seed: int, *, contrast: Any = 0.0, at: int = 10**6, level: float = 1e4
+) -> np.ndarray:
+    """Speckle, 1 % power noise, and a contrast from one frame on."""
+    rng = np.random.default_rng(seed)
+    power = 1 + 0.01 * rng.standard_normal(frames)
+    light = level * np.random.default_rng(2).uniform(0.8, 1.2, SHAPE)
+    return np.array(
+        [rng.poisson(p * light * (1 + (contrast if t >= at else 0))) for t, p in enumerate(power)],
+        dtype="u2",
+    )
+
+
+def _chunk(
+    counts: np.ndarray, camera: Camera | None = None, *, stride: int = 5, **bad: int
+) -> Chunk:
+    camera = camera or Camera()
+    light, repeats = measure_frames(counts, camera)
+    good = np.isfinite(light) & ~repeats
+    return make_chunk(
+        bad.get("first", 0), counts, good, light, camera, stride=stride, defects=find_defects
+    )
+
+
+# ---- sums ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2", "i4", "f4", "f8"])
+def test_blocks_are_plain_sums(kind: str) -> None:
+    counts = np.random.default_rng(1).integers(50, 200, (23, *SHAPE)).astype(kind)
+    camera = Camera(gain_e_per_adu=2.0, offset_adu=7.0)
+    chunk = _chunk(counts, camera)
+    electrons = 2.0 * (counts.astype(float) - 7)
+    for k, (start, stop) in enumerate(zip(chunk.edges[:-1], chunk.edges[1:], strict=True)):
+        np.testing.assert_allclose(chunk.blocks_e[k], electrons[start:stop].sum(axis=0))
+    assert chunk.edges.tolist() == [0, 5, 10, 15, 20, 23]
+    np.testing.assert_allclose(chunk.power.mean(), 1.0)
+    np.testing.assert_allclose(
+        chunk.power / chunk.power[0], electrons.sum((1, 2)) / electrons[0].sum()
+    )
+
+
+def test_maps_of_the_camera_enter_pixel_by_pixel() -> None:
+    rng = np.random.default_rng(1)
+    counts = rng.integers(50, 200, (20, *SHAPE)).astype("u2")
+    gain, offset = rng.uniform(1, 3, SHAPE), rng.uniform(0, 9, SHAPE)
+    chunk = _chunk(counts, Camera(gain_e_per_adu=gain, offset_adu=offset))
+    electrons = gain * (counts - offset)
+    np.testing.assert_allclose(chunk.blocks_e[1], electrons[5:10].sum(axis=0))
+    np.testing.assert_allclose(
+        chunk.power, electrons.sum((1, 2)) / electrons.sum((1, 2)).mean(), rtol=1e-12
+    )
+    summed, frames, power = chunk.patch(3, 9, (5, 15), (7, 20)).window(4, 8)
+    np.testing.assert_allclose(summed, electrons[4:8, 5:15, 7:20].sum(axis=0))
+    assert frames == 4
+    assert power == pytest.approx(chunk.power[4:8].sum())
+
+
+def test_stuck_and_dark_frames_do_not_exist() -> None:
+    counts = _movie(40, 3)
+    counts[7] = counts[6]
+    counts[20] = 0
+    light, repeats = measure_frames(counts, Camera())
+    assert np.flatnonzero(repeats).tolist() == [7]
+    assert np.flatnonzero(~np.isfinite(light)).tolist() == [20]
+    chunk = _chunk(counts)
+    assert chunk.power[7] == chunk.power[20] == 0
+    np.testing.assert_allclose(chunk.blocks_e[1], counts[[5, 6, 8, 9]].sum(axis=0))
+    assert chunk.patch(0, 40, (0, 4), (0, 4)).window(18, 22)[1] == 3
+
+
+def test_a_saturated_pixel_is_not_usable() -> None:
+    counts = _movie(20, 3)
+    counts[4, 5, 6] = 65535
+    chunk = _chunk(counts, Camera(full_scale_adu=65535.0))
+    assert np.argwhere(chunk.saturated).tolist() == [[5, 6]]
+    assert not chunk.usable[5, 6]
+
+
+# ---- the statistic ---------------------------------------------------------------------------
+
+
+def test_the_map_is_the_matched_filter_written_out() -> None:
+    chunk = _chunk(_movie(40, 5, contrast=_spot(18, 20, 0.05), at=20))
+    snr, effective = sliding_maps(chunk, make_filter(chunk, TEMPLATE), 4)
+    before, after = chunk.blocks_e[:4].sum(0), chunk.blocks_e[4:].sum(0)
+    contrast = after / before * before.sum() / after.sum() - 1
+    p = chunk.power
+    h = p[:20].sum() * p[20:].sum() / p.sum()
+    for y, x in ((18, 20), (10, 30)):
+        here = (slice(y - 6, y + 7), slice(x - 6, x + 7))
+        weight = chunk.mean_e[here] * h
+        expected = np.sum(weight * TEMPLATE * contrast[here]) / np.sqrt(
+            np.sum(weight * TEMPLATE**2)
+        )
+        assert snr[3, y, x] == pytest.approx(expected, rel=1e-3, abs=0.02)
+    assert effective[3] == pytest.approx(h)
+
+
+def test_noise_has_unit_variance_at_every_boundary() -> None:
+    chunk = _chunk(_movie(80, 6))
+    snr, _ = sliding_maps(chunk, make_filter(chunk, TEMPLATE), 4)
+    independent = snr[:, ::6, ::6]
+    spread = independent.std(axis=(1, 2))
+    assert np.abs(spread - 1).max() < 5 / np.sqrt(2 * independent[0].size)
+
+
+def test_a_step_is_found_where_and_when_it_is_and_vanishes_once_explained() -> None:
+    image = _spot(18.3, 20.6, -0.05)
+    chunk = _chunk(_movie(80, 7, contrast=image, at=40), first=1000)
+    matched = make_filter(chunk, TEMPLATE)
+    snr, effective = sliding_maps(chunk, matched, 4)
+    best = find_steps(chunk, matched, snr, effective, 6.0)[0]
+    assert best.frame == 1040
+    assert (best.x_px, best.y_px) == pytest.approx((20.6, 18.3), abs=0.15)
+    assert best.amplitude == pytest.approx(-0.05, rel=0.1)
+    assert not any(p.snr < 0 for p in find_steps(chunk, matched, snr, effective, 6.0, polarity=1))
+
+    def explained(_: int, before: slice, after: slice) -> np.ndarray:
+        share = [np.mean(np.arange(s.start, s.stop) >= 40) for s in (before, after)]
+        return (1 + share[1] * image) / (1 + share[0] * image) - 1
+
+    left, _ = sliding_maps(chunk, matched, 4, explained=explained)
+    assert np.abs(left).max() < 5.5
+
+
+# ---- the frame -------------------------------------------------------------------------------
+
+
+def _dated(seed: int, depth: float, at: int, *, shift: int = 0) -> Any:
+    image = _spot(18, 20, depth)
+    chunk = _chunk(_movie(60, seed, contrast=image, at=at), first=100)
+    rows, columns = (12, 25), (14, 27)
+    patch = chunk.patch(100, 160, rows, columns)
+    return locate_step(patch, image[12:25, 14:27], (115 + shift, 146 + shift))
+
+
+def test_a_strong_step_is_dated_to_the_frame() -> None:
+    found = _dated(1, -0.1, 31)
+    assert (found.frame, found.half_width, found.gap) == (131, 0, 0)
+    assert found.height == pytest.approx(1.0, abs=0.05)
+
+
+def _inside(depth: float, wrong: int = 0) -> int:
+    """Of 60 faint steps, those inside their 95 % interval."""
+    found = [(25 + s % 9, _dated(s, depth, 25 + s % 9)) for s in range(60)]
+    return sum(abs(f.frame - 100 - at - wrong) <= f.half_width for at, f in found)
+
+
+def test_the_interval_of_a_faint_step_holds_it() -> None:
+    """95 % of 60 are 57; the binomial gives fewer than 51 once in 200."""
+    assert _inside(-0.008) >= 51
+
+
+def test_the_interval_misses_another_frame() -> None:
+    """Control: the test above can fail."""
+    assert _inside(-0.02, wrong=3) < 51
+
+
+def test_a_neighbour_that_is_known_does_not_pull_the_frame() -> None:
+    image, other = _spot(18, 20, -0.05), _spot(18, 24, -0.1)
+    counts = _movie(60, 9, contrast=image, at=30)
+    late = np.random.default_rng(1).poisson(np.maximum(-other, 0) * counts[38:])
+    early = np.random.default_rng(2).poisson(np.maximum(other, 0) * counts[38:])
+    counts[38:] = counts[38:] - late + early
+    patch = _chunk(counts).patch(0, 60, (12, 25), (14, 27))
+    height = crosstalk(patch, image[12:25, 14:27], other[12:25, 14:27])
+    known = height * (np.arange(60) >= 38)
+    assert locate_step(patch, image[12:25, 14:27], (15, 50), known=known).frame == 30
+    assert height == pytest.approx(np.sum(image * other) / np.sum(image**2), abs=0.15)
+
+
+# ---- noise and windows -----------------------------------------------------------------------
+
+
+def test_shot_noise_averages_down() -> None:
+    curve = measure_noise(_movie(200, 4), Camera(), 50)
+    assert curve.shot_limited == 50
+    assert np.abs(np.array(curve.variance_over_shot) - 1).max() < 0.2
+    assert choose_window(curve, 2000) == 50
+    assert choose_window(curve, 200) == 20
+
+
+def test_a_pattern_that_wanders_sets_the_window() -> None:
+    counts = _movie(400, 4).astype(float)
+    walk = np.cumsum(np.random.default_rng(5).standard_normal((400, *SHAPE)) * 2e-3, axis=0)
+    curve = measure_noise(counts * (1 + walk), Camera(), 100)
+    assert curve.shot_limited < 20
+    assert choose_window(curve, 4000) < 40
+
+
+@pytest.mark.parametrize(("frames", "expected"), [(40, 10), (500, 50), (10**6, 100)])
+def test_windows_are_a_small_part_of_the_movie(frames: int, expected: int) -> None:
+    assert longest_window(frames) == expected
+    assert choose_window(NoiseCurve((1, 100), (1.0, 1.0)), frames) == expected
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.15), (2.4, 1.1)])
+def test_drift_of_a_pattern(shift: tuple[float, float]) -> None:
+    n = 64
+    rng = np.random.default_rng(3)
+    f = np.fft.fftfreq(n)
+    envelope = np.exp(-((f[:, None] ** 2 + f**2) / (2 * 0.08**2)))
+    spectrum = np.fft.fft2(rng.standard_normal((n, n))) * envelope
+    moved = spectrum * np.exp(-2j * np.pi * (f[:, None] * shift[0] + f * shift[1]))
+    one, two = (np.fft.ifft2(s).real for s in (spectrum, moved))
+    scale = 0.1 / one.std()
+    found = measure_drift(1 + scale * one, 1 + scale * two)
+    assert found == pytest.approx(shift, rel=0.05, abs=0.03)  # the taper costs a few per cent
