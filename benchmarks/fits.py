@@ -5,9 +5,9 @@
 Five parameters (x, y, z, mass, level) on 13 × 13, 32 × 32 and 64 × 64 pixels, in double precision;
 spread over CRB comes from the fits that were timed.  The peer fits six parameters of a Gaussian in
 single precision, in an environment of its own under ``benchmarks/results``, made on the first run;
-``--peer`` names a Python that has it.  Peer and model run in turns; rates are per second of processor
-time, each the best of its turns, so that a busy machine flatters nobody.  Only the scaling with
-threads is on the wall clock, and wants an idle machine.
+``--peer`` names a Python that has it.  Peer and model run in turns; rates are per second of
+processor time, each the best of its turns, so that a busy machine flatters nobody.  Only the
+scaling with threads is on the wall clock, and wants an idle machine.
 """
 
 from __future__ import annotations
