@@ -88,8 +88,12 @@ def scatter(likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> tuple
 
     Parameters
     ----------
-    likelihood, theta, free
-        As in `goodness_of_fit`.
+    likelihood : Likelihood
+        The one that was maximised.
+    theta : ndarray, shape (5,)
+        The estimate.
+    free : ndarray of bool, shape (5,)
+        Which parameters were fitted.
 
     Returns
     -------
@@ -105,17 +109,21 @@ def scatter(likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> tuple
 
 
 def structure(likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> float:
-    """p-value of the score test against smooth changes of the image.
+    """Test for smooth changes of the image around the particle.
 
     Parameters
     ----------
-    likelihood, theta, free
-        As in `goodness_of_fit`.
+    likelihood : Likelihood
+        The one that was maximised.
+    theta : ndarray, shape (5,)
+        The estimate.
+    free : ndarray of bool, shape (5,)
+        Which parameters were fitted.
 
     Returns
     -------
     float
-        Uniform on good data.
+        The p-value, uniform on good data.
 
     Notes
     -----
@@ -126,17 +134,19 @@ def structure(likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> flo
 
 
 def outlier(likelihood: Likelihood, theta: FloatArray) -> float:
-    """p-value of the least likely pixel among all.
+    """Test for the least likely pixel among all.
 
     Parameters
     ----------
-    likelihood, theta
-        As in `goodness_of_fit`.
+    likelihood : Likelihood
+        The one that was maximised.
+    theta : ndarray, shape (5,)
+        The estimate.
 
     Returns
     -------
     float
-        Two-sided, for as many pixels as there are.
+        The p-value, two-sided, for as many pixels as there are.
     """
     return _outlier(_look(likelihood, theta))
 
