@@ -28,6 +28,7 @@ DEFECT_SIGMAS = 6.0
 _BLOCK_BYTES = 16 * 2**20
 _CLIP_SIGMAS = 3.0
 _NEIGHBOURHOOD = 7  # pixels, on which a faint background is averaged for the weights
+_OUTSHONE = 0.1
 _LEAST_TOTAL_E = 1e6  # fewer background photoelectrons leave the power uncertain by over 0.1 %
 
 Check = Callable[[NDArray[Any], int], None]
@@ -193,8 +194,11 @@ def refine_power(windows: Windows, explained: FloatArray, *, additive: bool) -> 
     -------
     Windows
         With ρ = Σ after / Σ before·(1 + C) over the pixels in use: the maximum-likelihood estimate.
+        Pixels in which particles outshine an additive background say nothing of it.
     """
     used = ~windows.masked
+    if additive:
+        used &= explained < _OUTSHONE * windows.power_ratio * windows.before_e
     if windows.before_e[used].sum() < _LEAST_TOTAL_E:
         return windows
     after, before = windows.after_e[used], windows.before_e[used]

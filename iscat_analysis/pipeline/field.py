@@ -227,7 +227,7 @@ def fit_field(
         events = _without_doubles(events, scene)
         events = _fit_all(scene, windows, [e.candidate for e in events], events, pool)
         windows = _refined(scene, windows, events)
-    events = [e for e in events if e.snr > scene.templates.threshold]
+    events = [e for e in events if e.snr > scene.templates.threshold and _wanted(scene, e)]
     events = _judged(scene, windows, events)
     progress("detect", MAX_ROUNDS, MAX_ROUNDS)
     return tuple(sorted(events, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
@@ -419,6 +419,12 @@ def _refined(scene: Scene, windows: Windows, events: Sequence[Event]) -> Windows
     if scene.additive:
         signal = signal * photons_scale(scene, windows)
     return refine_power(windows, signal, additive=scene.additive)
+
+
+def _wanted(scene: Scene, event: Event) -> bool:
+    """Whether the fitted contrast has the polarity asked for; others are fitted but not reported."""
+    sign = {"both": 0, "bright": 1, "dark": -1}[scene.config.detection.polarity]
+    return sign == 0 or scene.additive or sign * event.fit.contrast > 0
 
 
 def _without_doubles(events: Sequence[Event], scene: Scene) -> list[Event]:
