@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iscat_analysis.background import refine_power, smooth_background
-from iscat_analysis.config import Config
+from iscat_analysis.config import Config, Detection
 from iscat_analysis.detect import Templates, find_particles, make_templates
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fit import fit_particle, window_nm
@@ -169,11 +169,7 @@ def make_scene(config: Config, field_px: tuple[int, int], *, searches: int = 1) 
         wide=forward_model(config, min(field_nm, math.sqrt(2) * (SPREAD_NM + 2 * pixel))),
         templates=make_templates(
             model,
-            config.detection.model_copy(
-                update={
-                    "false_alarms_per_movie": config.detection.false_alarms_per_movie / searches
-                }
-            ),
+            _search_both(config.detection, searches),
             pixel_nm=pixel,
             roi_nm=config.fit.roi_nm,
             z_range_nm=config.fit.z_range_nm if free_z else None,
@@ -346,7 +342,7 @@ def _search(scene: Scene, windows: Windows, events: Sequence[Event]) -> list[Can
     found = find_particles(
         field_likelihood(scene, windows),
         scene.templates,
-        scene.config.detection,
+        _search_both(scene.config.detection, 1),
         roi_px=scene.roi_px,
         explained=explained,
     )
@@ -421,8 +417,18 @@ def _refined(scene: Scene, windows: Windows, events: Sequence[Event]) -> Windows
     return refine_power(windows, signal, additive=scene.additive)
 
 
+def _search_both(detection: Detection, searches: int) -> Detection:
+    """Search both polarities, for one that is not wanted has side lobes that are.
+
+    Half of the false alarms have the wanted one, and `searches` images share them.
+    """
+    sides = 1 if detection.polarity == "both" else 2
+    alarms = sides * detection.false_alarms_per_movie / searches
+    return detection.model_copy(update={"polarity": "both", "false_alarms_per_movie": alarms})
+
+
 def _wanted(scene: Scene, event: Event) -> bool:
-    """Whether the fitted contrast has the polarity asked for; others are fitted but not reported."""
+    """Whether the fitted contrast has the polarity that is reported."""
     sign = {"both": 0, "bright": 1, "dark": -1}[scene.config.detection.polarity]
     return sign == 0 or scene.additive or sign * event.fit.contrast > 0
 
