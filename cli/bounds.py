@@ -32,7 +32,7 @@ EXAMPLE = """Example: the bounds for a 1 MDa protein on the coverslip.
 
 Along the focus, with a figure; the best focus for the mass; what 5 kDa takes:
 
-    iscat bounds --config setup.toml --scan focus=-1000:1000:20 --out focus.bounds
+    iscat bounds --config setup.toml --scan focus=-1000:1000:20 --out scan
 
     iscat bounds --config setup.toml --optimize focus --for mass
 

@@ -170,7 +170,16 @@ def atomic_folder(
         except OSError as error:
             raise DataError(f"{folder}: cannot be written ({error.strerror or error})") from error
         finally:
-            shutil.rmtree(building, ignore_errors=True)
+            _remove(building)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder of ours; an interrupt meanwhile does not stop halfway."""
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        if folder.exists():
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _resolved(folder: Path) -> Path:
@@ -271,4 +280,4 @@ def _swap(building: Path, target: Path) -> None:
         if kept.exists() and not target.exists():
             kept.rename(target)
         if target.exists():
-            shutil.rmtree(earlier, ignore_errors=True)
+            _remove(earlier)

@@ -4,8 +4,9 @@ Orders are lines of JSON on stdin, answers lines of JSON on stdout.  An order is
 at the same time, each ``{"run": [argument, …], "cwd": folder}``, with ``"kill": [signal, share]``
 to be ended after that share of an undisturbed run's duration, ``"limit": bytes`` for the largest
 file it may write, and ``"die": [word, number]`` to end by SIGKILL ``before`` or ``after`` its so
-manieth renaming.  The answer is a list of ``{"status": …, "out": …, "err": …}``; a signal's
-status is negative.
+manieth renaming.  Figures, which take nine tenths of a small run, are drawn for ``"figures": true``
+only; otherwise files of a kilobyte take their places.  The answer is a list of ``{"status": …,
+"out": …, "err": …}``; a signal's status is negative.
 """
 
 from __future__ import annotations
@@ -20,11 +21,15 @@ import threading
 import time
 from typing import Any
 
+from iscat_analysis import report
 from iscat_cli import main
+
+_write_figures = report.write_figures
 
 
 def _run(order: dict[str, Any]) -> int:
     os.chdir(order["cwd"])
+    report.write_figures = _write_figures if order.get("figures") else _sketch_figures
     if "limit" in order:
         resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
     if "die" in order:
@@ -33,6 +38,15 @@ def _run(order: dict[str, Any]) -> int:
     sys.stdout.flush()
     sys.stderr.flush()
     return status
+
+
+def _sketch_figures(analysis: Any, folder: pathlib.Path, **options: Any) -> dict[str, int]:
+    del analysis, options
+    folder.mkdir()
+    for number in range(10):
+        (folder / f"{number}.svg").write_bytes(b"<svg/>\n" * 150)
+        time.sleep(0.01)  # a moment to be killed in
+    return {}
 
 
 def _die_while_renaming(word: str, number: int) -> None:
