@@ -83,7 +83,8 @@ def write_tables(analysis: Analysis, folder: Path) -> None:
     table.to_csv(
         folder / "fits.csv", index=False, float_format=f"%.{CSV_DIGITS}g", lineterminator="\n"
     )
-    table.to_parquet(folder / "fits.parquet", index=False)
+    with (folder / "fits.parquet").open("wb") as file:  # pyarrow opens no path that is not text
+        table.to_parquet(file, index=False)
     summary = json.dumps(jsonable(analysis.summary), indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "summary.json").write_text(summary + "\n", encoding="utf-8")
     (folder / "config.toml").write_text(analysis.config_toml, encoding="utf-8")
