@@ -48,11 +48,11 @@ lint: $(STAMP)
 	$(BIN)/numpydoc lint $$(find iscat_analysis -name '*.py' -not -path '*/_*')
 
 test: lint
-	$(BIN)/pytest --cov --cov-fail-under=90
+	$(BIN)/pytest -n auto --cov --cov-fail-under=90
 
 # Old libraries may use what new ones deprecate, so that warnings are errors above but not here.
 test-lowest: $(LOWEST)/.installed
-	$(LOWEST)/bin/python -m pytest -q -p no:cacheprovider tests/unit tests/physics \
+	$(LOWEST)/bin/python -m pytest -q -n auto -p no:cacheprovider tests/unit tests/physics \
 	    -W default::DeprecationWarning -W default::PendingDeprecationWarning -W default::FutureWarning
 
 $(LOWEST)/.installed: pyproject.toml .ci/lowest.py
