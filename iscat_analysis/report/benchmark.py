@@ -14,7 +14,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.report.context import LABELS, UNITS
@@ -321,10 +321,10 @@ def _panels(stem: Path, mode: str, draw: Callable[[Axes, str], None]) -> None:
         axes = figure.add_subplot(1, len(names), position + 1)
         draw(axes, name)
         axes.set_title(f"{LABELS[name]} [{UNITS[name]}]")
-        if position == 0:
-            axes.legend(loc="best", fontsize=8)
-        else:
+        if position:
             axes.set_ylabel("")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=len(labels), fontsize=8)
     _save(figure, stem)
 
 
@@ -366,6 +366,7 @@ def _draw_ranks(found: Mapping[str, Any], axes: Axes, name: str) -> None:
     axes.axhline(float(counts.mean()), color=INK, linewidth=1, label="uniform")
     axes.set_title(f"p = {bins['p_value']:.2g}", loc="right", fontsize=8)
     axes.set_ylim(0, 1.25 * max(counts.max(), 1.0))
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.set_xlabel("rank of the truth")
     axes.set_ylabel("posteriors")
 
