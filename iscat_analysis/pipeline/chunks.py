@@ -230,7 +230,7 @@ class Done:
     masked: BoolArray
     saturated: BoolArray
     strongest: FloatArray
-    mean_e: FloatArray
+    ends_e: FloatArray  # mean images of its first and last quarter
     gain_message: str = ""
     sampled: int = field(default=0)
 
@@ -251,13 +251,12 @@ class Merged:
         self.sampled += done.sampled
         self.gain_message = self.gain_message or done.gain_message
         # the images are merged; holding them for every chunk would grow with the movie
-        first = not self._done
         small = np.empty((2, 0, 0))
         kept = done.views if sum(len(d.views) for d in self._done) < 2 * VIEWS else ()
-        self._done.append(replace(done, strongest=small, views=kept))
-        if not first and len(self._done) > 2:
-            middle = self._done[-2]
-            self._done[-2] = replace(middle, mean_e=np.empty((0, 0)))
+        ends = done.ends_e
+        if len(self._done) > 1:
+            self._done[-1] = replace(self._done[-1], ends_e=small)
+        self._done.append(replace(done, strongest=small, views=kept, ends_e=ends))
 
     @property
     def image(self) -> FloatArray:
@@ -324,10 +323,10 @@ class Merged:
         return np.flatnonzero(~good.astype(np.bool_))
 
     def drift(self) -> list[float] | None:
-        """Shift (y, x) of the fixed pattern from the first chunk to the last [px]."""
-        if len(self._done) < 2:
+        """Shift (y, x) of the fixed pattern from the first frames to the last [px]."""
+        if not self._done:
             return None
-        dy, dx = measure_drift(self._done[0].mean_e, self._done[-1].mean_e)
+        dy, dx = measure_drift(self._done[0].ends_e[0], self._done[-1].ends_e[1])
         return [dy, dx] if math.isfinite(dy) and math.isfinite(dx) else None
 
     def masks(self) -> tuple[int, int]:

@@ -22,6 +22,7 @@ from iscat_analysis.camera import Camera
 from iscat_analysis.forward import PixelGrid
 from iscat_analysis.pipeline.chunks import FRAME_COLUMN, Frames
 from iscat_analysis.pipeline.field import Scene
+from iscat_analysis.pipeline.steps import LARGEST_IMAGE
 from iscat_analysis.records import FloatArray, Status
 
 STAY = 3
@@ -182,7 +183,7 @@ def draw_particles(
         mass = float(rng.choice(good))
         spans = []
         for centre, size in zip((y, x), field_px, strict=True):
-            middle, half = round(centre), scene.roi_px
+            middle, half = round(centre), round(LARGEST_IMAGE * scene.roi_px)
             spans.append((max(middle - half, 0), min(middle + half + 1, size)))
         grid = PixelGrid.region(spans[0], spans[1], scene.pixel_nm)
         image = scene.wide.image(

@@ -41,7 +41,7 @@ from iscat_analysis.pipeline.field import Scene
 from iscat_analysis.pipeline.injection import InjectedMovie, draw_particles, recovery
 from iscat_analysis.pipeline.results import Row, table_of, view_of
 from iscat_analysis.pipeline.resume import Store
-from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
+from iscat_analysis.pipeline.steps import LARGEST_IMAGE, ChunkFitter, FittedStep
 from iscat_analysis.posterior import sample_posterior
 from iscat_analysis.records import EventView, FloatArray, Progress, Windows
 from iscat_analysis.sliding import STRIDES, Chunk
@@ -182,7 +182,7 @@ def analyse_landings(
             interrupted = True
     table, views = merged.result(scene)
     windows, light = merged.windows(reader.shape, (first, last))
-    for text in _warnings(movie.name, merged, light, first, window):
+    for text in frame_warnings(movie.name, merged, light, first, window):
         tell(text)
     message = merged.gain_message
     if message:
@@ -277,7 +277,7 @@ def make_landing_scene(config: Config, field_px: tuple[int, int], *, searches: i
     Returns
     -------
     Scene
-        Its `wide` model reaches one region beyond a step's own.
+        Its `wide` model reaches as far as the rings of a strong particle matter.
 
     Raises
     ------
@@ -300,7 +300,7 @@ def make_landing_scene(config: Config, field_px: tuple[int, int], *, searches: i
     return Scene(
         config=config,
         model=model,
-        wide=forward_model(config, math.sqrt(2) * (roi_px + 2) * pixel),
+        wide=forward_model(config, math.sqrt(2) * (LARGEST_IMAGE * roi_px + 2) * pixel),
         templates=make_templates(
             model,
             config.detection.model_copy(update={"false_alarms_per_movie": alarms}),
@@ -359,10 +359,18 @@ def _analyse_chunk(
         masked=~chunk.usable,
         saturated=chunk.saturated,
         strongest=fitter.strongest,
-        mean_e=chunk.mean_e,
+        ends_e=_ends(chunk, inside),
         gain_message=message,
         sampled=sampled,
     )
+
+
+def _ends(chunk: Chunk, inside: slice) -> FloatArray:
+    """Mean images of the first and the last quarter of a core, shape (2, y, x)."""
+    held = (chunk.edges[:-1] >= inside.start) & (chunk.edges[1:] <= inside.stop)
+    blocks = np.flatnonzero(held) if held.any() else np.arange(len(chunk.blocks_e))
+    few = max(1, blocks.size // 4)
+    return np.stack([chunk.blocks_e[part].mean(axis=0) for part in (blocks[:few], blocks[-few:])])
 
 
 def _row(number: int, step: FittedStep) -> Row:
@@ -379,10 +387,29 @@ def _posterior_wanted(config: Config) -> bool:
     return config.posterior.enabled and "enabled" in config.posterior.model_fields_set
 
 
-def _warnings(
+def frame_warnings(
     name: str, merged: Merged, light: FloatArray, first: int, window: int
 ) -> Iterator[str]:
-    """Say what is odd about the frames."""
+    """Say what is odd about the frames.
+
+    Parameters
+    ----------
+    name : str
+        What the lines call the movie.
+    merged : Merged
+        The chunks.
+    light : ndarray, shape (t,)
+        Light of every frame; NaN where it was left out.
+    first : int
+        Number of the first frame.
+    window : int
+        Frames before and after a step.
+
+    Yields
+    ------
+    str
+        One line each.
+    """
     missing = merged.repeats() + first
     if missing.size:
         verb = "is" if missing.size == 1 else "are"

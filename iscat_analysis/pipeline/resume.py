@@ -64,7 +64,7 @@ class Store:
                     masked=data["masked"],
                     saturated=data["saturated"],
                     strongest=data["strongest"],
-                    mean_e=data["mean_e"],
+                    ends_e=data["ends_e"],
                     gain_message=str(data["gain_message"]),
                 )
         except (OSError, ValueError, KeyError, EOFError):
@@ -94,7 +94,7 @@ class Store:
                     masked=done.masked,
                     saturated=done.saturated,
                     strongest=done.strongest,
-                    mean_e=done.mean_e,
+                    ends_e=done.ends_e,
                     gain_message=np.array(done.gain_message),
                 )
             building.replace(path)

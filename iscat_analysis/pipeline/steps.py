@@ -43,14 +43,20 @@ from iscat_analysis.sliding import (
     sliding_maps,
 )
 
-ROUNDS = 4
+ROUNDS = 6
 """Searches at most; each takes what was found so far off the contrast."""
 
 FEWEST_FRAMES = 10
 """A neighbour that would leave fewer is fitted beside the step, and both are flagged."""
 
+LARGEST_IMAGE = 3.5
+"""Regions from the centre to the edge of a strong particle's image; the rings go on, faintly."""
+
 _SWEEPS = 2  # fits of what has neighbours, with everything else in place
-_SIDELOBE = 0.5  # of a stronger peak, below which a peak waits for the next round
+_SIDELOBE = 0.5  # of a stronger peak, below which a peak in its region waits for the next round
+_FAR_LOBE = 0.05  # the same where only its outer rings reach
+_FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is enough
+_WEAK = 0.05  # contrast up to which several add up
 _RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
 _RINGS = 0.04  # the same for the rest of its region
 _SAME_PX = 1.5
@@ -157,6 +163,10 @@ class ChunkFitter:
         self._pool = pool
         self._strides = STRIDES
         self._roi_px = scene.roi_px
+        nominal = scene.model.material.mass_kda
+        self._contrast_per_kda = (
+            scene.model.peak_contrast(scene.config.particle.height_nm, nominal) / nominal
+        )
         self._stride = int(chunk.edges[1] - chunk.edges[0])
         self._power = np.concatenate([[0.0], np.cumsum(chunk.power)])
         self.strongest = np.zeros((2, *chunk.shape))
@@ -213,12 +223,12 @@ class ChunkFitter:
             near = [s for s in steps if self._overlaps(s, before.start, after.stop)]
             if not near:
                 return None
-            total = np.ones(chunk.shape)
+            total = np.zeros(chunk.shape)
             for step in near:
                 rows, columns = _spans(step.corner, step.image.shape)
                 here = (slice(*rows), slice(*columns))
-                total[here] *= self._factor(step, step.image, before, after)
-            return total - 1
+                total[here] += self._change(step, before, after)
+            return total
 
         snr, effective = sliding_maps(
             chunk, matched, self._strides,
@@ -233,31 +243,28 @@ class ChunkFitter:
             chunk, matched, snr, effective, scene.templates.threshold, polarity=polarity
         )
         fresh: list[Peak] = []
-        reach = self._strides * self._stride
+        taller: list[Peak] = []
         for peak in peaks:
-            if any(self._shadows(p.x_px, p.y_px, p.frame, p.snr, peak, _SIDELOBE) for p in fresh):
-                continue
-            if any(
-                math.hypot(p.x_px - peak.x_px, p.y_px - peak.y_px) < self._roi_px / 6
-                and abs(p.frame - peak.frame) < reach
-                for p in fresh
-            ):
-                continue
-            if any(self._is_residue(step, peak) for step in steps):
-                continue
-            fresh.append(peak)
+            # one that waits casts its shadow too, or its rings would be taken for particles
+            waits = any(self._shadows(p, peak) for p in taller)
+            taller.append(peak)
+            if not waits and not any(self._is_residue(step, peak) for step in steps):
+                fresh.append(peak)
         return [self._begin(peak) for peak in fresh]
 
-    def _shadows(
-        self, x_px: float, y_px: float, frame: int, snr: float, peak: Peak, share: float
-    ) -> bool:
-        """Whether a peak may be nothing but the side lobe or the residue of a stronger step."""
-        reach = (self._strides + 1) * self._stride
-        return (
-            abs(frame - peak.frame) <= reach
-            and abs(peak.snr) < share * abs(snr)
-            and max(abs(x_px - peak.x_px), abs(y_px - peak.y_px)) < self._roi_px
-        )
+    def _shadows(self, one: Peak, peak: Peak) -> bool:
+        """Whether a peak may be nothing but the side lobe of a stronger one."""
+        reach = self._strides * self._stride
+        apart = abs(one.frame - peak.frame)
+        if apart > reach + self._stride:
+            return False
+        dx, dy = abs(one.x_px - peak.x_px), abs(one.y_px - peak.y_px)
+        if apart < reach and math.hypot(dx, dy) < self._roi_px / 6:
+            return True
+        far = max(dx, dy) >= self._roi_px
+        if far and max(dx, dy) >= LARGEST_IMAGE * self._roi_px:
+            return False
+        return abs(peak.snr) < (_FAR_LOBE if far else _SIDELOBE) * abs(one.snr)
 
     def _is_residue(self, step: Step, peak: Peak) -> bool:
         """Whether a peak may be what a fitted step left over: the model is never quite right."""
@@ -269,7 +276,7 @@ class ChunkFitter:
         if on_top and abs(step.at.frame - peak.frame) > self._stride:
             return False
         share = _RESIDUE if on_top else _RINGS
-        return self._shadows(start.x_px, start.y_px, step.at.frame, start.snr, peak, share)
+        return distance < 1.5 * self._roi_px and abs(peak.snr) < share * abs(start.snr)
 
     def _begin(self, peak: Peak) -> Step:
         scene = self._scene
@@ -287,7 +294,7 @@ class ChunkFitter:
     def _with_image(self, step: Step) -> Step:
         """Draw the step's contrast anew."""
         scene, start = self._scene, step.start
-        half = self._roi_px
+        half = self._half(step)
         spans = []
         for centre, size in zip((start.y_px, start.x_px), self._chunk.shape, strict=True):
             middle = round(centre)
@@ -298,6 +305,10 @@ class ChunkFitter:
             grid, start.x_px * pixel, start.y_px * pixel, start.z_nm, start.mass_kda
         )
         return replace(step, corner=(spans[0][0], spans[1][0]), image=image)
+
+    def _half(self, step: Step) -> int:
+        """From the centre to the edge of a step's image [pixels]; strong rings reach far."""
+        return round(self._roi_px * min(max(step.start.snr / _FAINT_SNR, 1.0), LARGEST_IMAGE))
 
     # ---- neighbours ------------------------------------------------------------------------
 
@@ -322,6 +333,13 @@ class ChunkFitter:
         )
         return factor
 
+    def _change(self, step: Step, before: slice, after: slice) -> FloatArray:
+        """Contrast that a step's particle makes between two ranges of frames."""
+        image = step.image
+        if abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK:
+            return self._factor(step, image, before, after) - 1
+        return (self._presence(step, after) - self._presence(step, before)) * image
+
     def _neighbourhood(self, steps: Sequence[Step]) -> tuple[list[list[int]], list[list[int]]]:
         """For each step, others that its fit should know of, and those that it depends on."""
         x, y, frame = (
@@ -330,11 +348,12 @@ class ChunkFitter:
                 *((s.start.x_px, s.start.y_px, s.at.frame) for s in steps), strict=True
             )
         )
+        reach = np.array([self._half(s) for s in steps]) + self._roi_px / 2 + 2
         seen, bound = [], []
         for i in range(len(steps)):
             dt = np.abs(frame - frame[i])
             dx, dy = np.abs(x - x[i]), np.abs(y - y[i])
-            near = (dt < 3 * self._window) & (np.maximum(dx, dy) < 1.5 * self._roi_px + 2)
+            near = (dt < 3 * self._window) & (np.maximum(dx, dy) < reach)
             near[i] = False
             seen.append([int(k) for k in np.flatnonzero(near)])
             near &= (dt < 2 * self._window) & (np.hypot(dx, dy) < self._roi_px / 2)
@@ -492,7 +511,7 @@ class ChunkFitter:
         known = np.zeros(len(patch.counts))
         frames = np.arange(patch.first, patch.first + known.size)
         for other in neighbours:
-            both = self._shared(other, region)
+            both = self._shared(other, region) if _distance(other, step) < self._roi_px else None
             if both is None or not frames[0] < other.at.frame <= frames[-1]:
                 continue
             part, inside = both

@@ -1,0 +1,402 @@
+"""Landing movies from end to end, and what is odd about real ones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import tifffile
+
+from iscat_analysis import pipeline as pipeline_module
+from iscat_analysis.camera import Camera
+from iscat_analysis.config import Config, load_config
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.load import open_stack
+from iscat_analysis.pipeline import analyse, fit_stack
+from iscat_analysis.pipeline import chunks as chunks_module
+from iscat_analysis.pipeline import landing as landing_module
+from iscat_analysis.pipeline.chunks import FRAME_COLUMN, Done, Merged
+from iscat_analysis.pipeline.landing import analyse_landings, frame_warnings, has_landings
+from iscat_analysis.pipeline.resume import partial_folder
+from iscat_analysis.records import EVENT_COLUMNS
+from iscat_analysis.simulate import Movie
+
+PIXEL_NM = 84.0
+SIDE, FRAMES = 64, 420
+EVENTS = [
+    (80, None, 20.3, 21.7, 480.0),
+    (150, 300, 44.2, 40.6, 480.0),
+    (200, None, 22.6, 43.1, 146.0),
+    (330, None, 46.1, 17.4, 480.0),
+]
+
+
+def _config(*settings: str, **sections: Any) -> Config:
+    base = [
+        f"camera.pixel_size_nm={PIXEL_NM}",
+        "camera.gain_e_per_adu=4.0",
+        "particle.mass_kda=146.0",
+        "calibration.gradient_per_kda=-3.1e-5",
+        f"simulation.shape=[{SIDE}, {SIDE}]",
+        f"simulation.frames={FRAMES}",
+        "simulation.photons_per_pixel=1e5",
+        "simulation.background=speckle",
+        "simulation.power_noise=0.01",
+        "background.window_frames=40",
+        "detection.false_alarms_per_movie=0.01",
+    ]
+    config = load_config(None, [*base, *settings])
+    events = [
+        dict(zip(("frame", "leave", "x_px", "y_px", "mass_kda"), e, strict=True))
+        for e in sections.get("events", EVENTS)
+    ]
+    simulation = type(config.simulation).model_validate(
+        {**config.simulation.model_dump(), "events": events}
+    )
+    return config.model_copy(update={"simulation": simulation})
+
+
+class Memory:
+    """A movie in memory."""
+
+    def __init__(self, counts: np.ndarray) -> None:
+        self.counts = counts
+        self.shape = counts.shape
+        self.dtype = counts.dtype
+        self.name = "movie"
+        self.reads: list[tuple[int, int]] = []
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Frames [start, stop)."""
+        self.reads.append((start, stop))
+        return self.counts[start:stop].copy()
+
+
+@pytest.fixture(scope="module")
+def counts() -> np.ndarray:
+    """Draw the movie of `EVENTS` once."""
+    return np.array(list(Movie(_config(), 1).frames(2)))
+
+
+def _run(counts: np.ndarray, config: Config | None = None, **options: Any) -> tuple[Any, list[str]]:
+    told: list[str] = []
+    result = analyse_landings(
+        Memory(counts), config or _config(), options.pop("camera", Camera(gain_e_per_adu=4.0)),
+        tell=told.append, progress=options.pop("progress", lambda *_: None), **options,
+    )  # fmt: skip
+    return result, told
+
+
+STEPS = sorted(
+    [(f, 1, x, y, m) for f, _, x, y, m in EVENTS]
+    + [(leave, -1, x, y, m) for _, leave, x, y, m in EVENTS if leave]
+)
+
+
+def _assert_all_found(table: pd.DataFrame, *, frames: int = 1, sigmas: float = 4.5) -> None:
+    """Every step of `EVENTS`, and nothing else."""
+    assert len(table) == len(STEPS)
+    for row, (frame, sign, x, y, mass) in zip(table.itertuples(), STEPS, strict=True):
+        assert abs(row.frame - frame) <= max(frames, getattr(row, FRAME_COLUMN))
+        for value, truth, sigma in (
+            (row.x_nm, x * PIXEL_NM, row.sigma_x_nm),
+            (row.y_nm, y * PIXEL_NM, row.sigma_y_nm),
+            (row.mass_kda, sign * mass, row.sigma_mass_kda),
+        ):
+            assert abs(value - truth) < sigmas * sigma
+
+
+# ---- the whole -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def plain(counts: np.ndarray) -> tuple[Any, list[str]]:
+    """Analyse it once."""
+    return _run(counts)
+
+
+def test_every_step_is_found_dated_and_weighed(plain: tuple[Any, list[str]]) -> None:
+    result, told = plain
+    assert told == []
+    table = result.table
+    assert list(table.columns) == [*EVENT_COLUMNS, FRAME_COLUMN]
+    _assert_all_found(table)
+    assert set(table["status"]) == {"ok"}
+    assert (table["contrast"] * table["mass_kda"] < 0).all()  # landing darkens here
+    assert (table["qcrb_mass_kda"] < table["crb_mass_kda"]).all()
+    np.testing.assert_allclose(table["sigma_mass_kda"] / table["crb_mass_kda"], 1, atol=0.1)
+    assert result.summary["landings"] == 4
+    assert result.summary["leavings"] == 1
+    assert [v.event for v in result.views] == list(range(5))
+
+
+def test_the_bound_is_that_of_the_frames_used(plain: tuple[Any, list[str]]) -> None:
+    """n_b n_a/(n_b + n_a) frames inform: the 480 kDa steps differ by their windows alone."""
+    table = plain[0].table
+    heavy = table[table["mass_kda"].abs() > 300]
+    frames = heavy["n_before"] * heavy["n_after"] / (heavy["n_before"] + heavy["n_after"])
+    scaled = heavy["crb_mass_kda"] * np.sqrt(frames)
+    assert scaled.max() / scaled.min() < 1.1
+    assert (table["n_before"] <= 40).all()
+    assert (table["n_after"] <= 40).all()
+
+
+def test_nothing_is_found_in_a_blank_movie() -> None:
+    blank = np.array(list(Movie(_config(events=[]), 2).frames(2)))
+    result, told = _run(blank)
+    assert len(result.table) == 0
+    assert list(result.table.columns) == [*EVENT_COLUMNS, FRAME_COLUMN]
+    assert result.views == ()
+    assert told == []
+
+
+def test_chunks_change_nothing_but_the_last_digits(
+    counts: np.ndarray, plain: tuple[Any, list[str]]
+) -> None:
+    config = _config("compute.memory_limit_mb=64")
+    movie = Memory(np.tile(counts, (4, 1, 1)))
+    cut = analyse_landings(
+        movie, config, Camera(gain_e_per_adu=4.0), tell=lambda _: None, progress=lambda *_: None
+    )
+    assert cut.summary["chunks"] > 1
+    spans = sorted(set(movie.reads))
+    assert sum(b - a for a, b in spans) <= 4 * FRAMES + 2 * 400  # the noise curve reads again
+    table = cut.table
+    for part in range(4):
+        here = table[
+            (table["frame"] >= part * FRAMES + 60) & (table["frame"] < (part + 1) * FRAMES - 60)
+        ]
+        here = here.assign(frame=here["frame"] - part * FRAMES).reset_index(drop=True)
+        _assert_all_found(here)
+        np.testing.assert_allclose(here["mass_kda"], plain[0].table["mass_kda"], rtol=3e-3)
+
+
+# ---- overlap ---------------------------------------------------------------------------------
+
+
+def _close(second_frame: int, distance_px: float) -> pd.DataFrame:
+    events = [(150, None, 30.2, 31.6, 480.0), (second_frame, None, 30.2 + distance_px, 31.6, 480.0)]
+    config = _config(events=events)
+    return _run(np.array(list(Movie(config, 5).frames(2))), config)[0].table
+
+
+def test_a_window_ends_where_a_close_neighbour_lands() -> None:
+    table = _close(175, 3.0)
+    assert table["frame"].tolist() == [150, 175]
+    assert table["n_after"].tolist() == [25, 40]
+    assert table["n_before"].tolist() == [40, 25]
+    pulls = (table["mass_kda"] - 480) / table["sigma_mass_kda"]
+    assert pulls.abs().max() < 4.5
+    assert set(table["status"]) == {"ok"}
+
+
+def test_a_neighbour_farther_away_is_part_of_the_background() -> None:
+    table = _close(165, 9.0)
+    assert table["n_after"].tolist() == [40, 40]
+    pulls = (table["mass_kda"] - 480) / table["sigma_mass_kda"]
+    assert pulls.abs().max() < 4.5
+
+
+def test_two_that_land_together_are_flagged() -> None:
+    table = _close(152, 4.5)
+    assert len(table) == 2
+    assert set(table["status"]) == {"too_close"}
+
+
+# ---- odd movies ------------------------------------------------------------------------------
+
+
+def test_stuck_and_dropped_frames_are_left_out(counts: np.ndarray) -> None:
+    odd = counts.copy()
+    odd[100] = odd[99]
+    odd[210] = 0
+    result, told = _run(odd)
+    _assert_all_found(result.table, frames=2)
+    (line,) = told
+    assert "100, 210" in line
+    assert "left out" in line
+    assert result.summary["frames_left_out"] == 2
+
+
+def test_a_brightness_jump_is_divided_out_and_named(counts: np.ndarray) -> None:
+    odd = counts.copy()
+    thinned = np.random.default_rng(1).binomial(counts[250:].astype(int) * 4, 0.7)
+    odd[250:] = np.rint(thinned / 4)
+    result, told = _run(odd)
+    _assert_all_found(result.table, sigmas=6.0)
+    (line,) = [text for text in told if "jumps" in text]
+    assert "frame 250 " in line
+    assert "by up to -3" in line
+
+
+@pytest.mark.parametrize(("shift", "named"), [(0, False), (1, True)])
+def test_a_moving_pattern_is_named(shift: int, named: bool) -> None:
+    image = Movie(_config(), 3).background_e
+    nothing = np.zeros((SIDE, SIDE), dtype=bool)
+    merged = Merged((SIDE, SIDE))
+    merged.add(
+        Done(
+            core=(0, 400),
+            table=pd.DataFrame(),
+            views=(),
+            good=np.ones(400, dtype=bool),
+            light=np.ones(400),
+            masked=nothing,
+            saturated=nothing,
+            strongest=np.zeros((2, SIDE, SIDE)),
+            ends_e=np.stack([image, np.roll(image, shift, axis=1)]),
+        )
+    )
+    told = [
+        text for text in frame_warnings("movie", merged, np.ones(400), 0, 40) if "moved" in text
+    ]
+    assert len(told) == named
+    if named:
+        assert "not corrected" in told[0]
+        assert merged.drift() == pytest.approx([0.0, 1.0], abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("frames", "setting", "words"),
+    [
+        (30, "background.window_frames=40", ["30 frames", "80", "background.window_frames"]),
+        (30, "detection.polarity=both", ["30 frames", "--background 0:N"]),
+    ],
+)
+def test_a_movie_shorter_than_its_windows(
+    counts: np.ndarray, frames: int, setting: str, words: list[str]
+) -> None:
+    config = _config(setting)
+    if "window" not in setting:
+        free = config.background.model_copy(update={"window_frames": None})
+        config = config.model_copy(update={"background": free})
+    with pytest.raises(DataError) as refused:
+        _run(counts[:frames], config)
+    assert all(word in str(refused.value) for word in words)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_calibration_of_the_wrong_sign(counts: np.ndarray) -> None:
+    with pytest.raises(ConfigError, match="wrong sign"):
+        _run(counts, _config("calibration.gradient_per_kda=3.1e-5"))
+
+
+def test_windows_that_do_not_fit_into_memory() -> None:
+    movie = np.zeros((1, 1, 1), dtype="u2")
+    large = Memory(movie)
+    large.shape = (40, 1024, 1024)
+    large.read = lambda a, b: np.random.default_rng(a).integers(  # type: ignore[method-assign]
+        90, 110, (b - a, 1024, 1024), dtype="u2"
+    )
+    config = _config("compute.memory_limit_mb=64", "background.window_frames=5")
+    with pytest.raises(DataError, match=r"compute\.memory_limit_mb = "):
+        analyse_landings(large, config, Camera(), tell=lambda _: None, progress=lambda *_: None)
+
+
+@pytest.mark.parametrize(
+    ("setting", "sliding"),
+    [
+        ("fit.mode=mass", True),
+        ("fit.mode=joint", True),
+        ("fit.mode=track", False),
+        ("background.frames=[0, 100]", False),
+        ("background.method=median", False),
+        ("optics.scheme=darkfield", False),
+    ],
+)
+def test_which_movies_slide(setting: str, sliding: bool) -> None:
+    assert has_landings(load_config(None, [setting])) is sliding
+
+
+# ---- on disk ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def movie(counts: np.ndarray, tmp_path: Path) -> Path:
+    """Write the movie."""
+    path = tmp_path / "movie.tif"
+    tifffile.imwrite(path, counts, photometric="minisblack")
+    return path
+
+
+def test_an_interrupted_run_resumes_to_the_same_result(
+    movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = _config("posterior.enabled=false", "background.window_frames=20")
+    monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.0031)
+    monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
+    fit_stack(movie, config, out=tmp_path / "whole.iscat")
+    assert not partial_folder(tmp_path / "whole.iscat").exists()
+    real: Callable[..., Any] = landing_module._analyse_chunk
+    calls: list[int] = []
+
+    def stopping(*arguments: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr(landing_module, "_analyse_chunk", stopping)
+    out = tmp_path / "cut.iscat"
+    with pytest.raises(KeyboardInterrupt):
+        fit_stack(movie, config, out=out)
+    cut = json.loads((out / "summary.json").read_text())
+    assert cut["interrupted"]
+    assert cut["events"] < 5
+    assert partial_folder(out).is_dir()
+    resumed = fit_stack(movie, config, out=out)  # no --overwrite: it goes on
+    chunks = resumed.summary["landing"]["chunks"]
+    assert chunks > 2
+    assert len(calls) == 1 + chunks
+    assert not partial_folder(out).exists()
+    assert (out / "fits.csv").read_bytes() == (tmp_path / "whole.iscat" / "fits.csv").read_bytes()
+
+
+def test_chunks_of_another_configuration_are_not_used(tmp_path: Path) -> None:
+    from iscat_analysis.pipeline.resume import Store
+
+    one, two = _config(), _config("optics.focus_nm=-250")
+    keys = {Store(tmp_path, c, "movie", (8, 8), (0, 9))._key for c in (one, two)}
+    keys.add(Store(tmp_path, one, "another", (8, 8), (0, 9))._key)
+    assert len(keys) == 3
+    faster = one.model_copy(update={"compute": one.compute.model_copy(update={"workers": 7})})
+    assert Store(tmp_path, faster, "movie", (8, 8), (0, 9))._key in keys
+
+
+def test_injected_particles_are_recovered(movie: Path) -> None:
+    config = _config("posterior.enabled=false")
+    with open_stack(movie) as stack:
+        summary = analyse(stack, config, inject=6).summary["injection"]
+    assert summary["added"] == 12
+    assert summary["recall"] > 0.7
+    assert summary["recall_isolated"] == 1.0
+    assert abs(summary["bias_rel"]) < 5 * summary["bias_rel_se"]
+
+
+def test_injection_needs_sliding_windows(movie: Path) -> None:
+    config = _config("background.frames=[0, 60]", "posterior.enabled=false")
+    with open_stack(movie) as stack, pytest.raises(ConfigError, match="--inject"):
+        analyse(stack, config, inject=8)
+
+
+def test_posteriors_only_where_the_configuration_asks() -> None:
+    one = [EVENTS[0]]
+    quick = ["posterior.walkers=10", "posterior.steps=200"]
+    config = _config(*quick, "posterior.enabled=true", events=one)
+    few = np.array(list(Movie(replace_frames(config, 160), 1).frames(2)))
+    asked, _ = _run(few, config)
+    assert asked.views[0].posterior is not None
+    assert "level" in asked.views[0].posterior.names or asked.views[0].posterior.names
+    silent, _ = _run(few, _config(*quick, events=one))
+    assert silent.views[0].posterior is None
+
+
+def replace_frames(config: Config, frames: int) -> Config:
+    """Shorten the simulated movie."""
+    simulation = config.simulation.model_copy(update={"frames": frames})
+    return config.model_copy(update={"simulation": simulation})
