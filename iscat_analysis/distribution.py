@@ -56,7 +56,8 @@ _BOOTSTRAP_TRIES = 50
 _SUPPORT_DRAWS = 20
 _RIVAL_STEPS = 40
 _BROAD = 0.4  # width over mass
-_CURVE_POINTS = 400
+_CURVE_POINTS = 300
+_DIGITS = 6  # of the curves in summary.json
 _MOST_BINS = 240
 
 
@@ -160,7 +161,10 @@ class Distribution:
             "selection": self.selection.to_dict("records"),
             "support": self.support,
             "histogram": self.histogram.to_dict("list"),
-            "curves": self.curves.to_dict("list"),
+            "curves": {
+                name: [float(f"{value:.{_DIGITS}g}") for value in column]
+                for name, column in self.curves.items()
+            },
             "bandwidth_kda": self.bandwidth_kda,
             "draws": self.draws,
             "seed": self.seed,

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.bounds import EventBounds, event_bounds
+from iscat_analysis.distribution import Efficiency, describe
 from iscat_analysis.likelihood import LEVEL
 from iscat_analysis.pipeline.field import Event, Scene, photons_scale
 from iscat_analysis.records import (
@@ -220,8 +221,25 @@ def summary_of(
             "n_scattered": _median(good["n_scattered"]),
         },
         "precision": precision,
+        "distribution": _distribution(scene, good),
         "seconds": {name: round(value, 3) for name, value in timings.items()},
     }
+
+
+def _distribution(scene: Scene, good: pd.DataFrame) -> dict[str, Any] | None:
+    """Describe the species where masses were fitted, each event once.
+
+    The matched filter's standard deviation is what its snr makes of each mass.
+    """
+    if "mass_kda" not in FREE_PARAMETERS[scene.mode] or scene.mode == "track":
+        return None
+    mass, sigma, snr = (
+        good[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda", "snr")
+    )
+    filter_sigma = _median(np.abs(mass[snr > 0]) / snr[snr > 0])
+    efficiency = Efficiency(scene.templates.threshold, filter_sigma) if filter_sigma else None
+    found = describe(mass, sigma, efficiency=efficiency, seed=scene.config.simulation.seed)
+    return found.to_dict()
 
 
 def _median(values: pd.Series[float] | FloatArray) -> float | None:

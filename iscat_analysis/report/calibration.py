@@ -103,7 +103,7 @@ def mass_page(title: str, found: Mapping[str, Any], toml: str) -> str:
                 {
                     "label": "χ² of the line",
                     "value": number(found["chi2"], 3),
-                    "note": f"{found['dof']} degrees of freedom",
+                    "note": f"{found['dof']} degree{'' if found['dof'] == 1 else 's'} of freedom",
                 },
                 {
                     "label": "Largest residual",
@@ -285,8 +285,8 @@ def _standards_table(standards: list[Mapping[str, Any]]) -> dict[str, Any]:
         ("residual_percent", "residual [%]"),
     )
     return {
-        "caption": "Standards; the last column but one is what the calibration makes of each peak, "
-        "with the 95 % prediction interval beside it",
+        "caption": "Standards, and what the line makes of their peaks, "
+        "with 95 % prediction intervals",
         "columns": [{"label": label, "numeric": True} for _, label in names]
         + [{"label": "95 % [kDa]", "numeric": True}],
         "rows": [

@@ -227,7 +227,9 @@ def report_context(analysis: Analysis, figures: Mapping[str, int]) -> dict[str, 
         "config": analysis.config_toml,
         "provenance": _provenance(analysis),
         "versions": [(k, str(v)) for k, v in analysis.provenance.versions.items()],
-        "run_summary": _flatten(jsonable(analysis.summary)),
+        "run_summary": _flatten(
+            jsonable({k: v for k, v in analysis.summary.items() if k != "distribution"})
+        ),
         "figure_counts": figures,
         "data": {
             "mode": analysis.mode,

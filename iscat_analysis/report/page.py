@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from iscat_analysis.records import Analysis
 from iscat_analysis.report.context import report_context
+from iscat_analysis.report.distribution import distribution_section
 from iscat_analysis.report.tables import jsonable
 
 _UNSAFE_IN_SCRIPT = {
@@ -83,7 +84,13 @@ def render_report(analysis: Analysis, *, figures: Mapping[str, int] | None = Non
     str
         HTML.
     """
-    return render_page("report.html", report_context(analysis, figures or {}))
+    context = report_context(analysis, figures or {})
+    found = analysis.summary.get("distribution")
+    species = distribution_section(jsonable(found)) if found else None
+    if species is not None:
+        names = [name for name, _ in context["nav"]]
+        context["nav"].insert(names.index("distributions") + 1, (species["id"], species["title"]))
+    return render_page("report.html", {**context, "species": species})
 
 
 class _AskableUndefined(jinja2.StrictUndefined):
