@@ -7,6 +7,7 @@ c = o + (N + σ_r·n)/g counts, n standard normal.  `Camera` undoes it.
 from __future__ import annotations
 
 import math
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,12 @@ from numpy.typing import DTypeLike, NDArray
 from iscat_analysis.config import CameraConfig
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, FloatArray
+
+_UNREADABLE = (
+    ValueError, RuntimeError, TypeError, LookupError, OSError, ArithmeticError, MemoryError,
+    AttributeError, struct.error,
+)  # fmt: skip
+"""What a damaged TIFF makes its decoders raise."""
 
 _NEGATIVE_SIGMAS = 6.0  # 1e-9 of pixels in the dark
 _NEGATIVE_FRACTION = 0.01  # more pixels below the offset than a sensor has dead ones
@@ -172,18 +179,22 @@ def read_map(path: Path, key: str, shape_yx: tuple[int, int]) -> FloatArray:
     if not path.is_file():
         raise DataError(f"{where} names a file that does not exist; check the path")
     try:
-        image = np.squeeze(tifffile.imread(path))
-    except (ValueError, RuntimeError, TypeError, IndexError, KeyError, OSError) as error:
+        with tifffile.TiffFile(path) as tiff:
+            shape = tuple(n for n in tiff.series[0].shape if n != 1)
+            # decoded only where it has the right size: a small file may claim any
+            image = np.squeeze(tiff.series[0].asarray()) if shape == tuple(shape_yx) else None
+    except _UNREADABLE as error:
         raise DataError(f"{where} needs a TIFF map, but it cannot be read ({error})") from None
-    if image.shape != tuple(shape_yx):
-        shown = " x ".join(str(n) for n in image.shape) or "one number"
+    if image is None or image.shape != tuple(shape_yx):
+        shown = " x ".join(str(n) for n in shape) or "one number"
         raise DataError(
             f"{where} is a map of {shown} pixels but the movie has {shape_yx[0]} x {shape_yx[1]}; "
             "crop the map as the movie was cropped"
         )
     if image.dtype.kind not in "uif":
         raise DataError(f"{where} holds {image.dtype} values; save the map as real numbers")
-    values: FloatArray = image.astype(np.float64)
+    with np.errstate(all="ignore"):
+        values: FloatArray = image.astype(np.float64)
     bad = ~np.isfinite(values)
     if bad.any():
         raise DataError(f"{where} is not finite {_first(bad)}; repair the map")

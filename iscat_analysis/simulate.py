@@ -9,6 +9,7 @@ the frame number, so the bytes do not depend on how the work is divided.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -97,7 +98,8 @@ def write_stack(
         raise DataError(f"{found}: exists already; give another name, or --overwrite")
     movie = Movie(config, config.simulation.seed if seed is None else seed)
     shape = (config.simulation.frames, *config.simulation.shape)
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    partial_truth = path.with_name(f"{truth_path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         tifffile.imwrite(
@@ -110,12 +112,14 @@ def write_stack(
             ome=True,
             metadata=_metadata(config),
         )
-        movie.truth.to_csv(truth_path, index=False, float_format="%.10g")
+        movie.truth.to_csv(partial_truth, index=False, float_format="%.10g")
         partial.replace(path)
+        partial_truth.replace(truth_path)
     except OSError as error:
         raise DataError(f"{path}: cannot be written ({error.strerror or error})") from None
     finally:
         partial.unlink(missing_ok=True)
+        partial_truth.unlink(missing_ok=True)
     return movie.truth
 
 

@@ -6,6 +6,8 @@ import hashlib
 import json
 import os
 import shutil
+import zipfile
+import zlib
 from importlib.metadata import version
 from pathlib import Path
 
@@ -67,7 +69,7 @@ class Store:
                     ends_e=data["ends_e"],
                     gain_message=str(data["gain_message"]),
                 )
-        except (OSError, ValueError, KeyError, EOFError):
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
             return None  # never finished, or cut short
 
     def save(self, number: int, done: Done) -> None:
