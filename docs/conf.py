@@ -112,12 +112,13 @@ def _first_line(thing: object) -> str:
 
 
 def _write_commands() -> None:
-    from iscat_cli.app import COMMANDS
+    from iscat_cli.app import COMMANDS, GROUPS
 
     os.environ["TERMINAL_WIDTH"] = os.environ["COLUMNS"] = "84"
+    names = [(command.__name__,) for command, _ in COMMANDS]
+    names += [(group, command.__name__) for group, _, inner in GROUPS for command, _ in inner]
     pages = [
-        f"## iscat {command.__name__}\n\n```none\n{_said(command.__name__, '--help')}```\n"
-        for command, _ in COMMANDS
+        f"## iscat {' '.join(name)}\n\n```none\n{_said(*name, '--help')}```\n" for name in names
     ]
     (GENERATED / "commands.md").write_text("\n".join(pages), encoding="utf-8")
 

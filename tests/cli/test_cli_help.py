@@ -11,11 +11,15 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
+import tifffile
 
 from iscat_analysis.config import Config, config_to_toml, load_config
+from iscat_analysis.records import EVENT_COLUMNS
 from iscat_cli import console, main, main_fit
-from iscat_cli.app import COMMANDS
+from iscat_cli.app import COMMANDS, GROUPS
 from iscat_cli.console import Messages, duration
 
 PROGRAMS = {"iscat": main, "iscat-fit": main_fit}
@@ -33,10 +37,18 @@ SMALL = [
 ]
 
 
+NAMED = [((command.__name__,), example) for command, example in COMMANDS]
+NAMED += [
+    ((group, command.__name__), example)
+    for group, _, commands in GROUPS
+    for command, example in commands
+]
+
+
 def _examples() -> list[str]:
     return [
         line.strip()
-        for _, example in COMMANDS
+        for _, example in NAMED
         for line in example.splitlines()
         if line.startswith("    iscat")
     ]
@@ -51,6 +63,14 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory, sample_configs) -> Path
         shutil.copy(path, folder / "sample_configs" / f"{name}.toml")
     small = _small(folder / "sample_configs" / "mass.toml")
     (folder / "setup.toml").write_text(small, encoding="utf-8")
+    random = np.random.default_rng(1)
+    read = 4 * random.standard_normal((60, 64, 64))
+    tifffile.imwrite(folder / "dark.tif", np.rint(100 + read).astype("uint16"))
+    mass = random.normal(np.repeat([66.0, 146.0, 480.0], 60), 8.0)
+    table = pd.DataFrame(0.0, index=range(mass.size), columns=list(EVENT_COLUMNS))
+    table = table.assign(mass_kda=mass, sigma_mass_kda=8.0, contrast=-3.1e-5 * mass)
+    (folder / "standards.iscat").mkdir()
+    table.assign(status="ok", flags="").to_csv(folder / "standards.iscat/fits.csv", index=False)
     return folder
 
 
@@ -60,8 +80,8 @@ def _small(path: Path) -> str:
 
 def test_every_command_has_an_example() -> None:
     shown = _examples()
-    for command, _ in COMMANDS:
-        assert any(example.startswith(f"iscat {command.__name__}") for example in shown)
+    for name, _ in NAMED:
+        assert any(example.startswith(f"iscat {' '.join(name)} ") for example in shown)
 
 
 @pytest.mark.parametrize("example", _examples())
@@ -75,14 +95,14 @@ def test_every_example_runs(
     redirected: Path | None = None
     if ">" in arguments:
         arguments, redirected = arguments[:-2], Path(arguments[-1])
-    if "movie.tif" in arguments and "--out" not in arguments:
+    if "movie.tif" in arguments and "simulate" not in arguments:
         assert main(["simulate", "--config", "setup.toml", "--out", "movie.tif"]) == 0
         arguments = [a.replace("0:200", "0:30") for a in arguments]
     if "simulate" in arguments:
         arguments += [f"--set={change}" for change in SMALL]
     if "benchmark" in arguments:
         arguments.append("--no-posterior")
-        if "--trials" in arguments:
+        if "--trials" in arguments:  # fewer, and no posterior: the shape stays the same
             arguments[arguments.index("--trials") + 1] = "20"
     capsys.readouterr()
     assert PROGRAMS[program](arguments) == 0
