@@ -42,7 +42,8 @@ from iscat_analysis.report import EVENT_FIGURES, write_report
 from iscat_analysis.report.output import claim_output
 
 DEPENDENCIES = (
-    "numpy", "scipy", "numba", "tifffile", "emcee", "arviz", "pandas", "pyarrow", "matplotlib",
+    "numpy", "scipy", "numba", "tifffile", "emcee", "arviz-stats", "pandas", "pyarrow",
+    "matplotlib",
 )  # fmt: skip
 
 FEW_FIGURES = 4
