@@ -41,6 +41,9 @@ _OFFSET_SHARE = 0.35  # of the lightest peak's contrast that the offset may be
 _PROMINENCE_SIGMAS = 3.0
 _LANDING_SHARE = 0.4
 _MOST_PEAKS = 10
+_CORE = 2.5  # standard deviations of a peak that are fitted: its tails are other things
+_WINDOWS = 8
+_LEAST_IN_PEAK = 5
 _GRID = 4096
 _ROOT_2PI = math.sqrt(2 * math.pi)
 
@@ -445,7 +448,7 @@ def find_contrast_peaks(size: FloatArray, errors: FloatArray) -> list[Peak]:
     x, sigma = size[kept], errors[kept]
     low, high = np.quantile(x, [0.25, 0.75])
     spread = min(float(x.std()), float(high - low) / 1.349) or float(x.std())
-    h = 0.3 * spread * x.size**-0.2
+    h = 0.4 * spread * x.size**-0.2
     if (sigma > 0).any():
         h = max(h, 0.4 * float(np.median(sigma)))
     grid = np.linspace(0.0, float(x.max()) + 4 * h, _GRID)
@@ -469,20 +472,35 @@ def find_contrast_peaks(size: FloatArray, errors: FloatArray) -> list[Peak]:
         centre, top = float(grid[place]), float(density[place])
         half = _half_width(grid, density, int(place), 0.6065 * top)
         width = math.sqrt(max(half**2 - h**2, (0.3 * half) ** 2))
-        window = (
-            max(valleys[number], centre - 3.0 * half),
-            min(valleys[number + 1], centre + 3.0 * half),
-        )
-        inside = (x > window[0]) & (x < window[1])
-        if np.count_nonzero(inside) < 5:
-            continue
-        peaks.append(_fit_peak(x[inside], sigma[inside], window, centre, width))
+        limits = valleys[number], valleys[number + 1]
+        peak = _settled_peak(x, sigma, limits, centre, width)
+        if peak is not None:
+            peaks.append(peak)
     peaks = sorted(peaks, key=lambda peak: -peak.count)[:_MOST_PEAKS]
     return sorted(peaks, key=lambda peak: peak.contrast)
 
 
+def _settled_peak(
+    x: FloatArray, sigma: FloatArray, limits: tuple[float, float], centre: float, width: float
+) -> Peak | None:
+    """Fit a peak, then again within the window that its own width asks for, until it stays."""
+    peak = None
+    noise = float(np.sqrt(np.mean(sigma**2)))
+    for _ in range(_WINDOWS):
+        reach = _CORE * math.hypot(width, noise)
+        window = max(limits[0], centre - reach), min(limits[1], centre + reach)
+        inside = (x > window[0]) & (x < window[1])
+        if np.count_nonzero(inside) < _LEAST_IN_PEAK or not window[0] < centre < window[1]:
+            return peak
+        previous, peak = peak, _fit_peak(x[inside], sigma[inside], window, centre, width)
+        centre, width = peak.contrast, max(peak.width, 0.1 * math.hypot(width, noise))
+        if previous is not None and abs(previous.contrast - centre) < 0.1 * peak.contrast_se:
+            break
+    return peak
+
+
 def _half_width(grid: FloatArray, density: FloatArray, place: int, level: float) -> float:
-    """Distance from the mode to where the density has fallen to `level`, the nearer side."""
+    """Mean distance from the mode to where the density has fallen to `level`."""
     left = np.flatnonzero(density[:place] < level)
     right = np.flatnonzero(density[place:] < level)
     sides = []
@@ -490,7 +508,7 @@ def _half_width(grid: FloatArray, density: FloatArray, place: int, level: float)
         sides.append(grid[place] - grid[left[-1]])
     if right.size:
         sides.append(grid[place + right[0]] - grid[place])
-    return float(min(sides)) if sides else float(grid[-1] - grid[0])
+    return float(np.mean(sides)) if sides else float(grid[-1] - grid[0])
 
 
 def _fit_peak(

@@ -109,7 +109,7 @@ def test_york_needs_a_line() -> None:
 
 @pytest.mark.parametrize("known_errors", [False, True])
 def test_the_line_is_recovered_in_standard_errors(known_errors: bool) -> None:
-    pulls = []
+    pulls, widths = [], []
     for seed in range(20):
         rng = np.random.default_rng(seed)
         truth = np.array(STANDARDS) * (1 + 0.01 * rng.standard_normal(3))
@@ -122,13 +122,12 @@ def test_the_line_is_recovered_in_standard_errors(known_errors: bool) -> None:
                 (found.offset - OFFSET) / math.sqrt(found.covariance[1, 1]),
             ]
         )
-        if known_errors:
-            assert found.standards["width"].max() < 0.6 * NOISE
-        else:
-            assert abs(found.standards["width"] / NOISE - 1).max() < 0.35
+        widths += (found.standards["width"] / NOISE).tolist()
     table = np.array(pulls)
     assert np.all(np.abs(table.mean(axis=0)) < 4 / math.sqrt(20)), table.mean(axis=0)
     assert np.all(table.std(axis=0, ddof=1) < 1.6), table.std(axis=0)
+    # With the errors known, hardly any width is left beyond them.
+    assert np.median(widths) < 0.3 if known_errors else 0.85 < np.median(widths) < 1.1
 
 
 def test_peaks_are_unbiased_on_a_background() -> None:
@@ -241,4 +240,4 @@ def test_refeyns_masses_are_reproduced_exactly(data_dir: Path) -> None:
     found = calibrate_mass(contrast, STANDARDS)
     assert found.gradient_per_kda == pytest.approx(stored.gradient_per_kda, rel=0.03)
     assert np.allclose(found.standards["contrast"], stored.standard_contrasts, rtol=0.06)
-    assert abs(found.standards["residual_percent"]).max() < 1
+    assert abs(found.standards["residual_percent"]).max() < 1  # %
