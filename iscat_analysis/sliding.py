@@ -60,6 +60,7 @@ SHOT_LIMITED = 1.2
 """Noise variance over shot noise up to which averaging is called shot-noise limited."""
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
+_SAMPLED = 0.85  # of a peak's height that the pixel next to it has at least
 _ROWS = 16  # on which the noise is measured
 _NORMAL_QUARTILE = 0.6744897501960817
 _STEEP = 4.0  # (per-frame SNR)² at which about one frame around a step is doubtful
@@ -604,7 +605,8 @@ def find_steps(
     snr, effective
         From `sliding_maps`.
     threshold : float
-        Least signal-to-noise ratio.
+        Least signal-to-noise ratio, between the pixels: where the field peaks, not where it is
+        sampled, it exceeds the threshold as often as the theory of smooth fields has it.
     polarity : int
         Sign wanted, 0 for both.
 
@@ -614,13 +616,16 @@ def find_steps(
         With sub-pixel positions.
     """
     peaks = []
-    for k, i, j in step_peaks(snr, threshold, polarity):
+    for k, i, j in step_peaks(snr, _SAMPLED * threshold, polarity):
         value = float(snr[k, i, j])
         image = snr[k] * np.sign(value)
-        dy, dx = _vertex(image[:, j], int(i)), _vertex(image[i], int(j))
-        amplitude = value / math.sqrt(float(effective[k]) * float(matched.norm[i, j]))
+        (dy, above), (dx, beside) = _vertex(image[:, j], int(i)), _vertex(image[i], int(j))
+        height = math.copysign(abs(value) + above + beside, value)
+        if abs(height) <= threshold:
+            continue
+        amplitude = height / math.sqrt(float(effective[k]) * float(matched.norm[i, j]))
         boundary = chunk.first + int(chunk.edges[k + 1])
-        peaks.append(Peak(boundary, float(j + dx), float(i + dy), value, amplitude))
+        peaks.append(Peak(boundary, float(j + dx), float(i + dy), height, amplitude))
     return sorted(peaks, key=lambda p: -abs(p.snr))
 
 
@@ -787,10 +792,13 @@ def _at(value: float | FloatArray, here: tuple[slice, slice]) -> Any:
     return value[here] if isinstance(value, np.ndarray) else value
 
 
-def _vertex(line: NDArray[Any], index: int) -> float:
-    """Vertex of the parabola through a maximum and its neighbours."""
+def _vertex(line: NDArray[Any], index: int) -> tuple[float, float]:
+    """Vertex of the parabola through a maximum and its neighbours, and its height above it."""
     if not 0 < index < line.size - 1:
-        return 0.0
+        return 0.0, 0.0
     low, mid, high = (float(v) for v in line[index - 1 : index + 2])
     bend = low - 2 * mid + high
-    return float(np.clip(0.5 * (low - high) / bend, -0.5, 0.5)) if bend < 0 else 0.0
+    if bend >= 0:
+        return 0.0, 0.0
+    shift = float(np.clip(0.5 * (low - high) / bend, -0.5, 0.5))
+    return shift, 0.25 * (high - low) * shift

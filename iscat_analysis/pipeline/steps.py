@@ -59,6 +59,7 @@ _FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is
 _WEAK = 0.05  # contrast up to which several add up
 _RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
 _RINGS = 0.04  # the same for the rest of its region
+_EXPLAINED = 0.8  # of the threshold; a fit that reaches less is what other steps explain
 _SAME_PX = 1.5
 _SATURATION_NM = 500.0
 
@@ -187,8 +188,15 @@ class ChunkFitter:
         """
         matched = make_filter(self._chunk, self._scene.templates.images[0])
         steps: list[Step] = []
+        rejected: list[Step] = []
         for self.rounds in range(1, ROUNDS + 1):
-            fresh = self._search(matched, steps)
+            fresh = [
+                s
+                for s in self._search(matched, steps)
+                if not any(
+                    _distance(s, r) < _SAME_PX and _apart(s, r) <= self._stride for r in rejected
+                )
+            ]
             if not fresh:
                 break
             known = len(steps)
@@ -203,14 +211,17 @@ class ChunkFitter:
                 }  # fmt: skip
                 if not chosen:
                     break
-            steps = self._credible(steps)
+            credible = self._credible(steps)
+            kept = {id(s) for s in credible}
+            rejected += [s for s in steps if id(s) not in kept]
+            steps = credible
         if not steps:
             return []
         seen, _ = self._neighbourhood(steps)
         own = [i for i, s in enumerate(steps) if keep[0] <= s.at.frame < keep[1]]
         found = self._pool.map(lambda i: self._finish(i, steps, seen), own)
-        kept = [f for f in found if f is not None]
-        return sorted(kept, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
+        fitted = [f for f in found if f is not None]
+        return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
 
     # ---- search ----------------------------------------------------------------------------
 
@@ -548,7 +559,7 @@ class ChunkFitter:
             (0, task.region.columns[1] - task.region.columns[0]),
         )
         event = Event(local, fit, likelihood)
-        if event.snr < scene.templates.threshold:
+        if event.snr < _EXPLAINED * scene.templates.threshold:
             return None
         step = replace(step, at=task.at)
         return FittedStep(step, event, task.region, task.windows, task.n_before, task.n_after)
@@ -557,7 +568,7 @@ class ChunkFitter:
         """Leave out what the others explain, and the weaker of two steps that describe one."""
         kept: list[Step] = []
         for step in sorted(steps, key=lambda s: -s.start.snr):
-            if step.snr > self._scene.templates.threshold and not any(
+            if step.snr > _EXPLAINED * self._scene.templates.threshold and not any(
                 s.sign == step.sign
                 and _distance(s, step) < _SAME_PX
                 and abs(s.at.frame - step.at.frame) <= max(2, s.at.half_width + step.at.half_width)
@@ -603,7 +614,9 @@ def unbiased(likelihood: Likelihood, fit: FitResult) -> FitResult:
     weight = likelihood.signal_information(signal) * bright**2
     gradient = gradient[index].reshape(len(index), -1)
     bend = hessian[np.ix_(index, index)].reshape(len(index), len(index), -1)
-    inverse = np.linalg.pinv((gradient * weight.ravel()) @ gradient.T, hermitian=True)
+    fisher = (gradient * weight.ravel()) @ gradient.T
+    unit = 1 / np.sqrt(np.maximum(np.diag(fisher), 1e-300))
+    inverse = np.linalg.pinv(fisher * np.outer(unit, unit), hermitian=True) * np.outer(unit, unit)
     traces = np.einsum("ij,ijp->p", inverse, bend)
     bias = -0.5 * inverse @ (gradient @ (weight.ravel() * traces))
     shift = float(bias[index.index(3)]) * model.scale.slope(float(theta[3]))
@@ -644,3 +657,7 @@ def _spans(
 
 def _distance(one: Step, two: Step) -> float:
     return math.hypot(one.start.x_px - two.start.x_px, one.start.y_px - two.start.y_px)
+
+
+def _apart(one: Step, two: Step) -> int:
+    return abs(one.at.frame - two.at.frame)

@@ -1,0 +1,228 @@
+"""Landing movies in standard errors: false alarms, bias, spread against the bound, frames."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import poisson
+
+from iscat_analysis.camera import Camera
+from iscat_analysis.config import Config, load_config
+from iscat_analysis.fit import fit_particle
+from iscat_analysis.forward import PixelGrid
+from iscat_analysis.likelihood import conditional
+from iscat_analysis.pipeline.chunks import FRAME_COLUMN
+from iscat_analysis.pipeline.landing import analyse_landings, make_landing_scene
+from iscat_analysis.pipeline.steps import unbiased
+from iscat_analysis.records import Candidate
+from iscat_analysis.simulate import Movie
+
+PIXEL_NM = 84.0
+LEVEL_E = 1e5
+WINDOW = 40
+SIGMAS = 4.0
+TAIL = 1e-4  # of the Poisson law on either side
+
+
+class Memory:
+    """A movie in memory."""
+
+    def __init__(self, counts: np.ndarray) -> None:
+        self.counts = counts
+        self.shape = counts.shape
+        self.dtype = counts.dtype
+        self.name = "movie"
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Frames [start, stop)."""
+        return self.counts[start:stop]
+
+
+def _config(side: int, frames: int, *settings: str) -> Config:
+    return load_config(
+        None,
+        [
+            f"camera.pixel_size_nm={PIXEL_NM}",
+            "camera.gain_e_per_adu=4.0",
+            "particle.mass_kda=146.0",
+            "calibration.gradient_per_kda=-3.1e-5",
+            f"simulation.shape=[{side}, {side}]",
+            f"simulation.frames={frames}",
+            f"simulation.photons_per_pixel={LEVEL_E}",
+            "simulation.background=speckle",
+            "simulation.power_noise=0.01",
+            f"background.window_frames={WINDOW}",
+            *settings,
+        ],
+    )
+
+
+def _analyse(config: Config, seed: int) -> pd.DataFrame:
+    counts = np.array(list(Movie(config, seed).frames()))
+    return analyse_landings(
+        Memory(counts), config, Camera(gain_e_per_adu=4.0),
+        tell=lambda _: None, progress=lambda *_: None,
+    ).table  # fmt: skip
+
+
+# ---- blank movies ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def alarms() -> tuple[int, int]:
+    """Events found in blank movies at 1 expected in each, and the number of movies."""
+    config = _config(64, 240, "detection.false_alarms_per_movie=1.0", "fit.roi_nm=1800.0")
+    movies = 40
+    return sum(len(_analyse(config, seed)) for seed in range(movies)), movies
+
+
+def _assert_expected(found: int, expected: float) -> None:
+    assert poisson.ppf(TAIL, expected) <= found <= poisson.isf(TAIL, expected)
+
+
+def test_false_alarms_are_as_many_as_configured(alarms: tuple[int, int]) -> None:
+    found, movies = alarms
+    _assert_expected(found, movies)
+
+
+@pytest.mark.parametrize("wrong", [0.4, 2.5])
+def test_another_number_of_false_alarms_is_refused(alarms: tuple[int, int], wrong: float) -> None:
+    """Control: the test above can fail."""
+    found, movies = alarms
+    with pytest.raises(AssertionError):
+        _assert_expected(found, wrong * movies)
+
+
+# ---- isolated events -------------------------------------------------------------------------
+
+GRID = (18, 44, 70, 96)
+MASSES = (120.0, 250.0, 480.0)
+
+
+@pytest.fixture(scope="module")
+def events() -> pd.DataFrame:
+    """Sixteen particles a movie, apart from each other, at random frames; a third leave."""
+    tables = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        placed: list[dict[str, Any]] = []
+        for row in GRID:
+            for column in GRID:
+                frame = int(rng.integers(60, 110))
+                leaves = len(placed) % 3 == 0
+                placed.append(
+                    {
+                        "frame": frame,
+                        "leave": frame + 90 if leaves else None,
+                        "x_px": column + rng.uniform(-2, 2),
+                        "y_px": row + rng.uniform(-2, 2),
+                        "mass_kda": MASSES[len(placed) % 3],
+                    }
+                )
+        config = _config(115, 260)
+        simulation = type(config.simulation).model_validate(
+            {**config.simulation.model_dump(), "events": placed}
+        )
+        table = _analyse(config.model_copy(update={"simulation": simulation}), seed)
+        for truth in placed:
+            for sign, when in ((1, truth["frame"]), (-1, truth["leave"])):
+                if when is None:
+                    continue
+                near = table[
+                    (np.hypot(table.x_px - truth["x_px"], table.y_px - truth["y_px"]) < 2)
+                    & (table.mass_kda * sign > 0)
+                ]
+                found = near.iloc[0].to_dict() if len(near) else {}
+                tables.append(
+                    {
+                        **found, "true_frame": when, "true_mass": truth["mass_kda"],
+                        "true_x_nm": truth["x_px"] * PIXEL_NM,
+                        "true_y_nm": truth["y_px"] * PIXEL_NM,
+                        "found": len(near), "extra": len(table) - len(placed) - 6,
+                    }
+                )  # fmt: skip
+    return pd.DataFrame(tables)
+
+
+def test_every_event_is_found_once(events: pd.DataFrame) -> None:
+    assert (events["found"] == 1).all()
+    assert (events["extra"] == 0).all()
+
+
+def _pulls(events: pd.DataFrame, name: str, over: str) -> np.ndarray:
+    truth = events["true_mass" if name == "mass_kda" else f"true_{name}"]
+    value = events[name].abs() if name == "mass_kda" else events[name]
+    return ((value - truth) / events[f"{over}_{name}"]).to_numpy()
+
+
+def _assert_standard(pulls: np.ndarray) -> None:
+    n = pulls.size
+    assert abs(pulls.mean()) < SIGMAS / math.sqrt(n)
+    assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * n)
+
+
+@pytest.mark.parametrize("name", ["x_nm", "y_nm", "mass_kda"])
+def test_pulls_are_standard(events: pd.DataFrame, name: str) -> None:
+    _assert_standard(_pulls(events, name, "sigma"))
+
+
+@pytest.mark.parametrize("name", ["x_nm", "y_nm", "mass_kda"])
+def test_the_spread_meets_the_bound(events: pd.DataFrame, name: str) -> None:
+    pulls = _pulls(events, name, "crb")
+    assert pulls.std() < 1.05 + SIGMAS / math.sqrt(2 * pulls.size)
+
+
+def test_a_bound_of_twice_the_frames_is_missed(events: pd.DataFrame) -> None:
+    """Control: a window used twice would claim √2 less."""
+    with pytest.raises(AssertionError):
+        _assert_standard(math.sqrt(2) * _pulls(events, "mass_kda", "sigma"))
+
+
+def test_frames_lie_in_their_intervals(events: pd.DataFrame) -> None:
+    late = (events["frame"] - events["true_frame"]).abs()
+    inside = (late <= events[FRAME_COLUMN]).mean()
+    assert inside > 0.95 - SIGMAS * math.sqrt(0.05 * 0.95 / len(events))
+    heavy = events["true_mass"] > 200
+    assert (late[heavy] <= 1).mean() >= 0.95
+
+
+# ---- bias ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def biases() -> tuple[np.ndarray, np.ndarray]:
+    """Relative errors of a faint particle's mass, with and without the correction."""
+    config = _config(64, 200)
+    scene = make_landing_scene(config, (64, 64), searches=1)
+    grid = PixelGrid.region((0, scene.roi_px), (0, scene.roi_px), PIXEL_NM)
+    x, y, mass = 15.3, 15.8, 66.0
+    signal = scene.model.image(grid, x * PIXEL_NM, y * PIXEL_NM, 5.0, mass)
+    rng = np.random.default_rng(4)
+    start = Candidate(x, y, 5.0, mass, 8.0)
+    plain, corrected = [], []
+    for _ in range(1500):
+        before = rng.poisson(WINDOW * LEVEL_E, grid.shape).astype(float)
+        after = rng.poisson(WINDOW * LEVEL_E * (1 + signal)).astype(float)
+        likelihood = conditional(scene.model, grid, before, after, 1.0)
+        fit = fit_particle(likelihood, start, "mass", (0.0, 1000.0), level=True)
+        plain.append(fit.mass_kda / mass - 1)
+        corrected.append(unbiased(likelihood, fit).mass_kda / mass - 1)
+    return np.array(plain), np.array(corrected)
+
+
+def _assert_unbiased(errors: np.ndarray) -> None:
+    assert abs(errors.mean()) < 3 * errors.std() / math.sqrt(errors.size)
+
+
+def test_the_mass_of_a_faint_particle_is_unbiased(biases: tuple[np.ndarray, np.ndarray]) -> None:
+    _assert_unbiased(biases[1])
+
+
+def test_maximum_likelihood_alone_is_biased(biases: tuple[np.ndarray, np.ndarray]) -> None:
+    """Control: by the inverse square of the signal-to-noise ratio."""
+    with pytest.raises(AssertionError):
+        _assert_unbiased(biases[0])
