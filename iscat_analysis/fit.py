@@ -38,7 +38,18 @@ _WINDOW_NM = 350.0  # how far x and y may move from the start
 
 
 def window_nm(pixel_nm: float) -> float:
-    """How far x and y may move from the start of a fit [nm]."""
+    """How far x and y may move from the start of a fit.
+
+    Parameters
+    ----------
+    pixel_nm : float
+        Pixel side [nm].
+
+    Returns
+    -------
+    float
+        Distance [nm].
+    """
     return max(_WINDOW_NM, 3 * pixel_nm)
 
 
@@ -165,7 +176,20 @@ def fit_particle(
 
 
 def start_theta(likelihood: Likelihood, start: Candidate) -> FloatArray:
-    """θ of a candidate, shape (5,)."""
+    """Give a candidate's θ.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Its grid and mass scale are used.
+    start : Candidate
+        The candidate.
+
+    Returns
+    -------
+    ndarray, shape (5,)
+        θ.
+    """
     pixel = likelihood.grid.pixel_nm
     amplitude = likelihood.model.scale.amplitude(start.mass_kda)
     return np.array([start.x_px * pixel, start.y_px * pixel, start.z_nm, amplitude, 0.0])

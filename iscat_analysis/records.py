@@ -43,7 +43,15 @@ class Progress(Protocol):
 
 
 def silent(stage: str, done: int, total: int) -> None:
-    """Ignore progress."""
+    """Ignore progress.
+
+    Parameters
+    ----------
+    stage : str
+        Name of the stage.
+    done, total : int
+        Steps finished, and steps there are.
+    """
 
 
 class Status(StrEnum):

@@ -305,7 +305,18 @@ def choose_window(curve: NoiseCurve, frames: int) -> int:
 
 
 def longest_window(frames: int) -> int:
-    """Longest window that is chosen for a movie of so many frames."""
+    """Longest window that is chosen for a movie.
+
+    Parameters
+    ----------
+    frames : int
+        Frames in the movie.
+
+    Returns
+    -------
+    int
+        Frames.
+    """
     return max(SHORTEST_WINDOW, min(LONGEST_WINDOW, frames // MOVIE_SHARE))
 
 
@@ -602,7 +613,9 @@ def find_steps(
         The sums.
     matched : Filter
         From `make_filter`.
-    snr, effective
+    snr : ndarray, shape (n, y, x)
+        From `sliding_maps`.
+    effective : ndarray
         From `sliding_maps`.
     threshold : float
         Least signal-to-noise ratio, between the pixels: where the field peaks, not where it is

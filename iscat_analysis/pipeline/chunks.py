@@ -47,7 +47,7 @@ VIEWS = 1000
 FRAME_COLUMN = "frame_ci95"
 """Column after `EVENT_COLUMNS`: half-width of the 95 % interval of ``frame`` [frames]."""
 
-_MEMORY_SHARE = 0.35  # of compute.memory_limit_mb that the stored counts may take
+_MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _PIECE_BYTES = 8 * 2**20
 _NOISE_FRAMES = 800  # on which the windows are chosen
 _SEAM_PX = 2.0  # two chunks' estimates of one step are nearer than this
@@ -62,7 +62,17 @@ class Frames(FrameSource, Protocol):
 
 
 class Reader:
-    """Frames in memory, from one chunk to the next without reading any twice."""
+    """Frames in memory, from one chunk to the next without reading any twice.
+
+    Parameters
+    ----------
+    movie : Frames
+        The movie.
+    camera : Camera
+        Counts → photoelectrons.
+    first, last : int
+        Half-open range of frames to analyse.
+    """
 
     def __init__(self, movie: Frames, camera: Camera, first: int, last: int) -> None:
         self._movie = movie
@@ -167,7 +177,22 @@ def _runs(flags: BoolArray) -> Iterator[slice]:
 
 
 def choose_windows(reader: Reader, config: Config) -> tuple[NoiseCurve, int]:
-    """Noise curve, and frames before and after each step."""
+    """Choose how many frames before and after a step are summed.
+
+    Parameters
+    ----------
+    reader : Reader
+        The frames.
+    config : Config
+        ``background.window_frames`` wins where it is given.
+
+    Returns
+    -------
+    curve : NoiseCurve
+        Noise against averaging.
+    window : int
+        Frames before, and as many after, each step.
+    """
     frames = reader.last - reader.first
     given = config.background.window_frames
     needed = 2 * given if given else SHORTEST_MOVIE
@@ -188,7 +213,22 @@ def choose_windows(reader: Reader, config: Config) -> tuple[NoiseCurve, int]:
 def plan_chunks(
     reader: Reader, config: Config, window: int, stride: int
 ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Cores and the spans around them; block edges fall on the same frames in every chunk."""
+    """Divide a movie; block edges fall on the same frames in every chunk.
+
+    Parameters
+    ----------
+    reader : Reader
+        The frames.
+    config : Config
+        ``compute.memory_limit_mb`` bounds a chunk.
+    window, stride : int
+        Frames in a window, and between two of its positions.
+
+    Returns
+    -------
+    list of ((int, int), (int, int))
+        For each chunk its core, and the span of frames around it that is read.
+    """
     first, last = reader.first, reader.last
     halo = math.ceil(HALO * window / stride) * stride
     budget = int(_MEMORY_SHARE * config.compute.memory_limit_mb * 1e6)
@@ -236,7 +276,13 @@ class Done:
 
 
 class Merged:
-    """Finished chunks, in order."""
+    """Finished chunks, in order.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    """
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self._done: list[Done] = []

@@ -230,7 +230,20 @@ def fit_field(
 
 
 def field_likelihood(scene: Scene, windows: Windows) -> Likelihood:
-    """Likelihood of the whole field."""
+    """Likelihood of the whole field.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    windows : Windows
+        Sums before and after.
+
+    Returns
+    -------
+    Likelihood
+        For the matched filter.
+    """
     rows, columns = windows.after_e.shape
     return region_likelihood(scene, windows, Region((0, rows), (0, columns)), None)
 
@@ -288,14 +301,38 @@ def region_likelihood(
 
 
 def uses_conditional(config: Config) -> bool:
-    """Whether the fits condition on the sum of counts before and after."""
+    """Whether the fits condition on the sum of counts before and after.
+
+    Parameters
+    ----------
+    config : Config
+        ``fit.likelihood``, the scheme and ``background.method`` decide.
+
+    Returns
+    -------
+    bool
+        False where they take the background as known.
+    """
     if config.fit.likelihood == "auto":
         return config.optics.scheme != "darkfield" and config.background.method == "mean"
     return config.fit.likelihood == "conditional"
 
 
 def photons_scale(scene: Scene, windows: Windows) -> float:
-    """Photoelectrons per pixel for unit |E_sca|² in the frames after, in dark field."""
+    """Scale of the signal in dark field.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    windows : Windows
+        Frames and laser power.
+
+    Returns
+    -------
+    float
+        Photoelectrons per pixel for unit |E_sca|², summed over the frames after.
+    """
     per_frame = scene.model.photons_per_intensity(
         scene.config.simulation.photons_per_pixel, scene.pixel_nm
     )
@@ -303,7 +340,22 @@ def photons_scale(scene: Scene, windows: Windows) -> float:
 
 
 def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Event]) -> FloatArray:
-    """Signal of all fitted particles over the field, shape (y, x)."""
+    """Signal of all fitted particles over the field.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    shape : (int, int)
+        Rows and columns.
+    events : sequence of Event
+        The particles.
+
+    Returns
+    -------
+    ndarray, shape (y, x)
+        Contrast, or |E_sca|² in dark field.
+    """
     total = np.zeros(shape)
     for event in events:
         _add_signal(scene, event, Region((0, shape[0]), (0, shape[1])), total)

@@ -94,7 +94,18 @@ class LandingResult:
 
 
 def has_landings(config: Config) -> bool:
-    """Whether a configuration describes a movie in which the windows slide."""
+    """Whether a configuration describes a movie in which the windows slide.
+
+    Parameters
+    ----------
+    config : Config
+        Without background frames, interferometric, not to be tracked.
+
+    Returns
+    -------
+    bool
+        Whether `analyse_landings` is the way to analyse it.
+    """
     return (
         config.background.frames is None
         and config.background.method == "mean"
@@ -229,12 +240,18 @@ def inject_and_recover(
 
     Parameters
     ----------
-    movie, config, camera, progress
-        As in `analyse_landings`.
+    movie : Frames
+        The movie.
+    config : Config
+        As it was analysed.
+    camera : Camera
+        Counts → photoelectrons.
     result : LandingResult
         What was found without them: their masses are drawn from it.
     count : int
         Particles.
+    progress : Progress
+        Told how far it is.
 
     Returns
     -------

@@ -20,7 +20,21 @@ from iscat_analysis.records import EventView
 
 
 class Store:
-    """Finished chunks on disk, until the whole is done."""
+    """Finished chunks on disk, until the whole is done.
+
+    Parameters
+    ----------
+    folder : Path or None
+        Where they are kept; None keeps nothing.
+    config : Config
+        Part of the key, but for the number of workers.
+    identity : str
+        Hash of the movie; empty keeps nothing.
+    shape : (int, int)
+        Rows and columns.
+    span : (int, int)
+        Frames analysed.
+    """
 
     def __init__(
         self,
@@ -115,12 +129,34 @@ class Store:
 
 
 def partial_folder(folder: Path) -> Path:
-    """Where the finished chunks of an output folder are kept: hidden, beside it."""
+    """Name the folder of an output folder's finished chunks: hidden, beside it.
+
+    Parameters
+    ----------
+    folder : Path
+        The output folder.
+
+    Returns
+    -------
+    Path
+        It need not exist.
+    """
     return folder.with_name(f".{folder.name}.partial")
 
 
 def is_resumable(folder: Path) -> bool:
-    """Whether a folder holds what an interrupted run left, and its chunks are still there."""
+    """Whether a folder holds what an interrupted run left, and its chunks are still there.
+
+    Parameters
+    ----------
+    folder : Path
+        The output folder.
+
+    Returns
+    -------
+    bool
+        Whether a run into it would go on where the last one stopped.
+    """
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         return bool(summary["interrupted"]) and partial_folder(folder).is_dir()
