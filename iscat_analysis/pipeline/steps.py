@@ -59,7 +59,7 @@ _FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is
 _WEAK = 0.05  # contrast up to which several add up
 _RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
 _RINGS = 0.04  # the same for the rest of its region
-_EXPLAINED = 0.8  # of the threshold; a fit that reaches less is what other steps explain
+_EXPLAINED = 0.7  # of the threshold; a fit that reaches less is what other steps explain
 _SAME_PX = 1.5
 _SATURATION_NM = 500.0
 
