@@ -17,14 +17,13 @@ from iscat_analysis.pipeline.field import Event, Scene, photons_scale
 from iscat_analysis.records import (
     EVENT_COLUMNS,
     FREE_PARAMETERS,
+    PARAMETERS,
     EventView,
     FloatArray,
     PosteriorResult,
     Status,
     Windows,
 )
-
-_SHORT = {"x_nm": "x_nm", "y_nm": "y_nm", "z_nm": "z_nm", "mass_kda": "mass_kda"}
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ def _record(scene: Scene, row: Row) -> dict[str, Any]:
         "status": str(fit.status),
         "flags": ";".join(str(f) for f in fit.flags),
     }
-    for k, name in enumerate(_SHORT):
+    for k, name in enumerate(PARAMETERS):
         record[f"sigma_{name}"] = fit.sigma[k]
         record[f"crb_{name}"] = bounds.crb_joint[k]
         record[f"qcrb_{name}"] = bounds.qcrb[k]
