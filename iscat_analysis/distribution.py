@@ -54,7 +54,7 @@ _EM_STEPS = 40
 _POLISHED = 2  # starts, the best after EM
 _BOOTSTRAP_TRIES = 50
 _SUPPORT_DRAWS = 20
-_RIVAL_STEPS = 40
+_RIVAL_EVALUATIONS = 150
 _BROAD = 0.4  # width over mass
 _CURVE_POINTS = 300
 _DIGITS = 6  # of the curves in summary.json
@@ -340,7 +340,7 @@ def _em(events: _Events, start: _Mixture, steps: int) -> _Mixture:
     return _Mixture(weight, mean, variance)
 
 
-def _polish(events: _Events, start: _Mixture, steps: int = 200) -> _Mixture:
+def _polish(events: _Events, start: _Mixture, evaluations: int = 400) -> _Mixture:
     """Maximise the likelihood of the events seen, with its gradient, under τ² ≥ 0."""
     k = start.weight.size
     scale = max(float(np.median(events.sigma)), 1e-9)
@@ -392,9 +392,10 @@ def _polish(events: _Events, start: _Mixture, steps: int = 200) -> _Mixture:
         + [(0.0, (top / scale) ** 2)] * k
     )
     theta = np.clip(theta, [b[0] for b in bounds], [b[1] for b in bounds])
+    # TNC and not L-BFGS-B, whose calls of a threaded BLAS take longer than all the rest.
     found = minimize(
-        loss, theta, jac=True, method="L-BFGS-B", bounds=bounds,
-        options={"maxiter": steps, "ftol": 1e-9, "gtol": 1e-6},
+        loss, theta, jac=True, method="TNC", bounds=bounds,
+        options={"maxfun": evaluations, "ftol": 1e-9, "gtol": 1e-6},
     )  # fmt: skip
     return replace(unpack(np.asarray(found.x)), log_likelihood=-float(found.fun) * n)
 
@@ -530,7 +531,7 @@ def _bootstrap(
         if number < _SUPPORT_DRAWS:
             more, fewer = _neighbours(drawn, fit.sorted())
             rivals = [
-                _polish(drawn, max(starts, key=_height(drawn)), _RIVAL_STEPS)
+                _polish(drawn, max(starts, key=_height(drawn)), _RIVAL_EVALUATIONS)
                 for starts in (more, fewer)
                 if starts
             ]
