@@ -381,7 +381,7 @@ def test_ctrl_c_midway(stage: str, tmp_path: Path) -> None:
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
     try:
         if sign is None:
-            while not (tmp_path / "movie.tif.partial").exists() and process.poll() is None:
+            while not list(tmp_path.glob("movie.tif.*.partial")) and process.poll() is None:
                 time.sleep(0.05)
         else:
             for line in process.stderr:
