@@ -38,6 +38,9 @@ from iscat_analysis.records import FloatArray
 
 Branch = Literal["magnitude", "landing", "leaving"]
 
+LEAST_SPECIES = 3
+"""Fewer events apart from all others are outliers and no species."""
+
 LEAST_EVENTS = 10
 """Fewer are listed, not described."""
 
@@ -256,6 +259,13 @@ def describe(
             "fewer than half of the particles of "
             + ", ".join(f"{m:.3g}" for m in species["mass_kda"][faint])
             + " kDa are detected: their mass and number rest on the detection model"
+        )
+    apart = species["count"] < LEAST_SPECIES - 0.5
+    if apart.any():
+        notes.append(
+            "what lies at "
+            + ", ".join(f"{m:.3g}" for m in species["mass_kda"][apart])
+            + f" kDa is fewer than {LEAST_SPECIES} events: outliers, and no species"
         )
     broad = species["width_kda"] > _BROAD * species["mass_kda"]
     if broad.any():

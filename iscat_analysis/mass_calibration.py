@@ -41,6 +41,7 @@ _OFFSET_SHARE = 0.35  # of the lightest peak's contrast that the offset may be
 _PROMINENCE_SIGMAS = 3.0
 _LANDING_SHARE = 0.4
 _MOST_PEAKS = 10
+_DETAILS = (1.0, 2.0, 4.0)
 _CORE = 2.5  # standard deviations of a peak that are fitted: its tails are other things
 _WINDOWS = 8
 _LEAST_IN_PEAK = 5
@@ -377,12 +378,21 @@ def calibrate_mass(
         raise DataError(
             f"{name}: holds {size.size} landing events; a calibration needs {LEAST_EVENTS} or more"
         )
-    peaks = find_contrast_peaks(size, size_errors)
-    chosen = _match(peaks, masses, name)
-    line = york_line(
-        masses, masses_se, [direction * p.contrast for p in chosen], [p.contrast_se for p in chosen]
-    )
-    _check_match(line, chosen, peaks, masses, name)
+    for detail in _DETAILS:
+        peaks = find_contrast_peaks(size, size_errors, detail=detail)
+        try:
+            chosen = _match(peaks, masses, name)
+            line = york_line(
+                masses,
+                masses_se,
+                [direction * p.contrast for p in chosen],
+                [p.contrast_se for p in chosen],
+            )
+            _check_match(line, chosen, peaks, masses, name)
+            break
+        except DataError:
+            if detail == _DETAILS[-1]:
+                raise
     widen = max(1.0, line.chi2 / line.dof) if line.dof else 1.0
     notes = []
     if widen > 1:
@@ -426,7 +436,7 @@ def _standards(
     return values[order], se[order]
 
 
-def find_contrast_peaks(size: FloatArray, errors: FloatArray) -> list[Peak]:
+def find_contrast_peaks(size: FloatArray, errors: FloatArray, *, detail: float = 1.0) -> list[Peak]:
     """Find the peaks of |contrast|.
 
     Modes of a kernel density that stand out by three standard errors, each then fitted to the
@@ -438,6 +448,8 @@ def find_contrast_peaks(size: FloatArray, errors: FloatArray) -> list[Peak]:
         |contrast|, positive.
     errors : ndarray, shape (n,)
         Standard deviations of each; zero where unknown.
+    detail : float
+        Divides the kernel's width; more shows peaks that lie closer together.
 
     Returns
     -------
@@ -449,8 +461,9 @@ def find_contrast_peaks(size: FloatArray, errors: FloatArray) -> list[Peak]:
     low, high = np.quantile(x, [0.25, 0.75])
     spread = min(float(x.std()), float(high - low) / 1.349) or float(x.std())
     h = 0.4 * spread * x.size**-0.2
-    if (sigma > 0).any():
-        h = max(h, 0.4 * float(np.median(sigma)))
+    if (sigma > 0).any():  # no peak is narrower
+        h = min(h, 0.6 * float(np.median(sigma)))
+    h /= detail
     grid = np.linspace(0.0, float(x.max()) + 4 * h, _GRID)
     edges = np.concatenate([grid - (grid[1] - grid[0]) / 2, [grid[-1] + (grid[1] - grid[0]) / 2]])
     counts = np.histogram(x, edges)[0]

@@ -10,6 +10,8 @@ from typing import Any
 
 from iscat_analysis.report.context import number
 
+_LEAST_SPECIES = 3  # events, as in the stage
+
 _COLUMNS = (
     {"label": "mass [kDa]", "numeric": True},
     {"label": "95 %", "numeric": True},
@@ -64,14 +66,17 @@ def distribution_section(found: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def _lead(found: Mapping[str, Any]) -> str:
-    count = len(found["species"])
-    rivals = [row["delta_bic"] for row in found["selection"] if row["species"] != count]
+    fitted = len(found["species"])
+    count = sum(item["count"] >= _LEAST_SPECIES - 0.5 for item in found["species"])
+    rivals = [row["delta_bic"] for row in found["selection"] if row["species"] != fitted]
     text = (
         f"{count} species explain {found['events']} events best (BIC), fitted to the events "
         "themselves, each with its own error."
         if count > 1
         else f"One species explains {found['events']} events best (BIC)."
     )
+    if count < fitted:
+        text += " What lies apart from them in one or two events is listed, and is no species."
     if rivals:
         text += f" The next best number is worse by {number(min(rivals), 2)};"
     support = found["support"]

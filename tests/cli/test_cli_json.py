@@ -56,6 +56,7 @@ def test_schemas_are_schemas() -> None:
 def test_the_schema_of_an_event_is_the_table() -> None:
     event = schema("fit")["properties"]["events"]["items"]
     assert event["required"] == list(EVENT_COLUMNS)
+    assert set(event["properties"]) - set(EVENT_COLUMNS) == {"frame_ci95"}  # landing movies
     assert event["properties"]["status"]["enum"] == [str(status) for status in Status]
     assert all(column["description"] for column in event["properties"].values())
 
@@ -72,6 +73,24 @@ def test_simulate_fit_and_summary(mode: str, setup, capsys, tmp_path) -> None:
     _check(summary, "summary")
     empty = found | {"events": [], "status": {}}
     _check(empty, "fit")
+
+
+def test_what_fit_prints_holds_the_summary() -> None:
+    printed, summary = schema("fit")["properties"], schema("summary")["properties"]
+    assert set(printed) - set(summary) == {"out"}
+    assert all(printed[key] == summary[key] for key in summary if key != "events")
+
+
+def test_landing_movies(sample_configs, capsys, tmp_path) -> None:
+    movie, config = str(tmp_path / "movie.tif"), str(sample_configs["landing"])
+    small = ["simulation.count=4", "simulation.leavings=1", "simulation.shape=[64, 64]"]
+    options = ["--config", config, *(f"--set={change}" for change in small)]
+    _check(_printed(capsys, "simulate", "--out", movie, *options), "simulate")
+    found = _printed(capsys, "fit", movie, *options, "--inject", "2")
+    _check(found, "fit")
+    _check({**found, "events": len(found["events"])}, "summary")
+    assert found["landing"]["landings"] > 0
+    assert set(found) <= set(schema("fit")["properties"])
 
 
 @pytest.mark.parametrize(

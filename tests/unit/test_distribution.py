@@ -108,6 +108,14 @@ def test_few_events_are_listed_and_not_described() -> None:
         json.dumps(found.to_dict())
 
 
+def test_one_event_apart_is_an_outlier() -> None:
+    mass, sigma = sample()
+    found = describe(np.append(mass, 400.0), np.append(sigma, 6.0), seed=1, draws=0)
+    assert found.species["count"].iloc[-1] == pytest.approx(1)
+    assert any("at 400 kDa is fewer than 3 events" in note for note in found.notes)
+    assert found.species["width_kda"].iloc[1] < 5  # and spoils no species
+
+
 def test_missing_values_are_left_out() -> None:
     mass, sigma = sample()
     mass[0], sigma[1], sigma[2] = math.nan, math.nan, 0.0

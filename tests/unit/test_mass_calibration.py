@@ -159,6 +159,16 @@ def test_prediction_intervals_hold_the_mass() -> None:
         found.prediction_interval(0.01, level=1.0)
 
 
+@pytest.mark.parametrize("known_errors", [False, True])
+def test_peaks_of_equal_size_far_apart_are_all_found(known_errors: bool) -> None:
+    """Three narrow peaks make the histogram wide, and the first kernel too."""
+    rng = np.random.default_rng(12)
+    contrast = np.concatenate([-3.1e-5 * m + 1.6e-4 * rng.standard_normal(48) for m in STANDARDS])
+    sigmas = np.full(contrast.shape, 1.6e-4) if known_errors else None
+    found = calibrate_mass(contrast, STANDARDS, sigmas=sigmas)
+    assert abs(found.gradient_per_kda + 3.1e-5) < 4 * math.sqrt(found.covariance[0, 0])
+
+
 def test_landing_and_leaving_weigh_the_same() -> None:
     for gradient in (GRADIENT, -GRADIENT):
         offset = math.copysign(OFFSET, -gradient)

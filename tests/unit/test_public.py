@@ -50,8 +50,10 @@ def result(movie, config) -> ia.Result:
 
 
 def _in_a_new_process(code: str) -> str:
+    # Old libraries may use what new ones deprecate.
+    strict = ["-W", "error", "-W", "default::DeprecationWarning"]
     return subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True
+        [sys.executable, *strict, "-c", code], capture_output=True, text=True, check=True
     ).stdout
 
 
