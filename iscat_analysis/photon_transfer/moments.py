@@ -1,0 +1,176 @@
+"""One stack read once: mean and variance of every pixel, and how it follows the laser."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.records import BoolArray, FloatArray, FrameSource
+
+_BLOCK_BYTES = 32 * 2**20
+_BINS = 32
+_MAD = 0.6744898
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Moments of one stack, per pixel [counts].
+
+    Attributes
+    ----------
+    mean, variance : ndarray, shape (y, x)
+        Over the frames; the variance without the laser's flicker where that was taken out.
+    slope, slope_variance : ndarray, shape (y, x)
+        Of the pixel against the mean frame, 1 on average; NaN where nothing flickers.
+    highest : ndarray, shape (y, x)
+        Largest count, of the stack's own type.
+    n_frames : int
+        Frames read.
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    slope: FloatArray
+    slope_variance: FloatArray
+    highest: NDArray[Any]
+    n_frames: int
+
+    @property
+    def relative_se(self) -> float:
+        """Standard error of one pixel's variance, relative (von Neumann et al., 1941)."""
+        return math.sqrt(3 * self.n_frames - 4) / (self.n_frames - 1)
+
+
+def blocks(stack: FrameSource) -> Iterator[tuple[int, int]]:
+    """Divide a stack into ranges of frames that fit into memory.
+
+    Parameters
+    ----------
+    stack : FrameSource
+        Of any length.
+
+    Yields
+    ------
+    start, stop : int
+        Half-open ranges, in order.
+    """
+    frames, rows, columns = stack.shape
+    size = max(2, _BLOCK_BYTES // (8 * rows * columns))
+    for start in range(0, frames, size):
+        yield start, min(start + size, frames)
+
+
+def robust_sigma(deviations: FloatArray) -> float:
+    """Estimate the standard deviation of normal deviations from their median size.
+
+    Parameters
+    ----------
+    deviations : ndarray
+        Distances from the centre, of either sign.
+
+    Returns
+    -------
+    float
+        Indifferent to a few outliers.
+    """
+    return float(np.median(np.abs(deviations))) / _MAD
+
+
+def brightness_bins(mean: FloatArray) -> list[NDArray[np.intp]]:
+    """Group pixels of like brightness, equally many in each group.
+
+    Parameters
+    ----------
+    mean : ndarray, shape (n,)
+        Of each pixel.
+
+    Returns
+    -------
+    list of ndarray of int
+        Indices into `mean`, by rising brightness.
+    """
+    return np.array_split(np.argsort(mean), max(1, min(_BINS, mean.size // 32)))
+
+
+def moments_of(
+    stack: FrameSource, used: BoolArray | None, advance: Callable[[int], None]
+) -> Moments:
+    """Measure mean and variance of every pixel; with `used`, the laser's flicker is taken out.
+
+    Parameters
+    ----------
+    stack : FrameSource
+        Read once, a block at a time.
+    used : ndarray of bool, shape (y, x), or None
+        Pixels whose mean is the laser's power; None for a dark.
+    advance : callable
+        Told how many more frames are done.
+
+    Returns
+    -------
+    Moments
+        Of every pixel, used or not.
+
+    Raises
+    ------
+    DataError
+        The counts are not finite, or successive frames are identical.
+
+    Notes
+    -----
+    Differences d_k of successive frames have the covariance v·(2, −1 beside the diagonal).  Their
+    regression on the differences D_k of the mean over `used` takes away DᵀMD/DᵀD of the 2(K − 1)
+    squares that are expected, with M that matrix; the mean carries 1/P of each pixel's noise.
+    """
+    frames, rows, columns = stack.shape
+    total = np.zeros((rows, columns))
+    squares = np.zeros((rows, columns))
+    product = np.zeros((rows, columns))
+    highest = stack.read(0, 1)[0]
+    flicker = []
+    last: FloatArray | None = None
+    for start, stop in blocks(stack):
+        counts = stack.read(start, stop)
+        if not np.isfinite(counts).all():
+            raise DataError(
+                f"{stack.name}: frames {start} to {stop - 1} hold NaN or infinity; give raw counts"
+            )
+        highest = np.maximum(highest, counts.max(axis=0))
+        block = counts.astype(np.float64)
+        total += block.sum(axis=0)
+        if last is not None:
+            block = np.concatenate([last[np.newaxis], block])
+        steps = np.diff(block, axis=0)
+        squares += np.einsum("kyx,kyx->yx", steps, steps)
+        if used is not None:
+            common = steps[:, used].mean(axis=1)
+            product += np.tensordot(common, steps, axes=1)
+            flicker.append(common)
+        last = block[-1]
+        advance(stop - start)
+    n = frames - 1
+    mean = total / frames
+    if used is None:
+        still, certain = np.ones_like(mean), np.zeros_like(mean)
+        return Moments(mean, squares / (2 * n), still, certain, highest, frames)
+    common = np.concatenate(flicker)
+    power = float(common @ common)
+    spread = 2 * power - 2 * float(common[:-1] @ common[1:])
+    if power <= 0:
+        raise DataError(
+            f"{stack.name}: successive frames are identical: this is not raw camera data"
+        )
+    pixels = int(np.count_nonzero(used))
+    variance = (squares - product**2 / power) / (2 * n - spread / power) / (1 - 1 / pixels)
+    own = 2 * n * variance / pixels
+    slope_power = power - float(own[used].mean())
+    usable = slope_power > 0.1 * power  # else the flicker is the frames' own noise
+    slope = (product - own) / slope_power if usable else np.full_like(mean, np.nan)
+    slope_variance = variance * spread / slope_power**2 if usable else np.full_like(mean, np.nan)
+    return Moments(mean, variance, slope, slope_variance, highest, frames)
