@@ -1,11 +1,66 @@
 """The command line: parses, makes one library call, prints.
 
 One file per command; `app` lists them.  Nothing of the library is imported before a command runs,
-so that ``--help`` and shell completion stay quick.
+so that ``--help`` and shell completion stay quick; and `app` itself only once Ctrl-C is expected.
 """
 
 from __future__ import annotations
 
-from iscat_cli.app import main, main_fit
+import os
+from collections.abc import Sequence
 
 __all__ = ["main", "main_fit"]
+
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `iscat`.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Without the program's name; default those of the process.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
+    return _start("main", arguments)
+
+
+def main_fit(arguments: Sequence[str] | None = None) -> int:
+    """Run `iscat-fit`, which is ``iscat fit``.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Without the program's name; default those of the process.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
+    return _start("main_fit", arguments)
+
+
+def _start(program: str, arguments: Sequence[str] | None) -> int:
+    try:
+        import signal
+        import threading
+
+        ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        ours = ours and threading.current_thread() is threading.main_thread()
+        if ours:  # nothing is there to be tidied yet, and an import may lose an exception
+            signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+        try:
+            from iscat_cli import app
+        finally:
+            if ours:
+                signal.signal(signal.SIGINT, signal.default_int_handler)
+        status: int = getattr(app, program)(arguments)
+    except KeyboardInterrupt:  # before a command began or after it ended
+        return INTERRUPTED
+    return status

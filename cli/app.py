@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from iscat_cli import INTERRUPTED
 from iscat_cli.benchmark import EXAMPLE as BENCHMARK_EXAMPLE
 from iscat_cli.benchmark import benchmark
 from iscat_cli.bounds import EXAMPLE as BOUNDS_EXAMPLE
@@ -21,7 +22,7 @@ from iscat_cli.calibrate import CAMERA_EXAMPLE, MASS_EXAMPLE, camera, mass
 from iscat_cli.calibrate import SUMMARY as CALIBRATE_SUMMARY
 from iscat_cli.config import EXAMPLE as CONFIG_EXAMPLE
 from iscat_cli.config import config
-from iscat_cli.console import INTERRUPTED, Messages
+from iscat_cli.console import UNEXPECTED, Messages, silence
 from iscat_cli.fit import EXAMPLE as FIT_EXAMPLE
 from iscat_cli.fit import fit
 from iscat_cli.simulate import EXAMPLE as SIMULATE_EXAMPLE
@@ -138,6 +139,7 @@ def _run(app: typer.Typer, program: str, arguments: list[str]) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     command = typer.main.get_command(app)
+    messages = Messages(program)
     try:
         status = command.main(
             args=arguments,
@@ -152,6 +154,14 @@ def _run(app: typer.Typer, program: str, arguments: list[str]) -> int:
         Messages(name).error(f"{_nearest(text)}; see {name} --help")
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):
-        Messages(program).error("interrupted")
+        messages.error("interrupted")
         return INTERRUPTED
+    except OSError as error:  # of help, version and completion: commands see to their own
+        silence(sys.stdout)
+        messages.error(f"this cannot be printed ({error.strerror})")
+        return UNEXPECTED
+    except SystemExit as end:  # how typer answers a reader who has left, which is no failure
+        if isinstance(end.__context__, BrokenPipeError):
+            return 0
+        raise
     return status or 0

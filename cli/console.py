@@ -20,13 +20,14 @@ from typing import TYPE_CHECKING, Any, TextIO
 import typer
 from rich.console import Console, RenderableType
 
+from iscat_cli import INTERRUPTED
+
 if TYPE_CHECKING:
     from rich.progress import Progress as Bars
     from rich.progress import TaskID
 
     from iscat_analysis.records import Progress
 
-INTERRUPTED = 130
 UNEXPECTED = 1
 SECONDS_TO_FIRST_LINE = 2.0
 SECONDS_BETWEEN_LINES = 10.0
@@ -321,18 +322,29 @@ def _write(stream: TextIO | None, text: str) -> None:
         stream.flush()
 
 
+def silence(stream: TextIO) -> None:
+    """Let a stream that cannot be written swallow what comes later, Python's last flush included.
+
+    Parameters
+    ----------
+    stream : text stream
+        With a file descriptor.
+    """
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+
+
 @contextmanager
 def _failing_once(stream: TextIO) -> Iterator[None]:
-    """Let a stream that cannot be written swallow what comes later, Python's last flush included.
+    """Silence a stream that cannot be written.
 
     A reader who has left is no failure, and there is nowhere to say that stderr fails.
     """
     try:
         yield
     except OSError as error:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())
-        os.close(nowhere)
+        silence(stream)
         if isinstance(error, BrokenPipeError) or stream is sys.stderr:
             return
         from iscat_analysis.errors import DataError

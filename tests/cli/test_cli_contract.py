@@ -385,15 +385,30 @@ def _python(code: str, **options: Any) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", code], **options)
 
 
-def test_a_reader_that_leaves_is_no_error() -> None:
-    code = "import sys, iscat_cli; sys.exit(iscat_cli.main(['config']))"
+COMMAND_LINES = [
+    [], ["--help"], ["--version"], ["fit", "--help"], ["simulate", "-h"], ["bounds", "-h"],
+    ["benchmark", "-h"], ["calibrate"], ["calibrate", "camera", "-h"], ["calibrate", "mass", "-h"],
+    ["config", "-h"], ["config"],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("arguments", COMMAND_LINES, ids=" ".join)
+def test_a_full_device_is_one_line_and_a_reader_that_leaves_none(arguments: list[str]) -> None:
+    code = f"import sys, iscat_cli; sys.exit(iscat_cli.main({arguments}))"
+    with Path("/dev/full").open("wb") as full:
+        process = _python(code, stdout=full, stderr=subprocess.PIPE)
+        _, err = process.communicate(timeout=60)
+    (line,) = err.decode().splitlines()
+    assert process.returncode == 1
+    assert "error: " in line
+    assert "printed (No space left on device)" in line
+
     reading, writing = os.pipe()
     os.close(reading)
     process = _python(code, stdout=writing, stderr=subprocess.PIPE)
     os.close(writing)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 0
-    assert err == b""
+    assert (process.returncode, err) == (0, b"")
 
 
 def test_a_terminal_that_knows_only_ascii_is_served() -> None:
@@ -473,3 +488,23 @@ def test_an_interrupt_is_one_line_and_130() -> None:
     assert process.returncode == 130
     assert out == b""
     assert err == b"iscat-fit: error: interrupted\n"
+
+
+INTERRUPTED_IMPORT = """
+import os, signal, sys
+class Finder:
+    def find_spec(self, name, *_):
+        if name == sys.argv[1]:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Finder())
+import iscat_cli
+sys.exit(iscat_cli.main(["bounds", "--set", "camera.pixel_size_nm=80"]))
+"""
+
+
+@pytest.mark.parametrize("module", ["typer", "rich.console", "pydantic", "numpy", "scipy"])
+def test_an_interrupt_during_imports_is_quiet_and_130(module: str) -> None:
+    arguments = [sys.executable, "-c", INTERRUPTED_IMPORT, module]
+    done = subprocess.run(arguments, capture_output=True, check=False)
+    assert (done.returncode, done.stdout) == (130, b"")
+    assert done.stderr in (b"", b"iscat bounds: error: interrupted\n")
