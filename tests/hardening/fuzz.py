@@ -1,6 +1,6 @@
 """Feed the readers files that were damaged at random, and say what broke.
 
-    python tests/hardening/fuzz.py --inputs 20000 --seed 1
+    python tests/hardening/fuzz.py --inputs 25000 --seed 1
 
 Each input is a small whole file (`samples`) after one to six mutations, made from the seed and its
 number alone, so ``--only N`` repeats input N.  A reader may return or raise `DataError`, with one
@@ -40,7 +40,7 @@ from iscat_analysis.load import open_stack
 
 MEMORY_MB = 512
 SECONDS = 60.0  # a guard against hanging; an input takes milliseconds
-KINDS = ("tiff", "mp", "h5", "csv")
+KINDS = ("tiff", "map", "mp", "h5", "csv")
 _INTERESTING = (
     0, 1, 2, 7, 8, 127, 128, 255, 256, 32767, 32768, 65535, 65536, 2**24, 2**31 - 1, 2**31,
     2**32 - 1, 2**32, 2**40, 2**62, 2**63 - 1, 2**63, 2**64 - 1,
@@ -262,7 +262,7 @@ def eval_text(outcome: str) -> str:
 def main() -> int:
     """Run the command line; 0 where nothing broke."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--inputs", type=int, default=20_000)
+    parser.add_argument("--inputs", type=int, default=25_000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--show", type=int, default=20, help="failures to print")
