@@ -238,11 +238,12 @@ def value_batch(
 ) -> None:
     """Fill `out` (n) with the log-likelihood at θ (n, 5); where z repeats, so does the profile."""
     work, profile = _scratch(axial, 4)
-    z = np.nan
+    z, known = np.nan, 0
     for k in range(thetas.shape[0]):
-        if thetas[k, 2] != z:
-            z = thetas[k, 2]
-            profile_at(axial, z, profile.shape[1], work, profile)
+        reach = _intervals(pixels, thetas[k], lens.inv_step)
+        if thetas[k, 2] != z or reach > known:
+            z, known = thetas[k, 2], reach
+            profile_at(axial, z, known, work, profile)
         out[k] = value_pass(profile, lens, pixels, kind, data, thetas[k])
 
 
