@@ -27,8 +27,9 @@ def schema(name: str) -> dict[str, Any]:
     Parameters
     ----------
     name : str
-        ``"fit"``, ``"simulate"`` or ``"bounds"`` for what the command prints with ``--json``;
-        ``"summary"`` or ``"benchmark"`` for the file of that name.
+        ``"fit"``, ``"simulate"`` or ``"bounds"`` for what the command prints with ``--json``, and
+        ``"comparison"`` for ``iscat bounds --preset``; ``"summary"``, ``"benchmark"``, ``"camera"``
+        or ``"calibration"`` for the file of that name and what is printed beside it.
 
     Returns
     -------

@@ -5,11 +5,16 @@ from __future__ import annotations
 import copy
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jsonschema
+import numpy as np
+import pandas as pd
 import pytest
+import tifffile
 
+from iscat_analysis.bounds.paper import table1
 from iscat_analysis.config import config_to_toml, load_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.records import EVENT_COLUMNS, Status
@@ -46,7 +51,9 @@ def _printed(capsys, *arguments: str) -> Any:
 
 
 def test_schemas_are_schemas() -> None:
-    assert set(schema_names()) == {"benchmark", "bounds", "fit", "simulate", "summary"}
+    assert set(schema_names()) == {
+        "benchmark", "bounds", "calibration", "camera", "comparison", "fit", "simulate", "summary",
+    }  # fmt: skip
     for name in schema_names():
         jsonschema.Draft202012Validator.check_schema(schema(name))
     with pytest.raises(ConfigError, match="there are benchmark, bounds"):
@@ -115,6 +122,52 @@ def test_benchmark(setup, capsys, tmp_path) -> None:
     _check(printed, "benchmark")
     written = json.loads((tmp_path / "study" / "benchmark.json").read_text(encoding="utf-8"))
     _check(written, "benchmark")
+
+
+def test_camera(setup, capsys, tmp_path) -> None:
+    movie, shade = tmp_path / "movie.tif", tmp_path / "dark.tif"
+    main(["simulate", "--config", str(setup), "--out", str(movie), "--quiet"])
+    dark = 100 + 4 * np.random.default_rng(1).standard_normal((60, 64, 64))
+    tifffile.imwrite(shade, np.rint(dark).astype("u2"))
+    for number, options in enumerate(
+        ([str(movie), "--offset", "0"], [str(movie)], ["--dark", str(shade)])
+    ):
+        out = tmp_path / str(number)
+        printed = _printed(capsys, "calibrate", "camera", *options, "--out", str(out))
+        _check(printed, "camera")
+        written = json.loads((out / "camera.json").read_text(encoding="utf-8"))
+        _check(written, "camera")
+        assert set(printed) | set(written) == set(schema("camera")["properties"])
+        with pytest.raises(jsonschema.ValidationError):
+            _check(printed | {"gain_e_per_adu": {"value": 1.0}}, "camera")
+
+
+def test_comparison(capsys, tmp_path, monkeypatch) -> None:
+    """The table alone: test_bounds makes the figures."""
+    found = SimpleNamespace(table=table1(), curves=None, images=None, quantum=None)
+    monkeypatch.setattr("iscat_analysis.bounds.paper.reproduce", lambda **_: found)
+    monkeypatch.setattr("iscat_analysis.report.bounds.write_paper", lambda *_, **__: None)
+    printed = _printed(capsys, "bounds", "--preset", "dong2021", "--out", str(tmp_path / "paper"))
+    _check(printed, "comparison")
+    with pytest.raises(jsonschema.ValidationError):
+        _check({"table_1": printed["table_1"][:4]}, "comparison")
+
+
+def test_calibration(capsys, tmp_path) -> None:
+    random = np.random.default_rng(1)
+    table = pd.DataFrame(0.0, index=range(180), columns=list(EVENT_COLUMNS))
+    mass = random.normal(np.repeat([66.0, 146.0, 480.0], 60), 8.0)
+    table = table.assign(mass_kda=mass, sigma_mass_kda=8.0, contrast=-3.1e-5 * mass, status="ok")
+    table.to_csv(tmp_path / "fits.csv", index=False)
+    out = tmp_path / "line"
+    arguments = ["calibrate", "mass", str(tmp_path / "fits.csv"), "--standards", "66,146,480"]
+    printed = _printed(capsys, *arguments, "--out", str(out))
+    _check(printed, "calibration")
+    written = json.loads((out / "calibration.json").read_text(encoding="utf-8"))
+    _check(written, "calibration")
+    assert set(printed) | set(written) == set(schema("calibration")["properties"])
+    with pytest.raises(jsonschema.ValidationError):
+        _check(printed | {"landing": "grey"}, "calibration")
 
 
 def test_the_schemas_refuse_what_is_wrong(setup, capsys, tmp_path) -> None:
