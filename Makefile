@@ -7,13 +7,13 @@ STAMP  := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 LOWEST := $(VENV)/lowest
 
-DEMO_CONFIG := sample_configs/mass.toml
+DEMO_CONFIG := sample_configs/landing.toml
 DEMO        := demo
 
 .PHONY: help install demo test test-lowest lint bench docs clean
 
 help:
-	@echo "make demo         simulate a movie, fit it, say where the report is"
+	@echo "make demo         simulate a landing movie, analyse it, say where the report is"
 	@echo "make test         style, types, architecture, docstrings, tests with coverage"
 	@echo "make test-lowest  the quick tests with the lowest versions that pyproject.toml admits"
 	@echo "make lint         the same without the tests"
