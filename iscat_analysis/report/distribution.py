@@ -10,8 +10,6 @@ from typing import Any
 
 from iscat_analysis.report.context import number
 
-_LEAST_SPECIES = 3  # events, as in the stage
-
 _COLUMNS = (
     {"label": "mass [kDa]", "numeric": True},
     {"label": "95 %", "numeric": True},
@@ -67,7 +65,7 @@ def distribution_section(found: Mapping[str, Any]) -> dict[str, Any] | None:
 
 def _lead(found: Mapping[str, Any]) -> str:
     fitted = len(found["species"])
-    count = sum(item["count"] >= _LEAST_SPECIES - 0.5 for item in found["species"])
+    count = sum(not item["outlier"] for item in found["species"])
     rivals = [row["delta_bic"] for row in found["selection"] if row["species"] != fitted]
     text = (
         f"{count} species explain {found['events']} events best (BIC), fitted to the events "

@@ -18,6 +18,8 @@ from iscat_analysis.distribution import (
     Efficiency,
     describe,
 )
+from iscat_analysis.distribution.events import Events
+from iscat_analysis.distribution.mixture import Mixture, detection_score
 
 
 def sample(seed: int = 1, n: int = 200) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -46,6 +48,31 @@ def test_the_likelihood_is_that_of_scipy_and_so_is_its_slope() -> None:
     assert found == pytest.approx(expected, rel=1e-12)
     theta = np.concatenate([np.log(weight), mean, variance])
     assert np.allclose(gradient.ravel(), approx_fprime(theta, value, 1e-6), rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("same_noise", [False, True])
+def test_what_detection_takes_off_is_that_of_scipy_and_so_is_its_slope(same_noise: bool) -> None:
+    x, sigma = np.abs(sample(n=40)[0]), sample(n=40)[1]
+    efficiency = Efficiency(5.0, 12.0 if same_noise else 6.0)
+    events = Events(x, sigma, efficiency)
+    theta = np.array([-1.2, -0.4, 50.0, 190.0, 9.0, 100.0])
+
+    def found(theta: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        mixture = Mixture(np.exp(theta[:2]), theta[2:4], theta[4:])
+        value, slopes = detection_score(mixture, events, efficiency)
+        return value, np.concatenate(slopes)
+
+    noise = np.maximum(sigma, efficiency.sigma_kda)
+    expected = np.log(
+        sum(
+            math.exp(w) * norm.sf(efficiency.threshold_kda, m, np.sqrt(v + noise**2))
+            for w, m, v in zip(theta[:2], theta[2:4], theta[4:], strict=True)
+        )
+    ).sum()
+    value, slope = found(theta)
+    assert value == pytest.approx(expected, rel=1e-10)
+    numerical = approx_fprime(theta, lambda theta: found(theta)[0], 1e-6)
+    assert np.allclose(slope, numerical, rtol=1e-4, atol=1e-4)
 
 
 def test_em_never_goes_down() -> None:
@@ -112,6 +139,7 @@ def test_one_event_apart_is_an_outlier() -> None:
     mass, sigma = sample()
     found = describe(np.append(mass, 400.0), np.append(sigma, 6.0), seed=1, draws=0)
     assert found.species["count"].iloc[-1] == pytest.approx(1)
+    assert found.species["outlier"].tolist() == [False, False, True]
     assert any("at 400 kDa is fewer than 3 events" in note for note in found.notes)
     assert found.species["width_kda"].iloc[1] < 5  # and spoils no species
 

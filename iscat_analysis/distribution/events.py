@@ -1,0 +1,103 @@
+"""What is seen, and the chance that a particle is seen at all."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import ndtr
+
+from iscat_analysis.records import FloatArray
+
+
+@dataclass(frozen=True)
+class Efficiency:
+    """The chance that a particle is detected.
+
+    Attributes
+    ----------
+    threshold_snr : float
+        u, the matched filter's threshold [standard deviations].
+    sigma_kda : float
+        σ_d, standard deviation of its estimate of mass [kDa].
+    """
+
+    threshold_snr: float
+    sigma_kda: float
+
+    def __post_init__(self) -> None:
+        if not (self.sigma_kda > 0 and math.isfinite(self.sigma_kda + self.threshold_snr)):
+            raise ValueError(
+                f"an efficiency needs a finite threshold and a positive sigma_kda, not "
+                f"{self.threshold_snr:g} and {self.sigma_kda:g}"
+            )
+
+    @property
+    def threshold_kda(self) -> float:
+        """Mass that is detected every other time [kDa]."""
+        return self.threshold_snr * self.sigma_kda
+
+    def __call__(self, mass_kda: ArrayLike) -> FloatArray:
+        """Probability of detection.
+
+        Parameters
+        ----------
+        mass_kda : array_like
+            |mass| [kDa].
+
+        Returns
+        -------
+        ndarray
+            Φ(m/σ_d − u).
+        """
+        mass = np.asarray(mass_kda, dtype=np.float64)
+        return np.asarray(ndtr(mass / self.sigma_kda - self.threshold_snr))
+
+    def extra_sigma(self, sigma: FloatArray) -> FloatArray:
+        """Noise of the filter's estimate beyond that of the fit.
+
+        Parameters
+        ----------
+        sigma : ndarray
+            σ_i, standard deviation of the fit's estimate [kDa].
+
+        Returns
+        -------
+        ndarray
+            √(σ_d² − σ_i²), or 0 [kDa].
+        """
+        return np.asarray(np.sqrt(np.maximum(self.sigma_kda**2 - sigma**2, 0.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """Events that were seen.
+
+    Attributes
+    ----------
+    x : ndarray, shape (n,)
+        |mass| [kDa].
+    sigma : ndarray, shape (n,)
+        Standard deviation of each [kDa].
+    efficiency : Efficiency or None
+        Of the detector; None where nothing was missed.
+    """
+
+    x: FloatArray
+    sigma: FloatArray
+    efficiency: Efficiency | None
+
+    @cached_property
+    def variance(self) -> FloatArray:
+        """σ_i², shape (n,) [kDa²]."""
+        return self.sigma**2
+
+    @cached_property
+    def filter_variance(self) -> FloatArray:
+        """s_i² of the estimate that decides on detection, (n, 1), or (1, 1) where all agree."""
+        least = self.efficiency.sigma_kda if self.efficiency else 0.0
+        s = np.maximum(self.sigma, least)[:, np.newaxis]
+        return np.asarray((s[:1] if np.all(s == s[:1]) else s) ** 2)
