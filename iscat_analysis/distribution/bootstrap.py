@@ -6,13 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import log_ndtr, ndtri_exp
 
 from iscat_analysis.distribution.events import Events
 from iscat_analysis.distribution.mixture import Mixture, climb, height, polish
 from iscat_analysis.distribution.search import joined_starts, split_starts
 from iscat_analysis.records import FloatArray
 
-_TRIES = 50
 _SUPPORT_DRAWS = 20
 _RIVAL_EVALUATIONS = 150
 
@@ -62,7 +62,7 @@ def bootstrap(
     rng = np.random.default_rng(seed)
     repeats, agreed = [], []
     for number in range(draws):
-        drawn = _draw(events, best, max(least, int(rng.poisson(events.x.size))), rng)
+        drawn = draw_events(events, best, max(least, int(rng.poisson(events.x.size))), rng)
         fit = polish(drawn, best)  # from the estimate, so that species keep their places
         repeats.append(Repeat(fit, fit.shares(drawn).sum(axis=0), fit.weight * fit.arrived(drawn)))
         if number < _SUPPORT_DRAWS:
@@ -73,27 +73,46 @@ def bootstrap(
     return repeats, float(np.mean(agreed)) if agreed else math.nan
 
 
-def _draw(events: Events, mixture: Mixture, wanted: int, rng: np.random.Generator) -> Events:
-    """Events as the mixture would give them, detected as the real ones were."""
-    xs: list[FloatArray] = []
-    sigmas: list[FloatArray] = []
-    have = 0
-    for _ in range(_TRIES):
-        size = 2 * wanted
-        species = rng.choice(mixture.weight.size, size, p=mixture.weight)
-        sigma = rng.choice(events.sigma, size)
-        true = rng.normal(mixture.mean[species], np.sqrt(mixture.variance[species]))
-        x = rng.normal(true, sigma)
-        if events.efficiency is not None:
-            estimate = rng.normal(x, events.efficiency.extra_sigma(sigma))
-            kept = estimate > events.efficiency.threshold_kda
-            x, sigma = x[kept], sigma[kept]
-        xs.append(np.abs(x))
-        sigmas.append(sigma)
-        have += x.size
-        if have >= wanted:
-            break
-    return Events(np.concatenate(xs)[:wanted], np.concatenate(sigmas)[:wanted], events.efficiency)
+def draw_events(events: Events, mixture: Mixture, n: int, rng: np.random.Generator) -> Events:
+    """Draw events as the mixture would give them, each detected and with a real event's noise.
+
+    Parameters
+    ----------
+    events : Events
+        Whose noise and detector to take.
+    mixture : Mixture
+        The species.
+    n : int
+        Events to draw.
+    rng : numpy.random.Generator
+        Random numbers.
+
+    Returns
+    -------
+    Events
+        Exactly n.
+
+    Notes
+    -----
+    Species and the filter's estimate y are drawn given detection, y > u·σ_d, and x given y: however
+    unlikely a species is to be seen, no draw is thrown away.
+    """
+    which = rng.integers(events.x.size, size=n)
+    sigma, efficiency = events.sigma[which], events.efficiency
+    blank = Events(np.zeros(n), sigma, efficiency)
+    seen = mixture.weight * mixture.chance(blank)
+    steps = np.cumsum(seen, axis=1) / seen.sum(axis=1, keepdims=True)
+    species = (rng.random((n, 1)) > steps[:, :-1]).sum(axis=1)
+    mean, spread = mixture.mean[species], mixture.variance[species] + blank.variance
+    if efficiency is None:
+        return Events(np.abs(rng.normal(mean, np.sqrt(spread))), sigma, None)
+    total = spread + efficiency.extra_sigma(sigma) ** 2
+    reach = np.sqrt(total)
+    tail = np.log1p(-rng.random(n)) + log_ndtr((mean - efficiency.threshold_kda) / reach)
+    estimate = -reach * ndtri_exp(tail)  # less the mean
+    left = np.sqrt(spread * (total - spread) / total)
+    x = rng.normal(mean + spread / total * estimate, left)
+    return Events(np.abs(x), sigma, efficiency)
 
 
 def _rivals(events: Events, fit: Mixture) -> list[Mixture]:

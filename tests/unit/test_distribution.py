@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
-from scipy.stats import norm
+from scipy.stats import ks_2samp, norm
 
 from iscat_analysis._kernels.mixture import mixture_em, mixture_score
 from iscat_analysis.distribution import (
@@ -18,6 +18,7 @@ from iscat_analysis.distribution import (
     Efficiency,
     describe,
 )
+from iscat_analysis.distribution.bootstrap import draw_events
 from iscat_analysis.distribution.events import Events
 from iscat_analysis.distribution.mixture import Mixture, detection_score
 
@@ -142,6 +143,35 @@ def test_one_event_apart_is_an_outlier() -> None:
     assert found.species["outlier"].tolist() == [False, False, True]
     assert any("at 400 kDa is fewer than 3 events" in note for note in found.notes)
     assert found.species["width_kda"].iloc[1] < 5  # and spoils no species
+
+
+def test_events_far_below_what_is_detected_stop_nothing() -> None:
+    mass, sigma = sample()
+    found = describe(
+        np.append(1.5 * mass, [0.5, 2.0]), np.append(sigma, [9.0, 9.0]),
+        efficiency=Efficiency(5.0, 12.0), seed=1, draws=10,
+    )  # fmt: skip
+    real = found.species[found.species["efficiency"] > 0.9]
+    assert (real["corrected_low"] < real["count_corrected"]).all()
+    assert (real["corrected_high"] > real["count_corrected"]).all()
+    assert any("rest on the detection model" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("efficiency", [None, Efficiency(5.0, 12.0), Efficiency(5.0, 7.0)])
+def test_a_drawn_event_is_one_that_was_drawn_and_then_detected(
+    efficiency: Efficiency | None,
+) -> None:
+    rng = np.random.default_rng(1)
+    mixture = Mixture(np.array([0.5, 0.5]), np.array([50.0, 70.0]), np.array([25.0, 100.0]))
+    for noise in (4.0, 9.0):  # below and above that of the filter
+        found = draw_events(Events(np.ones(1), np.array([noise]), efficiency), mixture, 20_000, rng)
+        species = rng.integers(2, size=100_000)
+        true = rng.normal(mixture.mean[species], np.sqrt(mixture.variance[species]))
+        x = rng.normal(true, noise)
+        if efficiency is not None:
+            extra = math.sqrt(max(efficiency.sigma_kda**2 - noise**2, 0.0))
+            x = x[rng.normal(x, extra) > efficiency.threshold_kda]
+        assert ks_2samp(found.x, np.abs(x)).pvalue > 1e-3
 
 
 def test_missing_values_are_left_out() -> None:
