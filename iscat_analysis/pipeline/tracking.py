@@ -106,8 +106,15 @@ def _link(table: pd.DataFrame, reach_nm: float) -> pd.Series[int]:
     import trackpy
 
     logging.getLogger("trackpy").setLevel(logging.WARNING)  # it reports every frame
-    positions = table[["x_nm", "y_nm", "frame"]]
-    linked = trackpy.link(
-        positions, search_range=reach_nm, memory=MEMORY, pos_columns=["x_nm", "y_nm"]
+    frames = range(int(table["frame"].min()), int(table["frame"].max()) + 1)
+    rows = [np.flatnonzero(table["frame"] == frame) for frame in frames]
+    places = table[["x_nm", "y_nm"]].to_numpy()
+    linked = trackpy.link_iter(
+        ((frame, places[here]) for frame, here in zip(frames, rows, strict=True)),
+        search_range=reach_nm,
+        memory=MEMORY,
     )
-    return linked["particle"].reindex(table.index).astype("int64")
+    tracks = pd.Series(0, index=table.index)
+    for here, (_, numbers) in zip(rows, linked, strict=True):
+        tracks.iloc[here] = numbers
+    return tracks

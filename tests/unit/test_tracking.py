@@ -1,0 +1,105 @@
+"""Particles that move: every frame fitted on its own, positions linked into tracks."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from scenes import PIXEL_NM, make_config
+
+from iscat_analysis.config import Config
+from iscat_analysis.forward import PixelGrid, forward_model
+from iscat_analysis.load import open_stack
+from iscat_analysis.pipeline import analyse, fit_stack
+from iscat_analysis.records import Analysis
+
+BEFORE, FRAMES, LEVEL_E, SIGMAS = 60, 30, 1e5, 4.0
+SHAPE = (60, 76)
+STARTS = ((1800.0, 1900.0, 150.0), (4400.0, 3000.0, 150.0))  # x, y, z [nm]
+MASSES = (3000.0, 5000.0)
+
+
+def _config() -> Config:
+    return make_config(
+        optics={"focus_nm": -500.0},
+        particle={"height_nm": 150.0, "mass_kda": 4000.0},
+        background={"frames": [0, BEFORE]},
+        fit={"mode": "track", "frames": None, "roi_nm": 2200.0, "z_range_nm": [0.0, 320.0]},
+        simulation={"shape": list(SHAPE)},
+    )
+
+
+def _movie(path: Path, hidden: tuple[int, ...] = ()) -> np.ndarray:
+    """Write a movie of two particles that diffuse; their paths, shape (2, frames, 3)."""
+    rng = np.random.default_rng(7)
+    steps = rng.normal(0, (40.0, 40.0, 4.0), (len(STARTS), FRAMES, 3))
+    paths = np.array(STARTS)[:, None] + np.cumsum(steps, axis=1)
+    grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
+    model = forward_model(_config(), grid.diagonal_nm)
+    counts = []
+    for frame in range(-BEFORE, FRAMES):
+        signal = np.zeros(SHAPE)
+        for number, (track, mass) in enumerate(zip(paths, MASSES, strict=True)):
+            if frame >= 0 and not (number == 0 and frame in hidden):
+                signal += model.image(grid, *track[frame], mass)
+        counts.append(rng.poisson(LEVEL_E * (1 + signal)))
+    tifffile.imwrite(path, np.array(counts, dtype=np.uint32), photometric="minisblack")
+    return paths
+
+
+def _errors(found: Analysis, paths: np.ndarray, name: str, axis: int) -> tuple[np.ndarray, Any]:
+    table = found.table
+    nearest = [
+        int(np.argmin(np.hypot(p.x_nm - paths[:, p.frame - BEFORE, 0],
+                               p.y_nm - paths[:, p.frame - BEFORE, 1])))
+        for p in table.itertuples()
+    ]  # fmt: skip
+    truth = paths[nearest, table["frame"] - BEFORE, axis]
+    return ((table[name] - truth) / table[f"sigma_{name}"]).to_numpy(), nearest
+
+
+def test_each_particle_is_one_track_with_standard_pulls(tmp_path: Path) -> None:
+    paths = _movie(tmp_path / "movie.tif")
+    found = fit_stack(tmp_path / "movie.tif", _config())
+    assert len(found.table) == 2 * FRAMES
+    assert (found.table.groupby("event")["frame"].nunique() == FRAMES).all()
+    assert (found.table["frame"].diff().dropna().isin([1, 1 - FRAMES])).all()
+    assert (found.table["status"] == "ok").mean() > 0.9
+    for axis, name in enumerate(("x_nm", "y_nm", "z_nm")):
+        pulls, nearest = _errors(found, paths, name, axis)
+        assert len(set(zip(found.table["event"], nearest, strict=True))) == len(STARTS)
+        assert abs(pulls.mean()) < SIGMAS / math.sqrt(pulls.size)
+        assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * pulls.size)
+    assert len(found.views) == len(STARTS)
+
+
+def test_a_track_outlives_frames_in_which_the_particle_is_not_seen(tmp_path: Path) -> None:
+    hidden = (11, 12)
+    _movie(tmp_path / "movie.tif", hidden)
+    table = fit_stack(tmp_path / "movie.tif", _config()).table
+    seen = sorted(table.groupby("event")["frame"].nunique())
+    assert seen == [FRAMES - len(hidden), FRAMES]
+
+
+def test_an_interrupt_keeps_the_frames_that_are_done(tmp_path: Path) -> None:
+    _movie(tmp_path / "movie.tif")
+
+    def stop(stage: str, done: int, _: int) -> None:
+        if stage == "track" and done == 5:
+            raise KeyboardInterrupt
+
+    with open_stack(tmp_path / "movie.tif") as movie:
+        found = analyse(movie, _config(), progress=stop)
+    assert found.summary["interrupted"]
+    assert sorted(found.table["frame"].unique()) == list(range(BEFORE, BEFORE + 5))
+
+
+def test_nothing_to_track_is_an_empty_table(tmp_path: Path) -> None:
+    flat = np.random.default_rng(1).poisson(LEVEL_E, (BEFORE + 5, *SHAPE)).astype(np.uint32)
+    tifffile.imwrite(tmp_path / "movie.tif", flat, photometric="minisblack")
+    found = fit_stack(tmp_path / "movie.tif", _config())
+    assert found.table.empty
+    assert not found.views
