@@ -174,7 +174,12 @@ def _text(value: object) -> str:
 
 
 def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
-    folder = write_benchmark(study, tmp_path / "out")
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "benchmark.json").write_text("{}")  # of an earlier study
+    with pytest.raises(DataError, match="overwrite"):
+        write_benchmark(study, folder)
+    assert write_benchmark(study, folder, overwrite=True) == folder
     assert {entry.name for entry in folder.iterdir()} == set(BENCHMARK_NAMES)
     plain = json.loads((folder / "benchmark.json").read_text(encoding="utf-8"))
     assert plain["mass"]["x_nm"]["crb"] == pytest.approx(study["mass"]["x_nm"]["crb"])
@@ -187,9 +192,6 @@ def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
     } <= drawn
     page = (folder / "benchmark.html").read_text(encoding="utf-8")
     assert "spread / CRB" in page
-    with pytest.raises(DataError, match="overwrite"):
-        write_benchmark(study, folder)
-    write_benchmark(study, folder, overwrite=True)
 
 
 def test_too_few_trials_are_refused() -> None:
