@@ -16,7 +16,6 @@ import statistics
 import subprocess
 import sys
 import time
-import venv
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 import numpy as np  # noqa: E402  # after the thread counts
+from _peer import peer_python  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent
 RESULTS = ROOT / "results"
@@ -61,17 +61,6 @@ def median_ms(call: Callable[[], object], repeats: int) -> float:
         call()
         times.append(time.perf_counter() - start)
     return 1e3 * statistics.median(times)
-
-
-def peer_python() -> Path:
-    """Make the peer's environment where it is missing."""
-    folder = RESULTS / "peer-env"
-    python = folder / ("Scripts" if os.name == "nt" else "bin") / "python"
-    if not python.exists():
-        print("installing", *PEER_PACKAGES, file=sys.stderr)
-        venv.create(folder, with_pip=True)
-        subprocess.run([str(python), "-m", "pip", "install", "--quiet", *PEER_PACKAGES], check=True)
-    return python
 
 
 def run_peer(python: Path) -> dict[str, float]:
@@ -157,7 +146,7 @@ def main() -> None:
     if not options.skip_peer:
         peers = []
         for _ in range(1 if options.quick else 3):
-            peers.append(run_peer(options.peer or peer_python()))
+            peers.append(run_peer(options.peer or peer_python("psf-generator", *PEER_PACKAGES)))
             again = model_figures(repeats)
             found = {key: min(found[key], value) for key, value in again.items()}
         # the peer's best against the model's best: a busy machine flatters nobody

@@ -18,7 +18,6 @@ import os
 import subprocess
 import sys
 import time
-import venv
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -26,6 +25,7 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 import numpy as np  # noqa: E402  # after the thread counts
+from _peer import peer_python  # noqa: E402
 
 from iscat_analysis.benchmark import Setting, make_setting, trial_generator  # noqa: E402
 from iscat_analysis.config import parse_config  # noqa: E402
@@ -71,17 +71,6 @@ for side, sigma in ((13, 1.3), (32, 4.0)):
     out[f"levenberg_{side}"] = count / (time.process_time() - begun)
 json.dump(out, sys.stdout)
 """
-
-
-def peer_python() -> Path:
-    """Make the peer's environment where it is missing."""
-    folder = RESULTS / "picasso-env"
-    python = folder / ("Scripts" if os.name == "nt" else "bin") / "python"
-    if not python.exists():
-        print("installing", PEER_PACKAGE, file=sys.stderr)
-        venv.create(folder, with_pip=True)
-        subprocess.run([str(python), "-m", "pip", "install", "--quiet", PEER_PACKAGE], check=True)
-    return python
 
 
 def run_peer(python: Path, count: int) -> dict[str, float]:
@@ -204,7 +193,7 @@ def main() -> None:
     python = None
     if not options.skip_peer:
         try:
-            python = options.peer or peer_python()
+            python = options.peer or peer_python("picasso", PEER_PACKAGE)
         except (OSError, subprocess.CalledProcessError) as error:
             print(f"{PEER_PACKAGE} cannot be installed here: {error}", file=sys.stderr)
     peer: dict[str, float] = {}

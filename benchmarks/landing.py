@@ -1,14 +1,15 @@
 """Landing movies: speed of the whole job, of the sliding ratio beside PiSCAT's, peak memory.
 
-    python benchmarks/landing.py [--quick] [--peer PYTHON] [--seed N]
+    python benchmarks/landing.py [--quick] [--peer PYTHON] [--skip-peer] [--seed N]
 
 The whole job is ``iscat fit`` on a TIFF of 256 × 256 × 4 000 frames with 300 landings and 60
 leavings, report included, in a process of its own: megabytes of input per second and peak memory.
 The sliding ratio is everything up to the contrast after over before: ours at every boundary of a
 quarter of a window, PiSCAT's differential rolling average at every frame, as each needs it to find
 particles; both on the same frames in memory, 100 frames before and after, best of several.
-``--peer`` is the Python of an environment with PiSCAT (``pip install piscat PyWavelets``); without
-it the same algorithm is run from this file: running sums of two batches, a frame in and one out.
+PiSCAT lives in an environment of its own under ``benchmarks/results``, made on the first run;
+``--peer`` names a Python that has it.  With ``--skip-peer`` the same algorithm is run from this
+file: running sums of two batches, a frame in and one out.
 Exit status 1 where a promise is broken; ``--quick`` takes a small movie and judges nothing.
 """
 
@@ -27,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from _peer import peer_python
 
 from iscat_analysis._kernels.sliding import contrast_map
 from iscat_analysis.background import find_defects
@@ -41,6 +43,7 @@ RESULTS = ROOT / "results"
 CONFIG = ROOT.parent / "sample_configs" / "landing.toml"
 JOB_MB_PER_S, RATIO, MEMORY_MB = 60.0, 5.0, 1000.0
 WINDOW = 100
+PEER_PACKAGES = ("piscat==0.2.5", "PyWavelets")
 
 PEER = """
 import sys, time, json, warnings
@@ -105,7 +108,7 @@ def rolling_average(video: np.ndarray, window: int) -> None:
         out[i], first[i] = two - one, one
 
 
-def sliding_ratio(frames: int, side: int, peer: str | None) -> dict[str, float | str]:
+def sliding_ratio(frames: int, side: int, peer: Path | None) -> dict[str, float | str]:
     """Frames per second of both, in turns."""
     config = load_config(CONFIG, [f"simulation.shape=[{side}, {side}]"])
     template = make_landing_scene(config, (side, side), searches=1).templates.images[0]
@@ -139,7 +142,7 @@ def sliding_ratio(frames: int, side: int, peer: str | None) -> dict[str, float |
         matched()
         ratio = [_seconds(ratio_only) for _ in range(3)]
         if peer:
-            command = [peer, "-c", PEER, str(frames), str(side), str(WINDOW)]
+            command = [str(peer), "-c", PEER, str(frames), str(side), str(WINDOW)]
             environment = {**os.environ, "QT_QPA_PLATFORM": "offscreen"}
             done = subprocess.run(
                 command, check=True, capture_output=True, text=True, env=environment
@@ -167,13 +170,15 @@ def _seconds(job: Callable[[], Any]) -> float:
 def main() -> int:
     parser = argparse.ArgumentParser(description="Landing movies: speed and memory.")
     parser.add_argument("--quick", action="store_true", help="a small movie, no judgement")
-    parser.add_argument("--peer", metavar="PYTHON", help="of an environment with PiSCAT")
+    parser.add_argument("--peer", type=Path, help="a Python that has PiSCAT")
+    parser.add_argument("--skip-peer", action="store_true")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
+    peer = None if options.skip_peer else options.peer or peer_python("piscat", *PEER_PACKAGES)
     settings = ["simulation.shape=[256, 256]", "simulation.frames=4000"]
     settings += ["simulation.count=300", "simulation.leavings=60"]
     numbers: dict[str, Any] = {
-        "sliding_ratio": sliding_ratio(300 if options.quick else 600, 256, options.peer)
+        "sliding_ratio": sliding_ratio(300 if options.quick else 600, 256, peer)
     }
     with tempfile.TemporaryDirectory() as name:
         numbers["whole_job"] = whole_job(

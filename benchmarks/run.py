@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent
 
 
 def main() -> int:
-    scripts = {path.stem: path for path in sorted(ROOT.glob("*.py")) if path.stem != "run"}
+    scripts = {path.stem: path for path in sorted(ROOT.glob("[a-z]*.py")) if path.stem != "run"}
     parser = argparse.ArgumentParser(description="Run the benchmarks.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(scripts))
     parser.add_argument("--quick", action="store_true", help="rough numbers in a few minutes")
