@@ -130,27 +130,27 @@ class _Lines:
         self._lock = threading.Lock()
         self._said = ""
         self._stage = ""
-        self._begun = self._due = 0.0
-        self._begin("", time.monotonic())
-
-    def _begin(self, stage: str, now: float) -> None:
-        self._stage, self._begun, self._due = stage, now, now + SECONDS_TO_FIRST_LINE
+        self._first = (0.0, 0)  # when the stage first reported, and how much was done
+        self._due = time.monotonic() + SECONDS_TO_FIRST_LINE
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         with self._lock:
             now = time.monotonic()
             if stage != self._stage:
-                self._begin(stage, self._begun if not self._stage else now)
+                if self._stage:
+                    self._due = now + SECONDS_TO_FIRST_LINE
+                self._stage, self._first = stage, (now, done)
             text = f"{stage}: {done} of {total}"
             if done < total:
                 if now < self._due:
                     return
                 self._due = now + SECONDS_BETWEEN_LINES
-                if done:
-                    left = (now - self._begun) * (total - done) / done
+                begun, known = self._first
+                if done > known:
+                    left = (now - begun) * (total - done) / (done - known)
                     text += f", about {duration(left)} left"
             else:
-                self._begin("", now)
+                self._stage, self._due = "", now + SECONDS_TO_FIRST_LINE
             if text == self._said:  # a stage that is run again has said so already
                 return
             self._said = text

@@ -168,11 +168,12 @@ class Movie:
     @property
     def truth(self) -> pd.DataFrame:
         """What was put into the movie."""
+        peaks = self._peak_contrasts() if self._model.rho else {}
         rows = [
             (
                 i, p.frame, p.leave, p.x_px, p.y_px, p.x_px * self._pixel_nm,
                 p.y_px * self._pixel_nm, p.z_nm, p.mass_kda,
-                self._model.peak_contrast(p.z_nm, p.mass_kda) if self._model.rho else None,
+                peaks.get((p.z_nm, p.mass_kda)),
             )
             for i, p in enumerate(self.particles)
         ]  # fmt: skip
@@ -278,10 +279,14 @@ class Movie:
             self._config.simulation.photons_per_pixel, self._pixel_nm
         )
 
+    def _peak_contrasts(self) -> dict[tuple[float, float], float]:
+        """Peak contrast for every height and mass that occurs."""
+        kinds = {(p.z_nm, p.mass_kda) for p in self.particles}
+        return {kind: self._model.peak_contrast(*kind) for kind in kinds}
+
     def _check_range(self) -> None:
         camera = self._camera
-        peaks = (self._model.peak_contrast(p.z_nm, p.mass_kda) for p in self.particles)
-        peak = max((0.0, *peaks))
+        peak = max((0.0, *self._peak_contrasts().values()))
         level = float(self.background_e.max())
         top = level * (1 + peak) if self._model.rho else level + self._signal_scale * peak
         top *= float(self.power.max())
