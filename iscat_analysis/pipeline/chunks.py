@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from iscat_analysis.background import find_defects
 from iscat_analysis.camera import Camera, check_counts
 from iscat_analysis.config import Config
+from iscat_analysis.drift import measure_drift
 from iscat_analysis.errors import DataError
 from iscat_analysis.pipeline.field import Scene
 from iscat_analysis.pipeline.results import table_of
@@ -33,7 +34,6 @@ from iscat_analysis.sliding import (
     choose_window,
     longest_window,
     make_chunk,
-    measure_drift,
     measure_frames,
     measure_noise,
 )
