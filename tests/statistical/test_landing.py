@@ -15,9 +15,9 @@ from iscat_analysis.config import Config, load_config
 from iscat_analysis.fit import fit_particle
 from iscat_analysis.forward import PixelGrid
 from iscat_analysis.likelihood import conditional
+from iscat_analysis.pipeline.bias import unbiased
 from iscat_analysis.pipeline.chunks import FRAME_COLUMN
 from iscat_analysis.pipeline.landing import analyse_landings, make_landing_scene
-from iscat_analysis.pipeline.steps import unbiased
 from iscat_analysis.records import Candidate
 from iscat_analysis.simulate import Movie
 

@@ -1,0 +1,220 @@
+"""Steps and what they do to each other's light.
+
+A neighbour that lands or leaves in the frames of a step enters its likelihood through ρ, pixel by
+pixel: the factor (1 + φ_a C)/(1 + φ_b C), φ the share of the light of the frames after and before
+in which it is there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iscat_analysis.forward import PixelGrid
+from iscat_analysis.pipeline.field import Region, Scene
+from iscat_analysis.records import Candidate, FloatArray
+from iscat_analysis.sliding import Chunk, StepFrame
+
+LARGEST_IMAGE = 3.5
+"""Regions from the centre to the edge of a strong particle's image; the rings go on, faintly."""
+
+_FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is enough
+_WEAK = 0.05  # contrast up to which several add up
+
+
+@dataclass(frozen=True)
+class Step:
+    """One particle that lands or leaves.
+
+    Attributes
+    ----------
+    sign : int
+        1 where it lands, −1 where it leaves.
+    at : StepFrame
+        When.
+    start : Candidate
+        Where, and its mass (positive); `snr` is that of the search.
+    corner : (int, int)
+        Row and column of the first pixel of `image`.
+    image : ndarray
+        Its contrast around it.
+    theta : ndarray, shape (5,), or None
+        Latest estimate.
+    snr : float
+        √(2 Δℓ) of it against no particle, with the neighbours in place.
+    """
+
+    sign: int
+    at: StepFrame
+    start: Candidate
+    corner: tuple[int, int]
+    image: FloatArray
+    theta: FloatArray | None = None
+    snr: float = math.inf
+
+
+class Neighbours:
+    """Which steps see each other, and how.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models; `wide` reaches over a step's image.
+    chunk : Chunk
+        The frames.
+    window : int
+        Frames before and after a step.
+    """
+
+    def __init__(self, scene: Scene, chunk: Chunk, window: int) -> None:
+        self._scene = scene
+        self._chunk = chunk
+        self._window = window
+        self._roi_px = scene.roi_px
+        nominal = scene.model.material.mass_kda
+        self._contrast_per_kda = (
+            scene.model.peak_contrast(scene.config.particle.height_nm, nominal) / nominal
+        )
+        self._power = np.concatenate([[0.0], np.cumsum(chunk.power)])
+
+    def drawn(self, step: Step) -> Step:
+        """Draw the step's contrast anew."""
+        scene, start = self._scene, step.start
+        half = self._half(step)
+        sides = []
+        for centre, size in zip((start.y_px, start.x_px), self._chunk.shape, strict=True):
+            middle = round(centre)
+            sides.append((max(middle - half, 0), min(middle + half + 1, size)))
+        grid = PixelGrid.region(sides[0], sides[1], scene.pixel_nm)
+        pixel = scene.pixel_nm
+        image = scene.wide.image(
+            grid, start.x_px * pixel, start.y_px * pixel, start.z_nm, start.mass_kda
+        )
+        return replace(step, corner=(sides[0][0], sides[1][0]), image=image)
+
+    def _half(self, step: Step) -> int:
+        """From the centre to the edge of a step's image [pixels]; strong rings reach far."""
+        return round(self._roi_px * min(max(step.start.snr / _FAINT_SNR, 1.0), LARGEST_IMAGE))
+
+    def overlaps(self, step: Step, start: int, stop: int) -> bool:
+        """Whether a step lies inside frames relative to the chunk."""
+        return start < step.at.frame - self._chunk.first < stop
+
+    def _presence(self, step: Step, frames: slice) -> float:
+        """Share of the frames' light that shines while the particle is there."""
+        power = self._power
+        whole = power[frames.stop] - power[frames.start]
+        if whole <= 0:
+            return 0.0
+        turn = min(max(step.at.frame - self._chunk.first, frames.start), frames.stop)
+        later = (power[frames.stop] - power[turn]) / whole
+        return float(later if step.sign > 0 else 1 - later)
+
+    def factor(self, step: Step, image: FloatArray, before: slice, after: slice) -> FloatArray:
+        """Light after over light before that a step's particle makes, pixel by pixel."""
+        factor: FloatArray = (1 + self._presence(step, after) * image) / (
+            1 + self._presence(step, before) * image
+        )
+        return factor
+
+    def change(self, step: Step, before: slice, after: slice) -> FloatArray:
+        """Contrast that a step's particle makes between two ranges of frames."""
+        image = step.image
+        if abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK:
+            return self.factor(step, image, before, after) - 1
+        return (self._presence(step, after) - self._presence(step, before)) * image
+
+    def of(self, steps: Sequence[Step]) -> tuple[list[list[int]], list[list[int]]]:
+        """For each step, others that its fit should know of, and those that it depends on."""
+        x, y, frame = (
+            np.array(values, dtype=float)
+            for values in zip(
+                *((s.start.x_px, s.start.y_px, s.at.frame) for s in steps), strict=True
+            )
+        )
+        reach = np.array([self._half(s) for s in steps]) + self._roi_px / 2 + 2
+        seen, bound = [], []
+        for i in range(len(steps)):
+            dt = np.abs(frame - frame[i])
+            dx, dy = np.abs(x - x[i]), np.abs(y - y[i])
+            near = (dt < 3 * self._window) & (np.maximum(dx, dy) < reach)
+            near[i] = False
+            seen.append([int(k) for k in np.flatnonzero(near)])
+            near &= (dt < 2 * self._window) & (np.hypot(dx, dy) < self._roi_px / 2)
+            bound.append([int(k) for k in np.flatnonzero(near)])
+        return seen, bound
+
+    def shared(self, step: Step, region: Region) -> tuple[Region, FloatArray] | None:
+        """Part of a step's image inside a region."""
+        rows, columns = spans(step.corner, step.image.shape)
+        top, bottom = max(rows[0], region.rows[0]), min(rows[1], region.rows[1])
+        left, right = max(columns[0], region.columns[0]), min(columns[1], region.columns[1])
+        if top >= bottom or left >= right:
+            return None
+        inside = step.image[
+            top - rows[0] : bottom - rows[0], left - columns[0] : right - columns[0]
+        ]
+        return Region((top, bottom), (left, right)), inside
+
+
+def region_around(side: int, shape: tuple[int, int], start: Candidate) -> Region:
+    """Place the square that is fitted.
+
+    Parameters
+    ----------
+    side : int
+        Its side [pixels].
+    shape : (int, int)
+        Rows and columns of the field.
+    start : Candidate
+        Its centre.
+
+    Returns
+    -------
+    Region
+        Cut at the edges of the field.
+    """
+    sides = []
+    for centre, size in zip((start.y_px, start.x_px), shape, strict=True):
+        first = round(centre - (side - 1) / 2)
+        sides.append((max(first, 0), min(first + side, size)))
+    return Region(sides[0], sides[1])
+
+
+def spans(
+    corner: tuple[int, int], shape: tuple[int, ...]
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Rows and columns that an image covers.
+
+    Parameters
+    ----------
+    corner : (int, int)
+        Row and column of its first pixel.
+    shape : tuple of int
+        Its rows and columns.
+
+    Returns
+    -------
+    rows, columns : (int, int)
+        Half-open.
+    """
+    return (corner[0], corner[0] + shape[0]), (corner[1], corner[1] + shape[1])
+
+
+def distance_px(one: Step, two: Step) -> float:
+    """Distance between two steps.
+
+    Parameters
+    ----------
+    one, two : Step
+        The steps.
+
+    Returns
+    -------
+    float
+        In the plane [pixels].
+    """
+    return math.hypot(one.start.x_px - two.start.x_px, one.start.y_px - two.start.y_px)
