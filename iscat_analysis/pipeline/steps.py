@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.fit import fit_particle, search_box, start_theta
+from iscat_analysis.fit import POOR_FIT_P, fit_particle, search_box, start_theta
 from iscat_analysis.pipeline.bias import unbiased
 from iscat_analysis.pipeline.field import Event, Region, Scene
 from iscat_analysis.pipeline.neighbours import (
@@ -50,6 +50,7 @@ ROUNDS = 6
 """Searches at most; each takes what was found so far off the contrast."""
 
 _SWEEPS = 2  # fits of what has neighbours, with everything else in place
+_MOST_SWEEPS = 8  # while neighbours are still dated anew
 _SIDELOBE = 0.5  # of a stronger peak, below which a peak in its region waits for the next round
 _FAR_LOBE = 0.05  # the same where only its outer rings reach
 _RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
@@ -151,12 +152,14 @@ class ChunkFitter:
             steps = steps + fresh
             seen, bound = self._neighbours.of(steps)
             chosen = set(range(known, len(steps)))
-            for _ in range(_SWEEPS):
-                steps = self._improve(steps, chosen, seen)
-                chosen = {
-                    i for i, others in enumerate(bound)
-                    if others and (i >= known or max(others) >= known)
+            for sweep in range(1, _MOST_SWEEPS + 1):
+                improved = self._improve(steps, chosen, seen)
+                moved = {
+                    i for i, (old, new) in enumerate(zip(steps, improved, strict=True))
+                    if old.at.frame != new.at.frame or (sweep < _SWEEPS and i in chosen)
                 }  # fmt: skip
+                steps = improved
+                chosen = {i for i, others in enumerate(bound) if moved.intersection(others)}
                 if not chosen:
                     break
             credible = self._credible(steps)
@@ -247,7 +250,7 @@ class ChunkFitter:
         start = Candidate(
             peak.x_px, peak.y_px, scene.config.particle.height_nm, mass, abs(peak.snr)
         )
-        at = StepFrame(peak.frame, self._stride, 1.0, 1.0)
+        at = StepFrame(peak.frame, self._stride, 1.0, 1.0, 1.0)
         return self._neighbours.drawn(Step(sign, at, start, (0, 0), np.empty((0, 0))))
 
     # ---- one step --------------------------------------------------------------------------
@@ -341,11 +344,12 @@ def _judged(scene: Scene, fit: FitResult, task: Task) -> FitResult:
     rows, columns = np.nonzero(task.windows.saturated)
     dx = (columns + task.region.columns[0]) * scene.pixel_nm - fit.x_nm
     dy = (rows + task.region.rows[0]) * scene.pixel_nm - fit.y_nm
+    poor = Status.POOR_FIT in fit.flags or task.at.p_constant < POOR_FIT_P
     flags = [
         *([Status.SATURATED] if np.any(np.hypot(dx, dy) < _SATURATION_NM) else []),
         *(f for f in fit.flags if f != Status.POOR_FIT),
         *([Status.TOO_CLOSE] if task.crowded else []),
-        *(f for f in fit.flags if f == Status.POOR_FIT),
+        *([Status.POOR_FIT] if poor else []),
     ]
     return replace(fit, status=Status(flags[0]) if flags else Status.OK, flags=tuple(flags))
 

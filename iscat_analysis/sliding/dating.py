@@ -8,7 +8,7 @@ interval (D. V. Hinkley, Biometrika 57, 1, 1970).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,12 +36,16 @@ class StepFrame:
         Step in units of the template that was used.
     per_frame_snr : float
         Its height over the noise of one frame.
+    p_constant : float
+        Chance that a height which is constant before the step and after it changes as much as
+        this one does within either side.
     """
 
     frame: int
     half_width: int
     height: float
     per_frame_snr: float
+    p_constant: float
 
     @property
     def gap(self) -> int:
@@ -99,7 +103,7 @@ def locate_step(
     inside = (frames >= search[0]) & (frames < search[1]) & usable
     if not inside.any():
         middle = int(np.clip((search[0] + search[1]) // 2, frames[0], frames[-1]))
-        return StepFrame(middle, search[1] - search[0], 0.0, 0.0)
+        return StepFrame(middle, search[1] - search[0], 0.0, 0.0, 1.0)
     log = np.where(inside, gain_in_log, -np.inf)
     best = int(np.argmax(log))
     posterior = np.exp(log - log[best])
@@ -109,7 +113,33 @@ def locate_step(
     held = np.cumsum(posterior[order])
     half_width = int(distance[order][np.searchsorted(held, CREDIBLE * (1 - 1e-12))])
     height = float(jump[best])
-    return StepFrame(int(frames[best]), half_width, height, abs(height) * math.sqrt(scale))
+    found = StepFrame(int(frames[best]), half_width, height, abs(height) * math.sqrt(scale), 1.0)
+    turn = best + 1
+    sides = (slice(0, max(turn - found.gap, 0)), slice(turn + found.gap, None))
+    p = min(_p_constant(heights[side], weight[side]) for side in sides)
+    return replace(found, p_constant=1 - (1 - p) ** 2)
+
+
+def _p_constant(heights: FloatArray, weight: FloatArray) -> float:
+    """Chance that constant heights, of variance 1/weight, seem to change as much at some frame.
+
+    Notes
+    -----
+    Tail of the likelihood ratio of one change of mean anywhere: B. James, K. L. James and
+    D. Siegmund, Biometrika 74, 71 (1987), eq. (4).
+    """
+    lit = weight > 0
+    heights, weight = heights[lit], weight[lit]
+    if heights.size < 3:
+        return 1.0
+    n, total = np.cumsum(weight), np.cumsum(weight * heights)
+    before, after = n[:-1], n[-1] - n[:-1]
+    jump = (total[-1] - total[:-1]) / after - total[:-1] / before
+    b = math.sqrt(float(np.max(before * after / n[-1] * jump**2)))
+    density = math.exp(-0.5 * b * b) / math.sqrt(2 * math.pi)
+    widest = 2 * math.log(heights.size - 1)  # ln of the odds of the last split over the first
+    tail = density * ((b - 1 / b) * widest + 4 / b) if b > 1 else 1.0
+    return min(tail, 1.0)
 
 
 def crosstalk(patch: Patch, image: FloatArray, other: FloatArray) -> float:

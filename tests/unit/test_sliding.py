@@ -12,6 +12,7 @@ from iscat_analysis.camera import Camera
 from iscat_analysis.sliding import (
     Chunk,
     NoiseCurve,
+    Patch,
     choose_window,
     crosstalk,
     find_steps,
@@ -207,6 +208,31 @@ def test_a_neighbour_that_is_known_does_not_pull_the_frame() -> None:
     known = height * (np.arange(60) >= 38)
     assert locate_step(patch, image[12:25, 14:27], (15, 50), known=known).frame == 30
     assert height == pytest.approx(np.sum(image * other) / np.sum(image**2), abs=0.15)
+
+
+def _inconstant(again: float, count: int = 400, level: float = 0.01) -> int:
+    """Of `count` steps, those that seem to change again, where a second lands on top at 42."""
+    image = _spot(18, 20, -0.1)[12:25, 14:27]
+    background = 1e4 * np.random.default_rng(2).uniform(0.8, 1.2, image.shape)
+    height = np.where(np.arange(60) >= 30, 1.0, 0.0) + np.where(np.arange(60) >= 42, again, 0.0)
+    rng = np.random.default_rng(6)
+    few = 0
+    for _ in range(count):
+        counts = rng.poisson(background * (1 + height[:, None, None] * image)).astype("u2")
+        nothing = np.ones(image.shape, dtype=bool)
+        patch = Patch(0, counts, np.ones(60, bool), np.ones(60), 1.0, 0.0, 0.0, background, nothing)
+        few += locate_step(patch, image, (15, 46)).p_constant < level
+    return few
+
+
+def test_a_constant_height_seldom_seems_to_change() -> None:
+    """The chance is a bound: 1 % of 400 are 4, more than 12 come once in 10 000."""
+    assert _inconstant(0.0) <= 12
+
+
+def test_a_second_step_on_top_is_noticed() -> None:
+    """Control: the chance falls where the height does change, by 6 standard deviations here."""
+    assert _inconstant(0.1) > 360
 
 
 # ---- noise and windows -----------------------------------------------------------------------
