@@ -260,8 +260,8 @@ def _target(config: Config, text: str) -> dict[str, Any]:
 
 def _paper(messages: Messages, out: Path, *, overwrite: bool, as_json: bool) -> None:
     from iscat_analysis.bounds.paper import FIELD_NM, reproduce
-    from iscat_analysis.report.bounds import PAPER_FILES, write_paper
     from iscat_analysis.report.output import check_output
+    from iscat_analysis.report.paper import PAPER_FILES, write_paper
 
     check_output(out, overwrite, known=PAPER_FILES)
     with messages.progress() as progress:

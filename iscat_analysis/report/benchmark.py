@@ -18,8 +18,8 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.report.context import LABELS, UNITS
-from iscat_analysis.report.figures import _STYLE, BLUE, INK, VERMILLION, _figure, _save
 from iscat_analysis.report.page import render_page
+from iscat_analysis.report.style import BLUE, INK, STYLE, VERMILLION, new_figure, save_figure
 
 BENCHMARK_NAMES = frozenset({"benchmark.json", "benchmark.html", "config.toml", "figures"})
 """Everything `write_benchmark` leaves in its folder."""
@@ -301,7 +301,7 @@ def draw_benchmark(study: Mapping[str, Any], folder: Path) -> None:
         Made if absent.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         for mode in MODES:
             if mode not in study:
                 continue
@@ -316,7 +316,7 @@ def draw_benchmark(study: Mapping[str, Any], folder: Path) -> None:
 
 def _panels(stem: Path, mode: str, draw: Callable[[Axes, str], None]) -> None:
     names = FREE_PARAMETERS[mode]
-    figure = _figure(2.9 * len(names), 2.9, layout="constrained")
+    figure = new_figure(2.9 * len(names), 2.9)
     for position, name in enumerate(names):
         axes = figure.add_subplot(1, len(names), position + 1)
         draw(axes, name)
@@ -325,7 +325,7 @@ def _panels(stem: Path, mode: str, draw: Callable[[Axes, str], None]) -> None:
             axes.set_ylabel("")
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=len(labels), fontsize=8)
-    _save(figure, stem)
+    save_figure(figure, stem)
 
 
 def _draw_curve(axis: str, curve: Mapping[str, Any], axes: Axes, name: str) -> None:

@@ -10,7 +10,6 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -33,6 +32,16 @@ from iscat_analysis.report.pack import (
     display_range,
     residual_limit,
 )
+from iscat_analysis.report.style import (
+    BLUE,
+    GREY,
+    INK,
+    PURPLE,
+    STYLE,
+    VERMILLION,
+    new_figure,
+    save_figure,
+)
 from iscat_analysis.report.tables import event_table
 
 EVENT_FIGURES = 50
@@ -44,26 +53,7 @@ CORNER_FIGURES = 20
 NUMBERED_EVENTS = 100
 """Events in the overview that may carry their number; the others are rings only."""
 
-DPI = 140
-"""Resolution of the PNG files."""
-
-VERMILLION, BLUE, PURPLE, GREY, INK = "#D55E00", "#0072B2", "#CC79A7", "#8A8F96", "#1B1D21"
 DIVERGING = LinearSegmentedColormap.from_list("residual", ["#00528C", "#FAFAF8", "#BE4600"])
-
-_STYLE: Any = {
-    "font.size": 9,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": GREY,
-    "axes.labelcolor": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "legend.frameon": False,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "iscat-analysis",
-}
 
 
 def write_figures(
@@ -92,16 +82,16 @@ def write_figures(
     folder.mkdir(parents=True, exist_ok=True)
     table = event_table(analysis)
     free = FREE_PARAMETERS[analysis.mode]
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         if np.asarray(analysis.ratio_image).size:
-            _save(_overview(analysis, table), folder / "overview")
+            save_figure(_overview(analysis, table), folder / "overview")
         if np.asarray(analysis.power).size > 1:
-            _save(_power(analysis), folder / "power")
+            save_figure(_power(analysis), folder / "power")
         main = "mass_kda" if "mass_kda" in free else "z_nm"
         if np.isfinite(table[main].to_numpy(float)).any():
             name = "mass_histogram" if main == "mass_kda" else "height_histogram"
-            _save(_histogram(table, main), folder / name)
-            _save(_precision(table, free), folder / "precision")
+            save_figure(_histogram(table, main), folder / name)
+            save_figure(_precision(table, free), folder / "precision")
         drawn = analysis.views[:events]
         names: set[str] = set()
         for view in drawn:
@@ -109,33 +99,22 @@ def write_figures(
             if name in names:  # a track has one view for each of its frames
                 name += f"_{sum(known.startswith(name) for known in names) + 1}"
             names.add(name)
-            _save(_triptych(view, analysis), folder / name)
+            save_figure(_triptych(view, analysis), folder / name)
         sampled = [
             (view, view.posterior)
             for view in analysis.views
             if view.posterior is not None and view.posterior.converged
         ][:CORNER_FIGURES]
         for view, posterior in sampled:
-            _save(_corner(posterior, view.event), folder / f"corner_{view.event:04d}")
+            save_figure(_corner(posterior, view.event), folder / f"corner_{view.event:04d}")
     return {"events": len(drawn), "corners": len(sampled)}
-
-
-def _figure(width: float, height: float, **options: Any) -> Figure:
-    figure = Figure(figsize=(width, height), **options)
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _save(figure: Figure, stem: Path) -> None:
-    figure.savefig(stem.with_suffix(".png"), dpi=DPI, pil_kwargs={"compress_level": 3})
-    figure.savefig(stem.with_suffix(".svg"), metadata={"Date": None})
 
 
 def _overview(analysis: Analysis, table: pd.DataFrame) -> Figure:
     image = np.asarray(analysis.ratio_image, float)
     rows, columns = image.shape
     height = float(np.clip(6.4 * rows / columns, 2.5, 9.0))
-    figure = _figure(7.4, height + 0.5, layout="constrained")
+    figure = new_figure(7.4, height + 0.5)
     axes = figure.add_subplot()
     low, high = display_range([image], analysis.scheme)
     shown = axes.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
@@ -202,7 +181,7 @@ def _scale_bar(axes: Axes, columns: int, rows: int, pixel_size_nm: float) -> Non
 
 
 def _power(analysis: Analysis) -> Figure:
-    figure = _figure(7.0, 2.6, layout="constrained")
+    figure = new_figure(7.0, 2.6)
     axes = figure.add_subplot()
     axes.axhline(1.0, color=GREY, lw=0.8, ls="--")
     axes.plot(analysis.power_frames, analysis.power, color=BLUE, lw=0.8)
@@ -216,7 +195,7 @@ def _histogram(table: pd.DataFrame, name: str) -> Figure:
     good = (table["status"] == Status.OK.value).to_numpy()
     bins = int(np.clip(2 * np.sqrt(finite.sum()), 10, 60))
     edges = np.histogram_bin_edges(values[finite], bins=bins)
-    figure = _figure(5.4, 3.4, layout="constrained")
+    figure = new_figure(5.4, 3.4)
     axes = figure.add_subplot()
     groups = [values[finite & good], values[finite & ~good]]
     axes.hist(
@@ -230,7 +209,7 @@ def _histogram(table: pd.DataFrame, name: str) -> Figure:
 
 
 def _precision(table: pd.DataFrame, free: Sequence[str]) -> Figure:
-    figure = _figure(3.3 * len(free), 3.5, layout="constrained")
+    figure = new_figure(3.3 * len(free), 3.5)
     good = (table["status"] == Status.OK.value).to_numpy()
     for place, name in enumerate(free):
         axes = figure.add_subplot(1, len(free), place + 1)
@@ -274,7 +253,7 @@ def _plain_log_ticks(axes: Axes) -> None:
 def _triptych(view: EventView, analysis: Analysis) -> Figure:
     rows, columns = view.contrast.shape
     aspect = float(np.clip(rows / columns, 0.3, 3.0))
-    figure = _figure(8.4, 2.55 * aspect + 1.0)
+    figure = new_figure(8.4, 2.55 * aspect + 1.0, constrained=False)
     low, high = display_range([view.contrast, view.model], analysis.scheme)
     limit = residual_limit(view.residual)
     unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
@@ -303,7 +282,7 @@ def _triptych(view: EventView, analysis: Analysis) -> Figure:
 def _corner(posterior: PosteriorResult, event: int) -> Figure:
     flat = posterior.samples.reshape(-1, len(posterior.names))
     n = len(posterior.names)
-    figure = _figure(1.9 * n + 0.6, 1.9 * n + 0.6)
+    figure = new_figure(1.9 * n + 0.6, 1.9 * n + 0.6, constrained=False)
     grid = figure.subplots(n, n, squeeze=False, gridspec_kw={"wspace": 0.08, "hspace": 0.08})
     figure.subplots_adjust(left=0.14, right=0.98, bottom=0.12, top=0.93)
     ends = []

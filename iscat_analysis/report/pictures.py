@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, PosteriorResult, Status
 from iscat_analysis.report import figures
+from iscat_analysis.report.style import STYLE
 from iscat_analysis.report.tables import event_table
 
 
@@ -171,7 +172,7 @@ def _movie(analysis: Analysis) -> str:
 
 
 def _shown(make: Callable[[], Figure]) -> Figure:
-    with mpl.rc_context(figures._STYLE):
+    with mpl.rc_context(STYLE):
         figure = make()
     # A notebook asks an object for its picture; pyplot, with its global state, is not needed.
     setattr(figure, "_repr_png_", functools.partial(_png, figure))  # noqa: B010

@@ -1,0 +1,333 @@
+"""Figures of Dong et al. (2021), each drawn twice: in the authors' convention, and exactly.
+
+Everything arrives as tables; nothing is computed here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from iscat_analysis.records import FloatArray
+from iscat_analysis.report.style import BLUE, GREY, INK, VERMILLION, log_y, new_figure
+
+SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "dark field"}
+SCHEME_COLORS = {"iscat": BLUE, "cobri": VERMILLION, "darkfield": INK}
+SCHEME_THEME = {"iscat": "qcrb", "cobri": "sigma", "darkfield": "ink"}
+SHADES = ("#1B1D21", "#0072B2", "#009E73", "#D55E00", "#B5578C")
+SHADE_THEME = ("ink", "qcrb", "ok", "sigma", "flag")
+CONVENTIONS = {"dong2021": "Authors' convention", "exact": "Exact"}
+
+
+@dataclass(frozen=True)
+class Panel:
+    """How one of D21's panels is drawn.
+
+    Attributes
+    ----------
+    title, x_label, y_label : str
+        Words.
+    log : bool
+        Logarithmic y axis.
+    quantities : tuple of str
+        The quantities shown; the CSV has all.
+    bound : int or None
+        Index of the quantum bound drawn dashed.
+    by_attenuation : bool
+        Curves are attenuations of one scheme instead of schemes.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    log: bool
+    quantities: tuple[str, ...]
+    bound: int | None = None
+    by_attenuation: bool = False
+
+
+_Z, _F = "height z [nm]", "focus height [nm]"
+_MASS = "σ of mass / mass, one photon"
+PANELS = {
+    "2b": Panel("Fig. 2b: on-axis phase", _Z, "phase [rad]", False, ("phase",)),
+    "2c": Panel("Fig. 2c: on-axis signal over noise", _Z, "SNR of one pixel, one photon", False,
+                ("snr",)),
+    "2d": Panel("Fig. 2d: transverse precision", _Z, "σ of x, one photon [nm]", True, ("x",), 0),
+    "2e": Panel("Fig. 2e: axial precision", _Z, "σ of z, one photon [nm]", True, ("z",), 2),
+    "3": Panel("Fig. 3: mass", _F, _MASS, True, ("mass", "mass joint"), 3),
+    "4a": Panel("Fig. 4a: axial precision, COBRI attenuated", _Z, "σ of z, one photon [nm]", True,
+                ("z",), 2, True),
+    "4b": Panel("Fig. 4b: axial precision, iSCAT attenuated", _Z, "σ of z, one photon [nm]", True,
+                ("z",), 2, True),
+    "4c": Panel("Fig. 4c: mass, COBRI attenuated", _F, _MASS, True, ("mass",), 3, True),
+    "4d": Panel("Fig. 4d: mass, iSCAT attenuated", _F, _MASS, True, ("mass",), 3, True),
+}  # fmt: skip
+"""D21's panels but 2a."""
+
+QUANTITY_LABELS = {
+    "x": "σ of x [nm]",
+    "y": "σ of y [nm]",
+    "z_iscat": "σ of z, iSCAT [nm]",
+    "z_cobri": "σ of z, COBRI [nm]",
+    "mass": "σ of mass / mass",
+}
+WAYS = {
+    "printed": "printed",
+    "authors": "authors' program",
+    "dong2021": "their formulas, exact integrals",
+    "exact": "exact",
+    "reciprocal": "exact, energy conserved",
+}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One curve of a panel.
+
+    Attributes
+    ----------
+    name : str
+        Its legend.
+    x, y : ndarray, shape (n,)
+        Its points.
+    color, theme : str
+        Its colour in print, and the name of that in a page's theme.
+    dashed : bool
+        How it is drawn.
+    """
+
+    name: str
+    x: FloatArray
+    y: FloatArray
+    color: str
+    theme: str
+    dashed: bool
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A quantum bound, drawn across a panel.
+
+    Attributes
+    ----------
+    name : str
+        Its legend.
+    value : float
+        Where it lies.
+    color, theme : str
+        As in `Curve`.
+    """
+
+    name: str
+    value: float
+    color: str
+    theme: str
+
+
+def curves_of(panel: str, rows: pd.DataFrame, convention: str) -> list[Curve]:
+    """Gather the curves of a panel.
+
+    Parameters
+    ----------
+    panel : str
+        A key of `PANELS`.
+    rows : pandas.DataFrame
+        Its curves, as in `write_paper`.
+    convention : str
+        A key of `CONVENTIONS`.
+
+    Returns
+    -------
+    list of Curve
+        In the order of the legend.
+    """
+    spec, found = PANELS[panel], []
+    rows = rows[(rows["convention"] == convention) & rows["quantity"].isin(spec.quantities)]
+    keys = ["attenuation", "quantity"] if spec.by_attenuation else ["scheme", "quantity"]
+    if spec.by_attenuation:
+        rows = rows.sort_values("attenuation", ascending=False, kind="stable")
+    for number, (key, group) in enumerate(rows.groupby(keys, sort=False)):
+        first, quantity = key
+        joint = str(quantity).endswith("joint")
+        if joint and first != "iscat":
+            continue  # as in D21; the CSV has all three
+        if spec.by_attenuation and first == 0:
+            name, color, theme = "dark field", GREY, "plain"
+        elif spec.by_attenuation:
+            name, color, theme = f"β = {first:g}", SHADES[number], SHADE_THEME[number]
+        else:
+            name, color, theme = SCHEMES[first], SCHEME_COLORS[first], SCHEME_THEME[first]
+        found.append(
+            Curve(
+                f"{name}, with z unknown" if joint else name,
+                group["x"].to_numpy(float), group["value"].to_numpy(float), color, theme, joint,
+            )
+        )  # fmt: skip
+    return found
+
+
+def limits_of(
+    panel: str, quantum: Mapping[tuple[str, str], FloatArray], convention: str
+) -> list[Limit]:
+    """Gather the quantum bounds of a panel.
+
+    Parameters
+    ----------
+    panel : str
+        A key of `PANELS`.
+    quantum : mapping
+        As in `write_paper`.
+    convention : str
+        A key of `CONVENTIONS`.
+
+    Returns
+    -------
+    list of Limit
+        None where the panel shows none.
+    """
+    spec = PANELS[panel]
+    if spec.bound is None:
+        return []
+    if spec.bound == 2:
+        schemes = {"4a": ("cobri",), "4b": ("iscat",)}.get(panel, ("iscat", "cobri"))
+        return [
+            Limit(
+                f"quantum bound, {SCHEMES[s]}", float(quantum[convention, s][2]),
+                GREY if spec.by_attenuation else SCHEME_COLORS[s],
+                "plain" if spec.by_attenuation else SCHEME_THEME[s],
+            )
+            for s in schemes
+        ]  # fmt: skip
+    value = float(quantum[convention, "iscat"][spec.bound])
+    return [Limit("quantum bound", value, GREY, "plain")]
+
+
+def panel_figure(
+    panel: str, rows: pd.DataFrame, quantum: Mapping[tuple[str, str], FloatArray]
+) -> Figure:
+    """Draw a panel, both conventions side by side.
+
+    Parameters
+    ----------
+    panel : str
+        A key of `PANELS`.
+    rows : pandas.DataFrame
+        Its curves, as in `write_paper`.
+    quantum : mapping
+        As in `write_paper`.
+
+    Returns
+    -------
+    Figure
+        With one y axis for both.
+    """
+    spec = PANELS[panel]
+    figure = new_figure(9.2, 3.9)
+    both = figure.subplots(1, 2, sharey=True, sharex=True)
+    for axes, (convention, title) in zip(both, CONVENTIONS.items(), strict=True):
+        for c in curves_of(panel, rows, convention):
+            dash = (4, 2) if c.dashed else (None, None)
+            axes.plot(c.x, c.y, color=c.color, lw=1.4, label=c.name, dashes=dash)
+        for limit in limits_of(panel, quantum, convention):
+            axes.axhline(limit.value, color=limit.color, lw=1.1, dashes=(1.5, 2), label=limit.name)
+        axes.set_title(title)
+        axes.set_xlabel(spec.x_label)
+        axes.margins(x=0.01)
+    if spec.log:
+        log_y(both[0])
+    both[0].set_ylabel(spec.y_label)
+    handles, labels = both[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)))
+    figure.suptitle(spec.title, x=0.01, ha="left", fontsize=11, fontweight="bold")
+    return figure
+
+
+def images_figure(images: Mapping[tuple[str, float], FloatArray], field_nm: float) -> Figure:
+    """Draw figure 2a: one row per scheme, each with its own grey scale.
+
+    Parameters
+    ----------
+    images : mapping
+        As in `write_paper`.
+    field_nm : float
+        Side of the images [nm].
+
+    Returns
+    -------
+    Figure
+        One column per height.
+    """
+    schemes = list(dict.fromkeys(scheme for scheme, _ in images))
+    heights = list(dict.fromkeys(z for _, z in images))
+    figure = new_figure(1.75 * len(heights) + 1.3, 1.75 * len(schemes) + 0.4)
+    grid = figure.subplots(len(schemes), len(heights), squeeze=False)
+    half = field_nm / 2000
+    for row, scheme in enumerate(schemes):
+        low = min(float(images[scheme, z].min()) for z in heights)
+        high = max(float(images[scheme, z].max()) for z in heights)
+        for column, z in enumerate(heights):
+            axes = grid[row, column]
+            shown = axes.imshow(
+                images[scheme, z], cmap="gray", vmin=low, vmax=high, interpolation="nearest",
+                extent=(-half, half, -half, half),
+            )  # fmt: skip
+            axes.set_xticks([])
+            axes.set_yticks([])
+            for spine in axes.spines.values():
+                spine.set_visible(False)
+            if row == 0:
+                axes.set_title(f"z = {z / 1000:g} µm", loc="center")
+        grid[row, 0].set_ylabel(SCHEMES[scheme])
+        bar = figure.colorbar(shown, ax=grid[row, :], shrink=0.85, pad=0.01, aspect=14)
+        bar.ax.ticklabel_format(axis="y", scilimits=(-2, 3))
+        bar.outline.set_visible(False)
+    grid[-1, 0].plot([-half + 0.3, -half + 1.3], [-half + 0.35] * 2, color="white", lw=2.5)
+    grid[-1, 0].text(
+        -half + 0.8, -half + 0.5, "1 µm", color="white", ha="center", va="bottom", fontsize=8
+    )
+    return figure
+
+
+def table_figure(table: pd.DataFrame) -> Figure:
+    """Draw Table 1.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        As in `write_paper`.
+
+    Returns
+    -------
+    Figure
+        One line per length, a mark for each way to compute it.
+    """
+    figure = new_figure(7.4, 3.0)
+    axes = figure.subplots()
+    rows = table[table["unit"] == "nm"]
+    marks = {"printed": ("s", GREY), "authors": ("x", GREY), "dong2021": ("+", INK),
+             "exact": ("o", BLUE), "reciprocal": ("D", VERMILLION)}  # fmt: skip
+    for number, (way, (mark, color)) in enumerate(marks.items()):
+        at = np.arange(len(rows)) + 0.13 * (number - 2)
+        axes.plot(rows[way], at, mark, color=color, label=WAYS[way], ms=6, mew=1.4)
+    for y, (printed, exact) in enumerate(zip(rows["printed"], rows["exact"], strict=True)):
+        axes.text(
+            1.02, y, f"printed {printed:g}\nexact {exact:.1f}", va="center", fontsize=8,
+            transform=axes.get_yaxis_transform(),
+        )  # fmt: skip
+    axes.set_yticks(range(len(rows)), [QUANTITY_LABELS[q].split(" [")[0] for q in rows["quantity"]])
+    axes.invert_yaxis()
+    axes.set_xscale("log")
+    axes.set_xlim(15, 150)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel("quantum bound of one collected photon [nm]")
+    axes.grid(axis="x", color="#E7E4DD", lw=0.8)
+    axes.set_axisbelow(True)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
+    return figure
