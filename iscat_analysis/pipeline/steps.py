@@ -49,8 +49,7 @@ from iscat_analysis.sliding import (
 ROUNDS = 6
 """Searches at most; each takes what was found so far off the contrast."""
 
-_SWEEPS = 2  # fits of what has neighbours, with everything else in place
-_MOST_SWEEPS = 8  # while neighbours are still dated anew
+_SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
 _SIDELOBE = 0.5  # of a stronger peak, below which a peak in its region waits for the next round
 _FAR_LOBE = 0.05  # the same where only its outer rings reach
 _RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
@@ -152,12 +151,9 @@ class ChunkFitter:
             steps = steps + fresh
             seen, bound = self._neighbours.of(steps)
             chosen = set(range(known, len(steps)))
-            for sweep in range(1, _MOST_SWEEPS + 1):
+            for _ in range(_SWEEPS):
                 improved = self._improve(steps, chosen, seen)
-                moved = {
-                    i for i, (old, new) in enumerate(zip(steps, improved, strict=True))
-                    if old.at.frame != new.at.frame or (sweep < _SWEEPS and i in chosen)
-                }  # fmt: skip
+                moved = {i for i in chosen if _has_moved(steps[i], improved[i])}
                 steps = improved
                 chosen = {i for i, others in enumerate(bound) if moved.intersection(others)}
                 if not chosen:
@@ -352,6 +348,14 @@ def _judged(scene: Scene, fit: FitResult, task: Task) -> FitResult:
         *([Status.POOR_FIT] if poor else []),
     ]
     return replace(fit, status=Status(flags[0]) if flags else Status.OK, flags=tuple(flags))
+
+
+def _has_moved(old: Step, new: Step) -> bool:
+    """Whether a fit changed what the neighbours see by more than its error."""
+    if old.theta is None or old.at.frame != new.at.frame:
+        return True
+    tolerance = max(old.start.mass_kda, new.start.mass_kda) / max(new.snr, 1.0)
+    return abs(new.start.mass_kda - old.start.mass_kda) > tolerance
 
 
 def _apart(one: Step, two: Step) -> int:

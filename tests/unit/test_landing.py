@@ -195,14 +195,14 @@ def test_a_window_ends_where_a_close_neighbour_lands() -> None:
     assert set(table["status"]) == {"ok"}
 
 
-@pytest.mark.parametrize("leave", [173, 177, 181])
-def test_a_short_visit_is_weighed_while_it_lasts(leave: int) -> None:
-    """The leaving is dated anew after the landing was first fitted up to it."""
-    config = _config(events=[(152, leave, 30.2, 31.7, 480.0)])
-    table = _run(np.array(list(Movie(config, leave).frames(2))), config)[0].table
-    assert table["frame"].tolist() == [152, leave]
-    assert table["n_after"].tolist() == [leave - 152, 40]
-    assert table["n_before"].tolist() == [40, leave - 152]
+@pytest.mark.parametrize(("land", "leave"), [(159, 171), (163, 183), (163, 191)])
+def test_a_short_visit_is_weighed_while_it_lasts(land: int, leave: int) -> None:
+    """Where one step is dated anew, the other's window has to follow."""
+    config = _config("background.window_frames=100", events=[(land, leave, 30.2, 31.7, 480.0)])
+    table = _run(np.array(list(Movie(config, land).frames(2))), config)[0].table
+    assert table["frame"].tolist() == [land, leave]
+    assert table["n_after"].tolist() == [leave - land, 100]
+    assert table["n_before"].tolist() == [100, leave - land]
     pulls = (table["mass_kda"].abs() - 480) / table["sigma_mass_kda"]
     assert pulls.abs().max() < 4.5
 
