@@ -17,7 +17,7 @@ from iscat_analysis.bounds import EventBounds, Experiment, plan
 from iscat_analysis.config import Config
 from iscat_analysis.forward import PixelGrid
 from iscat_analysis.likelihood import Likelihood
-from iscat_analysis.pipeline.field import Region, Scene, make_scene, region_likelihood
+from iscat_analysis.pipeline.scene import Region, Scene, make_scene, region_likelihood
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Candidate, FloatArray, Windows
 
 CLEARANCE = 8.0

@@ -23,10 +23,11 @@ from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.likelihood import compile_kernels
 from iscat_analysis.load import Stack, open_stack
-from iscat_analysis.pipeline.field import Scene, field_likelihood, fit_field, make_scene
+from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.landing import analyse_landings, has_landings, inject_and_recover
 from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
 from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
+from iscat_analysis.pipeline.scene import Scene, field_likelihood, make_scene
 from iscat_analysis.pipeline.tracking import track_particles
 from iscat_analysis.posterior import sample_posterior
 from iscat_analysis.records import (

@@ -17,8 +17,8 @@ from iscat_analysis.camera import Camera, check_counts
 from iscat_analysis.config import Config
 from iscat_analysis.drift import measure_drift
 from iscat_analysis.errors import DataError
-from iscat_analysis.pipeline.field import Scene
 from iscat_analysis.pipeline.results import table_of
+from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import (
     BoolArray,
     EventView,

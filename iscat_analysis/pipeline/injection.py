@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from iscat_analysis.camera import Camera
 from iscat_analysis.forward import PixelGrid
 from iscat_analysis.pipeline.chunks import FRAME_COLUMN, Frames
-from iscat_analysis.pipeline.field import Scene
 from iscat_analysis.pipeline.neighbours import LARGEST_IMAGE
+from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import FloatArray, Status
 
 STAY = 3

@@ -37,11 +37,11 @@ from iscat_analysis.pipeline.chunks import (
     choose_windows,
     plan_chunks,
 )
-from iscat_analysis.pipeline.field import Scene
 from iscat_analysis.pipeline.injection import InjectedMovie, draw_particles, recovery
 from iscat_analysis.pipeline.neighbours import LARGEST_IMAGE
 from iscat_analysis.pipeline.results import Row, table_of, view_of
 from iscat_analysis.pipeline.resume import Store
+from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
 from iscat_analysis.posterior import sample_posterior
 from iscat_analysis.records import EventView, FloatArray, Progress, Windows

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iscat_analysis.forward import PixelGrid
-from iscat_analysis.pipeline.field import Region, Scene
+from iscat_analysis.pipeline.scene import Region, Scene
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.sliding import Chunk, StepFrame
 

@@ -13,7 +13,8 @@ import pandas as pd
 from iscat_analysis.bounds import EventBounds, event_bounds
 from iscat_analysis.distribution import Efficiency, describe
 from iscat_analysis.likelihood import LEVEL
-from iscat_analysis.pipeline.field import Event, Scene, photons_scale
+from iscat_analysis.pipeline.field import Event
+from iscat_analysis.pipeline.scene import Scene, photons_scale
 from iscat_analysis.records import (
     EVENT_COLUMNS,
     FREE_PARAMETERS,

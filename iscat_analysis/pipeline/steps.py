@@ -18,7 +18,7 @@ import numpy as np
 
 from iscat_analysis.fit import POOR_FIT_P, fit_particle, search_box, start_theta
 from iscat_analysis.pipeline.bias import unbiased
-from iscat_analysis.pipeline.field import Event, Region, Scene
+from iscat_analysis.pipeline.field import Event
 from iscat_analysis.pipeline.neighbours import (
     LARGEST_IMAGE,
     Neighbours,
@@ -26,6 +26,7 @@ from iscat_analysis.pipeline.neighbours import (
     distance_px,
     spans,
 )
+from iscat_analysis.pipeline.scene import Region, Scene
 from iscat_analysis.pipeline.tasks import Task, TaskBuilder
 from iscat_analysis.records import (
     FREE_PARAMETERS,

@@ -13,8 +13,8 @@ import numpy as np
 
 from iscat_analysis.forward import PixelGrid
 from iscat_analysis.likelihood import Likelihood, conditional
-from iscat_analysis.pipeline.field import Region, Scene
 from iscat_analysis.pipeline.neighbours import Neighbours, Step, distance_px, region_around
+from iscat_analysis.pipeline.scene import Region, Scene
 from iscat_analysis.records import Windows
 from iscat_analysis.sliding import Chunk, Patch, StepFrame, crosstalk, locate_step
 

@@ -11,7 +11,7 @@ from microscopes import setting
 from iscat_analysis.benchmark import Setting, run_trials, trial_generator
 from iscat_analysis.fit import fit_particle
 from iscat_analysis.likelihood import Likelihood
-from iscat_analysis.pipeline.field import Region
+from iscat_analysis.pipeline.scene import Region
 from iscat_analysis.records import PARAMETERS, Candidate, FitResult, FloatArray, Status
 
 SEED = 77

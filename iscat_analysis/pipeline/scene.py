@@ -1,0 +1,261 @@
+"""What a configuration makes of a movie: models, matched filter, likelihoods of its pixels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from iscat_analysis.background import smooth_background
+from iscat_analysis.config import Config, Detection
+from iscat_analysis.detect import Templates, make_templates
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.fit import window_nm
+from iscat_analysis.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.likelihood import Likelihood, conditional, poisson
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Windows
+
+SPREAD_NM = 10_000.0
+"""Farther than this from a particle its rings are left out; they are 1e-4 of its peak."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """Half-open ranges of full-frame pixels."""
+
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Index of the region in a full frame."""
+        return slice(*self.rows), slice(*self.columns)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns it has."""
+        return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a configuration fixes for every field of a movie: model, templates, scale.
+
+    Attributes
+    ----------
+    config : Config
+        Resolved.
+    model : ForwardModel
+        For fitted regions.
+    wide : ForwardModel
+        For signals up to `SPREAD_NM` away.
+    templates : Templates
+        Matched filter.
+    mode : str
+        Key of `FREE_PARAMETERS`.
+    """
+
+    config: Config
+    model: ForwardModel
+    wide: ForwardModel
+    templates: Templates
+    mode: str
+
+    @property
+    def pixel_nm(self) -> float:
+        """Pixel side [nm]."""
+        return _pixel_nm(self.config)
+
+    @property
+    def roi_px(self) -> int:
+        """Side of the fitted square [pixels]."""
+        return max(5, round(self.config.fit.roi_nm / self.pixel_nm))
+
+    @property
+    def additive(self) -> bool:
+        """Whether particles add to the background instead of multiplying it."""
+        return self.model.rho == 0
+
+
+def make_scene(config: Config, field_px: tuple[int, int], *, searches: int = 1) -> Scene:
+    """Build the models and the matched filter for a field.
+
+    Parameters
+    ----------
+    config : Config
+        With a pixel size.
+    field_px : (int, int)
+        Rows and columns.
+    searches : int
+        Images that will be searched; they share the expected false alarms.
+
+    Returns
+    -------
+    Scene
+        Ready for `fit_field`.
+
+    Raises
+    ------
+    ConfigError
+        The region is too small or too large, or the likelihood does not suit the scheme.
+    """
+    pixel = _pixel_nm(config)
+    roi_px = max(5, round(config.fit.roi_nm / pixel))
+    if roi_px > min(field_px):
+        raise ConfigError(
+            f"fit.roi_nm = {config.fit.roi_nm:g} is {roi_px} pixels, more than the field of "
+            f"{field_px[0]} x {field_px[1]}: lower fit.roi_nm or check camera.pixel_size_nm"
+        )
+    darkfield = config.optics.scheme == "darkfield"
+    if config.fit.likelihood == "conditional" and (darkfield or config.background.method != "mean"):
+        raise ConfigError(
+            'fit.likelihood = "conditional" needs an interferometric scheme and '
+            'background.method = "mean": use "auto"'
+        )
+    reach = math.sqrt(2) * (roi_px * pixel / 2 + window_nm(pixel) + pixel)
+    model = forward_model(config, reach)
+    mode = config.fit.mode
+    free_z = "z_nm" in FREE_PARAMETERS[mode]
+    field_nm = math.hypot(field_px[0] + 1, field_px[1] + 1) * pixel
+    return Scene(
+        config=config,
+        model=model,
+        wide=forward_model(config, min(field_nm, math.sqrt(2) * (SPREAD_NM + 2 * pixel))),
+        templates=make_templates(
+            model,
+            search_both(config.detection, searches=searches),
+            pixel_nm=pixel,
+            roi_nm=config.fit.roi_nm,
+            z_range_nm=config.fit.z_range_nm if free_z else None,
+            field_px=field_px,
+        ),
+        mode=mode,
+    )
+
+
+def field_likelihood(scene: Scene, windows: Windows) -> Likelihood:
+    """Likelihood of the whole field.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    windows : Windows
+        Sums before and after.
+
+    Returns
+    -------
+    Likelihood
+        For the matched filter.
+    """
+    rows, columns = windows.after_e.shape
+    return region_likelihood(scene, windows, Region((0, rows), (0, columns)), None)
+
+
+def region_likelihood(
+    scene: Scene, windows: Windows, region: Region, others: FloatArray | None
+) -> Likelihood:
+    """Likelihood of a region, with the signal of other particles as part of its background.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    windows : Windows
+        Sums before and after.
+    region : Region
+        Which pixels.
+    others : ndarray, shape (rows, columns), optional
+        Signal of the other particles there.
+
+    Returns
+    -------
+    Likelihood
+        Conditional where a measured background is divided out, Poisson otherwise.
+    """
+    cut = region.slices
+    config = scene.config
+    grid = PixelGrid.region(region.rows, region.columns, scene.pixel_nm)
+    model = scene.model if grid.diagonal_nm <= scene.model.reach_nm else scene.wide
+    before, after, masked = windows.before_e[cut], windows.after_e[cut], windows.masked[cut]
+    ratio = windows.power_ratio
+    signal = np.zeros(grid.shape) if others is None else others
+    if _uses_conditional(config):
+        return conditional(
+            model, grid, before, after, ratio * (1 + signal),
+            read_variance_before_e2=windows.read_variance_before_e2[cut],
+            read_variance_after_e2=windows.read_variance_after_e2[cut],
+            masked=masked,
+        )  # fmt: skip
+    measured = {"mean": 1.0, "median": math.pi / 2, "none": 0.0}[config.background.method]
+    read = windows.read_variance_before_e2[cut]
+    steady = smooth_background(before, read, masked) if measured else before
+    # The expected variance is that of the smooth background; the excess is that over the own one.
+    extra = windows.read_variance_after_e2[cut] + ratio**2 * (measured * steady + read)
+    extra = extra + ratio * (steady - before)
+    background = ratio * before
+    if scene.additive:
+        scale = photons_scale(scene, windows)
+        return poisson(
+            model, grid, after, background + scale * signal, scale,
+            extra_variance_e2=extra, masked=masked,
+        )  # fmt: skip
+    level = background * (1 + signal)
+    return poisson(model, grid, after, level, level, extra_variance_e2=extra, masked=masked)
+
+
+def photons_scale(scene: Scene, windows: Windows) -> float:
+    """Scale of the signal in dark field.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    windows : Windows
+        Frames and laser power.
+
+    Returns
+    -------
+    float
+        Photoelectrons per pixel for unit |E_sca|², summed over the frames after.
+    """
+    per_frame = scene.model.photons_per_intensity(
+        scene.config.simulation.photons_per_pixel, scene.pixel_nm
+    )
+    return per_frame * windows.power_ratio * max(windows.n_before, 1)
+
+
+def search_both(detection: Detection, *, searches: int = 1) -> Detection:
+    """Search both polarities, for one that is not wanted has side lobes that are.
+
+    Parameters
+    ----------
+    detection : Detection
+        As configured.
+    searches : int
+        Images that share the expected false alarms.
+
+    Returns
+    -------
+    Detection
+        Where one polarity is wanted, twice the false alarms: half of them have the other.
+    """
+    sides = 1 if detection.polarity == "both" else 2
+    alarms = sides * detection.false_alarms_per_movie / searches
+    return detection.model_copy(update={"polarity": "both", "false_alarms_per_movie": alarms})
+
+
+def _uses_conditional(config: Config) -> bool:
+    """Whether the fits condition on the sum of counts before and after."""
+    if config.fit.likelihood == "auto":
+        return config.optics.scheme != "darkfield" and config.background.method == "mean"
+    return config.fit.likelihood == "conditional"
+
+
+def _pixel_nm(config: Config) -> float:
+    if config.camera.pixel_size_nm is None:
+        raise ConfigError(
+            "camera.pixel_size_nm is needed: set it, as in --set camera.pixel_size_nm=84.4"
+        )
+    return config.camera.pixel_size_nm
