@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from iscat_analysis.report.context import number
+from iscat_analysis.report.context import decimals_for, fixed, number
 from iscat_analysis.report.page import render_page
 
 _SOURCES = {
@@ -91,7 +91,7 @@ def mass_page(title: str, found: Mapping[str, Any], toml: str) -> str:
             "facts": [
                 {
                     "label": "Gradient",
-                    "value": number(found["gradient_per_kda"], 4),
+                    "value": number(found["gradient_per_kda"], 3),
                     "unit": "per kDa",
                     "note": f"± {number(found['gradient_se'], 2)}",
                 },
@@ -157,13 +157,13 @@ def _camera_facts(found: Mapping[str, Any]) -> list[dict[str, str]]:
                 facts.append({"label": label, "value": "—", "unit": "", "note": "not identifiable"})
             continue
         low, high = estimate["ci95"]
-        digits = 4 if key != "read_noise_e" else 3
-        note = f"95 %: {number(low, digits)} to {number(high, digits)}"
+        decimals = decimals_for([(high - low) / 2])
+        note = f"95 %: {fixed(low, decimals)} to {fixed(high, decimals)}"
         if key == "offset_adu":
-            note += f"; {_SOURCES[found['offset_from']]}"
-        facts.append(
-            {"label": label, "value": number(estimate["value"], digits), "unit": unit, "note": note}
-        )
+            source = _SOURCES[found["offset_from"]]
+            note = source if low == high else f"{note}; {source}"
+        value = fixed(estimate["value"], decimals)
+        facts.append({"label": label, "value": value, "unit": unit, "note": note})
     masked = found["masked_pixels"]
     facts.append(
         {
@@ -274,24 +274,27 @@ def _peaks_chart(found: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _standards_table(standards: list[Mapping[str, Any]]) -> dict[str, Any]:
-    names = (
-        ("mass_kda", "mass [kDa]"),
-        ("mass_se", "its error [kDa]"),
-        ("contrast", "contrast"),
-        ("contrast_se", "its error"),
-        ("width", "width"),
-        ("count", "events"),
-        ("found_kda", "by the line [kDa]"),
-        ("residual_percent", "residual [%]"),
+    """Set every standard beside the line; contrasts in thousandths, so that they line up."""
+    errors = decimals_for(1e3 * s["contrast_se"] for s in standards)
+    reach = decimals_for((s["high_kda"] - s["low_kda"]) / 2 for s in standards)
+    columns = (
+        ("mass_kda", "mass [kDa]", 1.0, decimals_for([s["mass_se"] for s in standards])),
+        ("mass_se", "its error [kDa]", 1.0, decimals_for([s["mass_se"] for s in standards])),
+        ("contrast", "contrast [10⁻³]", 1e3, errors),
+        ("contrast_se", "its error", 1e3, errors),
+        ("width", "width", 1e3, errors),
+        ("count", "events", 1.0, 0),
+        ("found_kda", "by the line [kDa]", 1.0, reach),
+        ("residual_percent", "residual [%]", 1.0, 2),
     )
     return {
         "caption": "Standards, and what the line makes of their peaks, "
         "with 95 % prediction intervals",
-        "columns": [{"label": label, "numeric": True} for _, label in names]
+        "columns": [{"label": label, "numeric": True} for _, label, _, _ in columns]
         + [{"label": "95 % [kDa]", "numeric": True}],
         "rows": [
-            [{"text": number(s[key], 4), "sort": s[key]} for key, _ in names]
-            + [f"{number(s['low_kda'], 4)} to {number(s['high_kda'], 4)}"]
+            [{"text": fixed(scale * s[key], d), "sort": s[key]} for key, _, scale, d in columns]
+            + [f"{fixed(s['low_kda'], reach)} to {fixed(s['high_kda'], reach)}"]
             for s in standards
         ],
     }

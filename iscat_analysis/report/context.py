@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import PurePath
@@ -139,6 +139,45 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
+def decimals_for(errors: Iterable[float | None], digits: int = 2) -> int:
+    """Give the decimals with which a column of numbers lines up.
+
+    Parameters
+    ----------
+    errors : iterable of float or None
+        Errors of the numbers, or the numbers; what is zero or missing does not count.
+    digits : int
+        Digits of the smallest that are shown.
+
+    Returns
+    -------
+    int
+        0 to 8; 2 where there is nothing to go by.
+    """
+    known = [abs(e) for e in errors if e is not None and math.isfinite(e) and e != 0]
+    return min(8, max(0, digits - 1 - math.floor(math.log10(min(known))))) if known else 2
+
+
+def fixed(value: float | None, decimals: int) -> str:
+    """Write a number with so many decimals.
+
+    Parameters
+    ----------
+    value : float or None
+        The number.
+    decimals : int
+        From `decimals_for`.
+
+    Returns
+    -------
+    str
+        With a true minus sign; a dash for NaN and None.
+    """
+    if value is None or not math.isfinite(value):
+        return "—"
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
 def _percent(value: float) -> str:
     return "—" if not math.isfinite(value) else f"{number(100 * value, 2)} %"
 
@@ -207,6 +246,8 @@ def report_context(analysis: Analysis, figures: Mapping[str, int]) -> dict[str, 
         "chi2": _histogram_spec(table["chi2_reduced"], "reduced χ²", rule=1.0),
         "p_values": _histogram_spec(table["p_value"], "p-value", domain=(0.0, 1.0)),
         "power": _power_spec(analysis),
+        "noise": _noise_spec(analysis.summary.get("landing")),
+        "landing": _landing_lines(analysis.summary),
         "embedded": n_images,
         "embedding_note": (
             f"To keep this page small it holds the images of the first {n_images} of "
@@ -472,6 +513,44 @@ def _power_spec(analysis: Analysis) -> dict[str, Any] | None:
             {"kind": "rule", "color": "plain", "axis": "y", "value": 1.0},
         ],
     }  # fmt: skip
+
+
+def _noise_spec(landing: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    if not landing or len(landing["noise_frames"]) < 2:
+        return None
+    return {
+        "x": {"label": "frames averaged", "scale": "log"},
+        "y": {"label": "variance over shot noise"},
+        "series": [
+            {"kind": "rule", "name": "shot noise", "color": "ink", "axis": "y", "value": 1.0},
+            {"kind": "points", "name": "measured", "color": "sigma",
+             "x": landing["noise_frames"], "y": landing["noise_variance_over_shot"]},
+        ],
+    }  # fmt: skip
+
+
+def _landing_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    """Say what a landing movie's windows, drift and added particles came to."""
+    landing, injection = summary.get("landing"), summary.get("injection")
+    if landing:
+        yield (
+            f"Windows of {landing['window_frames']} frames; "
+            f"{_count(landing['frames_left_out'], 'frame')} left out."
+        )
+        if landing["drift_px"] is not None:
+            y, x = landing["drift_px"]
+            yield f"Drift of the fixed pattern: {x:+.3f} px in x, {y:+.3f} px in y.".replace(
+                "-", "−"
+            )
+    if injection and injection["added"]:
+        text = (
+            f"Of {injection['added']} landings and leavings added to the movie, "
+            f"{injection['recovered']} were found again."
+        )
+        if injection.get("bias_rel") is not None:
+            bias, error = (100 * injection[key] for key in ("bias_rel", "bias_rel_se"))
+            text += f" The masses of isolated ones are off by {bias:+.1f} ± {error:.1f} %."
+        yield text.replace("-", "−")
 
 
 def _provenance(analysis: Analysis) -> list[tuple[str, str]]:

@@ -5,10 +5,10 @@ Everything arrives as ``summary["distribution"]``; nothing is computed here.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from iscat_analysis.report.context import number
+from iscat_analysis.report.context import decimals_for, fixed, number
 
 _COLUMNS = (
     {"label": "mass [kDa]", "numeric": True},
@@ -56,7 +56,7 @@ def distribution_section(found: Mapping[str, Any]) -> dict[str, Any] | None:
                 "caption": "Species by mass; intervals from "
                 f"{found['draws']} simulated repetitions",
                 "columns": list(_COLUMNS),
-                "rows": [_row(item) for item in species],
+                "rows": _rows(species),
             }
         ],
         "notes": [f"{note[:1].upper()}{note[1:]}." for note in found["notes"]],
@@ -85,30 +85,38 @@ def _lead(found: Mapping[str, Any]) -> str:
     return text
 
 
-def _interval(low: float | None, high: float | None, factor: float = 1.0) -> str:
-    if low is None or high is None or low != low or high != high:
-        return "—"
-    return f"{number(factor * low)} to {number(factor * high)}"
-
-
-def _row(item: Mapping[str, Any]) -> list[Any]:
-    def cell(key: str, digits: int) -> dict[str, Any]:
-        return {"text": number(item[key], digits), "sort": item[key]}
-
-    return [
-        cell("mass_kda", 4),
-        _interval(item["mass_low"], item["mass_high"]),
-        cell("width_kda", 2),
-        _interval(item["width_low"], item["width_high"]),
-        {"text": f"{item['count']:.0f}", "sort": item["count"]},
-        {"text": f"{item['landing']:.0f}", "sort": item["landing"]},
-        {"text": f"{item['leaving']:.0f}", "sort": item["leaving"]},
-        {"text": f"{100 * item['efficiency']:.1f} %", "sort": item["efficiency"]},
-        {"text": f"{item['count_corrected']:.0f}", "sort": item["count_corrected"]},
-        _interval(item["corrected_low"], item["corrected_high"]),
-        {"text": f"{100 * item['fraction']:.1f} %", "sort": item["fraction"]},
-        _interval(item["fraction_low"], item["fraction_high"], 100.0),
-    ]
+def _rows(species: Sequence[Mapping[str, Any]]) -> list[list[Any]]:
+    """Write the species, each column with as many decimals as its narrowest interval supports."""
+    columns: list[list[Any]] = []
+    for key, bounds, factor, unit in (
+        ("mass_kda", "mass", 1.0, ""),
+        ("width_kda", "width", 1.0, ""),
+        ("count", "", 1.0, ""),
+        ("landing", "", 1.0, ""),
+        ("leaving", "", 1.0, ""),
+        ("efficiency", "", 100.0, " %"),
+        ("count_corrected", "corrected", 1.0, ""),
+        ("fraction", "fraction", 100.0, " %"),
+    ):
+        low: list[Any] = [s.get(f"{bounds}_low") for s in species]
+        high: list[Any] = [s.get(f"{bounds}_high") for s in species]
+        halves = [
+            factor * (q - p) / 2 if p is not None and q is not None else None
+            for p, q in zip(low, high, strict=True)
+        ]
+        decimals = decimals_for(halves) if bounds else int(factor > 1)
+        columns.append(
+            [{"text": fixed(factor * s[key], decimals) + unit, "sort": s[key]} for s in species]
+        )
+        if bounds:
+            columns.append(
+                [
+                    "—" if half is None or half != half
+                    else f"{fixed(factor * p, decimals)} to {fixed(factor * q, decimals)}"
+                    for p, q, half in zip(low, high, halves, strict=True)
+                ]
+            )  # fmt: skip
+    return [list(row) for row in zip(*columns, strict=True)]
 
 
 def _masses_chart(found: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,9 +8,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import pytest
+import tifffile
 
+from iscat_analysis.bounds import paper
+from iscat_analysis.records import EVENT_COLUMNS
 from iscat_analysis.report import render_page, render_report
+from iscat_cli import main
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from report_factory import make_analysis, without_events
@@ -100,7 +106,47 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def written(
+    tmp_path_factory: pytest.TempPathFactory, sample_configs: dict[str, Path]
+) -> dict[str, Path]:
+    """Let the commands write every kind of page, from small jobs."""
+    folder = tmp_path_factory.mktemp("written")
+    movie, shade, landing = (folder / f"{name}.tif" for name in ("movie", "dark", "landing"))
+    few = ["--config", str(sample_configs["landing"]), "--set", "simulation.count=40"]
+    dark = 4 * np.random.default_rng(1).standard_normal((60, 128, 128))
+    tifffile.imwrite(shade, np.rint(100 + dark).astype("uint16"))
+    mass = np.random.default_rng(1).normal(np.repeat([66.0, 146.0, 480.0], 60), 8.0)
+    table = pd.DataFrame(0.0, index=range(mass.size), columns=list(EVENT_COLUMNS))
+    table = table.assign(mass_kda=mass, sigma_mass_kda=8.0, contrast=-3.1e-5 * mass, status="ok")
+    table.to_csv(folder / "fits.csv", index=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper, "HEIGHTS_NM", np.linspace(0.0, 1000.0, 5))
+        patch.setattr(paper, "FOCI_NM", np.linspace(-1000.0, 1000.0, 5))
+        for arguments in (
+            ["simulate", *few, "--out", str(landing)],
+            ["fit", str(landing), *few, "--inject", "4", "--out", str(folder / "landing")],
+            ["calibrate", "mass", str(folder / "fits.csv"),
+             "--standards", "66,146,480", "--out", str(folder / "line")],
+            ["simulate", "--config", str(sample_configs["mass"]), "--out", str(movie),
+             "--set", "camera.offset_adu=100"],
+            ["calibrate", "camera", str(movie), "--dark", str(shade),
+             "--out", str(folder / "camera")],
+            ["benchmark", "--config", str(sample_configs["joint"]), "--trials", "20",
+             "--no-posterior", "--out", str(folder / "study")],
+            ["bounds", "--preset", "dong2021", "--out", str(folder / "paper")],
+        ):  # fmt: skip
+            assert main([*arguments, "--quiet"]) == 0, arguments
+    return {
+        "landing": folder / "landing" / "report.html",
+        "calibration": folder / "line" / "calibration.html",
+        "camera": folder / "camera" / "camera.html",
+        "benchmark": folder / "study" / "benchmark.html",
+        "comparison": folder / "paper" / "comparison.html",
+    }
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory, written: dict[str, Path]) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("pages")
     analyses = {
         "mass": make_analysis(60, "mass", posteriors=2, refused=1),
@@ -113,7 +159,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     }
     texts = {name: render_report(analysis) for name, analysis in analyses.items()}
     texts["document"] = render_page("document.html", DOCUMENT)
-    found = {}
+    found = dict(written)
     for name, text in texts.items():
         found[name] = folder / f"{name}.html"
         found[name].write_text(text, encoding="utf-8")
@@ -177,7 +223,9 @@ def click(browser: Any, selector: str) -> None:
     browser.execute_script("document.querySelector(arguments[0]).click()", selector)
 
 
-NAMES = ("mass", "joint", "localize", "track", "darkfield", "none", "one", "document")
+REPORTS = ("mass", "joint", "localize", "track", "darkfield", "one", "landing")
+DOCUMENTS = ("document", "calibration", "camera", "benchmark", "comparison")
+NAMES = (*REPORTS, "none", *DOCUMENTS)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -204,7 +252,7 @@ def test_every_text_has_enough_contrast(
     browser: Any, pages: dict[str, Path], name: str, scheme: str
 ) -> None:
     show(browser, pages[name], scheme=scheme)
-    if name not in ("none", "document"):
+    if name in REPORTS:
         click(browser, "#row-0")
     seen, poor = browser.execute_script(POOR_CONTRAST, AA_NORMAL, AA_LARGE)
     assert seen > 20
@@ -230,6 +278,46 @@ def test_columns_sort_both_ways(browser: Any, pages: dict[str, Path]) -> None:
     falling = [float(text) for text in first_cells(browser, 11)]
     assert falling == sorted(falling, reverse=True)
     assert falling[0] > rising[-1]
+
+
+@pytest.mark.parametrize("name", ["mass", "joint", "landing"])
+def test_the_numbers_of_a_column_line_up(browser: Any, pages: dict[str, Path], name: str) -> None:
+    show(browser, pages[name])
+    heads = browser.execute_script(
+        "return [...document.querySelectorAll('#table th')].map((h) => h.textContent)"
+    )
+    for column, head in list(enumerate(heads))[2:-1]:
+        cells = [text.removesuffix(" %") for text in first_cells(browser, column)]
+        decimals = {
+            len(text.partition(".")[2]) for text in cells if text != "—" and "×" not in text
+        }
+        assert len(decimals) == 1, (head, cells)
+
+
+def test_a_landing_movie_shows_its_noise_curve(browser: Any, pages: dict[str, Path]) -> None:
+    show(browser, pages["landing"])
+    text = browser.execute_script("return document.getElementById('noise').textContent")
+    assert "variance over shot noise" in text
+    assert "measured" in text
+    text = browser.execute_script("return document.getElementById('diagnostics').textContent")
+    for said in ("Windows of", "Drift of the fixed pattern", "added to the movie"):
+        assert said in text
+
+
+@pytest.mark.parametrize("name", ["mass", "joint", "landing", "benchmark", "camera"])
+def test_every_axis_has_two_ticks(browser: Any, pages: dict[str, Path], name: str) -> None:
+    show(browser, pages[name])
+    axes = browser.execute_script(
+        "const axes = new Map();"
+        "for (const t of document.querySelectorAll('.plot svg:not(:has(image)) text')) {"
+        "  if (!/^[−\\d.,]+$/.test(t.textContent)) continue;"
+        "  if (!axes.has(t.parentNode)) axes.set(t.parentNode, {});"
+        "  const numbers = axes.get(t.parentNode), side = t.getAttribute('text-anchor');"
+        "  numbers[side] = [...(numbers[side] || []), t.textContent];"
+        "} return [...axes.values()].flatMap((numbers) => Object.values(numbers));"
+    )
+    assert len(axes) > 3
+    assert [numbers for numbers in axes if len(numbers) < 2] == []
 
 
 def test_filters_narrow_the_table_and_clear(browser: Any, pages: dict[str, Path]) -> None:
@@ -330,3 +418,23 @@ def test_tables_of_documents_sort(browser: Any, pages: dict[str, Path]) -> None:
     click(browser, "table.sortable th:nth-child(2) button")
     script = "return [...document.querySelectorAll('tbody tr')].map((r) => r.cells[0].textContent)"
     assert browser.execute_script(script) == ["mass", "x", "y", "z"]
+
+
+@pytest.mark.parametrize("name", ["calibration", "benchmark", "comparison"])
+def test_written_tables_sort(browser: Any, pages: dict[str, Path], name: str) -> None:
+    show(browser, pages[name])
+    found = browser.execute_script(
+        "return [...document.querySelectorAll('table.sortable')].map((table) => {"
+        "  const cells = (n) => [...table.tBodies[0].rows].map((row) => row.cells[n].textContent);"
+        "  const last = table.tHead.rows[0].cells.length - 1;"
+        "  const seen = [];"
+        "  for (let n = 0; n < 2; n++) {"
+        "    table.tHead.rows[0].cells[last].querySelector('button').click();"
+        "    seen.push(cells(last));"
+        "  } return seen; })"
+    )
+    assert found
+    for rising, falling in found:
+        assert sorted(rising) == sorted(falling)
+        if len(set(rising)) > 1:
+            assert rising != falling

@@ -55,6 +55,16 @@ window.iscat = (() => {
     if (!finite(sigma) || sigma <= 0) return fmt(v, 4);
     return sign(v.toFixed(Math.min(6, Math.max(0, 1 - Math.floor(Math.log10(sigma))))));
   };
+  // How many decimals show so many digits of a column's median: its numbers then line up.
+  const decimalsOf = (values, digits) => {
+    const sizes = values.filter((v) => finite(v) && v !== 0).map(Math.abs).sort((a, b) => a - b);
+    const middle = sizes.length ? sizes[sizes.length >> 1] : 1;
+    return Math.min(8, Math.max(0, digits - 1 - Math.floor(Math.log10(middle))));
+  };
+  const fmtFixed = (v, decimals) => {
+    if (!finite(v)) return "—";
+    return v !== 0 && Math.abs(v) < 0.5 * 10 ** -decimals ? fmt(v, 1) : sign(v.toFixed(decimals));
+  };
   const fmtPercent = (v) => (finite(v) ? `${fmt(100 * v, v < 0.0995 ? 2 : 3)} %` : "—");
 
   // ---- scales ----------------------------------------------------------------------------------
@@ -64,6 +74,7 @@ window.iscat = (() => {
     const step = [1, 2, 5, 10].find((m) => m * unit >= raw * 0.999) * unit;
     const ticks = [];
     for (let i = Math.ceil(lo / step - 1e-9); i * step <= hi + step * 1e-9; i += 1) ticks.push(i * step);
+    if (ticks.length < 2 && hi > lo && count < 20) return niceTicks(lo, hi, count + 1); // one tick tells no scale
     return { ticks, step };
   };
   const logTicks = (lo, hi, count) => {
@@ -418,5 +429,5 @@ window.iscat = (() => {
     const spec = JSON.parse(source.textContent);
     responsive(figure.querySelector(".plot"), () => chart(figure.querySelector(".plot"), spec, { title: figure.dataset.title }));
   });
-  return { el, svg, css, finite, fmt, fmtWith, fmtPercent, textWidth, niceTicks, tickText, chart, canvas, responsive, showTip, hideTip, save, offerDownload };
+  return { el, svg, css, finite, fmt, fmtWith, fmtPercent, fmtFixed, decimalsOf, textWidth, niceTicks, tickText, chart, canvas, responsive, showTip, hideTip, save, offerDownload };
 })();

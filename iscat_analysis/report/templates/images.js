@@ -150,20 +150,27 @@ window.iscat.images = (() => {
         }
         const x = estimate[p.names[j]];
         if (finite(x) && x > sx.lo && x < sx.hi) rule(`M${X(x)} 0V${cell}`, `stroke:${css("sigma")};stroke-width:1.2`);
-        const ticksOf = (s) => { const t = niceTicks(s.lo, s.hi, cell > 110 ? 3 : 2); return t.ticks.map((v) => [v, tickText(v, t.step)]); };
+        const ticksOf = (s, count) => { const t = niceTicks(s.lo, s.hi, count); return t.ticks.map((v) => [v, tickText(v, t.step)]); };
+        const fewest = cell > 110 ? 3 : 2;
         if (i === n - 1) {
-          let freeFrom = -Infinity;
-          for (const [v, text] of ticksOf(sx)) {
-            const half = textWidth(text) / 2;
-            if (X(v) - half < Math.max(freeFrom, -gap / 2 + 1) || X(v) + half > cell + gap / 2) continue;
-            freeFrom = X(v) + half + 5;
+          let shown = [];
+          for (let count = fewest; shown.length < 2 && count < 9; count += 1) {
+            let freeFrom = -Infinity;
+            shown = ticksOf(sx, count).filter(([v, text]) => {
+              const half = textWidth(text) / 2;
+              if (X(v) - half < Math.max(freeFrom, -gap / 2 + 1) || X(v) + half > cell + gap / 2) return false;
+              freeFrom = X(v) + half + 5;
+              return true;
+            });
+          }
+          for (const [v, text] of shown) {
             svg("path", { d: `M${X(v)} ${cell}v4`, style: `stroke:${css("muted")}` }, g);
             svg("text", { x: X(v), y: cell + 17, "text-anchor": "middle" }, g, text);
           }
           svg("text", { x: cell / 2, y: cell + 36, "text-anchor": "middle", class: "strong" }, g, `${labels[p.names[j]]} [${units[p.names[j]]}]`);
         }
         if (j === 0 && i > 0) {
-          for (const [v, text] of ticksOf(sy)) {
+          for (const [v, text] of ticksOf(sy, fewest)) {
             svg("path", { d: `M0 ${Y(v)}h-4`, style: `stroke:${css("muted")}` }, g);
             svg("text", { x: -7, y: Y(v) + 4, "text-anchor": "end" }, g, text);
           }

@@ -1,7 +1,7 @@
 // The report's own behaviour: one filter that the table and every picture obey, rows that open.
 "use strict";
 (() => {
-  const { el, fmt, fmtWith, fmtPercent, finite, chart, responsive, offerDownload, save } = window.iscat;
+  const { el, fmt, fmtWith, fmtPercent, fmtFixed, decimalsOf, finite, chart, responsive, offerDownload, save } = window.iscat;
   const { panels, field, corner } = window.iscat.images;
   const data = JSON.parse(document.getElementById("analysis").textContent);
   const { columns, free, main, labels, units } = data;
@@ -125,21 +125,19 @@
 
   // ---- table -----------------------------------------------------------------------------------
   const table = byId("table");
+  const percent = (v) => (finite(v) ? `${fmtFixed(100 * v, 1)} %` : "—");
   const heads = () => [
     { key: "event", label: "event", numeric: true },
     { key: "frame", label: "frame", numeric: true },
-    ...free.map((name) => ({ key: name, label: `${labels[name]} [${units[name]}]`, numeric: true, cell: (i) => fmtWith(columns[name][i], columns[`sigma_${name}`][i]) })),
-    { key: `sigma_${state.bound}`, label: `σ ${labels[state.bound]}`, numeric: true },
-    { key: `crb_${state.bound}`, label: "CRB", numeric: true },
-    { key: `qcrb_${state.bound}`, label: "QCRB", numeric: true },
-    { key: `ratio_${state.bound}`, label: "σ / CRB", numeric: true },
-    { key: `used_${state.bound}`, label: "light used", numeric: true, cell: (i) => fmtPercent(derived[`used_${state.bound}`][i]) },
-    { key: "contrast", label: data.scheme === "darkfield" ? "signal [e⁻]" : "contrast", numeric: true },
-    { key: "snr", label: "SNR", numeric: true },
-    { key: "chi2_reduced", label: "χ²", numeric: true },
+    ...free.map((name) => ({ key: name, label: `${labels[name]} [${units[name]}]`, numeric: true, decimals: decimalsOf(columns[`sigma_${name}`], 2) })),
+    ...["sigma", "crb", "qcrb"].map((kind) => ({ key: `${kind}_${state.bound}`, label: kind === "sigma" ? `σ ${labels[state.bound]}` : kind.toUpperCase(), numeric: true, decimals: decimalsOf(columns[`crb_${state.bound}`], 3) })),
+    { key: `ratio_${state.bound}`, label: "σ / CRB", numeric: true, decimals: 3 },
+    { key: `used_${state.bound}`, label: "light used", numeric: true, cell: (i) => percent(derived[`used_${state.bound}`][i]) },
+    { key: "contrast", label: data.scheme === "darkfield" ? "signal [e⁻]" : "contrast", numeric: true, decimals: decimalsOf(columns.contrast, 3) },
+    { key: "snr", label: "SNR", numeric: true, decimals: decimalsOf(columns.snr, 3) },
+    { key: "chi2_reduced", label: "χ²", numeric: true, decimals: 2 },
     { key: "status", label: "status", cell: (i) => el("span", { class: isOk(i) ? "status" : "status flagged" }, columns.status[i]) },
   ];
-  const whole = new Set(["event", "frame", "n_before", "n_after"]);
   const render = () => {
     const list = heads();
     table.tHead.replaceChildren(el("tr", {}, ...list.map((h) => el("th", { scope: "col", class: h.numeric ? "num" : null, "aria-sort": state.sort === h.key ? (state.down ? "descending" : "ascending") : "none" },
@@ -152,7 +150,7 @@
       const opened = state.open.has(i);
       const cells = list.map((h, k) => {
         const raw = column(h.key)[i];
-        const content = k === 0 ? el("button", { type: "button", class: "toggle", "aria-expanded": String(opened), "aria-label": `Event ${columns.event[i]}` }, String(raw)) : h.cell ? h.cell(i) : whole.has(h.key) ? String(raw) : fmt(raw);
+        const content = k === 0 ? el("button", { type: "button", class: "toggle", "aria-expanded": String(opened), "aria-label": `Event ${columns.event[i]}` }, String(raw)) : h.cell ? h.cell(i) : h.decimals === undefined ? String(raw) : fmtFixed(raw, h.decimals);
         return el("td", { class: h.numeric ? "num" : null }, content);
       });
       body.push(el("tr", { class: opened ? "row open" : "row", id: `row-${i}`, onclick: () => toggle(i) }, ...cells));
@@ -188,7 +186,7 @@
     const names = ["", "estimate", "σ", "CRB", "QCRB", "σ / CRB", "light used"];
     const numbers = el("table", { class: "data" }, el("thead", {}, el("tr", {}, ...names.map((t, k) => el("th", { scope: "col", class: k ? "num" : null }, t)))), el("tbody", {}, ...free.map((name) => el("tr", {},
       el("th", { scope: "row" }, `${labels[name]} [${units[name]}]`),
-      ...[fmtWith(columns[name][i], columns[`sigma_${name}`][i]), fmt(columns[`sigma_${name}`][i]), fmt(columns[`crb_${name}`][i]), fmt(columns[`qcrb_${name}`][i]), fmt(derived[`ratio_${name}`][i]), fmtPercent(derived[`used_${name}`][i])].map((t) => el("td", { class: "num" }, t))))));
+      ...[fmtWith(columns[name][i], columns[`sigma_${name}`][i]), fmt(columns[`sigma_${name}`][i]), fmt(columns[`crb_${name}`][i]), fmt(columns[`qcrb_${name}`][i]), fmtFixed(derived[`ratio_${name}`][i], 3), percent(derived[`used_${name}`][i])].map((t) => el("td", { class: "num" }, t))))));
     const other = (columns.flags[i] || "").split(";").filter((f) => f && f !== columns.status[i]);
     const fixed = ["z_nm", "mass_kda"].filter((name) => !free.includes(name)).map((name) => pair(`${labels[name]}, fixed`, `${fmt(columns[name][i])} ${units[name]}`));
     const facts = el("dl", { class: "pairs" },
