@@ -23,6 +23,7 @@ from iscat_analysis.load import open_stack
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Progress, silent
 from iscat_analysis.report import check_output, write_report
+from iscat_analysis.report.context import LABELS, UNITS
 from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
 from iscat_analysis.simulate import write_stack
 
@@ -32,12 +33,6 @@ if TYPE_CHECKING:
 ROWS_SHOWN = 20
 """Events that a `Result` shows of itself in a notebook."""
 
-_UNITS = {
-    "x_nm": ("x", "nm"),
-    "y_nm": ("y", "nm"),
-    "z_nm": ("z", "nm"),
-    "mass_kda": ("mass", "kDa"),
-}
 _COLUMNS = ("event", "frame", "x_px", "y_px", "z_nm", "mass_kda")
 
 
@@ -382,7 +377,7 @@ class Result:
         chains, draws, _ = found.samples.shape
         coordinates = {"chain": range(chains), "draw": range(draws)}
         variables = {
-            name: (axes, found.samples[..., k], {"units": _UNITS[name][1]})
+            name: (axes, found.samples[..., k], {"units": UNITS[name]})
             for k, name in enumerate(found.names)
         }
         about = {
@@ -438,9 +433,8 @@ class Result:
                 )
                 if medians.get(key) is not None
             ]  # fmt: skip
-            symbol, unit = _UNITS[name]
             if cells:
-                facts.append((symbol, f"{', '.join(cells)} {unit} (medians)"))
+                facts.append((LABELS[name], f"{', '.join(cells)} {UNITS[name]} (medians)"))
         facts += [("warning", text) for text in self.warnings]
         return facts
 
