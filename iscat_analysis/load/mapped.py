@@ -7,6 +7,8 @@ from pathlib import Path
 
 from iscat_analysis.errors import DataError
 
+_MAPPED_ALONG = 2**16
+
 
 def map_file(path: Path) -> mmap.mmap:
     """Map a whole file for reading.
@@ -59,9 +61,10 @@ def release(data: mmap.mmap, start: int, stop: int) -> None:
     data : mmap
         From `map_file`.
     start, stop : int
-        Half-open range of bytes; only whole pages inside it are released.
+        Half-open range of bytes.  Pages around it, which the system maps along with those that are
+        touched, go as well; should they be read after all, they come back from the file.
     """
-    first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE
-    last = stop // mmap.PAGESIZE * mmap.PAGESIZE
+    first = max(start - _MAPPED_ALONG, 0) // mmap.PAGESIZE * mmap.PAGESIZE
+    last = min(stop + _MAPPED_ALONG, len(data))
     if last > first and hasattr(data, "madvise"):
         data.madvise(mmap.MADV_DONTNEED, first, last - first)
