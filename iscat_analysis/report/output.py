@@ -11,9 +11,9 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import secrets
 import shutil
 import sys
-import tempfile
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -156,13 +156,14 @@ def atomic_folder(
     """
     with claim_output(folder, overwrite, known=known):
         target = _resolved(folder)
+        building = _hidden(_BUILDING, target)
         try:
-            building = _hidden(_BUILDING, target)
-        except OSError as error:
-            raise DataError(
-                f"{folder}: cannot be made ({error.strerror}); choose another --out"
-            ) from None
-        try:
+            try:
+                building.mkdir(0o700)
+            except OSError as error:
+                raise DataError(
+                    f"{folder}: cannot be made ({error.strerror}); choose another --out"
+                ) from None
             yield building
             _like_an_ordinary_folder(building)
             check_output(folder, overwrite, known=known)
@@ -197,7 +198,8 @@ def _short(target: Path) -> str:
 
 
 def _hidden(kind: str, target: Path) -> Path:
-    return Path(tempfile.mkdtemp(prefix=kind, suffix=f".{_short(target)}", dir=target.parent))
+    """Name a folder beside the target before there is one, so that an interrupt leaves none."""
+    return target.with_name(f"{kind}{secrets.token_hex(4)}.{_short(target)}")
 
 
 if sys.platform == "win32":  # no lock there: two runs into one folder race for the last rename
@@ -259,7 +261,7 @@ def _recover(target: Path) -> None:
 
 
 def _like_an_ordinary_folder(folder: Path) -> None:
-    """Give a folder from `mkdtemp`, which only its owner may read, the mode `mkdir` would."""
+    """Give a folder that only its owner may read the mode `mkdir` would."""
     probe = folder / ".mode"
     probe.mkdir()
     folder.chmod(probe.stat().st_mode)
@@ -274,6 +276,7 @@ def _swap(building: Path, target: Path) -> None:
     earlier = _hidden(_EARLIER, target)
     kept = earlier / target.name
     try:
+        earlier.mkdir(0o700)
         target.rename(kept)
         building.rename(target)
     finally:

@@ -1,12 +1,18 @@
 """A process that has everything imported and compiled, and forks a child for each order it reads.
 
 Orders are lines of JSON on stdin, answers lines of JSON on stdout.  An order is one run or several
-at the same time, each ``{"run": [argument, …], "cwd": folder}``, with ``"kill": [signal, share]``
-to be ended after that share of an undisturbed run's duration, ``"limit": bytes`` for the largest
-file it may write, and ``"die": [word, number]`` to end by SIGKILL ``before`` or ``after`` its so
-manieth renaming.  Figures, which take nine tenths of a small run, are drawn for ``"figures": true``
-only; otherwise files of a kilobyte take their places.  The answer is a list of ``{"status": …,
-"out": …, "err": …}``; a signal's status is negative.
+at the same time, each ``{"run": [argument, …], "cwd": folder}``, with
+
+- ``"kill": [signal, share]`` to be ended after that share of an undisturbed run's duration, which
+  is the first order's or ``"duration": seconds``;
+- ``"die": [word, number]`` to end by SIGKILL ``before`` or ``after`` its so manieth renaming;
+- ``"limit": bytes`` for the largest file it may write;
+- ``"memory_share": share`` to cut a landing movie into many chunks;
+- ``"figures": true`` to draw the figures, which take nine tenths of a small run; otherwise files of
+  a kilobyte take their places.
+
+The answer is a list of ``{"status": …, "out": …, "err": …, "seconds": …}``; a signal's status is
+negative.
 """
 
 from __future__ import annotations
@@ -22,6 +28,7 @@ import time
 from typing import Any
 
 from iscat_analysis import report
+from iscat_analysis.pipeline import chunks
 from iscat_cli import main
 
 _write_figures = report.write_figures
@@ -32,6 +39,8 @@ def _run(order: dict[str, Any]) -> int:
     report.write_figures = _write_figures if order.get("figures") else _sketch_figures
     if "limit" in order:
         resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
+    if "memory_share" in order:
+        chunks._MEMORY_SHARE = order["memory_share"]
     if "die" in order:
         _die_while_renaming(*order["die"])
     status = main(order["run"])
@@ -79,7 +88,7 @@ def _start(order: dict[str, Any], duration: float) -> tuple[int, int, int]:
             os._exit(status)
     if "kill" in order:
         number, share = order["kill"]
-        timer = threading.Timer(share * duration, _signal, [child, number])
+        timer = threading.Timer(share * order.get("duration", duration), _signal, [child, number])
         timer.start()
     return child, out, err
 
@@ -113,12 +122,11 @@ def serve() -> None:
         orders = json.loads(line)
         if duration is None:
             _quietly(orders[0])
-            begin = time.perf_counter()
-            answer = _finish(*_start(orders[0], 0.0))
-            duration = time.perf_counter() - begin
-            answers = [answer]
-        else:
-            answers = [_finish(*started) for started in [_start(o, duration) for o in orders]]
+        begin = time.perf_counter()
+        answers = [_finish(*started) for started in [_start(o, duration or 0) for o in orders]]
+        seconds = time.perf_counter() - begin
+        duration = duration or seconds
+        answers = [answer | {"seconds": seconds} for answer in answers]
         sys.stdout.write(json.dumps(answers) + "\n")
         sys.stdout.flush()
 

@@ -49,6 +49,31 @@ shape = [48, 48]
 frames = 40
 events = [{frame = 20, x_px = 23.2, y_px = 24.4, mass_kda = 3000.0}]
 """
+LANDING = """
+[optics]
+na = 1.3
+attenuation = 1.0
+focus_nm = -300.0
+[camera]
+pixel_size_nm = 84.4
+gain_e_per_adu = 4.0
+[background]
+window_frames = 20
+[fit]
+roi_nm = 1300.0
+[posterior]
+enabled = false
+[compute]
+workers = 1
+[calibration]
+gradient_per_kda = -3.1e-5
+[simulation]
+shape = [64, 64]
+frames = 480
+photons_per_pixel = 1e5
+count = 6
+species = [600.0]
+"""
 FIT = ["fit", "movie.tif", "--config", "setup.toml", "--out", "result", "--overwrite"]
 
 
@@ -110,11 +135,11 @@ def names(folder: Path) -> list[str]:
     return sorted(entry.name for entry in folder.iterdir())
 
 
-def assert_whole(result: Path) -> None:
-    """Every file is there and complete."""
+def assert_whole(result: Path, extra: tuple[str, ...] = ()) -> None:
+    """Every file is there and complete; `extra` are the table's further columns."""
     assert REQUIRED <= set(names(result)) <= OUTPUT_NAMES
     table = pd.read_csv(result / "fits.csv")
-    assert tuple(table.columns) == EVENT_COLUMNS
+    assert tuple(table.columns) == (*EVENT_COLUMNS, *extra)
     with (result / "fits.parquet").open("rb") as file:
         assert len(pd.read_parquet(file)) == len(table)
     summary = json.loads((result / "summary.json").read_text(encoding="utf-8"))
@@ -210,6 +235,40 @@ def test_killed_at_random_moments(forker: Forker, place: Path) -> None:
     assert (-signal.SIGKILL, True) in seen
 
 
+def test_a_landing_movie_killed_at_random_moments_resumes(forker: Forker, tmp_path: Path) -> None:
+    (tmp_path / "setup.toml").write_text(LANDING)
+    write_stack(load_config(tmp_path / "setup.toml"), tmp_path / "movie.tif")
+    order = {"run": FIT, "cwd": str(tmp_path), "memory_share": 0.0031}
+    result, kept = tmp_path / "result", tmp_path / ".result.partial"
+    forker.run(order)  # compiles what landing movies need
+    (whole,) = forker.run(order)
+    assert whole["status"] == 0, whole["err"]
+    assert not kept.exists()
+    summary = json.loads((result / "summary.json").read_text(encoding="utf-8"))
+    assert summary["landing"]["chunks"] >= 4
+    assert summary["events"] >= 3
+    expected = contents(result)
+    rng = np.random.default_rng()
+    resumed = 0
+    for number in range(KILLS // 2):
+        shutil.rmtree(result, ignore_errors=True)
+        share = float(rng.uniform(0, 1))
+        (answer,) = forker.run(
+            {**order, "kill": [signal.SIGKILL, share], "duration": whole["seconds"]}
+        )
+        assert answer["status"] in (0, -signal.SIGKILL)
+        if result.exists():
+            assert_whole(result, extra=("frame_ci95",))
+        if number % 5 == 4:
+            shutil.rmtree(result, ignore_errors=True)
+            resumed += any(kept.glob("*.npz"))
+            (again,) = forker.run(order)
+            assert again["status"] == 0, again["err"]
+            assert differing(contents(result), expected) == []
+            assert names(tmp_path) == ["movie.tif", "movie.truth.csv", "result", "setup.toml"]
+    assert resumed >= 2
+
+
 @pytest.mark.parametrize("word", ["before", "after"])
 @pytest.mark.parametrize("number", [1, 2])
 def test_killed_between_two_renamings(forker: Forker, place: Path, word: str, number: int) -> None:
@@ -238,7 +297,7 @@ def test_asked_to_end(forker: Forker, place: Path, number: int) -> None:
         (answer,) = forker.run(order)
         assert answer["status"] in (0, 130, -number, 70)  # the last two: before it has begun
         assert set(names(place)) - {"result"} == {"movie.tif", "setup.toml"}, answer
-        if answer["status"] == 130:
+        if answer["status"] == 130 and answer["err"]:  # quiet before the command has begun
             assert "interrupted" in one_line(answer)
         if (place / "result").exists():
             assert_whole(place / "result")
