@@ -109,9 +109,11 @@ def _embed(value: Any) -> Markup:
 
 
 def _cell(value: Any) -> str:
-    """Format a table cell: numbers to four significant digits, nothing as a dash."""
+    """Format a table cell: numbers to four digits unless two say it all, nothing as a dash."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "—"
     if isinstance(value, float):
-        return f"{value:.4g}".replace("-", "−")
+        plain = value.is_integer() or float(f"{value:.2g}") == value
+        short = f"{value:.4g}" if plain else f"{value:#.4g}".rstrip(".")
+        return short.replace("-", "−")
     return str(value).replace("-", "−") if isinstance(value, int) else str(value)
