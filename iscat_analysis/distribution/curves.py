@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 import pandas as pd
-from scipy.special import logsumexp, ndtr
-from scipy.stats import chi2
+from scipy.special import gammaincinv, logsumexp, ndtr
 
 from iscat_analysis.distribution.events import Events
 from iscat_analysis.distribution.mixture import Mixture
@@ -58,14 +57,14 @@ def histogram_of(events: Events) -> pd.DataFrame:
     """
     edges = _edges(events)
     counts = np.histogram(events.x, edges)[0]
-    low = np.where(counts > 0, chi2.ppf(0.025, 2 * np.maximum(counts, 1)) / 2, 0.0)
+    low = np.where(counts > 0, gammaincinv(np.maximum(counts, 1), 0.025), 0.0)
     return pd.DataFrame(
         {
             "low_kda": edges[:-1],
             "high_kda": edges[1:],
             "count": counts,
             "count_low": low,
-            "count_high": chi2.ppf(0.975, 2 * counts + 2) / 2,
+            "count_high": gammaincinv(counts + 1, 0.975),
         }
     )
 

@@ -159,14 +159,14 @@ class Reader:
             stride=stride, defects=find_defects, mapper=pool.map,
         )  # fmt: skip
 
-    def noise(self, longest: int) -> NoiseCurve:
+    def noise(self, longest: int, mapper: Mapper = map) -> NoiseCurve:
         """Noise against averaging in the first frames."""
         stop = min(self.last, self.first + _NOISE_FRAMES)
-        counts, good, _ = self.counts(self.first, stop)
+        counts, good, _ = self.counts(self.first, stop, mapper)
         used = counts if good.all() else counts[good]
         if len(used) < 2:
             raise DataError(f"{self.name}: has no two frames that differ; export it again")
-        return measure_noise(used, self._camera, longest)
+        return measure_noise(used, self._camera, longest, mapper=mapper)
 
 
 def _runs(flags: BoolArray) -> Iterator[slice]:
@@ -176,7 +176,7 @@ def _runs(flags: BoolArray) -> Iterator[slice]:
         yield slice(int(start), int(stop))
 
 
-def choose_windows(reader: Reader, config: Config) -> tuple[NoiseCurve, int]:
+def choose_windows(reader: Reader, config: Config, mapper: Mapper = map) -> tuple[NoiseCurve, int]:
     """Choose how many frames before and after a step are summed.
 
     Parameters
@@ -185,6 +185,8 @@ def choose_windows(reader: Reader, config: Config) -> tuple[NoiseCurve, int]:
         The frames.
     config : Config
         ``background.window_frames`` wins where it is given.
+    mapper : callable
+        `map`, or the one of a pool.
 
     Returns
     -------
@@ -206,7 +208,7 @@ def choose_windows(reader: Reader, config: Config) -> tuple[NoiseCurve, int]:
             + (", or lower background.window_frames" if given else "")
             + "; or give the frames before the particles bind as --background 0:N"
         )
-    curve = reader.noise(min(given or longest_window(frames), _NOISE_FRAMES // 4))
+    curve = reader.noise(min(given or longest_window(frames), _NOISE_FRAMES // 4), mapper)
     return curve, given or choose_window(curve, frames)
 
 

@@ -166,7 +166,8 @@ def analyse_landings(
             "change fit.frames"
         )
     reader = Reader(movie, camera, first, last)
-    curve, window = choose_windows(reader, config)
+    with ThreadPoolExecutor(config.compute.workers) as pool:
+        curve, window = choose_windows(reader, config, pool.map)
     stride = max(1, window // STRIDES)
     count = max(math.ceil((last - first) / stride) - 1, 1)
     posterior = _posterior_wanted(config)

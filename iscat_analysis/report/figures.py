@@ -121,13 +121,11 @@ def _overview(analysis: Analysis, table: pd.DataFrame) -> Figure:
     _scale_bar(axes, columns, rows, analysis.pixel_size_nm)
     unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
     figure.colorbar(shown, ax=axes, label=unit, fraction=0.05, pad=0.02)
-    tracks = not table["event"].is_unique
-    for _, group in table.groupby("event", sort=False):
-        x, y = group["x_px"].to_numpy(float), group["y_px"].to_numpy(float)
-        if tracks:
-            axes.plot(x, y, color="#56B4E9", lw=1)
-        else:
-            axes.plot(x, y, "o", mfc="none", mec="#F0E442", ms=11, mew=1)
+    if table["event"].is_unique:
+        axes.plot(table["x_px"], table["y_px"], "o", mfc="none", mec="#F0E442", ms=11, mew=1)
+    else:
+        for _, track in table.groupby("event", sort=False):
+            axes.plot(track["x_px"], track["y_px"], color="#56B4E9", lw=1)
     first = table.drop_duplicates("event")[["event", "x_px", "y_px"]].dropna()
     _number(axes, first.to_numpy(float), columns / 6.4, (rows, columns))
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
@@ -189,11 +187,18 @@ def _power(analysis: Analysis) -> Figure:
     return figure
 
 
+def _bins(extent: float, spread: FloatArray) -> int:
+    """Count bins of two standard deviations, which do not blur neighbouring species."""
+    width = 2 * float(np.median(spread)) if spread.size else 0.0
+    return int(np.clip(extent / width, 10, 90)) if width > 0 else 10
+
+
 def _histogram(table: pd.DataFrame, name: str) -> Figure:
     values = table[name].to_numpy(float)
     finite = np.isfinite(values)
     good = (table["status"] == Status.OK.value).to_numpy()
-    bins = int(np.clip(2 * np.sqrt(finite.sum()), 10, 60))
+    spread = table[f"sigma_{name}"].to_numpy(float)[good]
+    bins = _bins(np.ptp(values[finite]), spread[np.isfinite(spread)])
     edges = np.histogram_bin_edges(values[finite], bins=bins)
     figure = new_figure(5.4, 3.4)
     axes = figure.add_subplot()

@@ -63,6 +63,7 @@ def save_figure(figure: Figure, stem: Path) -> None:
         Of the two files.
     """
     figure.savefig(stem.with_suffix(".png"), dpi=DPI, pil_kwargs={"compress_level": 3})
+    figure.set_layout_engine("none")  # everything has its place
     figure.savefig(stem.with_suffix(".svg"), metadata={"Date": None})
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera import Camera
+from iscat_analysis.sliding.frames import Mapper
 
 LONGEST_WINDOW = 100
 """Frames that a window chosen from the noise may have; beyond it events overlap too often."""
@@ -63,7 +64,9 @@ class NoiseCurve:
         return self.frames[int(np.argmin(noise))]
 
 
-def measure_noise(counts: NDArray[Any], camera: Camera, longest: int) -> NoiseCurve:
+def measure_noise(
+    counts: NDArray[Any], camera: Camera, longest: int, *, mapper: Mapper = map
+) -> NoiseCurve:
     """Noise of averages over frames, as the Allan deviation has it: neighbours are compared.
 
     Parameters
@@ -74,6 +77,8 @@ def measure_noise(counts: NDArray[Any], camera: Camera, longest: int) -> NoiseCu
         Counts → photoelectrons.
     longest : int
         Longest average wanted.
+    mapper : callable
+        `map`, or the one of a pool.
 
     Returns
     -------
@@ -92,11 +97,9 @@ def measure_noise(counts: NDArray[Any], camera: Camera, longest: int) -> NoiseCu
         np.broadcast_to(v, shape)[rows] for v in (camera.gain_e_per_adu, camera.offset_adu)
     )
     read = camera.read_variance_e2(shape)[rows]
-    lengths, ratios = [], []
-    for n in (*_LENGTHS[:-1], max(longest, 1)):
+
+    def ratio(n: int) -> float:
         pairs = len(strip) // (2 * n)
-        if n > longest or not pairs or n in lengths:
-            continue
         used = strip[: 2 * n * min(pairs, 8)]
         sums = gain * (
             np.add.reduceat(used, np.arange(0, len(used), n), axis=0, dtype=np.float64) - n * offset
@@ -108,9 +111,11 @@ def measure_noise(counts: NDArray[Any], camera: Camera, longest: int) -> NoiseCu
         contrast = after / (power * before) - 1
         variance = (before + n * read[lit]) / before**2 + (after + n * read[lit]) / after**2
         deviation = float(np.median(np.abs(contrast) / np.sqrt(variance)))
-        lengths.append(n)
-        ratios.append((deviation / _NORMAL_QUARTILE) ** 2)
-    return NoiseCurve(tuple(lengths), tuple(ratios))
+        return (deviation / _NORMAL_QUARTILE) ** 2
+
+    lengths = sorted({*_LENGTHS[:-1], max(longest, 1)})
+    lengths = [n for n in lengths if n <= longest and 2 * n <= len(strip)]
+    return NoiseCurve(tuple(lengths), tuple(mapper(ratio, lengths)))
 
 
 def choose_window(curve: NoiseCurve, frames: int) -> int:
