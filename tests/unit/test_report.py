@@ -16,7 +16,7 @@ import pytest
 from iscat_analysis.config import load_config, parse_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import EVENT_COLUMNS, Status
-from iscat_analysis.report import check_output, render_page, render_report, write_report
+from iscat_analysis.report import check_output, figures, render_page, render_report, write_report
 from iscat_analysis.report.context import number, precision_of
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder
 from iscat_analysis.report.pack import CREDIBLE_LEVELS, credible_shades, quantise
@@ -308,3 +308,12 @@ def test_a_page_without_a_title_is_an_error() -> None:
 
     with pytest.raises(jinja2.UndefinedError, match="title"):
         render_page("document.html", {"sections": []})
+
+
+def test_the_histogram_keeps_species_apart() -> None:
+    """A bin is two standard deviations wide, within reason."""
+    spread = np.full(30, 6.0)
+    assert 1000 / figures._bins(1000.0, spread) == pytest.approx(12, rel=0.01)
+    assert figures._bins(5.0, spread) == 10
+    assert figures._bins(1e5, spread) == 90
+    assert figures._bins(1000.0, np.array([])) == 10

@@ -65,7 +65,9 @@
     if (!values.length) { host.replaceChildren(el("p", { class: "empty" }, "No finite values to show.")); return; }
     let lo = Math.min(...values), hi = Math.max(...values);
     if (hi - lo < Math.abs(hi) * 1e-6 + 1e-9) { lo -= Math.abs(lo) * 0.1 + 0.5; hi += Math.abs(hi) * 0.1 + 0.5; }
-    const bins = Math.max(10, Math.min(60, Math.round(2 * Math.sqrt(values.length))));
+    const spread = columns[`sigma_${name}`].filter((v, i) => finite(v) && v > 0 && isOk(i)).sort((a, b) => a - b);
+    const width = spread.length ? 2 * spread[spread.length >> 1] : Infinity; // does not blur neighbouring species
+    const bins = Math.max(10, Math.min(90, Math.round((hi - lo) / width)));
     const edges = Array.from({ length: bins + 1 }, (_, k) => lo + ((hi - lo) * k) / bins);
     const counts = { ok: new Array(bins).fill(0), flagged: new Array(bins).fill(0), out: new Array(bins).fill(0) };
     columns[name].forEach((v, i) => {
