@@ -6,6 +6,7 @@ so that ``--help`` and shell completion stay quick; and `app` itself only once C
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Sequence
 
@@ -61,6 +62,8 @@ def _start(program: str, arguments: Sequence[str] | None) -> int:
             if ours:
                 signal.signal(signal.SIGINT, signal.default_int_handler)
         status: int = getattr(app, program)(arguments)
+        if arguments is None:  # the process ends; looking through what is left takes half a second
+            gc.freeze()
     except KeyboardInterrupt:  # before a command began or after it ended
         return INTERRUPTED
     return status

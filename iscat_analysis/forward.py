@@ -8,8 +8,9 @@ the contrast C in the interferometric schemes and |E_sca|² for unit incident am
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,8 @@ ComplexArray = NDArray[np.complex128]
 
 NEAR_CRITICAL = 0.98
 """NA over n_sample from which the quadrature minds the critical angle."""
+
+_HEIGHTS_KEPT = 8  # profiles at hand; where z is fixed, every image asks for the same one
 
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
@@ -127,8 +130,15 @@ class ForwardModel:
         Returns
         -------
         ndarray, shape (4·orders, intervals, 6)
-            See `iscat_analysis._kernels.radial`.
+            See `iscat_analysis._kernels.radial`.  The last few are kept: not to be written to.
         """
+        return self._profiles(z_nm, orders)
+
+    @cached_property
+    def _profiles(self) -> Callable[[float, int], FloatArray]:
+        return lru_cache(_HEIGHTS_KEPT)(self._profile)
+
+    def _profile(self, z_nm: float, orders: int) -> FloatArray:
         points = self.table.shape[3]
         nodes = np.empty((4 * orders, 3 * points))
         out = np.empty((4 * orders, points - 1, 6))
@@ -334,14 +344,12 @@ class ForwardModel:
 
     def _peak(self, z_nm: float, amplitude: float) -> tuple[float, float, float]:
         """Linear and quadratic part of the extreme signal, and its distance [nm]."""
-        r = np.linspace(0, self.reach_nm, 8 * (self.table.shape[3] - 1), endpoint=False)
+        r, fields = self._axes(z_nm)
 
-        def parts(r: FloatArray) -> tuple[FloatArray, FloatArray]:
-            f0, f2 = self._radial(r, z_nm)
-            along = np.stack([f0 + f2 * r**2, f0 - f2 * r**2])
+        def parts(along: ComplexArray) -> tuple[FloatArray, FloatArray]:
             return 2 * self.rho * amplitude * along.real, amplitude**2 * np.abs(along) ** 2
 
-        linear, quadratic = parts(r)
+        linear, quadratic = parts(fields)
         axis, best = np.unravel_index(np.argmax(np.abs(linear + quadratic)), linear.shape)
         if 0 < best < r.size - 1:
             low, mid, high = (linear + quadratic)[axis, best - 1 : best + 2]
@@ -350,8 +358,18 @@ class ForwardModel:
             r_peak = r[best] + shift * r[1]
         else:
             r_peak = r[best]
-        linear, quadratic = parts(np.array([r_peak]))
+        linear, quadratic = parts(self._along(np.array([r_peak]), z_nm))
         return float(linear[axis, 0]), float(quadratic[axis, 0]), float(r_peak)
+
+    def _along(self, r: FloatArray, z_nm: float) -> ComplexArray:
+        """Field along the polarisation and across it, shape (2, n)."""
+        f0, f2 = self._radial(r, z_nm)
+        return np.stack([f0 + f2 * r**2, f0 - f2 * r**2])
+
+    @cached_property
+    def _axes(self) -> Callable[[float], tuple[FloatArray, ComplexArray]]:
+        r = np.linspace(0, self.reach_nm, 8 * (self.table.shape[3] - 1), endpoint=False)
+        return lru_cache(_HEIGHTS_KEPT)(lambda z_nm: (r, self._along(r, z_nm)))
 
     def _geometry(
         self, grid: PixelGrid, x_nm: float, y_nm: float, amplitude: float
