@@ -1,6 +1,7 @@
 """Mixture of normal distributions with an error of its own for each event: EM and likelihood.
 
-x_i ~ Σ_k w_k N(μ_k, τ_k² + σ_i²).  Loops, because the arrays are a few hundred by a few.
+x_i ~ Σ_k w_k N(μ_k, τ_k² + σ_i²), seen where an estimate of it exceeds a threshold.
+Loops, because the arrays are a few hundred by a few.
 """
 
 from __future__ import annotations
@@ -112,3 +113,68 @@ def mixture_score(
             gradient[1, j] += r * z
             gradient[2, j] += 0.5 * r * (z * z - 1.0 / total)
     return value, gradient
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _log_normal_cdf(a: float) -> float:
+    """Logarithm of Φ(a); the asymptotic series where erfc would vanish."""
+    if a > -20.0:
+        return math.log(0.5 * math.erfc(-a * math.sqrt(0.5)))
+    b = 1.0 / (a * a)
+    series = -b * (1.0 - 3.0 * b * (1.0 - 5.0 * b * (1.0 - 7.0 * b)))
+    return -0.5 * a * a - math.log(-a) - 0.5 * _LOG_2PI + math.log1p(series)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def detection_score(
+    noise: FloatArray,
+    threshold: float,
+    times: int,
+    weight: FloatArray,
+    mean: FloatArray,
+    variance: FloatArray,
+) -> tuple[float, FloatArray]:
+    """Logarithm of the chance to see the events, and its gradient.
+
+    Parameters
+    ----------
+    noise : ndarray, shape (n,)
+        s_i² of the estimate that decides.
+    threshold : float
+        What it must exceed.
+    times : int
+        How often each counts.
+    weight, mean, variance : ndarray, shape (k,)
+        w, μ and τ².
+
+    Returns
+    -------
+    value : float
+        Σ_i log Z_i, Z_i = Σ_k w_k Φ((μ_k − threshold)/√(τ_k² + s_i²)).
+    gradient : ndarray, shape (3, k)
+        With respect to log w (each by itself), μ and τ².
+    """
+    n, k = noise.size, weight.size
+    gradient = np.zeros((3, k))
+    at, seen, part = np.empty(k), np.empty(k), np.empty(k)
+    value = 0.0
+    for i in range(n):
+        top = -1e300
+        for j in range(k):
+            at[j] = (mean[j] - threshold) / math.sqrt(variance[j] + noise[i])
+            seen[j] = _log_normal_cdf(at[j])
+            part[j] = math.log(weight[j] + 1e-300) + seen[j]
+            top = max(top, part[j])
+        total = 0.0
+        for j in range(k):
+            part[j] = math.exp(part[j] - top)
+            total += part[j]
+        value += top + math.log(total)
+        for j in range(k):
+            share = part[j] / total
+            spread = variance[j] + noise[i]
+            slope = math.exp(-0.5 * at[j] * at[j] - 0.5 * _LOG_2PI - seen[j])
+            gradient[0, j] += share
+            gradient[1, j] += share * slope / math.sqrt(spread)
+            gradient[2, j] -= 0.5 * share * slope * at[j] / spread
+    return times * value, times * gradient

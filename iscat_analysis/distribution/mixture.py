@@ -9,8 +9,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import log_ndtr, logsumexp
 
-from iscat_analysis._kernels.mixture import mixture_em, mixture_score
-from iscat_analysis.distribution.events import Efficiency, Events
+from iscat_analysis._kernels.mixture import detection_score, mixture_em, mixture_score
+from iscat_analysis.distribution.events import Events
 from iscat_analysis.records import FloatArray
 
 _SIZE_FLOOR = 1e-3  # of a component's share of the events
@@ -151,13 +151,15 @@ def polish(events: Events, start: Mixture, evaluations: int = 400) -> Mixture:
         if events.efficiency is None:
             by_weight = by_weight - n * mixture.weight
         else:
-            norm, (norm_weight, norm_mean, norm_variance) = detection_score(
-                mixture, events, events.efficiency
-            )
-            value -= norm
-            by_weight = by_weight - norm_weight
-            by_mean = by_mean - norm_mean
-            by_variance = by_variance - norm_variance
+            seen, slopes = detection_score(
+                events.filter_variance[:, 0], events.efficiency.threshold_kda,
+                n // len(events.filter_variance),
+                mixture.weight, mixture.mean, mixture.variance,
+            )  # fmt: skip
+            value -= seen
+            by_weight = by_weight - slopes[0]
+            by_mean = by_mean - slopes[1]
+            by_variance = by_variance - slopes[2]
         gradient = np.concatenate([by_weight[1:], by_mean * scale, by_variance * scale**2])
         return -value / n, -gradient / n
 
@@ -177,42 +179,3 @@ def polish(events: Events, start: Mixture, evaluations: int = 400) -> Mixture:
         options={"maxfun": evaluations, "ftol": 1e-9, "gtol": 1e-6},
     )  # fmt: skip
     return replace(unpack(np.asarray(found.x)), log_likelihood=-float(found.fun) * n)
-
-
-def detection_score(
-    mixture: Mixture, events: Events, efficiency: Efficiency
-) -> tuple[float, tuple[FloatArray, FloatArray, FloatArray]]:
-    """Give what detection takes off the log-likelihood, and its slopes.
-
-    Parameters
-    ----------
-    mixture : Mixture
-        The species.
-    events : Events
-        What was seen.
-    efficiency : Efficiency
-        Of the detector.
-
-    Returns
-    -------
-    norm : float
-        Σ_i log Z_i.
-    slopes : tuple of ndarray, each shape (k,)
-        Its derivatives by log w (not normalised), μ and τ².
-    """
-    reach = np.sqrt(mixture.variance + events.filter_variance)
-    at = (mixture.mean - efficiency.threshold_kda) / reach
-    log_seen = log_ndtr(at)
-    with np.errstate(divide="ignore"):
-        part = np.log(mixture.weight) + log_seen
-    top = part.max(axis=1, keepdims=True)
-    share = np.exp(part - top)
-    total = share.sum(axis=1, keepdims=True)
-    share /= total
-    slope = np.exp(-0.5 * at**2 - 0.5 * math.log(2 * math.pi) - log_seen)
-    times = events.x.size if len(total) == 1 else 1
-    return times * float((np.log(total) + top).sum()), (
-        times * share.sum(axis=0),
-        times * np.sum(share * slope / reach, axis=0),
-        times * -0.5 * np.sum(share * slope * at / reach**2, axis=0),
-    )

@@ -159,7 +159,7 @@ def _number(axes: Axes, events: FloatArray, per_inch: float, shape: tuple[int, i
                 taken.append(box)
                 axes.text(
                     left + width / 2, top + tall / 2, text, color="white", fontsize=7,
-                    ha="center", va="center",
+                    ha="center", va="center", in_layout=False,
                     path_effects=[withStroke(linewidth=1.6, foreground="black", alpha=0.7)],
                 )  # fmt: skip
                 break

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
+from scipy.special import log_ndtr
 from scipy.stats import ks_2samp, norm
 
-from iscat_analysis._kernels.mixture import mixture_em, mixture_score
+from iscat_analysis._kernels.mixture import detection_score, mixture_em, mixture_score
 from iscat_analysis.distribution import (
     LEAST_EVENTS,
     SPECIES_COLUMNS,
@@ -20,7 +21,7 @@ from iscat_analysis.distribution import (
 )
 from iscat_analysis.distribution.bootstrap import draw_events
 from iscat_analysis.distribution.events import Events
-from iscat_analysis.distribution.mixture import Mixture, detection_score
+from iscat_analysis.distribution.mixture import Mixture
 
 
 def sample(seed: int = 1, n: int = 200) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -60,8 +61,11 @@ def test_what_detection_takes_off_is_that_of_scipy_and_so_is_its_slope(same_nois
 
     def found(theta: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         mixture = Mixture(np.exp(theta[:2]), theta[2:4], theta[4:])
-        value, slopes = detection_score(mixture, events, efficiency)
-        return value, np.concatenate(slopes)
+        value, slopes = detection_score(
+            events.filter_variance[:, 0], efficiency.threshold_kda, 40 if same_noise else 1,
+            mixture.weight, mixture.mean, mixture.variance,
+        )  # fmt: skip
+        return value, slopes.ravel()
 
     noise = np.maximum(sigma, efficiency.sigma_kda)
     expected = np.log(
@@ -217,3 +221,12 @@ def test_efficiency_is_half_at_the_threshold() -> None:
     light = found.species.iloc[0]
     assert light["count_corrected"] == pytest.approx(light["count"] / light["efficiency"], rel=1e-3)
     assert found.curves["efficiency"].is_monotonic_increasing
+
+
+@pytest.mark.parametrize("mean", [-300.0, -120.0, -99.0, 0.0, 300.0])
+def test_far_below_the_threshold_the_chance_is_that_of_scipy(mean: float) -> None:
+    one = (np.array([1.0]), np.array([mean]), np.array([0.0]))
+    value, slopes = detection_score(np.array([25.0]), 0.0, 1, *one)
+    assert value == pytest.approx(float(log_ndtr(mean / 5)), rel=1e-9)
+    hazard = math.exp(norm.logpdf(mean / 5) - float(log_ndtr(mean / 5)))
+    assert slopes[1, 0] == pytest.approx(hazard / 5, rel=1e-6)
