@@ -40,6 +40,7 @@ from iscat_analysis.sliding import (
     STRIDES,
     Chunk,
     Filter,
+    MapArray,
     Peak,
     StepFrame,
     find_steps,
@@ -119,6 +120,8 @@ class ChunkFitter:
         self._neighbours = Neighbours(scene, chunk, window)
         self._tasks = TaskBuilder(scene, chunk, window, self._neighbours)
         self._stride = int(chunk.edges[1] - chunk.edges[0])
+        self._maps: tuple[MapArray, FloatArray] | None = None
+        self._near: list[list[Step]] = []  # steps that each of the maps knows of
         self.strongest = np.zeros((2, *chunk.shape))
         self.rounds = 0
 
@@ -178,21 +181,31 @@ class ChunkFitter:
         polarity = {"both": 0, "bright": 1, "dark": -1}[scene.config.detection.polarity]
         polarity *= int(scene.templates.signs[0])
 
-        def explained(_: int, before: slice, after: slice) -> FloatArray | None:
-            near = [s for s in steps if self._neighbours.overlaps(s, before.start, after.stop)]
-            if not near:
+        edges, count = chunk.edges, chunk.edges.size - 2
+        near = []
+        for j in range(count):
+            low, high = max(j + 1 - self._strides, 0), min(j + 1 + self._strides, count + 1)
+            span = int(edges[low]), int(edges[high])
+            near.append([s for s in steps if self._neighbours.overlaps(s, *span)])
+
+        def explained(j: int, before: slice, after: slice) -> FloatArray | None:
+            if not near[j]:
                 return None
             total = np.zeros(chunk.shape)
-            for step in near:
+            for step in near[j]:
                 rows, columns = spans(step.corner, step.image.shape)
                 here = (slice(*rows), slice(*columns))
                 total[here] += self._neighbours.change(step, before, after)
             return total
 
-        snr, effective = sliding_maps(
+        self._maps = snr, effective = sliding_maps(
             chunk, matched, self._strides,
-            explained=explained if steps else None, mapper=self._pool.map,
+            explained=explained if steps else None,
+            earlier=self._maps,
+            changed=[j for j, old in enumerate(self._near) if _ids(old) != _ids(near[j])],
+            mapper=self._pool.map,
         )  # fmt: skip
+        self._near = near
         if not steps and len(snr):
             where = np.argmax(np.abs(snr), axis=0)
             best = np.take_along_axis(snr, where[None], axis=0)[0].astype(np.float64)
@@ -349,6 +362,11 @@ def _judged(scene: Scene, fit: FitResult, task: Task) -> FitResult:
         *([Status.POOR_FIT] if poor else []),
     ]
     return replace(fit, status=Status(flags[0]) if flags else Status.OK, flags=tuple(flags))
+
+
+def _ids(steps: Sequence[Step]) -> set[int]:
+    """Tell apart the very same steps from those that were fitted anew."""
+    return {id(step) for step in steps}
 
 
 def _has_moved(old: Step, new: Step) -> bool:

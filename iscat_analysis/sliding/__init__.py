@@ -23,6 +23,7 @@ from iscat_analysis.sliding.noise import (
 from iscat_analysis.sliding.search import (
     STRIDES,
     Filter,
+    MapArray,
     Peak,
     find_steps,
     make_filter,
@@ -39,6 +40,7 @@ __all__ = [
     "STRIDES",
     "Chunk",
     "Filter",
+    "MapArray",
     "Mapper",
     "NoiseCurve",
     "Patch",

@@ -10,7 +10,7 @@ threshold each boundary counts as an independent search.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -105,6 +105,8 @@ def sliding_maps(
     strides: int,
     *,
     explained: Callable[[int, slice, slice], FloatArray | None] | None = None,
+    earlier: tuple[MapArray, FloatArray] | None = None,
+    changed: Sequence[int] = (),
     mapper: Mapper = map,
 ) -> tuple[MapArray, FloatArray]:
     """Signal-to-noise ratio of a step at every boundary between blocks and every pixel.
@@ -119,6 +121,10 @@ def sliding_maps(
         Blocks in a window; fewer near the ends.
     explained : callable, optional
         Boundary, and the frames before and after → contrast of known events, or None for none.
+    earlier : (ndarray, ndarray), optional
+        What an earlier call returned; overwritten where `changed`, and returned.
+    changed : sequence of int
+        Boundaries at which what is explained has changed since.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -131,9 +137,11 @@ def sliding_maps(
     """
     count = chunk.edges.size - 2
     rows, columns = chunk.shape
-    snr = np.empty((count, rows, columns), dtype=np.float32)
     block_power = np.add.reduceat(chunk.power, chunk.edges[:-1])
-    effective = np.zeros(count)
+    if earlier is None:
+        earlier = np.empty((count, rows, columns), dtype=np.float32), np.zeros(count)
+        changed = range(count)
+    snr, effective = earlier
 
     def one(j: int) -> None:
         low, middle, high = max(j + 1 - strides, 0), j + 1, min(j + 1 + strides, count + 1)
@@ -159,7 +167,7 @@ def sliding_maps(
         effective[j] = powers[0] * powers[1] / (powers[0] + powers[1])
         np.divide(overlap * math.sqrt(effective[j]), np.sqrt(matched.norm), out=snr[j])
 
-    for _ in mapper(one, range(count)):
+    for _ in mapper(one, changed):
         pass
     return snr, effective
 
