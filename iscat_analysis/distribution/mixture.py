@@ -116,7 +116,9 @@ def height(events: Events, start: Mixture) -> float:
     )
 
 
-def polish(events: Events, start: Mixture, evaluations: int = 400) -> Mixture:
+def polish(
+    events: Events, start: Mixture, *, evaluations: int = 400, tolerance: float = 1e-9
+) -> Mixture:
     """Maximise the likelihood of the events seen, with its gradient, under τ² ≥ 0.
 
     Parameters
@@ -127,6 +129,8 @@ def polish(events: Events, start: Mixture, evaluations: int = 400) -> Mixture:
         Where to begin.
     evaluations : int
         Of the likelihood, at most.
+    tolerance : float
+        Of the log-likelihood per event.
 
     Returns
     -------
@@ -176,6 +180,6 @@ def polish(events: Events, start: Mixture, evaluations: int = 400) -> Mixture:
     # TNC and not L-BFGS-B, whose calls of a threaded BLAS take longer than all the rest.
     found = minimize(
         loss, theta, jac=True, method="TNC", bounds=bounds,
-        options={"maxfun": evaluations, "ftol": 1e-9, "gtol": 1e-6},
+        options={"maxfun": evaluations, "ftol": tolerance, "gtol": 1e-6},
     )  # fmt: skip
     return replace(unpack(np.asarray(found.x)), log_likelihood=-float(found.fun) * n)

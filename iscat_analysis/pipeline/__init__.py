@@ -47,7 +47,7 @@ DEPENDENCIES = (
     "matplotlib",
 )  # fmt: skip
 
-FEW_FIGURES = 4
+FEW_FIGURES = 2
 """Events of a landing movie that are drawn for print; the page shows hundreds."""
 
 _GAIN_FRAMES = 64  # background frames that the noise is measured on
