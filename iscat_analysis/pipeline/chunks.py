@@ -72,15 +72,21 @@ class Reader:
         Counts → photoelectrons.
     first, last : int
         Half-open range of frames to analyse.
+    room_bytes : int
+        Of counts, for the longest chunk; from `counts_budget`.
     """
 
-    def __init__(self, movie: Frames, camera: Camera, first: int, last: int) -> None:
+    def __init__(
+        self, movie: Frames, camera: Camera, first: int, last: int, room_bytes: int
+    ) -> None:
         self._movie = movie
         self._camera = camera
         self.first, self.last = first, last
         self.shape = (movie.shape[1], movie.shape[2])
         self.frame_bytes = math.prod(self.shape) * movie.dtype.itemsize
-        self._buffer = np.empty((0, *self.shape), dtype=movie.dtype)
+        # made at once, because growing copies; only what is written to takes memory
+        room = min(max(last - first, 0), room_bytes // self.frame_bytes)
+        self._buffer = np.empty((room, *self.shape), dtype=movie.dtype)
         self._held = (first, first)
         self._light: FloatArray = np.empty(0)
         self._repeats: BoolArray = np.empty(0, dtype=np.bool_)
@@ -90,8 +96,7 @@ class Reader:
         """What messages call the movie."""
         return self._movie.name
 
-    def reserve(self, frames: int) -> None:
-        """Make room for so many frames."""
+    def _reserve(self, frames: int) -> None:
         if frames > len(self._buffer):
             kept = self._held[1] - self._held[0]
             larger = np.empty((frames, *self.shape), dtype=self._movie.dtype)
@@ -112,7 +117,7 @@ class Reader:
             self._repeats = self._repeats[start - low : start - low + kept]
         else:
             self._light, self._repeats = np.empty(0), np.empty(0, dtype=np.bool_)
-        self.reserve(stop - start)
+        self._reserve(stop - start)
         self._held = (start, start + kept)
         self._append(start + kept, stop, mapper)
         good = np.isfinite(self._light) & ~self._repeats
@@ -212,6 +217,22 @@ def choose_windows(reader: Reader, config: Config, mapper: Mapper = map) -> tupl
     return curve, given or choose_window(curve, frames)
 
 
+def counts_budget(config: Config) -> int:
+    """Bytes that the stored counts of a chunk may take.
+
+    Parameters
+    ----------
+    config : Config
+        ``compute.memory_limit_mb``.
+
+    Returns
+    -------
+    int
+        A share of it.
+    """
+    return int(_MEMORY_SHARE * config.compute.memory_limit_mb * 1e6)
+
+
 def plan_chunks(
     reader: Reader, config: Config, window: int, stride: int
 ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
@@ -233,7 +254,7 @@ def plan_chunks(
     """
     first, last = reader.first, reader.last
     halo = math.ceil(HALO * window / stride) * stride
-    budget = int(_MEMORY_SHARE * config.compute.memory_limit_mb * 1e6)
+    budget = counts_budget(config)
     # beside its counts, a block holds its sum and its map, and the field some images in doubles
     pixels = math.prod(reader.shape)
     per_frame = reader.frame_bytes + 20 * pixels // stride
@@ -250,7 +271,6 @@ def plan_chunks(
         )
     count = math.ceil((last - first) / core)
     core = math.ceil((last - first) / count / stride) * stride  # of equal length
-    reader.reserve(min(core + 2 * halo, last - first))
     return [
         (
             (begin, min(begin + core, last)),

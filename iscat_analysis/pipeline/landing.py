@@ -35,6 +35,7 @@ from iscat_analysis.pipeline.chunks import (
     Merged,
     Reader,
     choose_windows,
+    counts_budget,
     plan_chunks,
 )
 from iscat_analysis.pipeline.injection import InjectedMovie, draw_particles, recovery
@@ -165,7 +166,7 @@ def analyse_landings(
             f"{movie.name}: has {movie.shape[0]} frames, but fit.frames asks for {first}:{last}; "
             "change fit.frames"
         )
-    reader = Reader(movie, camera, first, last)
+    reader = Reader(movie, camera, first, last, counts_budget(config))
     with ThreadPoolExecutor(config.compute.workers) as pool:
         curve, window = choose_windows(reader, config, pool.map)
     stride = max(1, window // STRIDES)
