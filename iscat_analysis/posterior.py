@@ -11,14 +11,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import emcee
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from iscat_analysis.likelihood import Likelihood
 from iscat_analysis.records import PARAMETERS, FitResult, FloatArray, PosteriorResult
+
+if TYPE_CHECKING:
+    import emcee
 
 MAX_R_HAT = 1.01
 MIN_ESS = 400.0
@@ -60,6 +63,8 @@ def sample_posterior(
     PosteriorResult
         Samples in nm and kDa, diagnostics and verdict.
     """
+    import emcee  # takes a third of a second, and only chains need it
+
     index = np.flatnonzero(fit.box.free)
     names = (*PARAMETERS, "level")
     proposal = _Proposal.around(likelihood, fit, index)
@@ -198,6 +203,7 @@ def _after_burn_in(sampler: emcee.EnsembleSampler) -> tuple[FloatArray, FloatArr
 
 
 def _diagnose(samples: FloatArray) -> _Verdict:
+    import emcee
     from arviz_stats.base import array_stats  # takes a second, and only chains need it
 
     draws = samples.shape[1]
