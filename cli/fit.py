@@ -87,8 +87,8 @@ def fit(
         typer.Option(
             min=1,
             metavar="N",
-            help="Landing movies: add N known particles in a second run and report recall, bias "
-            "and spread.",
+            help="Landing movies: add N known particles, which land and leave, in a second run and "
+            "report recall, bias and spread.",
             show_default=False,
         ),
     ] = None,
