@@ -200,6 +200,9 @@ class BackgroundConfig(Section):
     power_normalization: bool = Field(
         True, description="divide out the laser power, estimated with the particles excluded"
     )
+    drift_correction: bool = Field(
+        False, description="landing movies: divide out the motion of the fixed pattern"
+    )
 
     @model_validator(mode="after")
     def _known(self) -> BackgroundConfig:
@@ -273,7 +276,9 @@ class SimulatedEvent(Section):
     leave: Annotated[int, Field(ge=1)] | None = Field(
         None, description="first frame without it again"
     )
-    x_px: Finite = Field(description="column; integer = pixel centre")
+    x_px: Finite = Field(
+        description="column; integer = pixel centre; with drift, that of its first frame"
+    )
     y_px: Finite = Field(description="row, downwards")
     z_nm: NonNegative | None = Field(None, description="default particle.height_nm")
     mass_kda: Positive | None = Field(None, description="default particle.mass_kda")
@@ -300,6 +305,9 @@ class Simulation(Section):
     background: str = Field("flat", description='"flat" | "speckle" | path of a TIFF')
     speckle_contrast: NonNegative = Field(0.1, description="standard deviation over mean")
     power_noise: NonNegative = Field(0.0, description="relative laser-power noise, frame to frame")
+    drift_px_per_frame: tuple[Finite, Finite] = Field(
+        (0.0, 0.0), description="of background and particles together, along x and y"
+    )
     seed: Annotated[int, Field(ge=0)] = Field(1, description="same seed, same bytes")
     events: tuple[SimulatedEvent, ...] = Field((), description="each particle, placed by hand")
     count: Annotated[int, Field(ge=1)] | None = Field(

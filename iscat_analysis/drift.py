@@ -1,13 +1,282 @@
-"""Drift: how far the fixed pattern of a movie moves."""
+"""Drift: how far the fixed pattern of a movie moves, and the pattern moved.
+
+Speckle moves with the sample, so that after over before holds B(x − d_a)/B(x − d_b), a false
+contrast −∇B·(d_a − d_b)/B, beside that of particles.  Counts are never interpolated: they would be
+Poisson no longer.  The *expectation* is: the pattern, an average over many frames, is moved to
+where it was in either window, and the ratio of the two is a known factor of the likelihood.
+
+The way is followed block by block.  Each is set against the one before it, by least squares
+weighted by shot noise; particles, which cover few pixels, are clipped.  Noise of block k
+enters d_k as a linear functional L of that noise, and every later shift through L as well, so that
+it does not add up along the way, and the shift between two windows is the one that fits *these*
+windows best: two degrees of freedom of their noise, out of as many as there are pixels.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
+from scipy.ndimage import binary_dilation, distance_transform_edt
 
-from iscat_analysis.records import FloatArray
+from iscat_analysis._kernels.drift import extend, mismatch, shift_equations
+from iscat_analysis.records import BoolArray, FloatArray, Mapper
+
+ComplexArray = NDArray[np.complex128]
+
+REACH_PX = 4
+"""From the edges of a field, within which a moved pattern is not to be trusted."""
+
+_PASSES = 4
+_CLIP = 4.0  # robust standard deviations beyond which a pixel does not count
+_SETTLED_PX = 1e-5
+_POOR = 3.0  # mismatch over shot noise that asks for another start: the stage has jumped
+_PATTERN = 1.0  # least squared gradient of the pattern over that of its noise
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where the fixed pattern was.
+
+    Attributes
+    ----------
+    frames : ndarray, shape (k,)
+        Mean frame of each block.
+    shift_px : ndarray, shape (k, 2)
+        How far the pattern has moved since the first block, along y and x.
+    error_px : ndarray, shape (k, 2)
+        Standard error of a block's shift against the block before it.
+    """
+
+    frames: FloatArray
+    shift_px: FloatArray
+    error_px: FloatArray
+
+    @property
+    def typical_error_px(self) -> float:
+        """Median standard error of a block's shift along the worse axis [pixels]."""
+        return float(np.median(self.error_px.max(axis=1)))
+
+    def at(self, frames: FloatArray | float) -> FloatArray:
+        """Shift in some frames, shape (…, 2); a straight line between blocks and beyond them."""
+        at, known = np.asarray(frames, dtype=float), self.frames
+        if known.size < 2:
+            return np.broadcast_to(self.shift_px[0], (*at.shape, 2)).copy()
+        k = np.clip(np.searchsorted(known, at) - 1, 0, known.size - 2)
+        share = ((at - known[k]) / (known[k + 1] - known[k]))[..., None]
+        between: FloatArray = (1 - share) * self.shift_px[k] + share * self.shift_px[k + 1]
+        return between
+
+
+def follow_pattern(
+    blocks_e: FloatArray,
+    power: FloatArray,
+    frames: FloatArray,
+    usable: BoolArray,
+    read_variance_e2: FloatArray,
+    *,
+    mapper: Mapper = map,
+) -> Trajectory | None:
+    """Follow the fixed pattern from block to block.
+
+    Parameters
+    ----------
+    blocks_e : ndarray, shape (k, y, x)
+        Photoelectrons summed over blocks of frames.
+    power : ndarray, shape (k,)
+        Light of each; blocks without any are passed over.
+    frames : ndarray, shape (k,)
+        Mean frame of each.
+    usable : ndarray of bool, shape (y, x)
+        Pixels that are neither defective nor saturated.
+    read_variance_e2 : ndarray, shape (y, x)
+        Of one unit of power [e²].
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    Trajectory or None
+        None where there is no pattern to follow: its gradient does not stand out from noise.
+    """
+    lit = np.flatnonzero(power > 0)
+    nearest = filling(usable)
+    usable = trusted(usable)
+    mover = Mover((usable.shape[0], usable.shape[1]))
+
+    def one(place: int) -> tuple[FloatArray, FloatArray, float]:
+        here, before = lit[place], lit[place - 1]
+        return _register(
+            mover, blocks_e[before][nearest], blocks_e[here], usable,
+            power[before] * read_variance_e2, power[here] * read_variance_e2,
+            float(power[here] / power[before]),
+        )  # fmt: skip
+
+    found = list(mapper(one, range(1, lit.size)))
+    if not found or not np.median([clear for _, _, clear in found]) > _PATTERN:
+        return None
+    steps = np.array([step for step, _, _ in found])
+    errors = np.array([error for _, error, _ in found])
+    way = np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+    return Trajectory(frames[lit], way, np.vstack([errors[:1], errors]))
+
+
+def _register(
+    mover: Mover,
+    pattern: FloatArray,
+    image: FloatArray,
+    usable: BoolArray,
+    pattern_read: FloatArray,
+    image_read: FloatArray,
+    ratio: float,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Shift (y, x) of an image against a pattern, its error, and how clear the pattern is."""
+    spectrum = mover.spectrum(pattern)
+    deviation = np.empty(pattern.shape)
+    normal, right = np.empty((3, 3)), np.empty(3)
+
+    def refined(shift: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:
+        for _ in range(_PASSES):
+            moved = pattern
+            if shift.any():
+                moved = mover.image(spectrum * mover.transfer(shift[None], np.ones(1)))
+            mismatch(moved, image, usable, pattern_read, image_read, ratio, deviation)
+            scale = max(1.4826 * float(np.nanmedian(np.abs(deviation[::2, ::3]))), 1.0)
+            spurious = shift_equations(
+                moved, pattern_read, image_read, ratio, deviation, _CLIP * scale, normal, right
+            )
+            clear = float(normal[0, 0] + normal[1, 1]) / max(2 * spurious, 1e-300)
+            if not clear > 0 or np.linalg.eigvalsh(normal)[0] <= 0:
+                return math.inf, np.zeros(2), np.full(2, math.inf), 0.0
+            inverse = np.linalg.inv(normal)
+            step = (inverse @ right)[:2]
+            shift = shift + step
+            if np.hypot(*step) < _SETTLED_PX:
+                break
+        return scale, shift, scale * np.sqrt(np.diag(inverse)[:2]), clear
+
+    found = refined(np.zeros(2))
+    if found[0] > _POOR:
+        far = measure_drift(pattern, np.where(usable, image, ratio * pattern))
+        found = min(found, refined(np.array(far)), key=lambda result: result[0])
+    return found[1:]
+
+
+class Mover:
+    """Moves images of one size by any part of a pixel, by the phase of their spectra.
+
+    Exact for a pattern that the pixels resolve.  Beyond its edges an image is continued by its
+    reflection; what that pretends is felt within `REACH_PX` of them.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    """
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._shape = shape
+        self._size = tuple(fft.next_fast_len(n + 4 * REACH_PX, real=True) for n in shape)
+        self._fy, self._fx = fft.fftfreq(self._size[0]), fft.rfftfreq(self._size[1])
+
+    @property
+    def waves(self) -> tuple[ComplexArray, ComplexArray]:
+        """What multiplies a spectrum where the image is differentiated by y or by x."""
+        return 2j * np.pi * self._fy[:, None], 2j * np.pi * self._fx[None]
+
+    def spectrum(self, image: FloatArray) -> ComplexArray:
+        """Spectrum of an image, shape (v, u)."""
+        extended = np.empty(self._size)
+        extend(np.ascontiguousarray(image), extended)
+        spectrum: ComplexArray = fft.rfft2(extended)
+        return spectrum
+
+    def image(self, spectrum: ComplexArray) -> FloatArray:
+        """Image of a spectrum, shape (y, x)."""
+        rows, columns = self._shape
+        image: FloatArray = fft.irfft2(spectrum, s=self._size)[:rows, :columns]
+        return image
+
+    def transfer(self, shift_px: FloatArray, weights: FloatArray) -> ComplexArray:
+        """Give what multiplies a spectrum where the image is a weighted sum of moved ones.
+
+        Parameters
+        ----------
+        shift_px : ndarray, shape (n, 2)
+            Of each, along y and x.
+        weights : ndarray, shape (n,)
+            Of each.
+
+        Returns
+        -------
+        ndarray, shape (v, u)
+            Σ w exp(−2πi f·d).
+        """
+        y = np.exp(-2j * np.pi * shift_px[:, :1] * self._fy) * weights[:, None]
+        x = np.exp(-2j * np.pi * shift_px[:, 1:] * self._fx)
+        transfer: ComplexArray = np.einsum("kv,ku->vu", y, x)
+        return transfer
+
+
+def derivatives(image: FloatArray) -> FloatArray:
+    """Differentiate an image that fades at its edges.
+
+    Parameters
+    ----------
+    image : ndarray, shape (y, x)
+        The image.
+
+    Returns
+    -------
+    ndarray, shape (5, y, x)
+        By y, x, yy, yx and xx, per pixel; those of its Fourier series.
+    """
+    mover = Mover((image.shape[0], image.shape[1]))
+    spectrum, (y, x) = mover.spectrum(image), mover.waves
+    return np.stack([mover.image(spectrum * w) for w in (y, x, y * y, y * x, x * x)])
+
+
+def trusted(usable: BoolArray, moved_px: float = 0.0) -> BoolArray:
+    """Pixels at which a moved pattern is known.
+
+    Parameters
+    ----------
+    usable : ndarray of bool, shape (y, x)
+        Pixels that are neither defective nor saturated.
+    moved_px : float
+        How far the pattern is moved at most.
+
+    Returns
+    -------
+    ndarray of bool, shape (y, x)
+        Those of them that keep away from the edges and do not touch an unusable one.
+    """
+    near = binary_dilation(~usable, iterations=2)
+    border = REACH_PX + math.ceil(moved_px - _SETTLED_PX)
+    inside = np.zeros_like(usable)
+    inside[border:-border, border:-border] = True
+    kept: BoolArray = inside & ~near
+    return kept
+
+
+def filling(usable: BoolArray) -> tuple[FloatArray, ...]:
+    """Index that puts the nearest usable pixel's value in place of an unusable one's.
+
+    Parameters
+    ----------
+    usable : ndarray of bool, shape (y, x)
+        Pixels to keep.
+
+    Returns
+    -------
+    tuple of ndarray
+        Rows and columns: ``image[filling(usable)]`` is the image with its gaps closed.
+    """
+    index = distance_transform_edt(~usable, return_distances=False, return_indices=True)
+    return tuple(index)
 
 
 def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, float]:

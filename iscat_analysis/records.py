@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Protocol
@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+Mapper = Callable[..., Iterable[Any]]
+"""`map`, or the one of a pool."""
 
 PARAMETERS = ("x_nm", "y_nm", "z_nm", "mass_kda")
 """The particle's parameters, in the order every matrix and vector uses."""

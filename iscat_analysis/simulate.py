@@ -2,8 +2,11 @@
 
 The expected photoelectrons of frame t are P_t·B·|1 + Σ e_i|², with P_t the laser power, B the
 static background and e_i the fields of the particles present, which add coherently; in dark field
-P_t·(b + s·|Σ E_i|²).  Every frame draws from a generator of its own, derived from the seed and
-the frame number, so the bytes do not depend on how the work is divided.
+P_t·(b + s·|Σ E_i|²).  Where the sample drifts, background and particles move together: both are
+made on a field larger by the way they go, and its expectation is shifted by the phase of its
+Fourier transform, exact for an image that the pixels resolve.  Every frame draws from a generator
+of its own, derived from the seed and the frame number, so the bytes do not depend on how the work
+is divided.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ import numpy as np
 import pandas as pd
 import tifffile
 from numpy.typing import NDArray
+from scipy import fft
 from scipy.ndimage import gaussian_filter
 
 from iscat_analysis.camera import camera_from_config, read_map
@@ -37,12 +41,13 @@ TRUTH_COLUMNS = (
 
 _STREAMS = {"background": 0, "power": 1, "events": 2, "frames": 3}
 _BATCH = 32  # frames drawn at once
+_MARGIN_PX = 8  # around what is ever seen of a sample that drifts
 _NO_UUID = "urn:uuid:00000000-0000-0000-0000-000000000000"
 
 
 @dataclass(frozen=True)
 class Particle:
-    """One simulated particle: where, when, how heavy."""
+    """One simulated particle: where, when, how heavy; its place is that in the frame it lands."""
 
     frame: int
     leave: int | None
@@ -136,7 +141,9 @@ class Movie:
     Attributes
     ----------
     background_e : ndarray, shape (y, x)
-        Expected photoelectrons without particles, per frame.
+        Expected photoelectrons without particles, per frame; the first frame's where it drifts.
+    drift_px : ndarray, shape (t, 2)
+        How far the sample has moved since the first frame, along y and x.
     power : ndarray, shape (t,)
         Laser power of each frame, mean 1.
     particles : tuple of Particle
@@ -148,9 +155,14 @@ class Movie:
         self._config = config
         self._seed = seed
         self._pixel_nm = config.camera.pixel_size_nm or 0.0
-        self._grid = PixelGrid.region(
-            (0, simulation.shape[0]), (0, simulation.shape[1]), self._pixel_nm
+        rate = np.array(simulation.drift_px_per_frame[::-1])
+        self.drift_px = np.arange(simulation.frames)[:, None] * rate
+        self._margins = self._margins_px()
+        rows, columns = (
+            (-low, size + high)
+            for (low, high), size in zip(self._margins, simulation.shape, strict=True)
         )
+        self._grid = PixelGrid.region(rows, columns, self._pixel_nm)
         self.particles = self._place()
         heights = [p.z_nm for p in self.particles]
         self._model = forward_model(
@@ -159,7 +171,8 @@ class Movie:
             z_max_nm=max([config.particle.height_nm, *heights]),
         )
         self._camera = camera_from_config(config.camera, simulation.shape, np.uint16)
-        self.background_e = self._background()
+        self._sample_e = self._background()
+        self.background_e = self._sample_e[self._field]
         noise = self._generator("power").standard_normal(simulation.frames)
         self.power = np.maximum(1 + simulation.power_noise * noise, 0.0)
         self._signal_scale = self._scale()
@@ -195,20 +208,23 @@ class Movie:
         rows, columns = self._grid.shape
         field = np.zeros((2, rows * q, columns * q), dtype=complex)
         present: dict[int, ComplexArray] = {}
-        current = self._expected(field)
+        changed = True
         for t in range(self.power.size):
-            changed = False
             for i, particle in enumerate(self.particles):
                 if particle.frame == t:
-                    present[i] = self._field(particle)
+                    present[i] = self._field_of(particle)
                     field = field + present[i]
                     changed = True
                 if particle.leave == t and i in present:
                     field = field - present.pop(i)
                     changed = True
             if changed:
-                current = self._expected(field)
-            yield self.power[t] * current
+                current, changed = self._expected(field), False
+                spectrum = fft.rfft2(current) if self.drift_px.any() else None
+            if spectrum is None:
+                yield self.power[t] * current
+            else:
+                yield self.power[t] * self._shifted(spectrum, t)
 
     def _expected(self, field: ComplexArray) -> FloatArray:
         """Average over the samples inside each pixel, on which `field` is given."""
@@ -219,13 +235,50 @@ class Movie:
         intensity = np.sum(np.abs(reference + field) ** 2, axis=0).reshape(rows, q, columns, q)
         signal = np.einsum("yixj,i,j->yx", intensity, weights, weights)
         if self._model.rho:
-            return np.asarray(self.background_e * signal)
-        return np.asarray(self.background_e + self._signal_scale * signal)
+            return np.asarray(self._sample_e * signal)
+        return np.asarray(self._sample_e + self._signal_scale * signal)
 
-    def _field(self, particle: Particle) -> ComplexArray:
+    @property
+    def _field(self) -> tuple[slice, slice]:
+        """Where the camera's field lies in the sample."""
+        (top, _), (left, _) = self._margins
+        rows, columns = self._config.simulation.shape
+        return slice(top, top + rows), slice(left, left + columns)
+
+    def _margins_px(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Pixels of sample before and after the camera's rows and columns."""
+        simulation = self._config.simulation
+        measured = simulation.background not in ("flat", "speckle")
+        margins = []
+        for way, size in zip(self.drift_px.T, simulation.shape, strict=True):
+            if not way.any():
+                margins.append((0, 0))
+                continue
+            low, high = math.ceil(max(way.max(), 0)), math.ceil(max(-way.min(), 0))
+            if max(low, high) > size:
+                raise ConfigError(
+                    f"simulation.drift_px_per_frame moves the sample by {max(low, high)} pixels, "
+                    f"out of a field of {size}: lower it, or simulate fewer frames"
+                )
+            # a measured image is continued by its reflection, of which a whole period closes
+            spare = size - low - high if measured else 2 * _MARGIN_PX
+            margins.append((low + spare // 2, high + spare - spare // 2))
+        return margins[0], margins[1]
+
+    def _shifted(self, spectrum: ComplexArray, frame: int) -> FloatArray:
+        """Give what the camera sees of the sample in a frame."""
+        rows, columns = self._grid.shape
+        dy, dx = self.drift_px[frame]
+        phase_y = np.exp(-2j * np.pi * dy * fft.fftfreq(rows))
+        phase_x = np.exp(-2j * np.pi * dx * fft.rfftfreq(columns))
+        moved = fft.irfft2(spectrum * phase_y[:, None] * phase_x, s=(rows, columns))
+        return np.asarray(np.maximum(moved[self._field], 0.0))
+
+    def _field_of(self, particle: Particle) -> ComplexArray:
         offsets = self._model.samples[0] * self._pixel_nm
-        x = (self._grid.x_nm[:, None] + offsets).ravel() - particle.x_px * self._pixel_nm
-        y = (self._grid.y_nm[:, None] + offsets).ravel() - particle.y_px * self._pixel_nm
+        dy, dx = self.drift_px[particle.frame]
+        x = (self._grid.x_nm[:, None] + offsets).ravel() - (particle.x_px - dx) * self._pixel_nm
+        y = (self._grid.y_nm[:, None] + offsets).ravel() - (particle.y_px - dy) * self._pixel_nm
         dx, dy = np.meshgrid(x, y)
         return self._model.field(dx, dy, particle.z_nm, particle.mass_kda)
 
@@ -248,7 +301,7 @@ class Movie:
 
     def _background(self) -> FloatArray:
         simulation = self._config.simulation
-        shape = simulation.shape
+        shape = self._grid.shape
         if self._config.optics.scheme == "darkfield":
             level = self._config.background.level_e or 0.0
         else:
@@ -263,14 +316,25 @@ class Movie:
                 max(grain_px, 0.5),
                 mode="wrap",
             )
+            if self.drift_px.any():
+                noise = self._resolved(noise)
             pattern = 1 + simulation.speckle_contrast * (noise - noise.mean()) / noise.std()
             return np.asarray(level * np.maximum(pattern, 0.05))
-        image = read_map(Path(simulation.background), "simulation.background", shape)
+        image = read_map(Path(simulation.background), "simulation.background", simulation.shape)
         if not image.mean() > 0 or (image < 0).any():
             raise ConfigError(
                 f"{simulation.background}: simulation.background needs a non-negative image"
             )
-        return np.asarray(image * (level / image.mean()))
+        around = np.pad(image, self._margins, mode="symmetric")
+        return np.asarray(around * (level / image.mean()))
+
+    def _resolved(self, image: FloatArray) -> FloatArray:
+        """Take off detail finer than the optics pass, 2 NA/λ: moved, it would not be the same."""
+        optics, spectrum = self._config.optics, fft.rfft2(image)
+        rows, columns = image.shape
+        finest = 2 * optics.na / optics.wavelength_nm * self._pixel_nm
+        detail = np.hypot(fft.fftfreq(rows)[:, None], fft.rfftfreq(columns))
+        return np.asarray(fft.irfft2(np.where(detail < finest, spectrum, 0.0), s=(rows, columns)))
 
     def _scale(self) -> float:
         if self._model.rho:
@@ -287,7 +351,7 @@ class Movie:
     def _check_range(self) -> None:
         camera = self._camera
         peak = max((0.0, *self._peak_contrasts().values()))
-        level = float(self.background_e.max())
+        level = float(self._sample_e.max())
         top = level * (1 + peak) if self._model.rho else level + self._signal_scale * peak
         top *= float(self.power.max())
         top = (top + 6 * math.sqrt(top)) / np.min(camera.gain_e_per_adu) + np.max(camera.offset_adu)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from iscat_analysis.background import find_defects
 from iscat_analysis.camera import Camera, check_counts
 from iscat_analysis.config import Config
-from iscat_analysis.drift import measure_drift
+from iscat_analysis.drift import Trajectory, measure_drift
 from iscat_analysis.errors import DataError
 from iscat_analysis.pipeline.results import table_of
 from iscat_analysis.pipeline.scene import Scene
@@ -24,12 +24,12 @@ from iscat_analysis.records import (
     EventView,
     FloatArray,
     FrameSource,
+    Mapper,
     Windows,
 )
 from iscat_analysis.sliding import (
     SHORTEST_MOVIE,
     Chunk,
-    Mapper,
     NoiseCurve,
     choose_window,
     longest_window,
@@ -255,9 +255,11 @@ def plan_chunks(
     first, last = reader.first, reader.last
     halo = math.ceil(HALO * window / stride) * stride
     budget = counts_budget(config)
-    # beside its counts, a block holds its sum and its map, and the field some images in doubles
+    # beside its counts, a block holds its sum and its map (where the pattern's motion is divided
+    # out, that and a spectrum as well), and the field some images in doubles
     pixels = math.prod(reader.shape)
-    per_frame = reader.frame_bytes + 20 * pixels // stride
+    per_block = 32 if config.background.drift_correction else 20
+    per_frame = reader.frame_bytes + per_block * pixels // stride
     room = (budget - 40 * pixels) // per_frame
     if room >= last - first:
         return [((first, last), (first, last))]
@@ -295,6 +297,7 @@ class Done:
     ends_e: FloatArray  # mean images of its first and last quarter
     gain_message: str = ""
     sampled: int = field(default=0)
+    trajectory: Trajectory | None = None  # of the pattern, in all frames that were read
 
 
 class Merged:
@@ -390,10 +393,41 @@ class Merged:
         good = np.concatenate([np.empty(0, dtype=np.bool_), *(d.good for d in self._done)])
         return np.flatnonzero(~good.astype(np.bool_))
 
+    def trajectory(self) -> Trajectory | None:
+        """Way of the fixed pattern through all chunks that followed it; None where none did."""
+        parts: list[Trajectory] = []
+        way: Trajectory | None = None  # the chunk before, halo included
+        for done in self._done:
+            part = done.trajectory
+            if part is None:
+                continue
+            if way is not None:
+                common = part.frames <= way.frames[-1]
+                common[0] = True
+                offset = way.at(part.frames[common]) - part.shift_px[common]
+                part = replace(part, shift_px=part.shift_px + offset.mean(axis=0))
+            own = (part.frames >= done.core[0]) & (part.frames < done.core[1])
+            parts.append(Trajectory(part.frames[own], part.shift_px[own], part.error_px[own]))
+            way = part
+        if not parts:
+            return None
+        return Trajectory(
+            np.concatenate([p.frames for p in parts]),
+            np.concatenate([p.shift_px for p in parts]) - parts[0].shift_px[0],
+            np.concatenate([p.error_px for p in parts]),
+        )
+
+    def unfollowed(self) -> list[tuple[int, int]]:
+        """Frames in which there was no pattern to follow, or nobody asked."""
+        return [done.core for done in self._done if done.trajectory is None]
+
     def drift(self) -> list[float] | None:
         """Shift (y, x) of the fixed pattern from the first frames to the last [px]."""
         if not self._done:
             return None
+        way = self.trajectory()
+        if way is not None:
+            return [float(d) for d in way.shift_px[-1]]
         dy, dx = measure_drift(self._done[0].ends_e[0], self._done[-1].ends_e[1])
         return [dy, dx] if math.isfinite(dy) and math.isfinite(dx) else None
 

@@ -11,6 +11,7 @@ later.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.camera import Camera
+from iscat_analysis.drift import Mover, Trajectory
 from iscat_analysis.forward import PixelGrid
 from iscat_analysis.pipeline.chunks import FRAME_COLUMN, Frames
 from iscat_analysis.pipeline.neighbours import LARGEST_IMAGE
@@ -72,9 +74,19 @@ class InjectedMovie:
         What is added.
     seed : int
         Of the noise; a frame's does not depend on how the movie is read.
+    trajectory : Trajectory, optional
+        Of the fixed pattern, with which the particles then move.
     """
 
-    def __init__(self, movie: Frames, camera: Camera, particles: list[Injected], seed: int) -> None:
+    def __init__(
+        self,
+        movie: Frames,
+        camera: Camera,
+        particles: list[Injected],
+        seed: int,
+        trajectory: Trajectory | None = None,
+    ) -> None:
+        self._trajectory = trajectory
         self._movie = movie
         self._camera = camera
         self._particles = particles
@@ -105,13 +117,25 @@ class InjectedMovie:
                 v[rows, columns] if isinstance(v, np.ndarray) else v
                 for v in (self._camera.gain_e_per_adu, self._camera.offset_adu)
             )
+            move = self._mover(particle)
             for t in range(max(start, particle.frame), min(stop, particle.leave)):
                 rng = np.random.default_rng(
                     np.random.SeedSequence(self._seed, spawn_key=(number, t))
                 )
                 here = counts[t - start, rows, columns]
-                here[...] = _with_particle(here, particle.contrast, gain, offset, rng)
+                here[...] = _with_particle(here, move(t), gain, offset, rng)
         return counts
+
+    def _mover(self, particle: Injected) -> Callable[[int], FloatArray]:
+        """Give what makes a particle's contrast in a frame."""
+        way = self._trajectory
+        if way is None:
+            return lambda _: particle.contrast
+        mover = Mover((particle.contrast.shape[0], particle.contrast.shape[1]))
+        spectrum, start = mover.spectrum(particle.contrast), way.at(particle.frame)
+        return lambda t: mover.image(
+            spectrum * mover.transfer((way.at(t) - start)[None], np.ones(1))
+        )
 
 
 def _with_particle(

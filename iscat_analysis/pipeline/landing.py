@@ -24,6 +24,7 @@ from iscat_analysis.calibrate import diagnose_gain
 from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.detect import make_templates
+from iscat_analysis.drift import Trajectory
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fit import window_nm
 from iscat_analysis.forward import forward_model
@@ -40,6 +41,7 @@ from iscat_analysis.pipeline.chunks import (
 )
 from iscat_analysis.pipeline.injection import InjectedMovie, draw_particles, recovery
 from iscat_analysis.pipeline.neighbours import LARGEST_IMAGE
+from iscat_analysis.pipeline.pattern import follow
 from iscat_analysis.pipeline.results import Row, table_of, view_of
 from iscat_analysis.pipeline.resume import Store
 from iscat_analysis.pipeline.scene import Scene
@@ -82,6 +84,8 @@ class LandingResult:
         Models and threshold.
     summary : dict
         What ``summary.json`` adds under ``"landing"``.
+    trajectory : Trajectory or None
+        Of the fixed pattern, where its motion was divided out.
     interrupted : bool
         Whether the user stopped it; the chunks that were finished are kept.
     """
@@ -92,6 +96,7 @@ class LandingResult:
     image: FloatArray
     scene: Scene
     summary: dict[str, Any]
+    trajectory: Trajectory | None
     interrupted: bool
 
 
@@ -196,7 +201,8 @@ def analyse_landings(
             interrupted = True
     table, views = merged.result(scene)
     windows, light = merged.windows(reader.shape, (first, last))
-    for text in frame_warnings(movie.name, merged, light, first, window):
+    wanted = config.background.drift_correction
+    for text in frame_warnings(movie.name, merged, light, first, window, corrected=wanted):
         tell(text)
     message = merged.gain_message
     if message:
@@ -215,6 +221,7 @@ def analyse_landings(
         "noise_variance_over_shot": list(curve.variance_over_shot),
         "frames_left_out": merged.left_out(),
         "drift_px": merged.drift(),
+        **_way(merged.trajectory()),
         "chunks": len(plan),
     }
     strongest = scene.model.peak_contrast(scene.model.height_nm, scene.model.material.mass_kda)
@@ -226,6 +233,7 @@ def analyse_landings(
         image=merged.image * strongest / amplitude,
         scene=scene,
         summary=summary,
+        trajectory=merged.trajectory(),
         interrupted=interrupted,
     )
 
@@ -269,13 +277,29 @@ def inject_and_recover(
         result.scene, (movie.shape[1], movie.shape[2]), frames, window, count, result.table, seed
     )
     again = analyse_landings(
-        InjectedMovie(movie, camera, particles, seed),
+        InjectedMovie(movie, camera, particles, seed, result.trajectory),
         config.model_copy(update={"background": fixed}),
         camera,
         tell=_unheard,
         progress=progress,
     )
     return recovery(particles, again.table, frames[1], result.scene.roi_px / 2, window)
+
+
+def _way(trajectory: Trajectory | None) -> dict[str, Any]:
+    """Give what the summary says of a trajectory."""
+    if trajectory is None:
+        return {
+            "drift_corrected": False,
+            **dict.fromkeys(("drift_frames", "drift_x_px", "drift_y_px", "drift_error_px")),
+        }
+    return {
+        "drift_corrected": True,
+        "drift_frames": trajectory.frames.tolist(),
+        "drift_x_px": trajectory.shift_px[:, 1].tolist(),
+        "drift_y_px": trajectory.shift_px[:, 0].tolist(),
+        "drift_error_px": trajectory.typical_error_px,
+    }
 
 
 def _unheard(text: str) -> None:
@@ -341,7 +365,9 @@ def _analyse_chunk(
     pool: ThreadPoolExecutor,
     posteriors: int,
 ) -> Done:
-    fitter = ChunkFitter(scene, chunk, window, pool)
+    wanted = scene.config.background.drift_correction
+    trajectory = follow(chunk, pool.map) if wanted else None
+    fitter = ChunkFitter(scene, chunk, window, pool, trajectory)
     seam = max(2, window // STRIDES)
     steps = fitter.run((core[0] - seam, core[1] + seam))
     rows = list(pool.map(_row, range(len(steps)), steps))
@@ -382,6 +408,7 @@ def _analyse_chunk(
         ends_e=_ends(chunk, inside),
         gain_message=message,
         sampled=sampled,
+        trajectory=trajectory,
     )
 
 
@@ -408,7 +435,13 @@ def _posterior_wanted(config: Config) -> bool:
 
 
 def frame_warnings(
-    name: str, merged: Merged, light: FloatArray, first: int, window: int
+    name: str,
+    merged: Merged,
+    light: FloatArray,
+    first: int,
+    window: int,
+    *,
+    corrected: bool = False,
 ) -> Iterator[str]:
     """Say what is odd about the frames.
 
@@ -424,6 +457,8 @@ def frame_warnings(
         Number of the first frame.
     window : int
         Frames before and after a step.
+    corrected : bool
+        Whether the motion of the fixed pattern was to be divided out.
 
     Yields
     ------
@@ -456,12 +491,32 @@ def frame_warnings(
             f"{burnt} pixels are saturated in some frame and left out; "
             "lower the exposure or the laser power"
         )
-    drift = merged.drift()
-    if drift is not None and math.hypot(*drift) > _DRIFT_PX * max(light.size / window / 2, 1.0):
+    yield from _drift_warnings(name, merged, light.size / window, corrected)
+
+
+def _drift_warnings(name: str, merged: Merged, windows: float, corrected: bool) -> Iterator[str]:
+    """Say how the fixed pattern moved, and what was done about it."""
+    drift, way = merged.drift(), merged.trajectory()
+    if way is not None and drift is not None:
+        yield (
+            f"{name}: the fixed pattern moved by {drift[1]:+.3f} pixels in x and "
+            f"{drift[0]:+.3f} in y; corrected, to ±{way.typical_error_px:.1g} pixels"
+        )
+    unfollowed = merged.unfollowed() if corrected else []
+    if unfollowed:
+        spans = ", ".join(f"{a}:{b}" for a, b in unfollowed[:4])
+        yield (
+            f"{name}: no fixed pattern stands out of the noise in frames {spans}"
+            f"{' and more' if len(unfollowed) > 4 else ''}, so background.drift_correction has "
+            "nothing to correct there"
+        )
+    if corrected or drift is None:
+        return
+    if math.hypot(*drift) > _DRIFT_PX * max(windows / 2, 1.0):
         yield (
             f"{name}: the fixed pattern moved by {drift[1]:+.2f} pixels in x and "
-            f"{drift[0]:+.2f} in y; it is not corrected: shorter windows "
-            "(background.window_frames) suffer less"
+            f"{drift[0]:+.2f} in y; it is not corrected: set background.drift_correction = true "
+            "(shorter windows, background.window_frames, suffer less too)"
         )
 
 

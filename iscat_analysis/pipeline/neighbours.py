@@ -3,17 +3,24 @@
 A neighbour that lands or leaves in the frames of a step enters its likelihood through ρ, pixel by
 pixel: the factor (1 + φ_a C)/(1 + φ_b C), φ the share of the light of the frames after and before
 in which it is there.
+
+Where the sample drifts, a particle moves with it: the mean of C over a window is its expansion to
+second order in the shift since the step, mean and smear.  In the pattern, whose motion is divided
+out, it is held with the share f of the light that makes the pattern, which is taken off again:
+(1 + φ_a C_a)/(1 + φ_b C_b) · (1 + f C_b)/(1 + f C_a).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from iscat_analysis.drift import derivatives
 from iscat_analysis.forward import PixelGrid
+from iscat_analysis.pipeline.pattern import MovingPattern
 from iscat_analysis.pipeline.scene import Region, Scene
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.sliding import Chunk, StepFrame
@@ -22,6 +29,9 @@ LARGEST_IMAGE = 3.5
 """Regions from the centre to the edge of a strong particle's image; the rings go on, faintly."""
 
 _FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is enough
+WHOLE = (slice(None), slice(None))
+"""All of an image."""
+
 _WEAK = 0.05  # contrast up to which several add up
 
 
@@ -39,8 +49,10 @@ class Step:
         Where, and its mass (positive); `snr` is that of the search.
     corner : (int, int)
         Row and column of the first pixel of `image`.
-    image : ndarray
+    image : ndarray, shape (y, x)
         Its contrast around it.
+    slopes : ndarray, shape (5, y, x)
+        Derivatives of `image` by y, x, yy, yx and xx [1/pixel]; empty where nothing moves.
     theta : ndarray, shape (5,), or None
         Latest estimate.
     snr : float
@@ -52,6 +64,7 @@ class Step:
     start: Candidate
     corner: tuple[int, int]
     image: FloatArray
+    slopes: FloatArray = field(default_factory=lambda: np.empty((5, 0, 0)))
     theta: FloatArray | None = None
     snr: float = math.inf
 
@@ -67,9 +80,14 @@ class Neighbours:
         The frames.
     window : int
         Frames before and after a step.
+    pattern : MovingPattern, optional
+        Of the same chunk, where its motion is corrected.
     """
 
-    def __init__(self, scene: Scene, chunk: Chunk, window: int) -> None:
+    def __init__(
+        self, scene: Scene, chunk: Chunk, window: int, pattern: MovingPattern | None = None
+    ) -> None:
+        self._pattern = pattern
         self._scene = scene
         self._chunk = chunk
         self._window = window
@@ -93,7 +111,8 @@ class Neighbours:
         image = scene.wide.image(
             grid, start.x_px * pixel, start.y_px * pixel, start.z_nm, start.mass_kda
         )
-        return replace(step, corner=(sides[0][0], sides[1][0]), image=image)
+        slopes = step.slopes if self._pattern is None else derivatives(image)
+        return replace(step, corner=(sides[0][0], sides[1][0]), image=image, slopes=slopes)
 
     def _half(self, step: Step) -> int:
         """From the centre to the edge of a step's image [pixels]; strong rings reach far."""
@@ -113,19 +132,63 @@ class Neighbours:
         later = (power[frames.stop] - power[turn]) / whole
         return float(later if step.sign > 0 else 1 - later)
 
-    def factor(self, step: Step, image: FloatArray, before: slice, after: slice) -> FloatArray:
+    def factor(
+        self, step: Step, before: slice, after: slice, inside: tuple[slice, slice] = WHOLE
+    ) -> FloatArray:
         """Light after over light before that a step's particle makes, pixel by pixel."""
-        factor: FloatArray = (1 + self._presence(step, after) * image) / (
-            1 + self._presence(step, before) * image
-        )
+        image = step.image[inside]
+        shares = self._presence(step, before), self._presence(step, after)
+        if self._pattern is None:
+            factor: FloatArray = (1 + shares[1] * image) / (1 + shares[0] * image)
+            return factor
+        held = self._presence(step, self._pattern.span(before, after))
+        if shares == (held, held):
+            return np.ones(image.shape)
+        windows = before, after
+        there = [
+            1 + share * self.seen(step, self._present(step, window), inside)
+            for share, window in zip(shares, windows, strict=True)
+        ]
+        known = [1 + held * self.seen(step, window, inside) for window in windows]
+        moving: FloatArray = there[1] / there[0] * known[0] / known[1]
+        return moving
+
+    def own_factor(
+        self, step: Step, before: slice, after: slice, inside: tuple[slice, slice]
+    ) -> FloatArray:
+        """`factor` of the step that is fitted, but for its image at its mean place in a window."""
+        with_it = after if step.sign > 0 else before
+        model = 1 + self.seen(step, with_it, inside, smeared=False)
+        factor: FloatArray = self.factor(step, before, after, inside) / model**step.sign
         return factor
 
     def change(self, step: Step, before: slice, after: slice) -> FloatArray:
         """Contrast that a step's particle makes between two ranges of frames."""
-        image = step.image
-        if abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK:
-            return self.factor(step, image, before, after) - 1
-        return (self._presence(step, after) - self._presence(step, before)) * image
+        strong = abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK
+        if strong or self._pattern is not None:
+            return self.factor(step, before, after) - 1
+        return (self._presence(step, after) - self._presence(step, before)) * step.image
+
+    def _present(self, step: Step, frames: slice) -> slice:
+        """Those of the frames in which the particle is there; all where it is in none."""
+        turn = min(max(step.at.frame - self._chunk.first, frames.start), frames.stop)
+        part = slice(turn, frames.stop) if step.sign > 0 else slice(frames.start, turn)
+        return part if part.start < part.stop else frames
+
+    def seen(
+        self, step: Step, frames: slice, inside: tuple[slice, slice], *, smeared: bool = True
+    ) -> FloatArray:
+        """Mean of a moving particle's contrast over frames, or its contrast at the mean place."""
+        image = step.image[inside]
+        if self._pattern is None:
+            return image
+        (y, x), (yy, yx, xx) = self._pattern.moments(frames, step.at.frame)
+        if not smeared:
+            yy, yx, xx = y * y, y * x, x * x
+        seen: FloatArray = image + np.einsum(
+            "k,kyx->yx", [-y, -x, yy / 2, yx, xx / 2], step.slopes[(slice(None), *inside)]
+        )
+        return seen
 
     def of(self, steps: Sequence[Step]) -> tuple[list[list[int]], list[list[int]]]:
         """For each step, others that its fit should know of, and those that it depends on."""
@@ -147,17 +210,20 @@ class Neighbours:
             bound.append([int(k) for k in np.flatnonzero(near)])
         return seen, bound
 
-    def shared(self, step: Step, region: Region) -> tuple[Region, FloatArray] | None:
-        """Part of a step's image inside a region."""
+    def shared(
+        self, step: Step, region: Region
+    ) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:
+        """Where a step's image and a region overlap: in the region, and in the image."""
         rows, columns = spans(step.corner, step.image.shape)
         top, bottom = max(rows[0], region.rows[0]), min(rows[1], region.rows[1])
         left, right = max(columns[0], region.columns[0]), min(columns[1], region.columns[1])
         if top >= bottom or left >= right:
             return None
-        inside = step.image[
-            top - rows[0] : bottom - rows[0], left - columns[0] : right - columns[0]
-        ]
-        return Region((top, bottom), (left, right)), inside
+        here, inside = (
+            (slice(top - y, bottom - y), slice(left - x, right - x))
+            for y, x in ((region.rows[0], region.columns[0]), (rows[0], columns[0]))
+        )
+        return here, inside
 
 
 def region_around(side: int, shape: tuple[int, int], start: Candidate) -> Region:

@@ -15,8 +15,9 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.config import Config, config_to_toml
+from iscat_analysis.drift import Trajectory
 from iscat_analysis.pipeline.chunks import Done
-from iscat_analysis.records import EventView
+from iscat_analysis.records import EventView, FloatArray
 
 
 class Store:
@@ -82,6 +83,7 @@ class Store:
                     strongest=data["strongest"],
                     ends_e=data["ends_e"],
                     gain_message=str(data["gain_message"]),
+                    trajectory=_trajectory(data["trajectory"]),
                 )
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
             return None  # never finished, or cut short
@@ -112,6 +114,7 @@ class Store:
                     strongest=done.strongest,
                     ends_e=done.ends_e,
                     gain_message=np.array(done.gain_message),
+                    trajectory=_columns(done.trajectory),
                 )
             building.replace(path)
         except OSError:
@@ -126,6 +129,16 @@ class Store:
         folder = self._folder or Path()
         stem = f"{self._key}-{number:05d}"
         return folder / f"{stem}.parquet", folder / f"{stem}.npz"
+
+
+def _columns(way: Trajectory | None) -> FloatArray:
+    if way is None:
+        return np.empty((0, 5))
+    return np.column_stack([way.frames, way.shift_px, way.error_px])
+
+
+def _trajectory(columns: FloatArray) -> Trajectory | None:
+    return Trajectory(columns[:, 0], columns[:, 1:3], columns[:, 3:]) if len(columns) else None
 
 
 def partial_folder(folder: Path) -> Path:

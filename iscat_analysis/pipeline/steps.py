@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from iscat_analysis.drift import Trajectory
 from iscat_analysis.fit import POOR_FIT_P, fit_particle, search_box, start_theta
 from iscat_analysis.pipeline.bias import unbiased
 from iscat_analysis.pipeline.field import Event
@@ -26,6 +27,7 @@ from iscat_analysis.pipeline.neighbours import (
     distance_px,
     spans,
 )
+from iscat_analysis.pipeline.pattern import MovingPattern
 from iscat_analysis.pipeline.scene import Region, Scene
 from iscat_analysis.pipeline.tasks import Task, TaskBuilder
 from iscat_analysis.records import (
@@ -100,6 +102,8 @@ class ChunkFitter:
         Frames before and after a step.
     pool : ThreadPoolExecutor
         Runs the fits; the result does not depend on its size.
+    trajectory : Trajectory, optional
+        Of the fixed pattern, whose motion is then divided out.
 
     Attributes
     ----------
@@ -110,15 +114,25 @@ class ChunkFitter:
         Searches made.
     """
 
-    def __init__(self, scene: Scene, chunk: Chunk, window: int, pool: ThreadPoolExecutor) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        chunk: Chunk,
+        window: int,
+        pool: ThreadPoolExecutor,
+        trajectory: Trajectory | None = None,
+    ) -> None:
+        pattern = MovingPattern(chunk, trajectory, pool.map) if trajectory else None
+        chunk = pattern.chunk if pattern else chunk
         self._scene = scene
         self._chunk = chunk
+        self._pattern = pattern
         self._window = window
         self._pool = pool
         self._strides = STRIDES
         self._roi_px = scene.roi_px
-        self._neighbours = Neighbours(scene, chunk, window)
-        self._tasks = TaskBuilder(scene, chunk, window, self._neighbours)
+        self._neighbours = Neighbours(scene, chunk, window, pattern)
+        self._tasks = TaskBuilder(scene, chunk, window, self._neighbours, pattern)
         self._stride = int(chunk.edges[1] - chunk.edges[0])
         self._maps: tuple[MapArray, FloatArray] | None = None
         self._near: list[list[Step]] = []  # steps that each of the maps knows of
@@ -181,26 +195,29 @@ class ChunkFitter:
         polarity = {"both": 0, "bright": 1, "dark": -1}[scene.config.detection.polarity]
         polarity *= int(scene.templates.signs[0])
 
-        edges, count = chunk.edges, chunk.edges.size - 2
+        moving, edges, count = self._pattern, chunk.edges, chunk.edges.size - 2
         near = []
         for j in range(count):
             low, high = max(j + 1 - self._strides, 0), min(j + 1 + self._strides, count + 1)
-            span = int(edges[low]), int(edges[high])
-            near.append([s for s in steps if self._neighbours.overlaps(s, *span)])
+            span = slice(int(edges[low]), int(edges[high]))
+            if moving:
+                middle = int(edges[j + 1])
+                span = moving.span(slice(span.start, middle), slice(middle, span.stop))
+            near.append([s for s in steps if self._neighbours.overlaps(s, span.start, span.stop)])
 
         def explained(j: int, before: slice, after: slice) -> FloatArray | None:
             if not near[j]:
-                return None
+                return moving.contrast[j] if moving else None
             total = np.zeros(chunk.shape)
             for step in near[j]:
                 rows, columns = spans(step.corner, step.image.shape)
                 here = (slice(*rows), slice(*columns))
                 total[here] += self._neighbours.change(step, before, after)
-            return total
+            return total + moving.contrast[j] * (1 + total) if moving else total
 
         self._maps = snr, effective = sliding_maps(
             chunk, matched, self._strides,
-            explained=explained if steps else None,
+            explained=explained if steps or moving else None,
             earlier=self._maps,
             changed=[j for j, old in enumerate(self._near) if _ids(old) != _ids(near[j])],
             mapper=self._pool.map,
@@ -276,7 +293,8 @@ class ChunkFitter:
             if task is None:
                 return step
             likelihood = task.likelihood
-            start = step.start
+            y_px, x_px = task.offset_px
+            start = _displaced(step.start, y_px, x_px)
             box = search_box(
                 likelihood, start, self._quick_mode, self._scene.config.fit.z_range_nm, level=True
             )
@@ -289,8 +307,8 @@ class ChunkFitter:
                 return replace(step, at=task.at, snr=0.0)
             moved = replace(
                 start,
-                x_px=float(best.theta[0]) / pixel,
-                y_px=float(best.theta[1]) / pixel,
+                x_px=float(best.theta[0]) / pixel - x_px,
+                y_px=float(best.theta[1]) / pixel - y_px,
                 mass_kda=mass,
             )
             snr = math.sqrt(2 * max(best.log_likelihood, 0.0))
@@ -319,12 +337,14 @@ class ChunkFitter:
         likelihood = task.likelihood
         if likelihood.n_pixels < 0.5 * math.prod(likelihood.grid.shape):
             return None
-        fit = fit_particle(
-            likelihood, step.start, scene.mode, scene.config.fit.z_range_nm, level=True
-        )
+        y_px, x_px = task.offset_px
+        start = _displaced(step.start, y_px, x_px)
+        fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=True)
         if fit.mass_kda <= 0 and "mass_kda" in fit.free:
             return None
         fit = _judged(scene, unbiased(likelihood, fit), task)
+        pixel = scene.pixel_nm
+        fit = replace(fit, x_nm=fit.x_nm - x_px * pixel, y_nm=fit.y_nm - y_px * pixel)
         local = Region(
             (0, task.region.rows[1] - task.region.rows[0]),
             (0, task.region.columns[1] - task.region.columns[0]),
@@ -375,6 +395,11 @@ def _has_moved(old: Step, new: Step) -> bool:
         return True
     tolerance = max(old.start.mass_kda, new.start.mass_kda) / max(new.snr, 1.0)
     return abs(new.start.mass_kda - old.start.mass_kda) > tolerance
+
+
+def _displaced(start: Candidate, y_px: float, x_px: float) -> Candidate:
+    """Move a candidate."""
+    return replace(start, x_px=start.x_px + x_px, y_px=start.y_px + y_px)
 
 
 def _apart(one: Step, two: Step) -> int:

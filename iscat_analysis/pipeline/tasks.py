@@ -14,8 +14,9 @@ import numpy as np
 from iscat_analysis.forward import PixelGrid
 from iscat_analysis.likelihood import Likelihood, conditional
 from iscat_analysis.pipeline.neighbours import Neighbours, Step, distance_px, region_around
+from iscat_analysis.pipeline.pattern import LocalPattern, MovingPattern
 from iscat_analysis.pipeline.scene import Region, Scene
-from iscat_analysis.records import Windows
+from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.sliding import Chunk, Patch, StepFrame, crosstalk, locate_step
 
 FEWEST_FRAMES = 10
@@ -40,6 +41,8 @@ class Task:
         Frames before and after the step that are used.
     crowded : bool
         Whether a close neighbour could not be kept out of them.
+    offset_px : ndarray, shape (2,)
+        Mean place (y, x) of the particle in the frames used, from where it is at its step.
     """
 
     likelihood: Likelihood
@@ -49,6 +52,7 @@ class Task:
     n_before: int
     n_after: int
     crowded: bool
+    offset_px: FloatArray
 
 
 class TaskBuilder:
@@ -64,9 +68,19 @@ class TaskBuilder:
         Frames before and after a step.
     neighbours : Neighbours
         Of the same chunk.
+    pattern : MovingPattern, optional
+        Of the same chunk, where its motion is corrected.
     """
 
-    def __init__(self, scene: Scene, chunk: Chunk, window: int, neighbours: Neighbours) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        chunk: Chunk,
+        window: int,
+        neighbours: Neighbours,
+        pattern: MovingPattern | None = None,
+    ) -> None:
+        self._pattern = pattern
         self._scene = scene
         self._chunk = chunk
         self._window = window
@@ -87,10 +101,15 @@ class TaskBuilder:
         patch = chunk.patch(*span, region.rows, region.columns)
         if len(patch.counts) < 2:
             return None
-        at = self._locate(step, neighbours, region, patch)
+        moving = self._pattern
+        local = moving.local(region, step.at.frame) if moving else None
+        at = self._locate(step, neighbours, region, patch, local)
         if at is None:
             return None
-        span, crowded = self._span(replace(step, at=at), close)
+        if moving and at.frame != step.at.frame:
+            local = moving.local(region, at.frame)
+        step = replace(step, at=at)
+        span, crowded = self._span(step, close)
         gap = min(at.gap, self._window // 5)
         begin, end = max(span[0], chunk.first), min(span[1], chunk.stop)
         first = (begin, max(at.frame - gap, begin))
@@ -106,12 +125,18 @@ class TaskBuilder:
         for other in neighbours:
             shared = self._neighbours.shared(other, region)
             if shared is not None:
-                part, image = shared
-                here = (
-                    slice(part.rows[0] - region.rows[0], part.rows[1] - region.rows[0]),
-                    slice(part.columns[0] - region.columns[0], part.columns[1] - region.columns[0]),
-                )
-                ratio[here] *= self._neighbours.factor(other, image, *cuts)
+                here, inside = shared
+                ratio[here] *= self._neighbours.factor(other, *cuts, inside)
+        offset = np.zeros(2)
+        if moving and local:
+            seen = [moving.seen(local, cut) for cut in cuts]
+            ratio *= seen[1] / seen[0]
+            shared = self._neighbours.shared(step, region)
+            if shared is not None:
+                here, inside = shared
+                ratio[here] *= self._neighbours.own_factor(step, *cuts, inside)
+            with_it = cuts[1] if step.sign > 0 else cuts[0]
+            offset = moving.shift(with_it) - moving.at(at.frame)
         read = chunk.camera.read_variance_e2(chunk.shape)[region.slices]
         variances = [n_before * read, n_after * read]
         if step.sign < 0:
@@ -140,7 +165,7 @@ class TaskBuilder:
             frames_after=ranges[1],
             power=np.empty(0),
         )
-        return Task(likelihood, region, windows, at, n_before, n_after, crowded)
+        return Task(likelihood, region, windows, at, n_before, n_after, crowded, offset)
 
     def _span(self, step: Step, close: Sequence[Step]) -> tuple[tuple[int, int], bool]:
         """Frames used around a step, and whether another one could not be kept out of them."""
@@ -158,12 +183,17 @@ class TaskBuilder:
         return (begin, end), crowded
 
     def _locate(
-        self, step: Step, neighbours: Sequence[Step], region: Region, patch: Patch
+        self,
+        step: Step,
+        neighbours: Sequence[Step],
+        region: Region,
+        patch: Patch,
+        pattern: LocalPattern | None,
     ) -> StepFrame | None:
         shared = self._neighbours.shared(step, region)
         if shared is None:
             return None
-        _, image = shared
+        image = step.image[shared[1]]
         if image.shape != (region.rows[1] - region.rows[0], region.columns[1] - region.columns[0]):
             return None
         known = np.zeros(len(patch.counts))
@@ -173,14 +203,37 @@ class TaskBuilder:
             both = self._neighbours.shared(other, region) if near else None
             if both is None or not frames[0] < other.at.frame <= frames[-1]:
                 continue
-            part, inside = both
+            here, inside = both
             padded = np.zeros(image.shape)
-            padded[
-                part.rows[0] - region.rows[0] : part.rows[1] - region.rows[0],
-                part.columns[0] - region.columns[0] : part.columns[1] - region.columns[0],
-            ] = inside
+            padded[here] = other.image[inside]
             height = crosstalk(patch, image, padded)
             known += other.sign * height * (frames >= other.at.frame)
+        if self._pattern and pattern:
+            known += self._drifting(step, image, shared[1], patch, self._pattern, pattern)
         reach = self._stride + self._stride // 2 + 1
         search = (step.at.frame - reach, step.at.frame + reach + 1)
         return locate_step(patch, step.sign * image, search, known=step.sign * known)
+
+    def _drifting(
+        self,
+        step: Step,
+        image: FloatArray,
+        inside: tuple[slice, slice],
+        patch: Patch,
+        moving: MovingPattern,
+        pattern: LocalPattern,
+    ) -> FloatArray:
+        """Height that the motion of the pattern, and of the particle itself, adds to each frame."""
+        frames = np.arange(patch.first, patch.first + len(patch.counts))
+        light = np.maximum(patch.mean_e, 1e-300)
+        centres, heights, own = [], [], []
+        for start in range(0, frames.size, self._stride):
+            part = frames[start : start + self._stride]
+            cut = self._chunk.cut(int(part[0]), int(part[-1]) + 1)
+            centres.append(float(part.mean()))
+            heights.append(crosstalk(patch, image, moving.seen(pattern, cut) / light - 1))
+            own.append(crosstalk(patch, image, self._neighbours.seen(step, cut, inside) - image))
+        there = (frames >= step.at.frame) == (step.sign > 0)
+        height: FloatArray = np.interp(frames, centres, heights)
+        height += there * np.interp(frames, centres, own)
+        return height

@@ -8,7 +8,7 @@ having; `search` sets the w frames after every boundary between blocks against t
 from __future__ import annotations
 
 from iscat_analysis.sliding.dating import CREDIBLE, StepFrame, crosstalk, locate_step
-from iscat_analysis.sliding.frames import Chunk, Mapper, Patch, make_chunk, measure_frames
+from iscat_analysis.sliding.frames import Chunk, Patch, make_chunk, measure_frames
 from iscat_analysis.sliding.noise import (
     LONGEST_WINDOW,
     MOVIE_SHARE,
@@ -41,7 +41,6 @@ __all__ = [
     "Chunk",
     "Filter",
     "MapArray",
-    "Mapper",
     "NoiseCurve",
     "Patch",
     "Peak",

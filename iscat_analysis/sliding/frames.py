@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,10 +11,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.sliding import block_sums, frame_totals, region_sum
 from iscat_analysis.camera import Camera
-from iscat_analysis.records import BoolArray, FloatArray
-
-Mapper = Callable[..., Iterable[Any]]
-"""`map`, or the one of a pool."""
+from iscat_analysis.records import BoolArray, FloatArray, Mapper
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera import Camera
-from iscat_analysis.sliding.frames import Mapper
+from iscat_analysis.records import Mapper
 
 LONGEST_WINDOW = 100
 """Frames that a window chosen from the noise may have; beyond it events overlap too often."""

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from iscat_analysis._kernels.sliding import contrast_map, step_peaks
-from iscat_analysis.records import FloatArray
-from iscat_analysis.sliding.frames import Chunk, Mapper
+from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.sliding.frames import Chunk
 
 MapArray = NDArray[np.float32]
 

@@ -42,6 +42,18 @@ class Memory:
         return self.counts[start:stop]
 
 
+STILL, DRIFTING = (0.0, 0.0), (0.005, -0.002)
+"""Pixels per frame along x and y; 0.2 pixels between two windows are ten times the shot noise."""
+
+
+def _moving(drift: tuple[float, float]) -> list[str]:
+    """Give the settings of a movie that drifts, and of what corrects it."""
+    return [
+        f"simulation.drift_px_per_frame={list(drift)}",
+        f"background.drift_correction={str(any(drift)).lower()}",
+    ]
+
+
 def _config(side: int, frames: int, *settings: str) -> Config:
     return load_config(
         None,
@@ -72,10 +84,13 @@ def _analyse(config: Config, seed: int) -> pd.DataFrame:
 # ---- blank movies ----------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def alarms() -> tuple[int, int]:
+BLANK = ["detection.false_alarms_per_movie=1.0", "fit.roi_nm=1800.0"]
+
+
+@pytest.fixture(scope="module", params=[STILL, DRIFTING], ids=["still", "drifting"])
+def alarms(request: pytest.FixtureRequest) -> tuple[int, int]:
     """Events found in blank movies at 1 expected in each, and the number of movies."""
-    config = _config(64, 240, "detection.false_alarms_per_movie=1.0", "fit.roi_nm=1800.0")
+    config = _config(64, 240, *BLANK, *_moving(request.param))
     movies = 64
     return sum(len(_analyse(config, seed)) for seed in range(movies)), movies
 
@@ -87,6 +102,14 @@ def _assert_expected(found: int, expected: float) -> None:
 def test_false_alarms_are_as_many_as_configured(alarms: tuple[int, int]) -> None:
     found, movies = alarms
     _assert_expected(found, movies)
+
+
+def test_drift_that_is_not_corrected_is_taken_for_particles() -> None:
+    """Control: of the false alarms above, and of the speed of the drift."""
+    short = ["background.window_frames=10", "background.drift_correction=false"]
+    config = _config(32, 50, *BLANK, *_moving(DRIFTING), *short)
+    with pytest.raises(AssertionError):
+        _assert_expected(len(_analyse(config, 1)), 1)
 
 
 @pytest.mark.parametrize("wrong", [0.35, 2.5])
@@ -103,10 +126,11 @@ GRID = (18, 44, 70, 96)
 MASSES = (120.0, 250.0, 480.0)
 
 
-@pytest.fixture(scope="module")
-def events() -> pd.DataFrame:
+@pytest.fixture(scope="module", params=[STILL, DRIFTING], ids=["still", "drifting"])
+def events(request: pytest.FixtureRequest) -> pd.DataFrame:
     """Sixteen particles a movie, apart from each other, at random frames; a third leave."""
     tables = []
+    rate = np.array(request.param)
     for seed in range(12):
         rng = np.random.default_rng(seed)
         placed: list[dict[str, Any]] = []
@@ -123,7 +147,7 @@ def events() -> pd.DataFrame:
                         "mass_kda": MASSES[len(placed) % 3],
                     }
                 )
-        config = _config(115, 260)
+        config = _config(115, 260, *_moving(request.param))
         simulation = type(config.simulation).model_validate(
             {**config.simulation.model_dump(), "events": placed}
         )
@@ -132,16 +156,17 @@ def events() -> pd.DataFrame:
             for sign, when in ((1, truth["frame"]), (-1, truth["leave"])):
                 if when is None:
                     continue
+                x_px, y_px = (truth["x_px"], truth["y_px"]) + rate * (when - truth["frame"])
                 near = table[
-                    (np.hypot(table.x_px - truth["x_px"], table.y_px - truth["y_px"]) < 2)
+                    (np.hypot(table.x_px - x_px, table.y_px - y_px) < 2)
                     & (table.mass_kda * sign > 0)
                 ]
                 found = near.iloc[0].to_dict() if len(near) else {}
                 tables.append(
                     {
                         **found, "true_frame": when, "true_mass": truth["mass_kda"],
-                        "true_x_nm": truth["x_px"] * PIXEL_NM,
-                        "true_y_nm": truth["y_px"] * PIXEL_NM,
+                        "true_x_nm": x_px * PIXEL_NM,
+                        "true_y_nm": y_px * PIXEL_NM,
                         "found": len(near), "extra": len(table) - len(placed) - 6,
                     }
                 )  # fmt: skip

@@ -270,6 +270,7 @@ def test_a_moving_pattern_is_named(shift: int, named: bool) -> None:
     assert len(told) == named
     if named:
         assert "not corrected" in told[0]
+        assert "background.drift_correction" in told[0]
         assert merged.drift() == pytest.approx([0.0, 1.0], abs=0.1)
 
 
@@ -378,6 +379,136 @@ def test_chunks_of_another_configuration_are_not_used(tmp_path: Path) -> None:
     assert len(keys) == 3
     faster = one.model_copy(update={"compute": one.compute.model_copy(update={"workers": 7})})
     assert Store(tmp_path, faster, "movie", (8, 8), (0, 9))._key in keys
+
+
+# ---- drift -----------------------------------------------------------------------------------
+
+RATE = (0.004, -0.003)
+
+
+@pytest.fixture(scope="module")
+def drifting() -> np.ndarray:
+    """Draw the movie of `EVENTS` once more, with the sample drifting."""
+    config = _config(f"simulation.drift_px_per_frame={list(RATE)}")
+    return np.array(list(Movie(config, 1).frames(2)))
+
+
+CORRECTED = "background.drift_correction=true"
+
+
+def _assert_moved(table: pd.DataFrame) -> None:
+    """Every step of `EVENTS` where it was when it came: `_assert_all_found` in the sample."""
+    came = {(x, y): frame for frame, _, x, y, _ in EVENTS}
+    still = table.copy()
+    for i, (frame, _, x, y, _) in enumerate(STEPS):
+        late = frame - came[x, y]
+        still.loc[i, ["x_nm", "y_nm"]] -= np.array(RATE) * late * PIXEL_NM
+    _assert_all_found(still)
+
+
+@pytest.fixture(scope="module")
+def followed(drifting: np.ndarray) -> tuple[Any, list[str]]:
+    """Analyse it with its drift corrected."""
+    return _run(drifting, _config(CORRECTED))
+
+
+def test_a_drifting_movie_is_analysed_as_a_still_one(followed: tuple[Any, list[str]]) -> None:
+    result, told = followed
+    _assert_moved(result.table)
+    assert set(result.table["status"]) == {"ok"}
+    (line,) = told
+    assert "+1.6" in line
+    assert "-1.2" in line
+    assert "corrected, to ±0.000" in line
+    landing = result.summary
+    assert landing["drift_corrected"]
+    for axis, rate in zip("xy", RATE, strict=True):
+        truth = rate * (np.array(landing["drift_frames"]) - landing["drift_frames"][0])
+        np.testing.assert_allclose(landing[f"drift_{axis}_px"], truth, atol=0.01)
+    assert landing["drift_px"] == [landing["drift_y_px"][-1], landing["drift_x_px"][-1]]
+
+
+def test_its_result_does_not_depend_on_the_workers(
+    drifting: np.ndarray, followed: tuple[Any, list[str]]
+) -> None:
+    alone, _ = _run(drifting, _config(CORRECTED, "compute.workers=1"))
+    pd.testing.assert_frame_equal(alone.table, followed[0].table)
+
+
+def test_its_chunks_agree(
+    drifting: np.ndarray, followed: tuple[Any, list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.005)
+    cut, _ = _run(drifting, _config(CORRECTED))
+    assert cut.summary["chunks"] > 1
+    _assert_moved(cut.table)
+    whole = followed[0]
+    sigma = whole.table["sigma_mass_kda"]
+    assert ((cut.table["mass_kda"] - whole.table["mass_kda"]).abs() < 0.2 * sigma).all()
+    np.testing.assert_allclose(cut.summary["drift_frames"], whole.summary["drift_frames"])
+    np.testing.assert_allclose(
+        cut.summary["drift_x_px"], whole.summary["drift_x_px"], atol=5 * 3e-4
+    )
+
+
+def test_where_nothing_drifts_the_correction_changes_nothing(
+    counts: np.ndarray, plain: tuple[Any, list[str]]
+) -> None:
+    result, told = _run(counts, _config(CORRECTED))
+    _assert_all_found(result.table)
+    for name in ("x_nm", "y_nm", "mass_kda"):
+        sigma = plain[0].table[f"sigma_{name}"]
+        change = (result.table[name] - plain[0].table[name]) / sigma
+        assert change.abs().max() < 0.2
+    assert any("corrected, to" in line for line in told)
+
+
+def test_without_a_pattern_there_is_nothing_to_correct() -> None:
+    config = _config(CORRECTED, "simulation.background=flat")
+    short = replace_frames(config, 160)
+    result, told = _run(np.array(list(Movie(short, 1).frames(2))), short)
+    assert not result.summary["drift_corrected"]
+    assert result.summary["drift_x_px"] is None
+    assert any("no fixed pattern" in line for line in told)
+
+
+def test_a_corrected_run_resumes_to_the_same_result(
+    drifting: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.005)
+    real, calls = landing_module._analyse_chunk, []
+    whole, _ = _run(drifting, _config(CORRECTED))
+
+    def stopping(*arguments: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr(landing_module, "_analyse_chunk", stopping)
+    _run(drifting, _config(CORRECTED), partial=tmp_path, identity="movie")
+    resumed, _ = _run(drifting, _config(CORRECTED), partial=tmp_path, identity="movie")
+    assert len(calls) == 1 + whole.summary["chunks"]
+    pd.testing.assert_frame_equal(resumed.table, whole.table)
+    assert resumed.summary == whole.summary
+
+
+def test_injected_particles_drift_along(followed: tuple[Any, list[str]]) -> None:
+    from iscat_analysis.pipeline.injection import Injected, InjectedMovie
+
+    way = followed[0].trajectory
+    y, x = np.indices((31, 31)) - 15.0
+    spot = -0.3 * np.exp(-(x**2 + y**2) / 8)
+    flat = Memory(np.full((FRAMES, SIDE, SIDE), 25000, dtype="u2"))
+    movie = InjectedMovie(
+        flat, Camera(gain_e_per_adu=4.0), [Injected(50, FRAMES, 30.0, 30.0, 1.0, (15, 15), spot)],
+        1, way,
+    )  # fmt: skip
+    late = 350
+    image = 25000.0 - movie.read(late - 20, late + 20).mean(axis=0)
+    rows, columns = np.indices(image.shape)
+    found = np.array([np.sum(columns * image), np.sum(rows * image)]) / image.sum()
+    np.testing.assert_allclose(found, 30 + np.array(RATE) * (late - 0.5 - 50), atol=0.1)
 
 
 def test_injected_particles_are_recovered(movie: Path) -> None:

@@ -188,6 +188,44 @@ def test_particles_come_and_leave() -> None:
     np.testing.assert_allclose(frames[9:], 1e4, rtol=1e-12)
 
 
+def test_a_sample_that_drifts_takes_its_particles_along() -> None:
+    """After 20 frames it has moved by whole pixels, so that two frames can be compared."""
+    event = {"frame": 5, "x_px": 12.3, "y_px": 13.1}
+    movie = Movie(
+        _config({"drift_px_per_frame": [0.1, -0.05], "background": "speckle", "frames": 30,
+                 "shape": [32, 36], "events": [event]}), 3,
+    )  # fmt: skip
+    frames = np.array([f / p for f, p in zip(movie.expected_frames(), movie.power, strict=True)])
+    np.testing.assert_allclose(frames[26][:-1, 2:], frames[6][1:, :-2], rtol=1e-9)
+    np.testing.assert_allclose(frames[0], movie.background_e, rtol=1e-12)
+    still = Movie(_config({"events": [event], "frames": 8, "shape": [32, 36]}), 3)
+    expected = np.array(list(still.expected_frames()))
+    with np.errstate(all="raise"):
+        contrast = expected[5] / expected[0] - 1
+    before = Movie(_config({**movie._config.simulation.model_dump(), "events": []}), 3)
+    empty = list(before.expected_frames())[5] / before.power[5]
+    found = frames[5] / empty - 1
+    assert np.abs(found - contrast).max() < 0.02 * np.abs(contrast).max()
+    assert movie.truth["x_px"][0] == 12.3
+
+
+def test_a_measured_background_goes_on_as_its_reflection(tmp_path: Path) -> None:
+    path = tmp_path / "background.tif"
+    y, x = np.indices((32, 32))
+    tifffile.imwrite(path, (1000 + 5 * x + 100 * np.cos(y / 3)).astype("f4"))
+    simulation = {"background": str(path), "shape": [32, 32], "frames": 20, "events": []}
+    still = Movie(_config(simulation), 1).background_e
+    movie = Movie(_config({**simulation, "drift_px_per_frame": [0.5, 0.0]}), 1)
+    last = list(movie.expected_frames())[10] / movie.power[10]
+    np.testing.assert_allclose(last[:, 5:], still[:, :-5], rtol=1e-9)
+    np.testing.assert_allclose(last[:, :5], still[:, 4::-1], rtol=1e-9)
+
+
+def test_a_sample_that_drifts_out_of_sight_is_refused() -> None:
+    with pytest.raises(ConfigError, match="out of a field of"):
+        Movie(_config({"drift_px_per_frame": [5.0, 0.0], "frames": 100}), 1)
+
+
 def test_dark_field_counts_the_collected_photons() -> None:
     """All the light of a particle, on a field wide enough, is what was asked for."""
     event = EVENT | {"x_px": 100.0, "y_px": 99.4}
