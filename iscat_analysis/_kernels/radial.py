@@ -209,12 +209,19 @@ def radial_profile(
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
-def _mix(t: FloatArray, w: FloatArray, out: FloatArray) -> None:
-    """Fill `out` (n) with the combination w (6) of the six rows of t (6, n)."""
-    t0, t1, t2, t3, t4, t5 = t[0], t[1], t[2], t[3], t[4], t[5]
-    w0, w1, w2, w3, w4, w5 = w[0], w[1], w[2], w[3], w[4], w[5]
+def _mix(heights: FloatArray, i: int, channel: int, w: FloatArray, out: FloatArray) -> None:
+    """Fill `out` (n) with the combination w (6) of a channel's rows at heights i and i + 1.
+
+    Three rows at a time: against more that might overlap, the compiler gives up on vectors.
+    """
+    t0, t1, t2 = heights[i, 0, channel], heights[i, 1, channel], heights[i, 2, channel]
+    w0, w1, w2 = w[0], w[1], w[2]
     for j in range(out.size):
-        out[j] = w0 * t0[j] + w1 * t1[j] + w2 * t2[j] + w3 * t3[j] + w4 * t4[j] + w5 * t5[j]
+        out[j] = w0 * t0[j] + w1 * t1[j] + w2 * t2[j]
+    t0, t1, t2 = heights[i + 1, 0, channel], heights[i + 1, 1, channel], heights[i + 1, 2, channel]
+    w0, w1, w2 = w[3], w[4], w[5]
+    for j in range(out.size):
+        out[j] += w0 * t0[j] + w1 * t1[j] + w2 * t2[j]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
@@ -275,15 +282,14 @@ def profile_at(
     d[4] = -12 * t2 + 28 * t3 - 15 * t4
     d[5] = 1.5 * t2 - 4 * t3 + 2.5 * t4
     d /= step_nm
-    six = heights[i : i + 2].reshape(6, 4, heights.shape[3])
     used = 6 * min(intervals, profile.shape[1])
     with_slope = profile.shape[0] == 8
     cos, sin = np.cos(kappa * z_nm), np.sin(kappa * z_nm)
     flat = profile.reshape(profile.shape[0], heights.shape[3])
     for channel in range(4):
-        _mix(six[:, channel], v, work[channel, 0, :used])
+        _mix(heights, i, channel, v, work[channel, 0, :used])
         if with_slope:
-            _mix(six[:, channel], d, work[channel, 1, :used])
+            _mix(heights, i, channel, d, work[channel, 1, :used])
     for c in range(0, 4, 2):
         re, im = work[c, 0, :used], work[c + 1, 0, :used]
         if with_slope:
