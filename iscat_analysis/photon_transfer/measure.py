@@ -26,6 +26,7 @@ from iscat_analysis.photon_transfer.pixels import (
     unsteady,
 )
 from iscat_analysis.photon_transfer.regression import Solution, dark_numbers, solve
+from iscat_analysis.photon_transfer.repeats import without_repeats
 from iscat_analysis.photon_transfer.result import CameraCalibration
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress, silent
 
@@ -77,7 +78,10 @@ def measure_camera(
         The stacks differ in shape, are too short, are saturated, or hold no noise that grows with
         the light.
     """
-    stacks = _checked(light, dark, maps)
+    _checked(light, dark, maps)
+    notes: list[str] = []
+    light = [without_repeats(stack, LEAST_FRAMES, notes) for stack in light]
+    stacks = [*light, *([dark] if dark is not None else [])]
     shape, total, done = stacks[0].shape[1:], sum(stack.shape[0] for stack in stacks), 0
 
     def advance(frames: int) -> None:
@@ -120,7 +124,6 @@ def measure_camera(
     used &= ~unsteady(found, used)
     masked["hot"] |= ~(used | masked["saturated"] | masked["dead"])
 
-    notes: list[str] = []
     result = solve(found, used, dark_found, offset_adu, notes)
     notes += mask_notes(masked)
     longest = int(np.argmax([item.n_frames for item in found]))
@@ -144,10 +147,8 @@ def measure_camera(
     )
 
 
-def _checked(
-    light: Sequence[FrameSource], dark: FrameSource | None, maps: bool
-) -> list[FrameSource]:
-    """Give every stack, once they are known to be usable together."""
+def _checked(light: Sequence[FrameSource], dark: FrameSource | None, maps: bool) -> None:
+    """Refuse stacks that are not usable together."""
     stacks = [*light, *([dark] if dark is not None else [])]
     if not stacks:
         raise DataError("no recording was given; give a flat, the movie, or a dark")
@@ -169,7 +170,6 @@ def _checked(
             f"--maps needs {LEAST_FRAMES_FOR_MAPS} frames or more, not {frames}: with fewer the "
             "gain of one pixel is all noise"
         )
-    return stacks
 
 
 def _glance(stack: FrameSource) -> NDArray[Any]:

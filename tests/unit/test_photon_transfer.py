@@ -262,6 +262,33 @@ def test_what_is_no_raw_movie_is_refused(change: Any, message: str) -> None:
         measure_camera([Movie(change(movie.counts))])
 
 
+def test_dropped_and_stuck_frames_are_left_out() -> None:
+    rng = np.random.default_rng(13)
+    good = record(scene(rng), 200, rng).counts
+    harmed = good.copy()
+    harmed[50:52] = 0
+    harmed[120:140] = harmed[119]
+    lost = [50, 51, *range(120, 140)]
+    found = measure_camera([Movie(harmed)])
+    alone = measure_camera([Movie(np.delete(good, lost, axis=0))])
+    assert found.gain_e_per_adu.value == alone.gain_e_per_adu.value
+    assert found.verdict == alone.verdict
+    assert found.frames == 178
+    (note,) = [note for note in found.notes if "dropped or stuck" in note]
+    assert "frames 50, 51, 120, 121 and 18 more" in note
+    # Control: with them in, the differences of the frames are too small.
+    harmed[50:52] = good[50:52]
+    stuck = np.mean(np.var(np.diff(harmed.astype(float), axis=0), axis=0))
+    assert stuck < 0.95 * np.mean(np.var(np.diff(good.astype(float), axis=0), axis=0))
+
+
+def test_hardly_any_frame_differs() -> None:
+    rng = np.random.default_rng(14)
+    few = record(scene(rng), 5, rng).counts
+    with pytest.raises(DataError, match=r"movie.tif: only 5 of 20 frames are neither zero"):
+        measure_camera([Movie(np.repeat(few, 4, axis=0))])
+
+
 def test_stacks_must_agree_in_shape() -> None:
     rng = np.random.default_rng(12)
     movie = record(scene(rng), 16, rng)
