@@ -16,6 +16,7 @@ import argparse
 import json
 import os
 import sys
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -63,29 +64,30 @@ class Report:
 def efficiency(report: Report) -> None:
     count = report.trials(10_000)
     flagged = judged = 0
-    for scheme in SCHEMES:
-        for mode in MODES:
-            experiment = setting(scheme, mode)
-            found = run_trials(experiment, count, seed=report.seed, workers=report.workers)
-            bounds, kept = experiment.bounds, found.usable
-            rate = float(np.mean(found.failed))
-            flagged += int(found.flagged(Status.POOR_FIT).sum())
-            judged += count
-            report.promise(rate < FAILURES, f"{scheme} {mode}: failures {rate:.2%} of {count}")
-            for name in experiment.free:
-                k = PARAMETERS.index(name)
-                error = (found.estimate - found.truth)[kept, k]
-                s = score(error, found.sigma[kept, k], bounds.crb_joint[k], bounds.qcrb[k])
-                report.numbers[f"{scheme}.{mode}.{name}"] = s.plain()
-                low, high = s.spread_over_crb_ci95
-                report.promise(
-                    EFFICIENT[0] <= s.spread_over_crb <= EFFICIENT[1]
-                    and abs(s.bias) < BIAS_SHARE * s.crb,
-                    f"{scheme} {mode} {name}: spread/CRB {s.spread_over_crb:.4f} "
-                    f"[{low:.3f}, {high:.3f}], bias {s.bias / s.crb:+.3f} ± "
-                    f"{s.bias_se / s.crb:.3f} CRB, pull {s.pull_std:.3f}, "
-                    f"inside σ {s.coverage68:.3f}",
-                )
+    for number, (scheme, mode) in enumerate(product(SCHEMES, MODES)):
+        experiment = setting(scheme, mode)
+        found = run_trials(
+            experiment, count, seed=report.seed, stream=100 + number, workers=report.workers
+        )
+        bounds, kept = experiment.bounds, found.usable
+        rate = float(np.mean(found.failed))
+        flagged += int(found.flagged(Status.POOR_FIT).sum())
+        judged += count
+        report.promise(rate < FAILURES, f"{scheme} {mode}: failures {rate:.2%} of {count}")
+        for name in experiment.free:
+            k = PARAMETERS.index(name)
+            error = (found.estimate - found.truth)[kept, k]
+            s = score(error, found.sigma[kept, k], bounds.crb_joint[k], bounds.qcrb[k])
+            report.numbers[f"{scheme}.{mode}.{name}"] = s.plain()
+            low, high = s.spread_over_crb_ci95
+            report.promise(
+                EFFICIENT[0] <= s.spread_over_crb <= EFFICIENT[1]
+                and abs(s.bias) < BIAS_SHARE * s.crb,
+                f"{scheme} {mode} {name}: spread/CRB {s.spread_over_crb:.4f} "
+                f"[{low:.3f}, {high:.3f}], bias {s.bias / s.crb:+.3f} ± "
+                f"{s.bias_se / s.crb:.3f} CRB, pull {s.pull_std:.3f}, "
+                f"inside σ {s.coverage68:.3f}",
+            )
     share, error = flagged / judged, np.sqrt(POOR_FIT_P / judged)
     report.numbers["poor_fit_share"] = share
     report.promise(

@@ -23,7 +23,7 @@ from iscat_analysis.load import open_stack
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Progress, silent
 from iscat_analysis.report import check_output, write_report
-from iscat_analysis.report.context import LABELS, UNITS
+from iscat_analysis.report.numbers import LABELS, UNITS
 from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
 from iscat_analysis.simulate import write_stack
 

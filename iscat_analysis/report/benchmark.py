@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from iscat_analysis.records import FREE_PARAMETERS
-from iscat_analysis.report.context import LABELS, UNITS
+from iscat_analysis.report.numbers import LABELS, UNITS
 from iscat_analysis.report.page import render_page
 from iscat_analysis.report.style import BLUE, INK, STYLE, VERMILLION, new_figure, save_figure
 

@@ -16,7 +16,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from iscat_analysis.records import PARAMETERS
-from iscat_analysis.report.context import LABELS, UNITS
+from iscat_analysis.report.numbers import LABELS, UNITS
 from iscat_analysis.report.output import atomic_folder
 from iscat_analysis.report.style import BLUE, INK, STYLE, VERMILLION, log_y, new_figure, save_figure
 from iscat_analysis.report.tables import jsonable

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import PurePath
 from typing import Any
@@ -16,9 +15,9 @@ from iscat_analysis.records import (
     EVENT_COLUMNS,
     FREE_PARAMETERS,
     Analysis,
-    FloatArray,
     Status,
 )
+from iscat_analysis.report.numbers import LABELS, UNITS, count, number, percent
 from iscat_analysis.report.pack import (
     event_images,
     field_image,
@@ -26,16 +25,17 @@ from iscat_analysis.report.pack import (
     rounded,
     views_of_rows,
 )
+from iscat_analysis.report.precision import (
+    Precision,
+    ladder,
+    precision_of,
+    precision_row,
+    quantiles,
+)
 from iscat_analysis.report.tables import event_table, jsonable
 
 POWER_POINTS = 1500
 """Points of the power curve; longer ones keep the extremes of each stretch."""
-
-LABELS = {"x_nm": "x", "y_nm": "y", "z_nm": "z", "mass_kda": "mass"}
-"""What the parameters are called in print."""
-
-UNITS = {"x_nm": "nm", "y_nm": "nm", "z_nm": "nm", "mass_kda": "kDa"}
-"""Their units."""
 
 _MODES = {
     "mass": "position and mass, height fixed",
@@ -44,146 +44,6 @@ _MODES = {
     "track": "position and mass in every frame, linked into tracks",
 }
 _SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "Dark field"}
-
-
-@dataclass(frozen=True)
-class Precision:
-    """How near the fits of one parameter came to its bounds, over the events that are ok.
-
-    Attributes
-    ----------
-    name : str
-        As in `PARAMETERS`.
-    events : int
-        Events with a usable σ and CRB.
-    sigma, crb, qcrb : float
-        Medians [nm or kDa]; NaN where there is none.
-    over_crb : ndarray, shape (5,)
-        5, 25, 50, 75 and 95 % quantiles of σ/CRB.
-    quantum_over_crb : ndarray, shape (5,)
-        The same of QCRB/CRB.
-    information : float
-        Median of (QCRB/CRB)², the share of the light's information that the measurement uses.
-    """
-
-    name: str
-    events: int
-    sigma: float
-    crb: float
-    qcrb: float
-    over_crb: FloatArray
-    quantum_over_crb: FloatArray
-    information: float
-
-
-def precision_of(table: pd.DataFrame, name: str) -> Precision:
-    """Set the spread of one parameter beside its bounds.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        Columns `EVENT_COLUMNS`.
-    name : str
-        As in `PARAMETERS`.
-
-    Returns
-    -------
-    Precision
-        Over the rows whose status is ok; NaN where nothing is known.
-    """
-    good = table[table["status"] == Status.OK.value]
-    sigma, crb, qcrb = (good[f"{kind}_{name}"].to_numpy(float) for kind in ("sigma", "crb", "qcrb"))
-    usable = np.isfinite(sigma) & np.isfinite(crb) & (crb > 0)
-    sigma, crb, qcrb = sigma[usable], crb[usable], qcrb[usable]
-    return Precision(
-        name,
-        int(usable.sum()),
-        _quantiles(sigma)[2],
-        _quantiles(crb)[2],
-        _quantiles(qcrb)[2],
-        _quantiles(sigma / crb),
-        _quantiles(qcrb / crb),
-        float(_quantiles((qcrb / crb) ** 2)[2]),
-    )
-
-
-def _quantiles(values: FloatArray) -> FloatArray:
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return np.full(5, np.nan)
-    return np.asarray(np.quantile(finite, [0.05, 0.25, 0.5, 0.75, 0.95]), dtype=np.float64)
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """Write a number for people.
-
-    Parameters
-    ----------
-    value : float or None
-        The number.
-    digits : int
-        Significant digits.
-
-    Returns
-    -------
-    str
-        Plain notation with a true minus sign; a dash for NaN and None.
-    """
-    if value is None or not math.isfinite(value):
-        return "—"
-    if value != 0 and not 1e-3 <= abs(value) < 1e6:
-        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-        raised = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-        return f"{mantissa}×10{raised}".replace("-", "−")
-    decimals = 0 if value == 0 else max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    return f"{value:.{decimals}f}".replace("-", "−")
-
-
-def decimals_for(errors: Iterable[float | None], digits: int = 2) -> int:
-    """Give the decimals with which a column of numbers lines up.
-
-    Parameters
-    ----------
-    errors : iterable of float or None
-        Errors of the numbers, or the numbers; what is zero or missing does not count.
-    digits : int
-        Digits of the smallest that are shown.
-
-    Returns
-    -------
-    int
-        0 to 8; 2 where there is nothing to go by.
-    """
-    known = [abs(e) for e in errors if e is not None and math.isfinite(e) and e != 0]
-    return min(8, max(0, digits - 1 - math.floor(math.log10(min(known))))) if known else 2
-
-
-def fixed(value: float | None, decimals: int) -> str:
-    """Write a number with so many decimals.
-
-    Parameters
-    ----------
-    value : float or None
-        The number.
-    decimals : int
-        From `decimals_for`.
-
-    Returns
-    -------
-    str
-        With a true minus sign; a dash for NaN and None.
-    """
-    if value is None or not math.isfinite(value):
-        return "—"
-    return f"{value:.{decimals}f}".replace("-", "−")
-
-
-def _percent(value: float) -> str:
-    return "—" if not math.isfinite(value) else f"{number(100 * value, 2)} %"
-
-
-def _count(n: int, noun: str) -> str:
-    return f"{n} {noun}{'' if n == 1 else 's'}"
 
 
 def report_context(analysis: Analysis, figures: Mapping[str, int]) -> dict[str, Any]:
@@ -235,8 +95,8 @@ def report_context(analysis: Analysis, figures: Mapping[str, int]) -> dict[str, 
         "n_events": len(table),
         "headline": _headline(table, precision, main, analysis.mode),
         "tiles": _tiles(table, precision, main),
-        "ladder": _ladder(precision) if any(p.events for p in precision) else None,
-        "precision_rows": [_precision_row(p) for p in precision],
+        "ladder": ladder(precision) if any(p.events for p in precision) else None,
+        "precision_rows": [precision_row(p) for p in precision],
         "main": main,
         "main_label": LABELS[main],
         "main_unit": UNITS[main],
@@ -309,14 +169,14 @@ def _headline(
     rows = "fitted position" if mode == "track" else "event"
     good = table[table["status"] == Status.OK.value]
     lines = [
-        f"{_count(n, rows)}, of which {len(good)} fitted without reservation."
+        f"{count(n, rows)}, of which {len(good)} fitted without reservation."
         if n > 1
         else f"One {rows}, fitted with status “{table['status'].iloc[0]}”."
     ]
     values = good[main].to_numpy(float)
     values = values[np.isfinite(values)]
     if values.size > 1:
-        _, low, middle, high, _ = _quantiles(np.abs(values))
+        _, low, middle, high, _ = quantiles(np.abs(values))
         what = "mass" if main == "mass_kda" else "height"
         lines[0] += (
             f" Median {what} {number(middle)} {UNITS[main]}, middle half "
@@ -329,7 +189,7 @@ def _headline(
             f"{number(close.over_crb[2])} times the Cramér–Rao bound"
             + (
                 f"; the light itself would allow {number(close.qcrb)} {UNITS[main]}, "
-                f"so {_percent(close.information)} of its information on {LABELS[main]} is used."
+                f"so {percent(close.information)} of its information on {LABELS[main]} is used."
                 if math.isfinite(close.information)
                 else "."
             )
@@ -352,7 +212,7 @@ def _tiles(table: pd.DataFrame, precision: Sequence[Precision], main: str) -> li
     values = good[main].to_numpy(float)
     values = values[np.isfinite(values)]
     leaving = int((values < 0).sum()) if main == "mass_kda" else 0
-    _, low, middle, high, _ = _quantiles(np.abs(values))
+    _, low, middle, high, _ = quantiles(np.abs(values))
     note = f"middle half {number(low)} to {number(high)}" if values.size > 1 else ""
     if leaving and values.size == 1:
         note = "leaving; magnitude"
@@ -379,63 +239,11 @@ def _tiles(table: pd.DataFrame, precision: Sequence[Precision], main: str) -> li
     tiles.append(
         {
             "label": f"Information on {LABELS[main]} used",
-            "value": _percent(p.information),
+            "value": percent(p.information),
             "note": f"(QCRB / CRB)², QCRB {number(p.qcrb)} {UNITS[main]}" if p.events else "",
         }
     )
     return tiles
-
-
-def _precision_row(p: Precision) -> list[Any]:
-    unit = UNITS[p.name]
-    return [
-        {"text": f"{LABELS[p.name]} [{unit}]"},
-        {"text": number(p.sigma), "sort": _sort(p.sigma)},
-        {"text": number(p.crb), "sort": _sort(p.crb)},
-        {"text": number(p.qcrb), "sort": _sort(p.qcrb)},
-        {"text": number(p.over_crb[2]), "sort": _sort(p.over_crb[2])},
-        {"text": _percent(p.information), "sort": _sort(p.information)},
-        {"text": str(p.events), "sort": p.events},
-    ]
-
-
-def _sort(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _ladder(precision: Sequence[Precision]) -> dict[str, Any]:
-    """Build the one picture: every parameter's σ and QCRB in multiples of its CRB."""
-    shown = [p for p in precision if p.events]
-
-    def interval(kind: str, color: str, label: str) -> dict[str, Any]:
-        data = np.array([p.over_crb if kind == "sigma" else p.quantum_over_crb for p in shown])
-        return {
-            "kind": "interval",
-            "name": label,
-            "color": color,
-            "at": list(range(len(shown))),
-            "lo2": data[:, 0],
-            "lo": data[:, 1],
-            "mid": data[:, 2],
-            "hi": data[:, 3],
-            "hi2": data[:, 4],
-            "tips": [
-                f"{LABELS[p.name]}: {label}\nmedian {number(row[2])} × CRB\n"
-                f"= {number(getattr(p, kind))} {UNITS[p.name]}"
-                for p, row in zip(shown, data, strict=True)
-            ],
-        }
-
-    return {
-        "height": 96 + 46 * len(shown),
-        "x": {"label": "multiples of the CRB (lower is better)", "scale": "log"},
-        "y": {"label": "", "categories": [LABELS[p.name] for p in shown]},
-        "series": [
-            {"kind": "rule", "name": "CRB", "color": "crb", "axis": "x", "value": 1.0},
-            interval("qcrb", "qcrb", "QCRB"),
-            interval("sigma", "sigma", "achieved σ"),
-        ],
-    }
 
 
 def _statuses(table: pd.DataFrame) -> list[list[Any]]:
@@ -535,7 +343,7 @@ def _landing_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     if landing:
         yield (
             f"Windows of {landing['window_frames']} frames; "
-            f"{_count(landing['frames_left_out'], 'frame')} left out."
+            f"{count(landing['frames_left_out'], 'frame')} left out."
         )
         if landing["drift_px"] is not None:
             y, x = landing["drift_px"]

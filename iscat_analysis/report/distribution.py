@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from iscat_analysis.report.context import decimals_for, fixed, number
+from iscat_analysis.report.numbers import decimals_for, fixed, number
 
 _COLUMNS = (
     {"label": "mass [kDa]", "numeric": True},

@@ -24,7 +24,7 @@ from iscat_analysis.records import (
     PosteriorResult,
     Status,
 )
-from iscat_analysis.report.context import LABELS, UNITS
+from iscat_analysis.report.numbers import LABELS, UNITS
 from iscat_analysis.report.pack import (
     CREDIBLE_LEVELS,
     POSTERIOR_BINS,

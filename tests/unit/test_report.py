@@ -17,9 +17,10 @@ from iscat_analysis.config import load_config, parse_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import EVENT_COLUMNS, Status
 from iscat_analysis.report import check_output, figures, render_page, render_report, write_report
-from iscat_analysis.report.context import number, precision_of
+from iscat_analysis.report.numbers import number
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder
 from iscat_analysis.report.pack import CREDIBLE_LEVELS, credible_shades, quantise
+from iscat_analysis.report.precision import precision_of
 from iscat_analysis.report.tables import event_table, jsonable
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
