@@ -10,6 +10,8 @@ refused.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -42,6 +44,7 @@ def sample_posterior(
     walkers: int = 32,
     steps: int = 2000,
     seed: int = 0,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> PosteriorResult:
     """Sample the posterior of a fitted particle.
 
@@ -57,11 +60,18 @@ def sample_posterior(
         Steps of each, burn-in included; up to `EXTENSIONS` times as many where the chain asks.
     seed : int
         Same seed, same samples.
+    stopped : callable
+        Asked at every step whether to give up; a chain in another thread hears no Ctrl-C.
 
     Returns
     -------
     PosteriorResult
         Samples in nm and kDa, diagnostics and verdict.
+
+    Raises
+    ------
+    concurrent.futures.CancelledError
+        It was stopped.
     """
     import emcee  # takes a third of a second, and only chains need it
 
@@ -90,7 +100,10 @@ def sample_posterior(
         _scatter(proposal, walkers, lower, upper, random), random_state=random.get_state()
     )
     for _ in range(EXTENSIONS):
-        state = sampler.run_mcmc(state, steps)
+        for latest in sampler.sample(state, iterations=steps):
+            if stopped():
+                raise CancelledError
+            state = latest
         samples, values = _after_burn_in(sampler)
         verdict = _diagnose(samples)
         if verdict.converged:

@@ -361,6 +361,7 @@ def _sampled(
 ) -> tuple[list[Row], bool]:
     """Sample the posteriors; an interrupt keeps those that are done."""
     settings, seed = scene.config.posterior, scene.config.simulation.seed
+    stop = threading.Event()
 
     def one(row: Row) -> PosteriorResult:
         return sample_posterior(
@@ -369,6 +370,7 @@ def _sampled(
             walkers=settings.walkers,
             steps=settings.steps,
             seed=seed + row.number,
+            stopped=stop.is_set,
         )
 
     done: list[Row] = []
@@ -377,7 +379,8 @@ def _sampled(
             done.append(replace(row, posterior=posterior))
             progress("posterior", len(done), len(rows))
     except KeyboardInterrupt:
-        pool.shutdown(wait=False, cancel_futures=True)
+        stop.set()
+        pool.shutdown(cancel_futures=True)
         return done + rows[len(done) :], True
     return done, False
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import CancelledError
+
 import numpy as np
 import pytest
 from scenes import PIXEL_NM, make_config
@@ -125,3 +127,10 @@ def test_a_chain_grows_until_it_converges(gaussian: Case) -> None:
     short = sample_posterior(*gaussian, walkers=32, steps=120, seed=1)
     assert short.samples.shape[1] > 120
     assert short.samples.shape[1] <= 120 * posterior.EXTENSIONS
+
+
+def test_a_chain_that_is_stopped_ends_there(gaussian: Case) -> None:
+    asked = iter([False, False, True])
+    with pytest.raises(CancelledError):
+        sample_posterior(*gaussian, walkers=10, steps=1000, seed=1, stopped=lambda: next(asked))
+    assert next(asked, None) is None
