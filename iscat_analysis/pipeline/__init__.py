@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -17,12 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.background import measure_windows
-from iscat_analysis.calibrate import diagnose_gain, resolve_metadata
+from iscat_analysis.calibrate import resolve_metadata
 from iscat_analysis.camera import Camera, camera_from_config, check_counts
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.likelihood import compile_kernels
 from iscat_analysis.load import Stack, open_stack
+from iscat_analysis.pipeline.diagnosis import (
+    camera_warnings,
+    drift_warning,
+    examine_background,
+)
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.landing import analyse_landings, has_landings, inject_and_recover
 from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
@@ -50,7 +55,6 @@ DEPENDENCIES = (
 FEW_FIGURES = 2
 """Events of a landing movie that are drawn for print; the page shows hundreds."""
 
-_GAIN_FRAMES = 64  # background frames that the noise is measured on
 _PATIENCE_S = 1.5  # after which a compilation is announced
 
 Notify = Callable[[str], None]
@@ -204,7 +208,7 @@ def analyse(
                 "--inject adds particles to a landing movie: it needs an interferometric scheme "
                 "and neither --background nor background.frames"
             )
-        scene, found, image = _measured_background(
+        scene, found, image, further = _measured_background(
             movie, config, camera, clock, tell=tell, notify=notify, progress=progress
         )
     windows = found.windows
@@ -295,8 +299,9 @@ def _measured_background(
     tell: Notify,
     notify: Notify,
     progress: Progress,
-) -> tuple[Scene, Found, FloatArray]:
+) -> tuple[Scene, Found, FloatArray, dict[str, Any]]:
     """Find particles against frames before they bound, or against a known background."""
+    further: dict[str, Any] = {}
     shape = (movie.shape[1], movie.shape[2])
     before, after = frame_ranges(movie, config)
     searches = after[1] - after[0] if config.fit.mode == "track" else 1
@@ -318,8 +323,13 @@ def _measured_background(
         check=check,
         progress=progress,
     )
-    for text in _camera_warnings(movie, camera, windows):
+    for text in camera_warnings(movie, camera, windows):
         tell(text)
+    if not scene.additive:
+        further["background"] = examine_background(movie, camera, windows)
+        moved = drift_warning(movie.name, further["background"])
+        if moved:
+            tell(moved)
     clock.lap("background")
     with ThreadPoolExecutor(config.compute.workers) as pool:
         if scene.mode == "track":
@@ -333,7 +343,7 @@ def _measured_background(
     if scene.additive:
         image = windows.after_e - windows.power_ratio * windows.before_e
     clock.lap("results")
-    return scene, found, image
+    return scene, found, image, further
 
 
 def _bound_particles(
@@ -383,30 +393,6 @@ def _sampled(
         pool.shutdown(cancel_futures=True)
         return done + rows[len(done) :], True
     return done, False
-
-
-def _camera_warnings(movie: Stack, camera: Camera, windows: Windows) -> Iterator[str]:
-    """Say what the background frames reveal about the camera."""
-    start, stop = windows.frames_before
-    used = ~windows.masked
-    light, read = windows.before_e[used], windows.read_variance_before_e2[used]
-    if stop - start >= 2 and light.sum() > read.sum():  # else there is no shot noise to look at
-        frames = movie.read(start, min(stop, start + _GAIN_FRAMES))
-        try:
-            message = diagnose_gain(frames, camera, masked=windows.masked).message
-        except DataError:
-            message = None  # too dark to tell
-        if message:
-            yield message
-    defects = int(np.sum(windows.masked & ~windows.saturated))
-    if defects:
-        yield f"{defects} dead or hot pixels are left out"
-    burnt = int(windows.saturated.sum())
-    if burnt:
-        yield (
-            f"{burnt} pixels are saturated in some frame and left out; "
-            "lower the exposure or the laser power"
-        )
 
 
 def _warm_up(scene: Scene, notify: Notify) -> None:

@@ -39,6 +39,7 @@ from iscat_analysis.pipeline.chunks import (
     counts_budget,
     plan_chunks,
 )
+from iscat_analysis.pipeline.diagnosis import DRIFT_PX
 from iscat_analysis.pipeline.injection import InjectedMovie, draw_particles, recovery
 from iscat_analysis.pipeline.neighbours import LARGEST_IMAGE
 from iscat_analysis.pipeline.pattern import follow
@@ -57,7 +58,6 @@ JUMP = 0.1
 """Relative change of the light from one frame to the next that is reported."""
 
 _GAIN_FRAMES = 64
-_DRIFT_PX = 0.02  # shift of the fixed pattern below which it is not worth a line
 
 Tell = Callable[[str], None]
 
@@ -512,7 +512,7 @@ def _drift_warnings(name: str, merged: Merged, windows: float, corrected: bool) 
         )
     if corrected or drift is None:
         return
-    if math.hypot(*drift) > _DRIFT_PX * max(windows / 2, 1.0):
+    if math.hypot(*drift) > DRIFT_PX * max(windows / 2, 1.0):
         yield (
             f"{name}: the fixed pattern moved by {drift[1]:+.2f} pixels in x and "
             f"{drift[0]:+.2f} in y; it is not corrected: set background.drift_correction = true "

@@ -106,8 +106,8 @@ def report_context(analysis: Analysis, figures: Mapping[str, int]) -> dict[str, 
         "chi2": _histogram_spec(table["chi2_reduced"], "reduced χ²", rule=1.0),
         "p_values": _histogram_spec(table["p_value"], "p-value", domain=(0.0, 1.0)),
         "power": _power_spec(analysis),
-        "noise": _noise_spec(analysis.summary.get("landing")),
-        "landing": _landing_lines(analysis.summary),
+        "noise": _noise_spec(analysis.summary.get("landing") or analysis.summary.get("background")),
+        "measured": _measured_lines(analysis.summary),
         "embedded": n_images,
         "embedding_note": (
             f"To keep this page small it holds the images of the first {n_images} of "
@@ -323,8 +323,8 @@ def _power_spec(analysis: Analysis) -> dict[str, Any] | None:
     }  # fmt: skip
 
 
-def _noise_spec(landing: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    if not landing or len(landing["noise_frames"]) < 2:
+def _noise_spec(noise: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    if not noise or len(noise["noise_frames"]) < 2:
         return None
     return {
         "x": {"label": "frames averaged", "scale": "log"},
@@ -332,14 +332,21 @@ def _noise_spec(landing: Mapping[str, Any] | None) -> dict[str, Any] | None:
         "series": [
             {"kind": "rule", "name": "shot noise", "color": "ink", "axis": "y", "value": 1.0},
             {"kind": "points", "name": "measured", "color": "sigma",
-             "x": landing["noise_frames"], "y": landing["noise_variance_over_shot"]},
+             "x": noise["noise_frames"], "y": noise["noise_variance_over_shot"]},
         ],
     }  # fmt: skip
 
 
-def _landing_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Say what a landing movie's windows, drift and added particles came to."""
+def _measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    """Say what windows, drift and added particles came to."""
     landing, injection = summary.get("landing"), summary.get("injection")
+    background = summary.get("background")
+    if background and background["drift_px"] is not None:
+        (y, x), (y_se, x_se) = background["drift_px"], background["drift_error_px"]
+        yield (
+            f"Drift of the fixed pattern from the background to the frames after it: {x:+.4f} ± "
+            f"{x_se:.4f} px in x, {y:+.4f} ± {y_se:.4f} px in y."
+        ).replace("-", "−")
     if landing:
         yield (
             f"Windows of {landing['window_frames']} frames; "

@@ -427,3 +427,24 @@ def test_a_field_smaller_than_the_region_is_refused(tmp_path: Path) -> None:
         fit_stack(movie, config)
     with pytest.raises(DataError, match="absent"):
         fit_stack(tmp_path / "absent.tif", config)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_noise_and_drift_of_the_background(moves: bool, tmp_path: Path) -> None:
+    rate = (0.002, -0.001) if moves else (0.0, 0.0)
+    found, _ = _run(_small(simulation={"drift_px_per_frame": rate}), tmp_path)
+    background = found.summary["background"]
+    assert background["noise_frames"] == [1, 2, 3, 5, 7, 10, 15]
+    # 16 rows of 68 pixels: robust variances are good to 1.65 √(2/1088), a few per cent.
+    np.testing.assert_allclose(background["noise_variance_over_shot"][:3], 1, atol=0.3)
+    assert (background["noise_variance_over_shot"][-1] > 2) == moves
+    # Frames 0 to 29 against 30 to 59.
+    truth = 30 * np.array(rate[::-1])
+    pulls = (np.array(background["drift_px"]) - truth) / background["drift_error_px"]
+    assert np.abs(pulls).max() < SIGMAS
+    assert any("fixed pattern moved" in text for text in found.warnings) == moves
+
+
+def test_no_drift_where_there_is_no_pattern(tmp_path: Path) -> None:
+    found, _ = _run(_small(simulation={"background": "flat"}), tmp_path)
+    assert found.summary["background"]["drift_px"] is None

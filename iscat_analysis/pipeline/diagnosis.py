@@ -1,0 +1,149 @@
+"""What the background frames reveal about camera and stage."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.calibrate import diagnose_gain
+from iscat_analysis.camera import Camera
+from iscat_analysis.drift import follow_pattern
+from iscat_analysis.errors import DataError
+from iscat_analysis.load import Stack
+from iscat_analysis.records import Windows
+from iscat_analysis.sliding import measure_noise
+
+DRIFT_PX = 0.02
+"""Shift of the fixed pattern below which it is not worth a line."""
+
+_GAIN_FRAMES = 64  # on which the gain is judged
+_NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
+_LONGEST = 100  # average of the noise curve
+_SMALLEST_PX = 32  # side of a field in which a pattern is followed
+_SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
+
+
+def camera_warnings(movie: Stack, camera: Camera, windows: Windows) -> Iterator[str]:
+    """Say what the background frames reveal about the camera.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    camera : Camera
+        Counts → photoelectrons.
+    windows : Windows
+        The background.
+
+    Yields
+    ------
+    str
+        One line each.
+    """
+    if windows.n_before >= 2 and _is_lit(windows):  # else there is no shot noise to look at
+        try:
+            message = diagnose_gain(
+                _first(movie, windows, _GAIN_FRAMES), camera, masked=windows.masked
+            ).message
+        except DataError:
+            message = None  # too dark to tell
+        if message:
+            yield message
+    defects = int(np.sum(windows.masked & ~windows.saturated))
+    if defects:
+        yield f"{defects} dead or hot pixels are left out"
+    saturated = int(windows.saturated.sum())
+    if saturated:
+        yield (
+            f"{saturated} pixels are saturated in some frame and left out; "
+            "lower the exposure or the laser power"
+        )
+
+
+def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[str, Any]:
+    """Measure noise against averaging, and how far the fixed pattern moved.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    camera : Camera
+        Counts → photoelectrons.
+    windows : Windows
+        The background, and the frames with the particles.
+
+    Returns
+    -------
+    dict
+        What ``summary.json`` adds under ``"background"``; drift is from the background to the
+        frames after it, None where there is no pattern to follow.
+    """
+    curve: tuple[tuple[int, ...], tuple[float, ...]] = ((), ())
+    limit = drift = error = None
+    if windows.n_before >= 2 and _is_lit(windows):
+        frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
+        some = _first(movie, windows, max(2, _NOISE_BYTES // frame_bytes))
+        noise = measure_noise(some, camera, min(_LONGEST, len(some) // 2))
+        curve, limit = (noise.frames, noise.variance_over_shot), noise.shot_limited
+        if min(movie.shape[1:]) >= _SMALLEST_PX:
+            way = follow_pattern(
+                np.stack([windows.before_e, windows.after_e]),
+                np.array([1.0, windows.power_ratio]),
+                np.array([np.mean(windows.frames_before), np.mean(windows.frames_after)]),
+                ~windows.masked,
+                windows.read_variance_before_e2,
+            )
+            if way is not None and np.isfinite(way.error_px).all():
+                drift, error = way.shift_px[1].tolist(), way.error_px[1].tolist()
+    return {
+        "noise_frames": list(curve[0]),
+        "noise_variance_over_shot": list(curve[1]),
+        "shot_noise_limited_frames": limit,
+        "drift_px": drift,
+        "drift_error_px": error,
+    }
+
+
+def drift_warning(name: str, background: dict[str, Any]) -> str | None:
+    """Say that the fixed pattern moved, where that can be taken for particles.
+
+    Parameters
+    ----------
+    name : str
+        Of the movie.
+    background : dict
+        From `examine_background`.
+
+    Returns
+    -------
+    str or None
+        None where it stood still, as far as one can tell.
+    """
+    if background["drift_px"] is None:
+        return None
+    (y, x), (y_error, x_error) = background["drift_px"], background["drift_error_px"]
+    pull = math.hypot(y / y_error, x / x_error)
+    if math.hypot(y, x) <= DRIFT_PX or pull <= _SIGNIFICANT:
+        return None
+    return (
+        f"{name}: the fixed pattern moved by {x:+.2f} pixels in x and {y:+.2f} in y between the "
+        "background and the frames after it; its edges look like particles: take background frames "
+        "nearer to them (--background), or fewer frames (fit.frames)"
+    )
+
+
+def _first(movie: Stack, windows: Windows, most: int) -> NDArray[Any]:
+    """Return the first background frames, shape (t, y, x) [counts]."""
+    start, stop = windows.frames_before
+    return movie.read(start, min(stop, start + most))
+
+
+def _is_lit(windows: Windows) -> bool:
+    """Whether there is light in the background, beyond the read noise."""
+    used = ~windows.masked
+    light, read = windows.before_e[used], windows.read_variance_before_e2[used]
+    return bool(light.sum() > read.sum())
