@@ -35,6 +35,7 @@ _CLIP = 4.0  # robust standard deviations beyond which a pixel does not count
 _SETTLED_PX = 1e-5
 _POOR = 3.0  # mismatch over shot noise that asks for another start: the stage has jumped
 _PATTERN = 1.0  # least squared gradient of the pattern over that of its noise
+_PEAK = 8.0  # least peak of a phase correlation over the noise of one of random phases
 
 
 @dataclass(frozen=True)
@@ -160,8 +161,9 @@ def _register(
 
     found = refined(np.zeros(2))
     if found[0] > _POOR:
-        far = measure_drift(pattern, np.where(usable, image, ratio * pattern))
-        found = min(found, refined(np.array(far)), key=lambda result: result[0])
+        far = np.array(measure_drift(pattern, np.where(usable, image, ratio * pattern)))
+        if np.isfinite(far).all():
+            found = min(found, refined(far), key=lambda result: result[0])
     return found[1:]
 
 
@@ -295,7 +297,9 @@ def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, 
     Notes
     -----
     C. D. Kuglin and D. C. Hines, Proc. IEEE Conf. Cybernetics and Society, 163 (1975).  Below a
-    pixel the phase of the cross-spectrum is fitted by a plane, weighted by its strength.
+    pixel the phase of the cross-spectrum is fitted by a plane, weighted by its strength.  Of two
+    images of nothing but noise the phases are random, and the highest of N points of their
+    correlation is at some 5/√N: a peak that is no higher says nothing of a shift.
     """
     rows, columns = reference_e.shape
     taper = np.outer(np.hanning(rows), np.hanning(columns))
@@ -306,6 +310,8 @@ def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, 
         return math.nan, math.nan
     surface = fft.irfft2(cross / np.maximum(magnitude, 1e-12 * magnitude.max()), s=taper.shape)
     at = np.unravel_index(int(np.argmax(surface)), surface.shape)
+    if surface[at] * math.sqrt(surface.size) < _PEAK:
+        return math.nan, math.nan
     y, x = (int((i + n // 2) % n - n // 2) for i, n in zip(at, taper.shape, strict=True))
     fy, fx = np.meshgrid(fft.fftfreq(rows), fft.rfftfreq(columns), indexing="ij")
     left = cross * np.exp(2j * np.pi * (fy * y + fx * x))

@@ -63,6 +63,14 @@ def test_drift_of_a_pattern(shift: tuple[float, float]) -> None:
     assert found == pytest.approx(shift, rel=0.05, abs=0.03)  # the taper costs a few per cent
 
 
+@pytest.mark.parametrize("n", [32, 128])
+def test_images_of_noise_alone_have_no_shift(n: int) -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(30):
+        one, two = 1 + 1e-3 * rng.standard_normal((2, n, n))
+        assert np.isnan(measure_drift(one, two)).all()
+
+
 def _window_pulls(way: Trajectory, rate: tuple[float, float]) -> np.ndarray:
     """Errors of the shift between neighbouring windows over that of a block against the next."""
     truth = way.frames[:, None] * np.array(rate)[::-1]
