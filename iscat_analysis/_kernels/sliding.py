@@ -163,7 +163,7 @@ def contrast_map(before: FloatArray, after: FloatArray, weight: MapArray, out: M
 
 
 @njit(cache=True, nogil=True)
-def step_peaks(maps: MapArray, threshold: float, polarity: int) -> NDArray[np.int64]:
+def step_peaks(maps: MapArray, threshold: float) -> NDArray[np.int64]:
     """Local extremes of a stack of maps.
 
     Parameters
@@ -172,8 +172,6 @@ def step_peaks(maps: MapArray, threshold: float, polarity: int) -> NDArray[np.in
         Signal-to-noise ratios.
     threshold : float
         Least magnitude.
-    polarity : int
-        1 or −1 for one sign, 0 for both.
 
     Returns
     -------
@@ -186,7 +184,7 @@ def step_peaks(maps: MapArray, threshold: float, polarity: int) -> NDArray[np.in
         for i in range(rows):
             for j in range(columns):
                 value = maps[k, i, j]
-                if abs(value) <= threshold or value * polarity < 0:
+                if abs(value) <= threshold:
                     continue
                 sign = 1.0 if value > 0 else -1.0
                 top = sign * value

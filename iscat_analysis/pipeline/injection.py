@@ -220,7 +220,13 @@ def draw_particles(
 
 
 def recovery(
-    particles: list[Injected], found: pd.DataFrame, last: int, separation_px: float, window: int
+    particles: list[Injected],
+    found: pd.DataFrame,
+    last: int,
+    separation_px: float,
+    window: int,
+    *,
+    sign: int = 0,
 ) -> dict[str, Any]:
     """Compare what was found with what was added.
 
@@ -236,6 +242,8 @@ def recovery(
         Steps farther from every other one than this, or than a window in time, are isolated.
     window : int
         Frames before and after a step.
+    sign : int
+        Of the steps that are looked for: 1 landings, −1 leavings, 0 both.
 
     Returns
     -------
@@ -251,9 +259,11 @@ def recovery(
         for name in ("frame", "x_px", "y_px", "mass_kda", FRAME_COLUMN)
     )
     rows: list[tuple[int, bool, int, Any]] = []
-    for when, sign, p in steps:
+    for when, side, p in steps:
+        if side * sign < 0:
+            continue
         close = np.hypot(x - p.x_px, y - p.y_px)
-        near = (close < _SAME_PX) & (mass * sign > 0)
+        near = (close < _SAME_PX) & (mass * side > 0)
         near &= np.abs(frame - when) <= error + _SAME_FRAMES
         best = int(np.argmin(np.where(near, close, np.inf))) if near.any() else -1
         others = (close < separation_px) & (np.abs(frame - when) < 2 * window)
@@ -263,7 +273,7 @@ def recovery(
             math.hypot(q.x_px - p.x_px, q.y_px - p.y_px) < separation_px
             and abs(t - when) < 2 * window
             for t, s, q in steps
-            if q is not p or s != sign
+            if q is not p or s != side
         )
         rows.append((best, alone, when, p))
     chosen = [(best, when, p) for best, alone, when, p in rows if alone and best >= 0]

@@ -45,7 +45,7 @@ from iscat_analysis.pipeline.neighbours import LARGEST_IMAGE
 from iscat_analysis.pipeline.pattern import follow
 from iscat_analysis.pipeline.results import Row, table_of, view_of
 from iscat_analysis.pipeline.resume import Store
-from iscat_analysis.pipeline.scene import Scene
+from iscat_analysis.pipeline.scene import Scene, reported_steps, search_both
 from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
 from iscat_analysis.posterior import sample_posterior
 from iscat_analysis.records import EventView, FloatArray, Progress, Windows
@@ -283,7 +283,14 @@ def inject_and_recover(
         tell=_unheard,
         progress=progress,
     )
-    return recovery(particles, again.table, frames[1], result.scene.roi_px / 2, window)
+    return recovery(
+        particles,
+        again.table,
+        frames[1],
+        result.scene.roi_px / 2,
+        window,
+        sign=reported_steps(result.scene),
+    )
 
 
 def _way(trajectory: Trajectory | None) -> dict[str, Any]:
@@ -340,14 +347,13 @@ def make_landing_scene(config: Config, field_px: tuple[int, int], *, searches: i
             f"{field_px[0]} x {field_px[1]}: lower fit.roi_nm or check camera.pixel_size_nm"
         )
     model = forward_model(config, math.sqrt(2) * (roi_px * pixel / 2 + window_nm(pixel) + pixel))
-    alarms = config.detection.false_alarms_per_movie / searches
     return Scene(
         config=config,
         model=model,
         wide=forward_model(config, math.sqrt(2) * (LARGEST_IMAGE * roi_px + 2) * pixel),
         templates=make_templates(
             model,
-            config.detection.model_copy(update={"false_alarms_per_movie": alarms}),
+            search_both(config.detection, searches=searches),
             pixel_nm=pixel,
             roi_nm=config.fit.roi_nm,
             z_range_nm=None,

@@ -246,6 +246,23 @@ def search_both(detection: Detection, *, searches: int = 1) -> Detection:
     return detection.model_copy(update={"polarity": "both", "false_alarms_per_movie": alarms})
 
 
+def reported_steps(scene: Scene) -> int:
+    """Give which steps of a landing movie have the polarity that is reported.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its template tells what landing does to the light.
+
+    Returns
+    -------
+    int
+        1 landings, −1 leavings, 0 both.
+    """
+    polarity = {"both": 0, "bright": 1, "dark": -1}[scene.config.detection.polarity]
+    return polarity * int(scene.templates.signs[0])
+
+
 def _uses_conditional(config: Config) -> bool:
     """Whether the fits condition on the sum of counts before and after."""
     if config.fit.likelihood == "auto":

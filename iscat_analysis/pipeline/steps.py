@@ -28,7 +28,7 @@ from iscat_analysis.pipeline.neighbours import (
     spans,
 )
 from iscat_analysis.pipeline.pattern import MovingPattern
-from iscat_analysis.pipeline.scene import Region, Scene
+from iscat_analysis.pipeline.scene import Region, Scene, reported_steps
 from iscat_analysis.pipeline.tasks import Task, TaskBuilder
 from iscat_analysis.records import (
     FREE_PARAMETERS,
@@ -183,7 +183,11 @@ class ChunkFitter:
         if not steps:
             return []
         seen, _ = self._neighbours.of(steps)
-        own = [i for i, s in enumerate(steps) if keep[0] <= s.at.frame < keep[1]]
+        # steps of the other polarity are fitted too: their rings have the one that is reported
+        sign = reported_steps(self._scene)
+        own = [
+            i for i, s in enumerate(steps) if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
+        ]
         found = self._pool.map(lambda i: self._finish(i, steps, seen), own)
         fitted = [f for f in found if f is not None]
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
@@ -192,9 +196,6 @@ class ChunkFitter:
 
     def _search(self, matched: Filter, steps: Sequence[Step]) -> list[Step]:
         scene, chunk = self._scene, self._chunk
-        polarity = {"both": 0, "bright": 1, "dark": -1}[scene.config.detection.polarity]
-        polarity *= int(scene.templates.signs[0])
-
         moving, edges, count = self._pattern, chunk.edges, chunk.edges.size - 2
         near = []
         for j in range(count):
@@ -228,9 +229,7 @@ class ChunkFitter:
             best = np.take_along_axis(snr, where[None], axis=0)[0].astype(np.float64)
             frames = np.maximum(effective[where], 1e-9)
             self.strongest = np.stack([np.abs(best), best / np.sqrt(frames * matched.norm)])
-        peaks = find_steps(
-            chunk, matched, snr, effective, scene.templates.threshold, polarity=polarity
-        )
+        peaks = find_steps(chunk, matched, snr, effective, scene.templates.threshold)
         fresh: list[Peak] = []
         taller: list[Peak] = []
         for peak in peaks:

@@ -201,8 +201,6 @@ def find_steps(
     snr: MapArray,
     effective: FloatArray,
     threshold: float,
-    *,
-    polarity: int = 0,
 ) -> list[Peak]:
     """Peaks in (t, y, x) above the threshold, strongest first.
 
@@ -219,8 +217,6 @@ def find_steps(
     threshold : float
         Least signal-to-noise ratio, between the pixels: where the field peaks, not where it is
         sampled, it exceeds the threshold as often as the theory of smooth fields has it.
-    polarity : int
-        Sign wanted, 0 for both.
 
     Returns
     -------
@@ -228,7 +224,7 @@ def find_steps(
         With sub-pixel positions.
     """
     peaks = []
-    for k, i, j in step_peaks(snr, _SAMPLED * threshold, polarity):
+    for k, i, j in step_peaks(snr, _SAMPLED * threshold):
         value = float(snr[k, i, j])
         image = snr[k] * np.sign(value)
         (dy, above), (dx, beside) = _vertex(image[:, j], int(i)), _vertex(image[i], int(j))

@@ -21,7 +21,12 @@ from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.pipeline import chunks as chunks_module
 from iscat_analysis.pipeline import landing as landing_module
 from iscat_analysis.pipeline.chunks import FRAME_COLUMN, Done, Merged
-from iscat_analysis.pipeline.landing import analyse_landings, frame_warnings, has_landings
+from iscat_analysis.pipeline.landing import (
+    analyse_landings,
+    frame_warnings,
+    has_landings,
+    inject_and_recover,
+)
 from iscat_analysis.pipeline.resume import partial_folder
 from iscat_analysis.records import EVENT_COLUMNS
 from iscat_analysis.simulate import Movie
@@ -233,6 +238,31 @@ def test_stuck_and_dropped_frames_are_left_out(counts: np.ndarray) -> None:
     assert "100, 210" in line
     assert "left out" in line
     assert result.summary["frames_left_out"] == 2
+
+
+@pytest.mark.parametrize(("polarity", "sign"), [("dark", 1), ("bright", -1)])
+def test_one_polarity_is_that_part_of_both(
+    counts: np.ndarray, plain: tuple[Any, list[str]], polarity: str, sign: int
+) -> None:
+    table = plain[0].table
+    found = _run(counts, _config(f"detection.polarity={polarity}"))[0].table
+    wanted = table[sign * table["mass_kda"] > 0]
+    assert len(found) == len(wanted) > 0
+    for name in ("frame", "x_px", "y_px", "mass_kda"):
+        assert found[name].to_numpy() == pytest.approx(wanted[name].to_numpy(), rel=1e-3)
+
+
+def test_what_was_injected_is_looked_for_in_the_polarity_that_is_reported(
+    counts: np.ndarray,
+) -> None:
+    config = _config("detection.polarity=dark")
+    camera = Camera(gain_e_per_adu=4.0)
+    result, _ = _run(counts, config)
+    found = inject_and_recover(
+        Memory(counts), config, camera, result, 3, progress=lambda *_: None
+    )  # fmt: skip
+    assert found["added"] == 3
+    assert found["recovered"] >= 2
 
 
 def test_a_brightness_jump_is_divided_out_and_named(counts: np.ndarray) -> None:
