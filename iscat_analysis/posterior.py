@@ -76,7 +76,6 @@ def sample_posterior(
     import emcee  # takes a third of a second, and only chains need it
 
     index = np.flatnonzero(fit.box.free)
-    names = (*PARAMETERS, "level")
     proposal = _Proposal.around(likelihood, fit, index)
     lower, upper = fit.box.lower[index], fit.box.upper[index]
 
@@ -96,6 +95,7 @@ def sample_posterior(
         moves=[(emcee.moves.MHMove(proposal), 0.5), (emcee.moves.DEMove(), 0.5)],
         vectorize=True,
     )
+    sampler.log_prob_fn = log_probability  # emcee's wrapper prints a traceback on Ctrl-C
     state = emcee.State(
         _scatter(proposal, walkers, lower, upper, random), random_state=random.get_state()
     )
@@ -111,14 +111,16 @@ def sample_posterior(
     amplitude = np.flatnonzero(index == 3)
     for column in amplitude:
         samples[..., column] = likelihood.model.scale.mass(samples[..., column])
+    # the level of the light, where it is free, says nothing of the particle: it is integrated over
+    told = index < len(PARAMETERS)
     return PosteriorResult(
-        names=tuple(names[i] for i in index),
-        samples=samples,
+        names=tuple(PARAMETERS[i] for i in index[told]),
+        samples=samples[..., told],
         log_likelihood=values,
-        tau=verdict.tau,
-        r_hat=verdict.r_hat,
-        ess_bulk=verdict.ess_bulk,
-        ess_tail=verdict.ess_tail,
+        tau=verdict.tau[told],
+        r_hat=verdict.r_hat[told],
+        ess_bulk=verdict.ess_bulk[told],
+        ess_tail=verdict.ess_tail[told],
         acceptance=float(np.mean(sampler.acceptance_fraction)),
         converged=verdict.converged,
         message=verdict.message,

@@ -129,6 +129,18 @@ def test_a_chain_grows_until_it_converges(gaussian: Case) -> None:
     assert short.samples.shape[1] <= 120 * posterior.EXTENSIONS
 
 
+def test_a_chain_that_is_interrupted_prints_nothing(
+    gaussian: Case, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(models.Likelihood, "values", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        sample_posterior(*gaussian, walkers=10, steps=10, seed=1)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_chain_that_is_stopped_ends_there(gaussian: Case) -> None:
     asked = iter([False, False, True])
     with pytest.raises(CancelledError):
