@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -127,6 +128,8 @@ def fit_stack(
         sliding = "landing" in analysis.summary
         figures = FEW_FIGURES if sliding else EVENT_FIGURES
         write_report(analysis, folder, overwrite=overwrite, event_figures=figures)
+        if not analysis.summary["interrupted"]:
+            shutil.rmtree(partial_folder(folder.resolve()), ignore_errors=True)
     if analysis.summary["interrupted"]:
         notify(f"interrupted; what was finished is in {folder}")
         raise KeyboardInterrupt
@@ -198,9 +201,12 @@ def analyse(
         config = scene.config
         clock.lap("landing")
         if inject and not result.interrupted:
-            further["injection"] = inject_and_recover(
-                movie, config, camera, result, inject, progress=progress
-            )
+            try:
+                further["injection"] = inject_and_recover(
+                    movie, config, camera, result, inject, progress=progress
+                )
+            except KeyboardInterrupt:  # what the movie itself gave is kept
+                found = replace(found, interrupted=True)
             clock.lap("injection")
     else:
         if inject:

@@ -297,6 +297,7 @@ class Done:
     ends_e: FloatArray  # mean images of its first and last quarter
     gain_message: str = ""
     sampled: int = field(default=0)
+    stopped: bool = False  # in the middle of its chains
     trajectory: Trajectory | None = None  # of the pattern, in all frames that were read
 
 

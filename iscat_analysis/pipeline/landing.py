@@ -150,7 +150,7 @@ def analyse_landings(
     prepare : callable
         Given the models before the first fit.
     partial : Path, optional
-        Folder that keeps finished chunks until the whole is done.
+        Folder that keeps finished chunks; who gave it removes it once the result is safe.
     identity : str
         What tells the movie's content from another's; finished chunks of another are not used.
 
@@ -182,7 +182,7 @@ def analyse_landings(
     scene = make_landing_scene(config, reader.shape, searches=count)
     prepare(scene)
     plan = plan_chunks(reader, config, window, stride)
-    store = Store(partial, config, identity, reader.shape, (first, last))
+    store = Store(partial, config, identity, reader.shape, (first, last), camera)
     merged = Merged(reader.shape)
     interrupted = False
     with ThreadPoolExecutor(config.compute.workers) as pool:
@@ -196,6 +196,9 @@ def analyse_landings(
                     store.save(number, done)
                 merged.add(done)
                 progress("landing", core[1] - first, last - first)
+                if done.stopped:
+                    interrupted = True
+                    break
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
             interrupted = True
@@ -204,11 +207,14 @@ def analyse_landings(
     wanted = config.background.drift_correction
     for text in frame_warnings(movie.name, merged, light, first, window, corrected=wanted):
         tell(text)
+    if not config.background.power_normalization:
+        tell(
+            "background.power_normalization = false has no effect on a landing movie: each frame "
+            "is weighed by its own light"
+        )
     message = merged.gain_message
     if message:
         tell(message)
-    if not interrupted:
-        store.clear()
     found = table["mass_kda"] < 0
     summary = {
         "window_frames": window,
@@ -268,6 +274,11 @@ def inject_and_recover(
     -------
     dict
         From `iscat_analysis.pipeline.injection.recovery`.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        The user stopped it: half of a search says nothing of what is found.
     """
     frames = config.fit.frames or (0, movie.shape[0])
     window = int(result.summary["window_frames"])
@@ -283,6 +294,8 @@ def inject_and_recover(
         tell=_unheard,
         progress=progress,
     )
+    if again.interrupted:
+        raise KeyboardInterrupt
     return recovery(
         particles,
         again.table,
@@ -377,15 +390,20 @@ def _analyse_chunk(
     seam = max(2, window // STRIDES)
     steps = fitter.run((core[0] - seam, core[1] + seam))
     rows = list(pool.map(_row, range(len(steps)), steps))
-    sampled = 0
+    sampled, stopped = 0, False
     for i, row in enumerate(rows):
         if sampled >= posteriors or not core[0] <= steps[i].step.at.frame < core[1]:
             continue
         settings = scene.config.posterior
-        chain = sample_posterior(
-            row.event.likelihood, row.event.fit, walkers=settings.walkers, steps=settings.steps,
-            seed=scene.config.simulation.seed + steps[i].step.at.frame,
-        )  # fmt: skip
+        try:
+            chain = sample_posterior(
+                row.event.likelihood, row.event.fit,
+                walkers=settings.walkers, steps=settings.steps,
+                seed=scene.config.simulation.seed + steps[i].step.at.frame,
+            )  # fmt: skip
+        except KeyboardInterrupt:  # the fits are done, and kept
+            stopped = True
+            break
         rows[i] = replace(row, posterior=chain)
         sampled += 1
     table = table_of(scene, rows, mapper=pool.map)
@@ -414,6 +432,7 @@ def _analyse_chunk(
         ends_e=_ends(chunk, inside),
         gain_message=message,
         sampled=sampled,
+        stopped=stopped,
         trajectory=trajectory,
     )
 

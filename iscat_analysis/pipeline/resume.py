@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 import zipfile
 import zlib
 from importlib.metadata import version
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.drift import Trajectory
 from iscat_analysis.pipeline.chunks import Done
@@ -21,7 +21,7 @@ from iscat_analysis.records import EventView, FloatArray
 
 
 class Store:
-    """Finished chunks on disk, until the whole is done.
+    """Finished chunks on disk.
 
     Parameters
     ----------
@@ -35,6 +35,8 @@ class Store:
         Rows and columns.
     span : (int, int)
         Frames analysed.
+    camera : Camera
+        Part of the key: a map may have changed under its name.
     """
 
     def __init__(
@@ -44,6 +46,7 @@ class Store:
         identity: str,
         shape: tuple[int, int],
         span: tuple[int, int],
+        camera: Camera,
     ) -> None:
         self._folder = folder if identity else None
         settings = config.model_copy(
@@ -52,7 +55,10 @@ class Store:
         text = json.dumps(
             [version("iscat-analysis"), identity, shape, span, config_to_toml(settings)]
         )
-        self._key = hashlib.sha256(text.encode()).hexdigest()[:32]
+        digest = hashlib.sha256(text.encode())
+        for value in (camera.gain_e_per_adu, camera.offset_adu, camera.read_noise_e):
+            digest.update(np.asarray(value, dtype=np.float64).tobytes())
+        self._key = digest.hexdigest()[:32]
 
     def load(self, number: int) -> Done | None:
         """Give a finished chunk, or None."""
@@ -119,11 +125,6 @@ class Store:
             building.replace(path)
         except OSError:
             self._folder = None
-
-    def clear(self) -> None:
-        """Remove what is no longer needed."""
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
 
     def _paths(self, number: int) -> tuple[Path, Path]:
         folder = self._folder or Path()

@@ -265,6 +265,11 @@ def test_what_was_injected_is_looked_for_in_the_polarity_that_is_reported(
     assert found["recovered"] >= 2
 
 
+def test_power_that_is_not_to_be_normalised_is_named(counts: np.ndarray) -> None:
+    _, told = _run(counts, _config("background.power_normalization=false"))
+    assert any("background.power_normalization" in text for text in told)
+
+
 def test_a_brightness_jump_is_divided_out_and_named(counts: np.ndarray) -> None:
     odd = counts.copy()
     thinned = np.random.default_rng(1).binomial(counts[250:].astype(int) * 4, 0.7)
@@ -404,11 +409,11 @@ def test_chunks_of_another_configuration_are_not_used(tmp_path: Path) -> None:
     from iscat_analysis.pipeline.resume import Store
 
     one, two = _config(), _config("optics.focus_nm=-250")
-    keys = {Store(tmp_path, c, "movie", (8, 8), (0, 9))._key for c in (one, two)}
-    keys.add(Store(tmp_path, one, "another", (8, 8), (0, 9))._key)
+    keys = {Store(tmp_path, c, "movie", (8, 8), (0, 9), Camera())._key for c in (one, two)}
+    keys.add(Store(tmp_path, one, "another", (8, 8), (0, 9), Camera())._key)
     assert len(keys) == 3
     faster = one.model_copy(update={"compute": one.compute.model_copy(update={"workers": 7})})
-    assert Store(tmp_path, faster, "movie", (8, 8), (0, 9))._key in keys
+    assert Store(tmp_path, faster, "movie", (8, 8), (0, 9), Camera())._key in keys
 
 
 # ---- drift -----------------------------------------------------------------------------------
@@ -502,6 +507,67 @@ def test_without_a_pattern_there_is_nothing_to_correct() -> None:
     assert any("no fixed pattern" in line for line in told)
 
 
+def test_chains_reach_the_report(movie: Path, tmp_path: Path) -> None:
+    config = _config("posterior.enabled=true", "posterior.steps=300", "fit.frames=[40, 190]")
+    out = tmp_path / "sampled.iscat"
+    result = fit_stack(movie, config, out=out)
+    (first, *_) = (view.posterior for view in result.views)
+    assert first is not None
+    assert first.names == ("x_nm", "y_nm", "mass_kda")
+    row = result.table.iloc[0]
+    assert first.samples[..., 2].std() == pytest.approx(row["sigma_mass_kda"], rel=0.15)
+    assert (out / "report.html").is_file()
+    assert list((out / "figures").glob("corner_*.png"))
+
+
+def test_an_interrupt_of_the_chains_keeps_the_fits(
+    counts: np.ndarray, plain: tuple[Any, list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(landing_module, "sample_posterior", interrupt)
+    result, _ = _run(counts, _config("posterior.enabled=true"))
+    assert result.interrupted
+    pd.testing.assert_frame_equal(result.table, plain[0].table)
+
+
+def test_an_interrupted_injection_keeps_what_the_movie_gave(
+    movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = _config("posterior.enabled=false")
+    monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
+    real, calls = landing_module._analyse_chunk, []
+
+    def stopping(*arguments: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr(landing_module, "_analyse_chunk", stopping)
+    out = tmp_path / "cut.iscat"
+    with pytest.raises(KeyboardInterrupt):
+        fit_stack(movie, config, out=out, inject=3)
+    cut = json.loads((out / "summary.json").read_text())
+    assert cut["interrupted"]
+    assert cut["events"] == len(STEPS)
+    assert "injection" not in cut
+    whole = fit_stack(movie, config, out=out, inject=3)  # no --overwrite: it goes on
+    assert len(calls) == 3
+    assert whole.summary["injection"]["added"] == 6
+    assert not partial_folder(out).exists()
+
+
+def test_chunks_of_another_camera_map_are_not_used(counts: np.ndarray, tmp_path: Path) -> None:
+    for gain in (4.0, 5.0):
+        camera = Camera(gain_e_per_adu=np.full((SIDE, SIDE), gain))
+        result, _ = _run(counts, camera=camera, partial=tmp_path, identity="movie")
+        if gain == 4.0:
+            first = result.table["sigma_mass_kda"]
+    assert (result.table["sigma_mass_kda"] < first).all()
+
+
 def test_a_corrected_run_resumes_to_the_same_result(
     drifting: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -563,7 +629,7 @@ def test_posteriors_only_where_the_configuration_asks() -> None:
     few = np.array(list(Movie(replace_frames(config, 160), 1).frames(2)))
     asked, _ = _run(few, config)
     assert asked.views[0].posterior is not None
-    assert "level" in asked.views[0].posterior.names or asked.views[0].posterior.names
+    assert asked.views[0].posterior.names == ("x_nm", "y_nm", "mass_kda")
     silent, _ = _run(few, _config(*quick, events=one))
     assert silent.views[0].posterior is None
 
