@@ -157,7 +157,7 @@ class Reader:
         if not good.any():
             raise DataError(
                 f"{self.name}: frames {span[0]}:{span[1]} hold no light that changes; every frame "
-                "is zero or repeats the one before it"
+                "is zero or repeats the one before it; analyse the others with --frames A:B"
             )
         return make_chunk(
             span[0], counts, good, light, self._camera,

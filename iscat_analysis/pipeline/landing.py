@@ -439,8 +439,9 @@ def _analyse_chunk(
 
 def _ends(chunk: Chunk, inside: slice) -> FloatArray:
     """Mean images of the first and the last quarter of a core, shape (2, y, x)."""
-    held = (chunk.edges[:-1] >= inside.start) & (chunk.edges[1:] <= inside.stop)
-    blocks = np.flatnonzero(held) if held.any() else np.arange(len(chunk.blocks_e))
+    lit = np.add.reduceat(chunk.good, chunk.edges[:-1], dtype=np.int64) > 0
+    held = lit & (chunk.edges[:-1] >= inside.start) & (chunk.edges[1:] <= inside.stop)
+    blocks = np.flatnonzero(held if held.any() else lit)
     few = max(1, blocks.size // 4)
     return np.stack([chunk.blocks_e[part].mean(axis=0) for part in (blocks[:few], blocks[-few:])])
 
@@ -494,8 +495,8 @@ def frame_warnings(
     if missing.size:
         verb = "is" if missing.size == 1 else "are"
         yield (
-            f"{name}: {_frames(missing)} {verb} zero throughout or the same as the frame before "
-            "(dropped or stuck in the camera); left out, the other frames are used"
+            f"{name}: {_frames(missing)} {verb} zero throughout, not finite or the same as the "
+            "frame before (dropped or stuck in the camera); left out, the other frames are used"
         )
     known = np.flatnonzero(np.isfinite(light))
     change = light[known][1:] / light[known][:-1] - 1

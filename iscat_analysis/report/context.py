@@ -364,7 +364,16 @@ def _measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
         )
         if injection.get("bias_rel") is not None:
             bias, error = (100 * injection[key] for key in ("bias_rel", "bias_rel_se"))
-            text += f" The masses of isolated ones are off by {bias:+.1f} ± {error:.1f} %."
+            spread, doubt = (injection[key] for key in ("spread_over_crb", "spread_over_crb_se"))
+            text += (
+                f" The masses of isolated ones are off by {bias:+.1f} ± {error:.1f} %, and their "
+                f"spread is {spread:.2f} ± {doubt:.2f} times the bound."
+            )
+        else:
+            text += (
+                " Too few are isolated to say how far their masses are off: add fewer to a movie "
+                "as short as this one."
+            )
         yield text.replace("-", "−")
 
 

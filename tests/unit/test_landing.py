@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -263,6 +264,17 @@ def test_what_was_injected_is_looked_for_in_the_polarity_that_is_reported(
     )  # fmt: skip
     assert found["added"] == 3
     assert found["recovered"] >= 2
+
+
+def test_a_movie_that_freezes_has_no_odd_numbers(counts: np.ndarray) -> None:
+    odd = counts.copy()
+    odd[250:] = odd[249]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result, told = _run(odd)
+    assert len(result.table) == 3
+    assert result.summary["frames_left_out"] == FRAMES - 250
+    assert len(told) == 1
 
 
 def test_power_that_is_not_to_be_normalised_is_named(counts: np.ndarray) -> None:

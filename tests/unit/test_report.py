@@ -17,6 +17,7 @@ from iscat_analysis.config import load_config, parse_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import EVENT_COLUMNS, Status
 from iscat_analysis.report import check_output, figures, render_page, render_report, write_report
+from iscat_analysis.report.context import _landing_lines
 from iscat_analysis.report.numbers import number
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder
 from iscat_analysis.report.pack import CREDIBLE_LEVELS, credible_shades, quantise
@@ -318,3 +319,24 @@ def test_the_histogram_keeps_species_apart() -> None:
     assert figures._bins(5.0, spread) == 10
     assert figures._bins(1e5, spread) == 90
     assert figures._bins(1000.0, np.array([])) == 10
+
+
+@pytest.mark.parametrize(
+    ("further", "words"),
+    [
+        ({}, "Too few are isolated"),
+        (
+            {
+                "bias_rel": -0.01,
+                "bias_rel_se": 0.02,
+                "spread_over_crb": 1.02,
+                "spread_over_crb_se": 0.1,
+            },
+            "off by −1.0 ± 2.0 %, and their spread is 1.02 ± 0.10 times the bound",
+        ),
+    ],
+)
+def test_what_was_injected_is_told(further: dict[str, float], words: str) -> None:
+    (line,) = _landing_lines({"injection": {"added": 20, "recovered": 19, **further}})
+    assert line.startswith("Of 20 landings and leavings added to the movie, 19 were found again.")
+    assert words in line
