@@ -15,6 +15,7 @@ import numpy as np
 
 from iscat_analysis.bounds import EventBounds, Experiment, plan
 from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
 from iscat_analysis.forward import PixelGrid
 from iscat_analysis.likelihood import Likelihood
 from iscat_analysis.pipeline.scene import Region, Scene, make_scene, region_likelihood
@@ -245,7 +246,8 @@ def make_setting(
     Raises
     ------
     ConfigError
-        As in `plan` and `make_scene`.
+        The particle lies outside the region or the heights that fits search, and as in `plan` and
+        `make_scene`.
     """
     pixel_nm = config.camera.pixel_size_nm
     side = max(5, round(config.fit.roi_nm / pixel_nm)) if pixel_nm else config.bounds.pixels
@@ -254,6 +256,8 @@ def make_setting(
         "fit": {"mode": mode},
     }
     config = _changed(config, changes)
+    if pixel_nm:
+        _check_place(config, side * pixel_nm / 2)
     asked = z_nm if z_nm is not None else config.bounds.z_nm
     height = config.particle.height_nm if asked is None else asked
     if scene is None:
@@ -262,6 +266,8 @@ def make_setting(
             known = {"method": "none", "frames": None, "level_e": level}
             config = _changed(config, {"background": known})
         scene = make_scene(config, (side, side))
+    if asked is not None:
+        _check_height(config, scene, asked)
     experiment = _experiment(config, scene, height, collected)
     if asked is None and "z_nm" in FREE_PARAMETERS[mode]:
         height = _clear_of_ends(config, scene, collected, mode, height)
@@ -281,6 +287,26 @@ def make_setting(
         truth=np.array([at.x_nm + centre, at.y_nm + centre, height, experiment.mass_kda]),
         read_variance_e2=float(read) ** 2 if not isinstance(read, str) else 0.0,
     )
+
+
+def _check_place(config: Config, half_nm: float) -> None:
+    at = config.bounds
+    if max(abs(at.x_nm), abs(at.y_nm)) > half_nm:
+        raise ConfigError(
+            f"bounds.x_nm = {at.x_nm:g}, bounds.y_nm = {at.y_nm:g} lies outside the fitted region "
+            f"of ±{half_nm:g} nm: move the particle, or enlarge fit.roi_nm"
+        )
+
+
+def _check_height(config: Config, scene: Scene, z_nm: float) -> None:
+    """Refuse heights at which no fit can find the particle: the model's profiles end there."""
+    free = "z_nm" in FREE_PARAMETERS[scene.mode]
+    low, high = config.fit.z_range_nm if free else scene.model.z_range_nm
+    if not low <= z_nm <= high:
+        raise ConfigError(
+            f"bounds.z_nm = {z_nm:g} lies outside the heights that are searched, fit.z_range_nm = "
+            f"[{low:g}, {high:g}]: move the particle, or widen the range"
+        )
 
 
 def _experiment(config: Config, scene: Scene, z_nm: float, collected: float | None) -> Experiment:

@@ -127,6 +127,22 @@ def test_the_height_is_moved_off_the_ends_only_where_it_is_free_and_not_given() 
     assert setting("iscat", "joint", bounds={"z_nm": 7.0}).truth[2] == 7.0
 
 
+def test_a_particle_that_no_fit_can_find_is_refused() -> None:
+    """Beyond the range profiles are continued wrongly, and every mode would be biased."""
+    for mode in ("mass", "joint"):
+        with pytest.raises(ConfigError, match=r"fit\.z_range_nm = \[0, 1000\]"):
+            setting("iscat", mode, bounds={"z_nm": 2000.0})
+    high = {"particle": {"height_nm": 2000.0}, "bounds": {"z_nm": 1900.0}, "calibration": None}
+    assert setting("iscat", "mass", **high).truth[2] == 1900.0
+    with pytest.raises(ConfigError, match="widen"):
+        setting("iscat", "joint", **high)
+
+
+def test_a_particle_outside_the_fitted_region_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"enlarge fit\.roi_nm"):
+        setting("iscat", "mass", bounds={"x_nm": 1400.0})
+
+
 def test_expected_counts_give_back_the_truth() -> None:
     made = make_setting(configuration(**SMALL), "joint")
     likelihood = made.likelihood(made.draw(made.truth, None))
