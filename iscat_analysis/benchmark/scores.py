@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
+from scipy.stats import binomtest, chi2, norm
 
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import BoolArray, FloatArray
 
 MIN_TRIALS = 8
 """Fewer trials have no spread worth stating."""
@@ -46,6 +46,8 @@ class Score:
         Their intervals.
     coverage68, coverage95 : float
         Share of trials whose truth lies within 1 and 1.96 stated σ; 68.3 % and 95 % if σ is right.
+    coverage68_ci95, coverage95_ci95 : (float, float)
+        Their intervals, see `share_interval`.
     pull_mean, pull_std : float
         Of (estimate − truth)/σ.
     """
@@ -62,7 +64,9 @@ class Score:
     spread_over_qcrb: float
     spread_over_qcrb_ci95: tuple[float, float]
     coverage68: float
+    coverage68_ci95: tuple[float, float]
     coverage95: float
+    coverage95_ci95: tuple[float, float]
     pull_mean: float
     pull_std: float
 
@@ -95,16 +99,13 @@ def score(error: FloatArray, sigma: FloatArray, crb: float, qcrb: float) -> Scor
         nothing, none = math.nan, (math.nan, math.nan)
         return Score(
             nothing, nothing, nothing, none, nothing, crb, qcrb, nothing, none, nothing, none,
-            nothing, nothing, nothing, nothing,
+            nothing, none, nothing, none, nothing, nothing,
         )  # fmt: skip
     spread = float(np.std(error, ddof=1))
     interval = spread_interval(error)
     quartiles = np.quantile(error, [0.25, 0.75])
     pull = (error / sigma)[np.isfinite(sigma)]
-    inside = [
-        float(np.mean(np.abs(pull) < k)) if pull.size else math.nan
-        for k in (1.0, float(norm.ppf(0.975)))
-    ]
+    narrow, wide = (np.abs(pull) < k for k in (1.0, float(norm.ppf(0.975))))
     return Score(
         bias=float(np.mean(error)),
         bias_se=spread / math.sqrt(n),
@@ -117,8 +118,10 @@ def score(error: FloatArray, sigma: FloatArray, crb: float, qcrb: float) -> Scor
         spread_over_crb_ci95=(_ratio(interval[0], crb), _ratio(interval[1], crb)),
         spread_over_qcrb=_ratio(spread, qcrb),
         spread_over_qcrb_ci95=(_ratio(interval[0], qcrb), _ratio(interval[1], qcrb)),
-        coverage68=inside[0],
-        coverage95=inside[1],
+        coverage68=share(narrow),
+        coverage68_ci95=share_interval(narrow),
+        coverage95=share(wide),
+        coverage95_ci95=share_interval(wide),
         pull_mean=float(np.mean(pull)) if pull.size else math.nan,
         pull_std=float(np.std(pull, ddof=1)) if pull.size > 1 else math.nan,
     )
@@ -168,6 +171,46 @@ def spread_interval(error: FloatArray, level: float = 0.95) -> tuple[float, floa
     if not math.isfinite(reach):
         return spread, spread
     return spread * math.exp(-reach), spread * math.exp(reach)
+
+
+def share(inside: BoolArray) -> float:
+    """Share of trials that something holds for.
+
+    Parameters
+    ----------
+    inside : ndarray of bool, shape (n,)
+        For which it holds.
+
+    Returns
+    -------
+    float
+        NaN without trials.
+    """
+    return float(np.mean(inside)) if inside.size else math.nan
+
+
+def share_interval(inside: BoolArray, level: float = 0.95) -> tuple[float, float]:
+    """Confidence interval of a share.
+
+    Parameters
+    ----------
+    inside : ndarray of bool, shape (n,)
+        For which trials it holds.
+    level : float
+        Probability.
+
+    Returns
+    -------
+    low, high : float
+        Of the score test, which is right for few trials too and stays within 0 and 1
+        (E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927); NaN without trials.
+    """
+    n = inside.size
+    if not n:
+        return math.nan, math.nan
+    found = binomtest(int(np.count_nonzero(inside)), n)
+    low, high = found.proportion_ci(level, method="wilson")
+    return float(low), float(high)
 
 
 def pull_histogram(pull: FloatArray) -> dict[str, list[float]]:

@@ -20,6 +20,8 @@ from iscat_analysis.benchmark.scores import (
     pull_histogram,
     rank_test,
     score,
+    share,
+    share_interval,
     spread_interval,
 )
 from iscat_analysis.benchmark.setting import Setting, make_setting
@@ -255,8 +257,10 @@ def _parameters(setting: Setting, found: Trials, ranked: Calibration) -> dict[st
                 }
         out[name] = {
             **own.plain(),
-            "posterior_coverage68": _share(ranked.inside68[ranked.kept, i]),
-            "posterior_coverage95": _share(ranked.inside95[ranked.kept, i]),
+            "posterior_coverage68": share(ranked.inside68[ranked.kept, i]),
+            "posterior_coverage68_ci95": share_interval(ranked.inside68[ranked.kept, i]),
+            "posterior_coverage95": share(ranked.inside95[ranked.kept, i]),
+            "posterior_coverage95_ci95": share_interval(ranked.inside95[ranked.kept, i]),
             "posterior_width_over_crb": _mean(ranked.width_over_crb[ranked.kept, i]),
             "baselines": baselines,
         }
@@ -357,10 +361,6 @@ class _Tally:
         with self._lock:
             self._done += more
             self._progress("benchmark", self._done, self._total)
-
-
-def _share(inside: FloatArray) -> float:
-    return float(np.mean(inside)) if inside.size else math.nan
 
 
 def _mean(values: FloatArray) -> float:

@@ -184,15 +184,22 @@ def _mode_section(study: Mapping[str, Any], mode: str) -> dict[str, Any]:
                     _number("spread"),
                     _number("CRB"),
                     _number("QCRB"),
-                    _number("coverage 68 %", "share of truths within one stated σ"),
-                    _number("95 %", "share of truths within 1.96 stated σ"),
                     _number("pull mean"),
                     _number("pull σ"),
-                    _number("posterior 68 %", "share of truths inside the credible interval"),
-                    _number("95 %", "share of truths inside the credible interval"),
                 ],
                 "rows": [_row(entry, at, name) for name in names],
-            }
+            },
+            {
+                "caption": "Truths inside the stated intervals",
+                "columns": [
+                    "parameter",
+                    _number("68 %", "share of truths within one stated σ"),
+                    _number("95 %", "share of truths within 1.96 stated σ"),
+                    _number("posterior 68 %", "share of truths inside the credible interval"),
+                    _number("posterior 95 %", "share of truths inside the credible interval"),
+                ],
+                "rows": [_coverage_row(entry, name) for name in names],
+            },
         ],
         "charts": charts,
     }
@@ -203,17 +210,19 @@ def _row(entry: Mapping[str, Any], at: Mapping[str, Any], name: str) -> list[Any
     return [
         f"{LABELS[name]} [{UNITS[name]}]",
         at[name],
-        f"{_plain(e['bias'], 2)} ± {_plain(e['bias_se'], 2)}",
+        _beside(e["bias"], e["bias_se"]),
         _with(e["spread"], e["spread_ci95"]),
         _plain(e["crb"]),
         _plain(e["qcrb"]),
-        _percent(e["coverage68"]),
-        _percent(e["coverage95"]),
         _plain(e["pull_mean"], 2),
         _plain(e["pull_std"]),
-        _percent(e.get("posterior_coverage68")),
-        _percent(e.get("posterior_coverage95")),
     ]
+
+
+def _coverage_row(entry: Mapping[str, Any], name: str) -> list[Any]:
+    kinds = ("coverage68", "coverage95", "posterior_coverage68", "posterior_coverage95")
+    shares = [_percent(entry[name][kind], entry[name][f"{kind}_ci95"]) for kind in kinds]
+    return [f"{LABELS[name]} [{UNITS[name]}]", *shares]
 
 
 def _curve_chart(study: Mapping[str, Any], mode: str, axis: str, name: str) -> dict[str, Any]:
@@ -388,9 +397,20 @@ def _plain(value: float | None, digits: int = 3) -> str:
     return f"{value:.{digits}g}".replace("-", "−")
 
 
-def _percent(value: float | None) -> str:
-    return "—" if value is None or not math.isfinite(value) else f"{100 * value:.1f} %"
+def _percent(value: float | None, interval: Sequence[float]) -> str:
+    if value is None or not math.isfinite(value):
+        return "—"
+    low, high = (f"{100 * end:.1f}" for end in interval)
+    return f"{100 * value:.1f} % [{low}, {high}]"
 
 
-def _with(value: float, interval: Sequence[float]) -> str:
+def _beside(value: float | None, error: float) -> str:
+    if value is None or not math.isfinite(value):
+        return "—"
+    return f"{_plain(value, 2)} ± {_plain(error, 2)}"
+
+
+def _with(value: float | None, interval: Sequence[float]) -> str:
+    if value is None or not math.isfinite(value):
+        return "—"
     return f"{_plain(value)} [{_plain(interval[0])}, {_plain(interval[1])}]"

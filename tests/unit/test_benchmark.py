@@ -17,6 +17,7 @@ from iscat_analysis.benchmark import (
     rank_test,
     run_benchmark,
     score,
+    share_interval,
     spread_error,
     spread_interval,
     van_trees,
@@ -29,6 +30,7 @@ from iscat_analysis.report.benchmark import BENCHMARK_NAMES
 FIELDS = {
     "bias", "bias_se", "spread", "spread_ci95", "crb", "qcrb", "spread_over_crb",
     "spread_over_crb_ci95", "spread_over_qcrb", "coverage68", "coverage95", "pull_mean", "pull_std",
+    "coverage68_ci95", "coverage95_ci95", "posterior_coverage68_ci95", "posterior_coverage95_ci95",
 }  # fmt: skip
 SMALL = {"fit": {"roi_nm": 900.0, "z_range_nm": [0.0, 300.0]}}
 
@@ -73,6 +75,21 @@ def test_interval_knows_the_kurtosis() -> None:
         covered += low < 1 < high
     assert covered > 362  # 380 expected, 4 standard errors fewer at most
     assert spread_interval(np.ones(10)) == (0.0, 0.0)
+
+
+def test_interval_of_a_share_covers_it() -> None:
+    rng = np.random.default_rng(4)
+    for truth in (0.6827, 0.95):
+        covered = 0
+        for _ in range(400):
+            low, high = share_interval(rng.random(50) < truth)
+            covered += low < truth < high
+        assert 360 < covered < 400  # 380 expected
+    found = score(rng.normal(size=1000), np.ones(1000), 1.0, 1.0)
+    assert found.coverage68_ci95[0] < found.coverage68 < found.coverage68_ci95[1]
+    assert found.coverage95_ci95[0] < 0.95 < found.coverage95_ci95[1]
+    assert share_interval(np.ones(20, dtype=bool)) == pytest.approx((0.839, 1.0), abs=1e-3)
+    assert all(math.isnan(end) for end in share_interval(np.zeros(0, dtype=bool)))
 
 
 def test_rank_test_accepts_uniform_and_rejects_others() -> None:
@@ -208,6 +225,8 @@ def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
     } <= drawn
     page = (folder / "benchmark.html").read_text(encoding="utf-8")
     assert "spread / CRB" in page
+    low, high = (f"{100 * end:.1f}" for end in plain["joint"]["z_nm"]["coverage68_ci95"])
+    assert f"[{low}, {high}]" in page
 
 
 def test_too_few_trials_are_refused() -> None:
