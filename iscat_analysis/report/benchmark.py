@@ -241,7 +241,16 @@ def _curve_chart(study: Mapping[str, Any], mode: str, axis: str, name: str) -> d
             "y": fine[name]["qcrb"],
             "dash": True,
         },
-        {"kind": "points", "name": "spread", "color": "sigma", "x": x, "y": line["spread"]},
+        {
+            "kind": "interval",
+            "name": "spread, 95 %",
+            "color": "sigma",
+            "along": "y",
+            "at": x,
+            "mid": line["spread"],
+            "lo": [low for low, _ in line["spread_ci95"]],
+            "hi": [high for _, high in line["spread_ci95"]],
+        },
     ]
     along = "photons" if axis == "photons" else "height"
     return {

@@ -25,7 +25,7 @@ from iscat_analysis.benchmark import (
 )
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
-from iscat_analysis.report.benchmark import BENCHMARK_NAMES
+from iscat_analysis.report.benchmark import BENCHMARK_NAMES, render_benchmark
 
 FIELDS = {
     "bias", "bias_se", "spread", "spread_ci95", "crb", "qcrb", "spread_over_crb",
@@ -227,6 +227,26 @@ def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
     assert "spread / CRB" in page
     low, high = (f"{100 * end:.1f}" for end in plain["joint"]["z_nm"]["coverage68_ci95"])
     assert f"[{low}, {high}]" in page
+
+
+def test_page_shows_how_sure_each_spread_is(study: dict[str, dict[str, object]]) -> None:
+    page = render_benchmark(study)
+    low, high = study["curves"]["z"]["joint"]["z_nm"]["spread_ci95"][0]
+    assert json.dumps(low) in page
+    assert json.dumps(high) in page
+
+
+def test_page_of_a_study_without_usable_fits(study: dict[str, dict[str, object]]) -> None:
+    none = math.nan, math.nan
+    nothing = {
+        key: none if isinstance(value, tuple) else math.nan
+        for key, value in study["joint"]["z_nm"].items()
+        if key not in ("crb", "qcrb", "baselines")
+    }
+    lost = {**study["joint"], "z_nm": {**study["joint"]["z_nm"], **nothing}}
+    page = render_benchmark({**study, "joint": lost})
+    assert "— ±" not in page
+    assert "[—" not in page
 
 
 def test_too_few_trials_are_refused() -> None:
