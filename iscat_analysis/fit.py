@@ -79,7 +79,8 @@ def search_box(
     Returns
     -------
     Box
-        Where z is free the amplitude keeps one sign: a change of sign is half a fringe.
+        Where z is free the amplitude keeps one sign: a change of sign is half a fringe.  What is
+        not free has no width, wherever it lies.
     """
     names = FREE_PARAMETERS[mode]
     grid = likelihood.grid
@@ -90,23 +91,23 @@ def search_box(
     largest = 100 * max(amplitude, nominal)
     signed = "z_nm" not in names and likelihood.model.rho > 0
     half = grid.pixel_nm / 2
-    return Box(
-        free=np.array([name in names for name in PARAMETERS] + [level]),
-        lower=np.array([
-            max(x - reach, grid.x_nm[0] - half),
-            max(y - reach, grid.y_nm[0] - half),
-            z_range_nm[0],
-            -largest if signed else 0.0,
-            -1.0,
-        ]),
-        upper=np.array([
-            min(x + reach, grid.x_nm[-1] + half),
-            min(y + reach, grid.y_nm[-1] + half),
-            z_range_nm[1],
-            largest,
-            1.0,
-        ]),
-    )  # fmt: skip
+    free = np.array([name in names for name in PARAMETERS] + [level])
+    fixed = start_theta(likelihood, start)
+    lower = np.array([
+        max(x - reach, grid.x_nm[0] - half),
+        max(y - reach, grid.y_nm[0] - half),
+        z_range_nm[0],
+        -largest if signed else 0.0,
+        -1.0,
+    ])  # fmt: skip
+    upper = np.array([
+        min(x + reach, grid.x_nm[-1] + half),
+        min(y + reach, grid.y_nm[-1] + half),
+        z_range_nm[1],
+        largest,
+        1.0,
+    ])  # fmt: skip
+    return Box(free, np.where(free, lower, fixed), np.where(free, upper, fixed))
 
 
 def fit_particle(

@@ -219,6 +219,16 @@ def test_polarisation_turns_the_image_and_its_uncertainty() -> None:
 # ---- the box -----------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("z_range_nm", [(0.0, 200.0), (500.0, 900.0)])
+def test_a_fixed_height_needs_no_range(z_range_nm: tuple[float, float]) -> None:
+    """`fit.z_range_nm` bounds z where it is free; a height known to lie outside it stays known."""
+    likelihood = _data(make_config(**JOINT), (X, Y, 300.0, 1000.0), seed=3)
+    fit = fit_particle(likelihood, _start(x=X + 0.5, z=300.0, mass=800.0), "mass", z_range_nm)
+    assert fit.status == Status.OK
+    assert fit.z_nm == 300.0
+    _assert_near(fit, {"x_nm": X * PIXEL_NM, "y_nm": Y * PIXEL_NM, "mass_kda": 1000.0})
+
+
 def test_the_box_holds_the_start_and_the_region() -> None:
     likelihood = _data(make_config(), (X, Y, 5.0, 1000.0), asimov=True)
     box = search_box(likelihood, _start(0.0, 31.0), "mass", (0, 1000))
