@@ -260,11 +260,8 @@ def make_setting(
         _check_place(config, side * pixel_nm / 2)
     asked = z_nm if z_nm is not None else config.bounds.z_nm
     height = config.particle.height_nm if asked is None else asked
+    config = _changed(config, {"background": _background(config)})
     if scene is None:
-        if config.bounds.n_before == 0 and config.optics.scheme != "darkfield":
-            level = config.bounds.photons_per_pixel
-            known = {"method": "none", "frames": None, "level_e": level}
-            config = _changed(config, {"background": known})
         scene = make_scene(config, (side, side))
     if asked is not None:
         _check_height(config, scene, asked)
@@ -287,6 +284,16 @@ def make_setting(
         truth=np.array([at.x_nm + centre, at.y_nm + centre, height, experiment.mass_kda]),
         read_variance_e2=float(read) ** 2 if not isinstance(read, str) else 0.0,
     )
+
+
+def _background(config: Config) -> dict[str, Any]:
+    """Tell the fits what ``[bounds]`` says of the background: measured beforehand, or known."""
+    at, background = config.bounds, config.background
+    if at.n_before:
+        return {"method": "mean"} if background.method == "none" else {}
+    dark = config.optics.scheme == "darkfield"
+    level = (background.level_e or 0.0) if dark else at.photons_per_pixel
+    return {"method": "none", "frames": None, "level_e": level}
 
 
 def _check_place(config: Config, half_nm: float) -> None:

@@ -126,8 +126,7 @@ def test_a_wrong_gain_is_seen_in_the_pulls() -> None:
 def test_a_wrong_likelihood_is_seen_in_the_pulls() -> None:
     """Counts of a measured background, fitted as if it were known: σ is understated by √2."""
     experiment = setting("iscat", "mass")
-    known = setting("iscat", "mass", fit={"likelihood": "poisson"}, background={"method": "none",
-                    "level_e": 1.0})  # fmt: skip
+    known = setting("iscat", "mass", bounds={"n_before": 0})
     wrong = Setting(
         experiment.config,
         known.scene,

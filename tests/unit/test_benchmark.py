@@ -144,6 +144,26 @@ def test_the_height_is_moved_off_the_ends_only_where_it_is_free_and_not_given() 
     assert setting("iscat", "joint", bounds={"z_nm": 7.0}).truth[2] == 7.0
 
 
+@pytest.mark.parametrize("scheme", ["iscat", "darkfield"])
+@pytest.mark.parametrize("n_before", [0, 20])
+@pytest.mark.parametrize("method", ["mean", "none"])
+def test_fits_know_as_much_of_the_background_as_the_bounds(
+    scheme: str, n_before: int, method: str
+) -> None:
+    """Whether it was measured is for [bounds] to say; the observed information then agrees."""
+    config = configuration(
+        scheme, bounds={"n_before": n_before}, background={"method": method, "level_e": 2.0}
+    )
+    first = make_setting(config, "mass", collected=3000.0)
+    later = make_setting(config, "mass", collected=1000.0, scene=first.scene)
+    for made in (first, later):
+        likelihood = made.likelihood(made.draw(made.truth, None))
+        theta = np.array([*made.truth[:3], likelihood.model.scale.amplitude(made.truth[3]), 0.0])
+        fisher = likelihood.score_fisher(theta)[2][:2, :2]
+        crb = made.bounds.crb_single[:2]
+        assert 1 / np.sqrt(np.diag(fisher)) == pytest.approx(crb, rel=1e-3)
+
+
 def test_a_particle_that_no_fit_can_find_is_refused() -> None:
     """Beyond the range profiles are continued wrongly, and every mode would be biased."""
     for mode in ("mass", "joint"):
