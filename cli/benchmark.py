@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -121,17 +121,21 @@ def benchmark_table(study: Mapping[str, Any]) -> Table:
         for name, values in entry.items():
             if not isinstance(values, Mapping) or "spread_over_crb" not in values:
                 continue
-            low, high = values["spread_over_crb_ci95"]
             table.add_row(
                 mode,
                 name,
                 *(_short(values[key]) for key in ("bias", "spread", "crb", "qcrb")),
                 _short(values["spread_over_crb"]),
-                f"{_short(low)}–{_short(high)}",
+                _interval(values["spread_over_crb_ci95"]),
                 _short(values["coverage68"]),
                 f"{entry['failed']} of {entry['trials']}",
             )
     return table
+
+
+def _interval(ends: Sequence[float | None]) -> str:
+    low, high = (_short(end) for end in ends)
+    return "–" if "–" in (low, high) else f"{low}–{high}"
 
 
 def _short(value: float | None) -> str:

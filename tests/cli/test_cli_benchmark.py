@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import pytest
 
 from iscat_cli import main
+from iscat_cli.benchmark import benchmark_table
 
 SMALL = ["--set", "fit.roi_nm=900", "--set", "fit.z_range_nm=[0,300]", "--no-posterior"]
 
@@ -48,3 +50,12 @@ def test_benchmark_refuses_too_few_trials(
     assert main(["benchmark", *arguments, "--trials", "3"]) == 2
     assert "--trials" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_mode_without_usable_fits_has_one_dash_in_each_cell() -> None:
+    none = math.nan, math.nan
+    score = dict.fromkeys(("bias", "spread", "spread_over_crb", "coverage68"), math.nan)
+    entry = {"failed": 20, "trials": 20,
+             "x_nm": {**score, "crb": 1.0, "qcrb": 0.5, "spread_over_crb_ci95": none}}  # fmt: skip
+    table = benchmark_table(dict.fromkeys(("mass", "localize", "joint"), entry))
+    assert list(table.columns[7].cells) == ["–"] * 3
