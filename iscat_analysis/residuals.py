@@ -16,11 +16,12 @@ Each p-value is uniform on good data; `goodness_of_fit` joins them by Šidák's 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betainc, gammainc, gammaincc, ndtr, ndtri, pdtr, pdtrc
+from scipy.special import betainc, gammainc, gammaincc, ndtr, pdtr, pdtrc
 
 from iscat_analysis._kernels.score_test import score_statistic
 from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR
@@ -289,18 +290,26 @@ def _attainable(rate: FloatArray, tail: float) -> FloatArray:
     out = np.full(rate.size, tail)
     few = rate < MANY_COUNTS
     mean = rate[few]
-    z, offsets = -float(ndtri(half)), np.arange(-3.0, 4.0)[:, None]
-    above, below = (
-        np.floor(mean * np.maximum(1 - 1 / (9 * mean) + turn / (3 * np.sqrt(mean)), 0) ** 3)
-        for turn in (z, -z)  # Wilson and Hilferty, Proc. Natl. Acad. Sci. 17, 684 (1931)
-    )
-    both = np.zeros(mean.size)
-    for law, near in ((pdtrc, above), (pdtr, below)):
-        counts = near + offsets
-        tails = np.where(counts >= 0, law(np.maximum(counts, 0), mean), 1.0)
-        both += np.max(np.where(tails <= half * (1 + 1e-9), tails, 0.0), axis=0)
-    out[few] = both
+    # Bernstein's and Chernoff's inequalities enclose the counts, halving finds them
+    depth = -math.log(half)
+    farthest = np.ceil(mean + depth / 3 + np.sqrt(depth**2 / 9 + 2 * mean * depth))
+    least = np.maximum(np.floor(mean - np.sqrt(2 * mean * depth)) - 1, -1.0)
+    limit = half * (1 + 1e-9)
+    above = _first(lambda k: pdtrc(k, mean) <= limit, np.floor(mean) - 1, farthest)
+    below = _first(lambda k: pdtr(k, mean) > limit, least, np.ceil(mean) + 1) - 1
+    out[few] = pdtrc(above, mean) + np.where(below >= 0, pdtr(np.maximum(below, 0), mean), 0.0)
     return out
+
+
+def _first(
+    holds: Callable[[FloatArray], BoolArray], low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """Find the smallest whole numbers above `low` for which something holds; at `high` it does."""
+    while np.any(high - low > 1):
+        middle = np.where(high - low > 1, np.floor((low + high) / 2), high)
+        there = holds(middle)
+        low, high = np.where(there, low, middle), np.where(there, middle, high)
+    return high
 
 
 def _modes(likelihood: Likelihood, theta: FloatArray) -> FloatArray:

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from microscopes import configuration, setting
-from scipy.stats import binom, kstest
+from scipy.stats import binom, kstest, poisson
 
 from iscat_analysis.benchmark import Setting, make_setting, run_trials, trial_generator
 from iscat_analysis.fit import POOR_FIT_P, fit_particle
 from iscat_analysis.records import FitResult, FloatArray, Status
-from iscat_analysis.residuals import outlier, scatter, structure
+from iscat_analysis.residuals import _attainable, outlier, scatter, structure
 
 SEED = 61
 TRIALS = 400
@@ -69,6 +69,17 @@ def test_each_test_is_uniform_on_good_data() -> None:
         found.append([scatter(*at, fit.box.free)[1], structure(*at, fit.box.free), outlier(*at)])
     for column in np.transpose(found):
         assert kstest(column, "uniform").pvalue > SURPRISE
+
+
+def test_the_least_likely_of_few_counts_is_judged_exactly() -> None:
+    """What a pixel can attain below a tail, against the sum over every count."""
+    means = np.array([1e-4, 0.02, 0.1, 0.2, 0.7, 3.0, 12.0, 40.0, 300.0])
+    counts = np.arange(900.0)[:, None]
+    above, below = poisson.sf(counts - 1, means), poisson.cdf(counts, means)
+    tails = np.minimum(1.0, 2 * np.minimum(above, below))
+    for tail in (0.5, 1e-2, 1.1e-5, 1e-7, 3e-11):
+        exact = np.sum(poisson.pmf(counts, means) * (tails <= tail), axis=0)
+        np.testing.assert_allclose(_attainable(means, tail), exact, rtol=1e-6, atol=1e-16)
 
 
 @pytest.mark.parametrize("mode", ["mass", "joint"])
