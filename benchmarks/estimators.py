@@ -65,7 +65,7 @@ class Report:
 
 def efficiency(report: Report) -> None:
     count = report.trials(10_000)
-    flagged = judged = 0
+    flagged = dict.fromkeys(SCHEMES, 0)
     for number, (scheme, mode) in enumerate(product(SCHEMES, MODES)):
         experiment = setting(scheme, mode)
         found = run_trials(
@@ -73,8 +73,7 @@ def efficiency(report: Report) -> None:
         )
         bounds, kept = experiment.bounds, found.usable
         rate = float(np.mean(found.failed))
-        flagged += int(found.flagged(Status.POOR_FIT).sum())
-        judged += count
+        flagged[scheme] += int(found.flagged(Status.POOR_FIT).sum())
         report.promise(rate < FAILURES, f"{scheme} {mode}: failures {rate:.2%} of {count}")
         for name in experiment.free:
             k = PARAMETERS.index(name)
@@ -90,12 +89,15 @@ def efficiency(report: Report) -> None:
                 f"{s.bias_se / s.crb:.3f} CRB, pull {s.pull_std:.3f}, "
                 f"inside σ {s.coverage68:.3f}",
             )
-    share, error = flagged / judged, np.sqrt(POOR_FIT_P / judged)
-    report.numbers["poor_fit_share"] = share
-    report.promise(
-        abs(share - POOR_FIT_P) < 4 * error,
-        f"good data called a poor fit: {share:.2e} of {judged}, nominal {POOR_FIT_P:.0e}",
-    )
+    judged = count * len(MODES)
+    for scheme, times in flagged.items():
+        share, error = times / judged, np.sqrt(POOR_FIT_P / judged)
+        report.numbers[f"{scheme}.poor_fit_share"] = share
+        report.promise(
+            abs(share - POOR_FIT_P) < 4 * error,
+            f"{scheme}: good data called a poor fit: {share:.2e} of {judged}, "
+            f"nominal {POOR_FIT_P:.0e}",
+        )
 
 
 def heights(report: Report) -> None:

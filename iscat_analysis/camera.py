@@ -26,6 +26,9 @@ _UNREADABLE = (
 )  # fmt: skip
 """What a damaged TIFF makes its decoders raise."""
 
+CEILING_REPEATS = 4
+"""Counts that must share the largest one before it is taken for a converter's full scale."""
+
 _NEGATIVE_SIGMAS = 6.0  # 1e-9 of pixels in the dark
 _NEGATIVE_FRACTION = 0.01  # more pixels below the offset than a sensor has dead ones
 
@@ -83,9 +86,10 @@ class Camera:
         Returns
         -------
         ndarray of bool, shape (..., y, x)
-            At or above the well depth, or at the full scale of the stored type.
+            At or above the well depth, at the full scale of the stored type, or at that of a
+            converter of fewer bits, see `converter_ceiling`.
         """
-        full = np.zeros(np.shape(counts), dtype=np.bool_)
+        full: BoolArray = counts >= converter_ceiling(counts)
         if self.full_scale_adu is not None:
             full |= counts >= self.full_scale_adu
         if self.well_depth_e is not None:
@@ -257,7 +261,8 @@ def check_counts(
             )
         if low < float(np.max(floor)):
             _refuse_negative(frame, floor, where)
-        if low >= float(np.min(ceiling)) and bool(np.all(frame >= ceiling)):
+        full = low == high >= converter_ceiling(frame)
+        if full or (low >= float(np.min(ceiling)) and bool(np.all(frame >= ceiling))):
             raise DataError(
                 f"{where} is saturated throughout; lower the exposure or the laser power, "
                 "or correct camera.well_depth_e"
@@ -281,6 +286,28 @@ def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatAr
     sigma = np.sqrt(np.square(np.divide(camera.read_noise_e, camera.gain_e_per_adu)) + rounding)
     floor: float | FloatArray = camera.offset_adu - _NEGATIVE_SIGMAS * sigma
     return floor
+
+
+def converter_ceiling(counts: NDArray[Any]) -> float:
+    """Find the full scale of an analogue-to-digital converter of fewer bits than the stored type.
+
+    Parameters
+    ----------
+    counts : ndarray
+        As stored [counts]; whole numbers.
+
+    Returns
+    -------
+    float
+        The largest count, where it is 2ⁿ − 1 with n ≥ 8 and `CEILING_REPEATS` counts share it, as
+        no largest count of unclipped noise does; infinity otherwise.
+    """
+    if not np.issubdtype(counts.dtype, np.integer) or not counts.size:
+        return math.inf
+    top = int(counts.max())
+    if top < 255 or top & (top + 1) or np.count_nonzero(counts == top) < CEILING_REPEATS:
+        return math.inf
+    return float(top)
 
 
 def _ceiling_adu(camera: Camera) -> float | FloatArray:

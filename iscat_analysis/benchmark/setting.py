@@ -288,11 +288,11 @@ def make_setting(
 
 def _background(config: Config) -> dict[str, Any]:
     """Tell the fits what ``[bounds]`` says of the background: measured beforehand, or known."""
-    at, background = config.bounds, config.background
+    at = config.bounds
     if at.n_before:
-        return {"method": "mean"} if background.method == "none" else {}
+        return {"method": "mean"}
     dark = config.optics.scheme == "darkfield"
-    level = (background.level_e or 0.0) if dark else at.photons_per_pixel
+    level = (config.background.level_e or 0.0) if dark else at.photons_per_pixel
     return {"method": "none", "frames": None, "level_e": level}
 
 

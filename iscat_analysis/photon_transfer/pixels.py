@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from iscat_analysis.camera import converter_ceiling
 from iscat_analysis.errors import DataError
 from iscat_analysis.photon_transfer.moments import Moments, brightness_bins, robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray
@@ -39,11 +39,9 @@ def saturated(highest: NDArray[Any], name: str) -> BoolArray:
         They are more than half of all.
     """
     top = float(highest.max())
-    ceiling = math.inf
+    ceiling = converter_ceiling(highest)
     if np.issubdtype(highest.dtype, np.integer):
-        ceiling = float(np.iinfo(highest.dtype).max)
-    if top >= 255 and math.log2(top + 1).is_integer():
-        ceiling = min(ceiling, top)
+        ceiling = min(ceiling, float(np.iinfo(highest.dtype).max))
     full: BoolArray = highest >= ceiling
     if full.mean() > 0.5:
         raise DataError(

@@ -258,3 +258,21 @@ def test_every_frame_is_checked_and_counted_once() -> None:
     )  # fmt: skip
     assert seen == list(range(50))
     assert steps[-1] == (50, 50)
+
+
+def test_the_full_scale_of_a_converter_is_saturation() -> None:
+    """Twelve bits stored as sixteen."""
+    stack, _ = _movie(6)
+    clipped = Stack(np.minimum(stack.counts, np.quantile(stack.counts, 0.7)).astype(np.uint16))
+    top = int(clipped.counts.max())
+    shift = 4095 - top
+    low = Stack((clipped.counts.astype(int) + shift).astype(np.uint16))
+    camera = Camera(offset_adu=float(shift), full_scale_adu=65535.0)
+    windows = measure_windows(low, camera, BEFORE, AFTER)
+    frames = np.r_[slice(*BEFORE), slice(*AFTER)]
+    np.testing.assert_array_equal(windows.saturated, (low.counts[frames] == 4095).any(axis=0))
+    # Controls: another largest count, and one that a single pixel has by chance.
+    other = measure_windows(Stack(low.counts - 1), camera, BEFORE, AFTER)
+    assert not other.saturated.any()
+    stack.counts[3, 4, 5] = 2 ** int(np.log2(stack.counts.max()) + 1) - 1
+    assert not measure_windows(stack, Camera(full_scale_adu=65535.0), BEFORE, AFTER).saturated.any()

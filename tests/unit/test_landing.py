@@ -229,6 +229,14 @@ def test_two_that_land_together_are_flagged() -> None:
 # ---- odd movies ------------------------------------------------------------------------------
 
 
+def test_a_converter_that_clips_makes_no_steps(counts: np.ndarray) -> None:
+    """Fourteen per cent of the pixels reach the full scale of twelve bits, stored as sixteen."""
+    clipped = np.minimum(counts // 7, 4095).astype(np.uint16)
+    result, told = _run(clipped, camera=Camera(gain_e_per_adu=28.0, full_scale_adu=65535.0))
+    assert result.table["frame"].tolist() == pytest.approx([s[0] for s in STEPS], abs=1)
+    assert any("pixels are saturated" in line for line in told)
+
+
 def test_stuck_and_dropped_frames_are_left_out(counts: np.ndarray) -> None:
     odd = counts.copy()
     odd[100] = odd[99]
