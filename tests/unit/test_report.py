@@ -17,7 +17,7 @@ from iscat_analysis.config import load_config, parse_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import EVENT_COLUMNS, Status
 from iscat_analysis.report import check_output, figures, render_page, render_report, write_report
-from iscat_analysis.report.context import _landing_lines
+from iscat_analysis.report.context import _measured_lines
 from iscat_analysis.report.numbers import number
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder
 from iscat_analysis.report.pack import CREDIBLE_LEVELS, credible_shades, quantise
@@ -337,6 +337,6 @@ def test_the_histogram_keeps_species_apart() -> None:
     ],
 )
 def test_what_was_injected_is_told(further: dict[str, float], words: str) -> None:
-    (line,) = _landing_lines({"injection": {"added": 20, "recovered": 19, **further}})
+    (line,) = _measured_lines({"injection": {"added": 20, "recovered": 19, **further}})
     assert line.startswith("Of 20 landings and leavings added to the movie, 19 were found again.")
     assert words in line
