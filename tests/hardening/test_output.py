@@ -253,6 +253,7 @@ def test_a_landing_movie_killed_at_random_moments_resumes(forker: Forker, tmp_pa
     for number in range(KILLS // 2):
         shutil.rmtree(result, ignore_errors=True)
         share = float(rng.uniform(0, 1))
+        resumed += any(kept.glob("*.npz"))
         (answer,) = forker.run(
             {**order, "kill": [signal.SIGKILL, share], "duration": whole["seconds"]}
         )
