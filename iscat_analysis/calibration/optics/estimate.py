@@ -1,9 +1,9 @@
 """One microscope, many particles: the maximum of their joint likelihood.
 
-Every sight of a particle has unknowns of its own (place, mass, background level) and shares those of
-the microscope with all others.  The information matrix is an arrow; its private blocks are
-eliminated sight by sight (their Schur complement), so that the cost grows linearly with the sights.
-Fisher scoring with Levenberg's damping; a step is taken only if the likelihood rises.
+Every sight of a particle has unknowns of its own (place, mass, background level) and shares those
+of the microscope with all others.  The information matrix is an arrow; its private blocks are
+eliminated sight by sight (their Schur complement), so that the cost grows linearly with the
+sights.  Fisher scoring with Levenberg's damping; a step is taken only if the likelihood rises.
 """
 
 from __future__ import annotations
@@ -11,15 +11,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from iscat_analysis.grid import PixelGrid
-from iscat_analysis.likelihood import CONDITIONAL
+from iscat_analysis._kernels.scoring import CONDITIONAL
+from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import FloatArray, Mapper
 
-PRIOR_RANGE = {"focus_nm": 1000.0, "na": 0.05, "reference_phase_deg": 180.0, "mask_na": 0.3, "attenuation": 0.5}
+PRIOR_RANGE = {
+    "focus_nm": 1000.0,
+    "na": 0.05,
+    "reference_phase_deg": 180.0,
+    "mask_na": 0.3,
+    "attenuation": 0.5,
+}
 """How far a parameter may plausibly lie from the configured one; what the data leave wider than
 this, they do not tell."""
 
@@ -29,7 +35,13 @@ TERM_RANGE_NM = 100.0
 PRIVATE = 4
 """Unknowns of one sight: x, y [nm], mass [kDa] and the logarithm of the background level."""
 
-_LARGEST_STEP = {"focus_nm": 120.0, "na": 0.02, "reference_phase_deg": 40.0, "mask_na": 0.1, "attenuation": 0.1}
+_LARGEST_STEP = {
+    "focus_nm": 120.0,
+    "na": 0.02,
+    "reference_phase_deg": 40.0,
+    "mask_na": 0.1,
+    "attenuation": 0.1,
+}
 _TERM_STEP_NM = 25.0
 _PLACE_STEP_NM = 60.0
 _DAMPING = (1e-3, 1e8)  # first, and where the search gives up
@@ -58,8 +70,11 @@ class Microscope(Protocol):
         """Signal, and its derivatives with respect to the named parameters of the optics."""
 
 
-Build = Callable[[Mapping[str, float]], Microscope]
-"""Parameters of the optics by name → the microscope that has them, all others as configured."""
+Settings = Mapping[str, Any]
+"""Values of ``[optics]`` by key, each aberration under its own name (``z5``…)."""
+
+Build = Callable[[Settings], Microscope]
+"""Makes the microscope of some settings."""
 
 
 @dataclass(frozen=True)
@@ -121,8 +136,8 @@ class Estimate:
     ----------
     names : tuple of str
         Parameters of the optics that were free.
-    values : mapping of str to float
-        All parameters of the optics that differ from the configuration or were free.
+    values : mapping
+        All parameters of the optics.
     sights : tuple of Sight
         The sights, each with its own unknowns at their estimates.
     information : ndarray, shape (n, n)
@@ -136,7 +151,7 @@ class Estimate:
     """
 
     names: tuple[str, ...]
-    values: Mapping[str, float]
+    values: Settings
     sights: tuple[Sight, ...]
     information: FloatArray
     log_likelihood: float
@@ -159,7 +174,7 @@ def prior_range(name: str) -> float:
 def maximise(
     sights: Sequence[Sight],
     build: Build,
-    start: Mapping[str, float],
+    start: Settings,
     names: Sequence[str],
     *,
     limits: Mapping[str, tuple[float, float]] | None = None,
@@ -175,7 +190,7 @@ def maximise(
         The pictures.
     build : callable
         Makes the microscope.
-    start : mapping of str to float
+    start : mapping
         Parameters of the optics, the free ones among them.
     names : sequence of str
         The free ones; none: only the particles are fitted.
@@ -223,11 +238,11 @@ def maximise(
 
 
 def _limited(
-    values: Mapping[str, float],
+    values: Settings,
     names: Sequence[str],
     step: FloatArray,
     limits: Mapping[str, tuple[float, float]],
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """Take a step and stay inside the limits."""
     out = dict(values)
     for name, move in zip(names, step, strict=True):
@@ -270,7 +285,7 @@ class _Point:
         cls,
         sights: Sequence[Sight],
         build: Build,
-        values: Mapping[str, float],
+        values: Settings,
         names: tuple[str, ...],
         private: FloatArray,
         mapper: Mapper,
@@ -333,8 +348,8 @@ def _solve(
 ) -> FloatArray:
     """Solve the damped normal equations in units of the prior ranges.
 
-    A unit on the diagonal, one part in 10⁴ of what a direction worth knowing has, keeps directions of
-    which the pictures say nothing at rest.
+    What is added to the diagonal, one part in 10⁴ of what a direction worth knowing has, keeps
+    directions of which the pictures say nothing at rest.
     """
     if not names:
         return np.empty(0)
@@ -395,11 +410,11 @@ def pixel_terms(
         Derivative with respect to η and its expected information; ∂η/∂signal and ∂η/∂level.
     """
     c0, c1, c2, c3 = data
-    bright = 1 + signal
+    bright, nothing = 1 + signal, np.zeros(signal.shape)
     if kind == CONDITIONAL:
         used = c3 > 0
         if np.any(bright[used] <= 0):
-            return -math.inf, *(np.zeros(signal.shape) for _ in range(4))
+            return -math.inf, nothing, nothing, nothing, nothing
         safe, odds = np.where(used, bright, 1.0), np.where(used, c2, 1.0)
         shift = np.log(safe) + level
         eta = np.log(odds) + shift
@@ -415,7 +430,7 @@ def pixel_terms(
     if np.any(rate[used] <= 0):
         return -math.inf, *(np.zeros(signal.shape) for _ in range(4))
     rate = np.where(used, rate, 1.0)
-    nothing = np.where(used, c1 + c3, 1.0)
-    value = float(np.sum(np.where(used, c0 * np.log(rate / nothing) - rate + nothing, 0.0)))
+    empty = np.where(used, c1 + c3, 1.0)
+    value = float(np.sum(np.where(used, c0 * np.log(rate / empty) - rate + empty, 0.0)))
     score = np.where(used, c0 / rate - 1, 0.0)
     return value, score, np.where(used, 1 / rate, 0.0), gain * c2, expected
