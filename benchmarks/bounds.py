@@ -76,7 +76,7 @@ def model_figures(repeats: int) -> dict[str, float]:
     from golden_setups import reference_setup, small_config
 
     from iscat_analysis.bounds import plan
-    from iscat_analysis.forward import PixelGrid, forward_model
+    from iscat_analysis.optics.forward import PixelGrid, forward_model
 
     config = small_config(
         optics={"focus_nm": 0.0}, particle={"height_nm": 5.0},

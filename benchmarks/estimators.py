@@ -30,9 +30,9 @@ sys.path.insert(0, str(ROOT.parent / "tests"))
 import numpy as np  # noqa: E402  # after the thread counts
 from microscopes import setting  # noqa: E402
 
-from iscat_analysis.benchmark import calibrate_posterior, run_trials, score  # noqa: E402
-from iscat_analysis.fit import POOR_FIT_P  # noqa: E402
+from iscat_analysis.inference.fit import POOR_FIT_P  # noqa: E402
 from iscat_analysis.records import PARAMETERS, Status  # noqa: E402
+from iscat_analysis.study import calibrate_posterior, run_trials, score  # noqa: E402
 
 RESULTS = ROOT / "results"
 SCHEMES, MODES = ("iscat", "cobri", "darkfield"), ("mass", "localize", "joint")

@@ -27,11 +27,11 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import numpy as np  # noqa: E402  # after the thread counts
 from _peer import peer_python  # noqa: E402
 
-from iscat_analysis.benchmark import Setting, make_setting, trial_generator  # noqa: E402
 from iscat_analysis.config import parse_config  # noqa: E402
-from iscat_analysis.fit import fit_particle, search_box, start_theta  # noqa: E402
-from iscat_analysis.likelihood import Likelihood, compile_kernels  # noqa: E402
+from iscat_analysis.inference.fit import fit_particle, search_box, start_theta  # noqa: E402
+from iscat_analysis.inference.likelihood import Likelihood, compile_kernels  # noqa: E402
 from iscat_analysis.records import Box, Candidate, FloatArray  # noqa: E402
+from iscat_analysis.study import Setting, make_setting, trial_generator  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent
 RESULTS = ROOT / "results"

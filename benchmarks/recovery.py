@@ -25,11 +25,11 @@ import numpy as np
 import pandas as pd
 from scipy.stats import poisson
 
-from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Config, load_config
+from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.pipeline.chunks import FRAME_COLUMN
 from iscat_analysis.pipeline.landing import LandingResult, analyse_landings
-from iscat_analysis.simulate import Movie
+from iscat_analysis.study.simulate import Movie
 
 ROOT = Path(__file__).resolve().parent
 RESULTS = ROOT / "results"

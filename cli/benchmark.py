@@ -67,7 +67,7 @@ def benchmark(
 
         resolved = load_config(config, settings or ())
 
-        from iscat_analysis.benchmark import (
+        from iscat_analysis.study import (
             check_benchmark_output,
             run_benchmark,
             write_benchmark,

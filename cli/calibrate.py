@@ -12,8 +12,8 @@ from iscat_cli.console import Messages, failures, print_json, print_result
 from iscat_cli.options import DebugOption, JsonOption, OverwriteOption, QuietOption
 
 if TYPE_CHECKING:
-    from iscat_analysis.mass_calibration import MassCalibration
-    from iscat_analysis.photon_transfer import CameraCalibration, Estimate
+    from iscat_analysis.calibration.camera import CameraCalibration, Estimate
+    from iscat_analysis.calibration.mass import MassCalibration
 
 SUMMARY = "Calibrate the camera, or contrast against mass."
 
@@ -171,8 +171,8 @@ def mass(
 
 def _standards(text: str) -> tuple[list[float], list[float]]:
     """Read ``66,146:1.5,480``."""
+    from iscat_analysis.calibration.mass import STANDARD_ERROR
     from iscat_analysis.errors import ConfigError
-    from iscat_analysis.mass_calibration import STANDARD_ERROR
 
     masses, errors = [], []
     for part in text.split(","):

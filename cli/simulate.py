@@ -51,7 +51,7 @@ def simulate(
 
         resolved = load_config(config, settings or ())
 
-        from iscat_analysis.simulate import write_stack
+        from iscat_analysis.study.simulate import write_stack
 
         with messages.progress() as progress:
             truth = write_stack(resolved, out, seed=seed, overwrite=overwrite, progress=progress)

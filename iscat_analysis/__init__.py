@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from iscat_analysis.errors import ConfigError as ConfigError
     from iscat_analysis.errors import DataError as DataError
     from iscat_analysis.errors import IscatError as IscatError
-    from iscat_analysis.load import Stack as Stack
-    from iscat_analysis.load import open_stack as open_stack
+    from iscat_analysis.movie import Stack as Stack
+    from iscat_analysis.movie import open_stack as open_stack
     from iscat_analysis.notebook import Bounds as Bounds
     from iscat_analysis.notebook import Result as Result
     from iscat_analysis.notebook import compute_bounds as compute_bounds
@@ -62,8 +62,8 @@ _HOME = {
     "Config": "config",
     "load_config": "config",
     "config_to_toml": "config",
-    "open_stack": "load",
-    "Stack": "load",
+    "open_stack": "movie",
+    "Stack": "movie",
     "fit_stack": "pipeline",
     "Analysis": "records",
     "Status": "records",

@@ -19,13 +19,13 @@ from matplotlib.figure import Figure
 from iscat_analysis.bounds import bounds_report, parse_scan, scan
 from iscat_analysis.config import Config, load_config, parse_config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.load import open_stack
+from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Progress, silent
 from iscat_analysis.report import check_output, write_report
 from iscat_analysis.report.numbers import LABELS, UNITS
 from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
-from iscat_analysis.simulate import write_stack
+from iscat_analysis.study.simulate import write_stack
 
 if TYPE_CHECKING:
     from arviz import InferenceData

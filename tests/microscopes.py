@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from iscat_analysis.benchmark import Setting, make_setting
 from iscat_analysis.config import Config, parse_config
+from iscat_analysis.study import Setting, make_setting
 
 ROI_NM = 2700.0
 PHOTONS = 3000.0

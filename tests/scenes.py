@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.background import start_power
 from iscat_analysis.config import Config, parse_config
+from iscat_analysis.movie.background import start_power
 from iscat_analysis.records import Windows
-from iscat_analysis.simulate import Movie
+from iscat_analysis.study.simulate import Movie
 
 Array = NDArray[np.float64]
 

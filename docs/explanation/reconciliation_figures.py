@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from iscat_analysis.bounds import quantum_bounds, quantum_information
 from iscat_analysis.bounds.paper import paper_config, photons_of_authors, point
-from iscat_analysis.forward import forward_model
+from iscat_analysis.optics.forward import forward_model
 
 FIGURES = Path(__file__).resolve().parent / "figures"
 INK, BLUE, ORANGE, GREY = "#1B1D21", "#0072B2", "#D55E00", "#8A8F96"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.records import PARAMETERS
 
 FloatArray = NDArray[np.float64]

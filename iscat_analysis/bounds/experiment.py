@@ -19,8 +19,8 @@ from iscat_analysis.bounds.quantum import (
 )
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.forward import ForwardModel, MassScale, PixelGrid, forward_model
-from iscat_analysis.likelihood import Likelihood, asimov_conditional, asimov_poisson
+from iscat_analysis.inference.likelihood import Likelihood, asimov_conditional, asimov_poisson
+from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
 
 FloatArray = NDArray[np.float64]

@@ -22,7 +22,7 @@ from iscat_analysis._kernels.pupil import make_pupil, rectangle
 from iscat_analysis.bounds.experiment import Experiment, plan
 from iscat_analysis.bounds.quantum import Measure, quantum_bounds, quantum_information
 from iscat_analysis.config import Config, parse_config
-from iscat_analysis.forward import ForwardModel, forward_model
+from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.records import PARAMETERS, Progress, silent
 
 FloatArray = NDArray[np.float64]

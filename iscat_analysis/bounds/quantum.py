@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.forward import NEAR_CRITICAL, ForwardModel
+from iscat_analysis.optics.forward import NEAR_CRITICAL, ForwardModel
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

@@ -23,7 +23,7 @@ from iscat_analysis.bounds.classical import bounds_from_matrices
 from iscat_analysis.bounds.experiment import Experiment, information_fraction, plan
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.forward import MassScale, forward_model
+from iscat_analysis.optics.forward import MassScale, forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Progress, silent
 
 FloatArray = NDArray[np.float64]

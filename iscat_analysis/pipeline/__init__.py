@@ -17,13 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.background import measure_windows
-from iscat_analysis.calibrate import resolve_metadata
-from iscat_analysis.camera import Camera, camera_from_config, check_counts
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.likelihood import compile_kernels
-from iscat_analysis.load import Stack, open_stack
+from iscat_analysis.inference.likelihood import compile_kernels
+from iscat_analysis.inference.posterior import sample_posterior
+from iscat_analysis.movie import Stack, open_stack
+from iscat_analysis.movie.background import measure_windows
+from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts
+from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pipeline.diagnosis import (
     camera_warnings,
     drift_warning,
@@ -35,7 +36,6 @@ from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, vi
 from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
 from iscat_analysis.pipeline.scene import Scene, field_likelihood, make_scene
 from iscat_analysis.pipeline.tracking import track_particles
-from iscat_analysis.posterior import sample_posterior
 from iscat_analysis.records import (
     Analysis,
     FloatArray,
@@ -151,7 +151,7 @@ def analyse(
     Parameters
     ----------
     movie : Stack
-        From `iscat_analysis.load.open_stack`.
+        From `iscat_analysis.movie.open_stack`.
     config : Config
         What to do.
     progress, notify, command

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from iscat_analysis.likelihood import Likelihood
+from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.records import FitResult
 
 

@@ -12,11 +12,11 @@ import numpy as np
 import pandas as pd
 import tifffile
 
+from iscat_analysis.calibration.camera import CameraCalibration, measure_camera
+from iscat_analysis.calibration.mass import Landing, MassCalibration, calibrate_mass
 from iscat_analysis.errors import DataError
-from iscat_analysis.events import read_events
-from iscat_analysis.load import open_stack
-from iscat_analysis.mass_calibration import Landing, MassCalibration, calibrate_mass
-from iscat_analysis.photon_transfer import CameraCalibration, measure_camera
+from iscat_analysis.movie import open_stack
+from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.records import Progress, Status, silent
 from iscat_analysis.report import atomic_folder, check_output, jsonable
 from iscat_analysis.report.calibration import camera_page, mass_page

@@ -12,11 +12,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.background import find_defects
-from iscat_analysis.camera import Camera, check_counts
 from iscat_analysis.config import Config
-from iscat_analysis.drift import Trajectory, measure_drift
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.background import find_defects
+from iscat_analysis.movie.camera import Camera, check_counts
+from iscat_analysis.movie.drift import Trajectory, measure_drift
 from iscat_analysis.pipeline.results import table_of
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import (
@@ -27,7 +27,7 @@ from iscat_analysis.records import (
     Mapper,
     Windows,
 )
-from iscat_analysis.sliding import (
+from iscat_analysis.search.sliding import (
     SHORTEST_MOVIE,
     Chunk,
     NoiseCurve,

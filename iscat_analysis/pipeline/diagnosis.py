@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.calibrate import diagnose_gain
-from iscat_analysis.camera import Camera
-from iscat_analysis.drift import follow_pattern
 from iscat_analysis.errors import DataError
-from iscat_analysis.load import Stack
+from iscat_analysis.movie import Stack
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.drift import follow_pattern
+from iscat_analysis.movie.metadata import diagnose_gain
 from iscat_analysis.records import Windows
-from iscat_analysis.sliding import measure_noise
+from iscat_analysis.search.sliding import measure_noise
 
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""

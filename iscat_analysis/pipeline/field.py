@@ -14,11 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.background import refine_power
-from iscat_analysis.detect import find_particles
-from iscat_analysis.fit import fit_particle
-from iscat_analysis.forward import PixelGrid
-from iscat_analysis.likelihood import Likelihood
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.movie.background import refine_power
+from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.scene import (
     SPREAD_NM,
     Region,
@@ -38,6 +37,7 @@ from iscat_analysis.records import (
     Windows,
     silent,
 )
+from iscat_analysis.search.templates import find_particles
 
 MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""

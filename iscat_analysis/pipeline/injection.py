@@ -19,9 +19,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.camera import Camera
-from iscat_analysis.drift import Mover, Trajectory
-from iscat_analysis.forward import PixelGrid
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.drift import Mover, Trajectory
+from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.chunks import FRAME_COLUMN, Frames
 from iscat_analysis.pipeline.neighbours import LARGEST_IMAGE
 from iscat_analysis.pipeline.scene import Scene

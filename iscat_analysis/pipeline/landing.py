@@ -20,14 +20,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.calibrate import diagnose_gain
-from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
-from iscat_analysis.detect import make_templates
-from iscat_analysis.drift import Trajectory
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.fit import window_nm
-from iscat_analysis.forward import forward_model
+from iscat_analysis.inference.fit import window_nm
+from iscat_analysis.inference.posterior import sample_posterior
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.drift import Trajectory
+from iscat_analysis.movie.metadata import diagnose_gain
+from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.pipeline.chunks import (
     FRAME_COLUMN,
     VIEWS,
@@ -47,9 +47,9 @@ from iscat_analysis.pipeline.results import Row, table_of, view_of
 from iscat_analysis.pipeline.resume import Store
 from iscat_analysis.pipeline.scene import Scene, reported_steps, search_both
 from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
-from iscat_analysis.posterior import sample_posterior
 from iscat_analysis.records import EventView, FloatArray, Progress, Windows
-from iscat_analysis.sliding import STRIDES, Chunk
+from iscat_analysis.search.sliding import STRIDES, Chunk
+from iscat_analysis.search.templates import make_templates
 
 POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""

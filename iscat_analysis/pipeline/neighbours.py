@@ -18,12 +18,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from iscat_analysis.drift import derivatives
-from iscat_analysis.forward import PixelGrid
+from iscat_analysis.movie.drift import derivatives
+from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.pattern import MovingPattern
 from iscat_analysis.pipeline.scene import Region, Scene
 from iscat_analysis.records import Candidate, FloatArray
-from iscat_analysis.sliding import Chunk, StepFrame
+from iscat_analysis.search.sliding import Chunk, StepFrame
 
 LARGEST_IMAGE = 3.5
 """Regions from the centre to the edge of a strong particle's image; the rings go on, faintly."""

@@ -16,10 +16,17 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.drift import ComplexArray, Mover, Trajectory, filling, follow_pattern, trusted
+from iscat_analysis.movie.drift import (
+    ComplexArray,
+    Mover,
+    Trajectory,
+    filling,
+    follow_pattern,
+    trusted,
+)
 from iscat_analysis.pipeline.scene import Region
 from iscat_analysis.records import FloatArray, Mapper
-from iscat_analysis.sliding import STRIDES, Chunk
+from iscat_analysis.search.sliding import STRIDES, Chunk
 
 SPAN = 2
 """Windows before a step, and as many after it, whose frames make the pattern."""

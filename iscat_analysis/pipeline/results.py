@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.bounds import EventBounds, event_bounds
-from iscat_analysis.distribution import Efficiency, describe
-from iscat_analysis.likelihood import LEVEL
+from iscat_analysis.inference.likelihood import LEVEL
 from iscat_analysis.pipeline.field import Event
 from iscat_analysis.pipeline.scene import Scene, photons_scale
 from iscat_analysis.records import (
@@ -25,6 +24,7 @@ from iscat_analysis.records import (
     Status,
     Windows,
 )
+from iscat_analysis.species import Efficiency, describe
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, config_to_toml
-from iscat_analysis.drift import Trajectory
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pipeline.chunks import Done
 from iscat_analysis.records import EventView, FloatArray
 

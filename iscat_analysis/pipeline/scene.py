@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iscat_analysis.background import smooth_background
 from iscat_analysis.config import Config, Detection
-from iscat_analysis.detect import Templates, make_templates
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.fit import window_nm
-from iscat_analysis.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.likelihood import Likelihood, conditional, poisson
+from iscat_analysis.inference.fit import window_nm
+from iscat_analysis.inference.likelihood import Likelihood, conditional, poisson
+from iscat_analysis.movie.background import smooth_background
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Windows
+from iscat_analysis.search.templates import Templates, make_templates
 
 SPREAD_NM = 10_000.0
 """Farther than this from a particle its rings are left out; they are 1e-4 of its peak."""

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.drift import Trajectory
-from iscat_analysis.fit import POOR_FIT_P, fit_particle, search_box, start_theta
+from iscat_analysis.inference.fit import POOR_FIT_P, fit_particle, search_box, start_theta
+from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pipeline.bias import unbiased
 from iscat_analysis.pipeline.field import Event
 from iscat_analysis.pipeline.neighbours import (
@@ -38,7 +38,7 @@ from iscat_analysis.records import (
     Status,
     Windows,
 )
-from iscat_analysis.sliding import (
+from iscat_analysis.search.sliding import (
     STRIDES,
     Chunk,
     Filter,

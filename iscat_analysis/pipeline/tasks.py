@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.forward import PixelGrid
-from iscat_analysis.likelihood import Likelihood, conditional
+from iscat_analysis.inference.likelihood import Likelihood, conditional
+from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.neighbours import Neighbours, Step, distance_px, region_around
 from iscat_analysis.pipeline.pattern import LocalPattern, MovingPattern
 from iscat_analysis.pipeline.scene import Region, Scene
 from iscat_analysis.records import FloatArray, Windows
-from iscat_analysis.sliding import Chunk, Patch, StepFrame, crosstalk, locate_step
+from iscat_analysis.search.sliding import Chunk, Patch, StepFrame, crosstalk, locate_step
 
 FEWEST_FRAMES = 10
 """A neighbour that would leave fewer is fitted beside the step, and both are flagged."""

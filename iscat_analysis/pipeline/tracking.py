@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.background import Check, add_frames, start_power
-from iscat_analysis.camera import Camera
+from iscat_analysis.movie.background import Check, add_frames, start_power
+from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.field import Event, fit_field
 from iscat_analysis.pipeline.results import Found, Row, table_of, view_of
 from iscat_analysis.pipeline.scene import Scene

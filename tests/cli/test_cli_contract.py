@@ -289,7 +289,7 @@ def test_simulate_makes_one_call(monkeypatch, capsys, tmp_path) -> None:
         return pd.DataFrame({"x_px": [1.5, np.nan]})
 
     stand_in = SimpleNamespace(write_stack=write_stack)
-    monkeypatch.setitem(sys.modules, "iscat_analysis.simulate", stand_in)
+    monkeypatch.setitem(sys.modules, "iscat_analysis.study.simulate", stand_in)
     setup = tmp_path / "setup.toml"
     setup.write_text("[simulation]\nframes = 10\n")
     arguments = ["simulate", "--config", str(setup), "--out", "m.tif", "--seed", "5", "--quiet"]

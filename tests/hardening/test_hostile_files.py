@@ -20,8 +20,8 @@ from hardening.samples import CALIBRATION, EVENTS, write_one_mp, write_two_mp
 from tiff_files import ASCII, LONG, SHORT, movie, pages_of, write_tiff
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.events import read_events
-from iscat_analysis.load import open_stack
+from iscat_analysis.movie import open_stack
+from iscat_analysis.movie.event_tables import read_events
 
 CAP = 256_000_000  # bytes that refusing a file may allocate
 ROOT = Path(__file__).resolve().parents[2]
@@ -385,7 +385,7 @@ def test_a_pickle_is_not_a_movie_nor_a_table(tmp_path: Path) -> None:
 
 
 def test_a_map_that_is_a_movie_of_colours_is_refused(tmp_path: Path) -> None:
-    from iscat_analysis.camera import read_map
+    from iscat_analysis.movie.camera import read_map
 
     tifffile.imwrite(tmp_path / "map.tif", np.zeros((10, 14, 3), "u1"), photometric="rgb")
     refuse(

@@ -24,7 +24,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.records import EVENT_COLUMNS
 from iscat_analysis.report import write_report
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output, claim_output
-from iscat_analysis.simulate import write_stack
+from iscat_analysis.study.simulate import write_stack
 
 KILLS = 50
 REQUIRED = OUTPUT_NAMES - {"posterior.nc"}

@@ -23,9 +23,14 @@ from numpy.typing import NDArray
 from tiff_files import movie
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.events import TABLE_COLUMNS, StoredCalibration, read_events, stored_calibration
-from iscat_analysis.load import open_stack
-from iscat_analysis.load import refeyn as refeyn_module
+from iscat_analysis.movie import open_stack
+from iscat_analysis.movie import refeyn as refeyn_module
+from iscat_analysis.movie.event_tables import (
+    TABLE_COLUMNS,
+    StoredCalibration,
+    read_events,
+    stored_calibration,
+)
 
 ENCODED = {"differences": True, "encoding": "TIME_DIFFERENCE"}
 

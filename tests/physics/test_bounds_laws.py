@@ -27,7 +27,7 @@ from iscat_analysis.bounds import (
 )
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.forward import PixelGrid, forward_model
+from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import PARAMETERS
 
 INTEGRATION = 2e-3  # 4 × 4 samples in pixels of at most λ/(4 NA)

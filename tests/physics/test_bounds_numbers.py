@@ -18,7 +18,7 @@ from iscat_analysis.bounds.paper import (
     rectangle_rule_bounds,
     table1,
 )
-from iscat_analysis.forward import forward_model
+from iscat_analysis.optics.forward import forward_model
 
 GOLDEN_CRB = 1e-7  # asked for: 1e-5
 GOLDEN_QCRB = 1e-10  # asked for: 1e-6

@@ -11,7 +11,7 @@ from golden_setups import CASES, GOLD, NAMES, PAPER, golden_config, reference_se
 
 from iscat_analysis.bounds import plan
 from iscat_analysis.config import Config
-from iscat_analysis.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 
 GOLDEN_FIELD = 1e-6  # precision promised by the golden files
 TABLE = 1e-7  # error of the radial quintic, relative to the peak

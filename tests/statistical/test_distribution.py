@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from iscat_analysis.distribution import Distribution, Efficiency, describe
+from iscat_analysis.species import Distribution, Efficiency, describe
 
 Array = NDArray[np.float64]
 

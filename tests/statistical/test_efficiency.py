@@ -14,7 +14,8 @@ import pytest
 from microscopes import setting
 from scipy.stats import binom
 
-from iscat_analysis.benchmark import (
+from iscat_analysis.records import PARAMETERS, FloatArray
+from iscat_analysis.study import (
     Baselines,
     Setting,
     Trials,
@@ -22,7 +23,6 @@ from iscat_analysis.benchmark import (
     score,
     spread_error,
 )
-from iscat_analysis.records import PARAMETERS, FloatArray
 
 TRIALS = 500
 SEED = 2021

@@ -7,8 +7,8 @@ import pytest
 from microscopes import setting
 from scipy.stats import binom
 
-from iscat_analysis.benchmark import Setting, Trials, run_trials
 from iscat_analysis.records import Status
+from iscat_analysis.study import Setting, Trials, run_trials
 
 SEED = 8
 TRIALS = 400

@@ -10,16 +10,16 @@ import pandas as pd
 import pytest
 from scipy.stats import poisson
 
-from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.fit import fit_particle
-from iscat_analysis.forward import PixelGrid
-from iscat_analysis.likelihood import conditional
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.likelihood import conditional
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.bias import unbiased
 from iscat_analysis.pipeline.chunks import FRAME_COLUMN
 from iscat_analysis.pipeline.landing import analyse_landings, make_landing_scene
 from iscat_analysis.records import Candidate
-from iscat_analysis.simulate import Movie
+from iscat_analysis.study.simulate import Movie
 
 PIXEL_NM = 84.0
 LEVEL_E = 1e5

@@ -20,7 +20,7 @@ from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.results import Row, table_of
 from iscat_analysis.pipeline.scene import make_scene
 from iscat_analysis.records import FREE_PARAMETERS
-from iscat_analysis.simulate import Movie
+from iscat_analysis.study.simulate import Movie
 
 STANDARD_ERRORS = 4.0
 PLACES, DRAWS, PARTICLES = 5, 8, 8  # 320 particles

@@ -9,10 +9,10 @@ import pytest
 from microscopes import configuration, setting
 from scipy.stats import binom, kstest, poisson
 
-from iscat_analysis.benchmark import Setting, make_setting, run_trials, trial_generator
-from iscat_analysis.fit import POOR_FIT_P, fit_particle
+from iscat_analysis.inference.fit import POOR_FIT_P, fit_particle
+from iscat_analysis.inference.goodness import _attainable, outlier, scatter, structure
 from iscat_analysis.records import FitResult, FloatArray, Status
-from iscat_analysis.residuals import _attainable, outlier, scatter, structure
+from iscat_analysis.study import Setting, make_setting, run_trials, trial_generator
 
 SEED = 61
 TRIALS = 400

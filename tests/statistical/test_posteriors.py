@@ -9,7 +9,10 @@ import pytest
 from microscopes import setting
 from scipy.stats import skew
 
-from iscat_analysis.benchmark import (
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.posterior import sample_posterior
+from iscat_analysis.records import PARAMETERS, FloatArray, PosteriorResult, Status
+from iscat_analysis.study import (
     Calibration,
     Setting,
     calibrate_posterior,
@@ -18,9 +21,6 @@ from iscat_analysis.benchmark import (
     trial_generator,
     van_trees,
 )
-from iscat_analysis.fit import fit_particle
-from iscat_analysis.posterior import sample_posterior
-from iscat_analysis.records import PARAMETERS, FloatArray, PosteriorResult, Status
 
 SEED = 12
 DRAWS = 40

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from microscopes import setting
 
-from iscat_analysis.benchmark import Setting, run_trials, trial_generator
-from iscat_analysis.fit import fit_particle
-from iscat_analysis.likelihood import Likelihood
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.pipeline.scene import Region
 from iscat_analysis.records import PARAMETERS, Candidate, FitResult, FloatArray, Status
+from iscat_analysis.study import Setting, run_trials, trial_generator
 
 SEED = 77
 SAME = 1e-2

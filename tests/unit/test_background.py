@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scenes import Stack
 
-from iscat_analysis.background import measure_windows, refine_power, smooth_background
-from iscat_analysis.camera import Camera
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.background import measure_windows, refine_power, smooth_background
+from iscat_analysis.movie.camera import Camera
 
 SHAPE = (48, 56)
 SIGMAS = 4.0

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from microscopes import configuration, setting
 
-from iscat_analysis.benchmark import (
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.records import FREE_PARAMETERS, Candidate
+from iscat_analysis.report.benchmark import BENCHMARK_NAMES, render_benchmark
+from iscat_analysis.study import (
     Baselines,
     gaussian_posterior,
     make_setting,
@@ -23,9 +26,6 @@ from iscat_analysis.benchmark import (
     van_trees,
     write_benchmark,
 )
-from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.records import FREE_PARAMETERS, Candidate
-from iscat_analysis.report.benchmark import BENCHMARK_NAMES, render_benchmark
 
 FIELDS = {
     "bias", "bias_se", "spread", "spread_ci95", "crb", "qcrb", "spread_over_crb",

@@ -12,12 +12,12 @@ import pytest
 from scenes import Light, blank, make_config
 
 from iscat_analysis.config import Config
-from iscat_analysis.detect import find_particles, signal_to_noise
-from iscat_analysis.forward import PixelGrid
+from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.scene import Scene, field_likelihood, make_scene
 from iscat_analysis.records import Candidate, Windows
-from iscat_analysis.simulate import Movie
+from iscat_analysis.search.templates import find_particles, signal_to_noise
+from iscat_analysis.study.simulate import Movie
 
 FIELD = (96, 96)
 TRIALS, SEED = 60, 5

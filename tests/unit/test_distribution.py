@@ -13,15 +13,15 @@ from scipy.special import log_ndtr
 from scipy.stats import ks_2samp, norm
 
 from iscat_analysis._kernels.mixture import detection_score, mixture_em, mixture_score
-from iscat_analysis.distribution import (
+from iscat_analysis.species import (
     LEAST_EVENTS,
     SPECIES_COLUMNS,
     Efficiency,
     describe,
 )
-from iscat_analysis.distribution.bootstrap import draw_events
-from iscat_analysis.distribution.events import Events
-from iscat_analysis.distribution.mixture import Mixture
+from iscat_analysis.species.bootstrap import draw_events
+from iscat_analysis.species.events import Events
+from iscat_analysis.species.mixture import Mixture
 
 
 def sample(seed: int = 1, n: int = 200) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from iscat_analysis.background import find_defects
-from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.drift import Mover, Trajectory, derivatives, measure_drift, trusted
+from iscat_analysis.movie.background import find_defects
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.drift import Mover, Trajectory, derivatives, measure_drift, trusted
 from iscat_analysis.pipeline.pattern import MovingPattern, follow
 from iscat_analysis.pipeline.scene import Region
-from iscat_analysis.simulate import Movie
-from iscat_analysis.sliding import Chunk, make_chunk, measure_frames
+from iscat_analysis.search.sliding import Chunk, make_chunk, measure_frames
+from iscat_analysis.study.simulate import Movie
 
 SIGMAS = 4.0
 STRIDE, WINDOW = 10, 40

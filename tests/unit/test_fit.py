@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scenes import PIXEL_NM, make_config
 
-from iscat_analysis import likelihood as models
 from iscat_analysis.config import Config
-from iscat_analysis.fit import AMBIGUITY_ODDS, fit_particle, search_box
-from iscat_analysis.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.likelihood import Likelihood
+from iscat_analysis.inference import likelihood as models
+from iscat_analysis.inference.fit import AMBIGUITY_ODDS, fit_particle, search_box
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Candidate, FitResult, Status
 
 FAR = 5.0  # σ: of the dozen numbers looked at here, one is beyond by chance once in 1e5 runs

@@ -14,10 +14,10 @@ import pytest
 import tifffile
 
 from iscat_analysis import pipeline as pipeline_module
-from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.load import open_stack
+from iscat_analysis.movie import open_stack
+from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.pipeline import chunks as chunks_module
 from iscat_analysis.pipeline import landing as landing_module
@@ -30,7 +30,7 @@ from iscat_analysis.pipeline.landing import (
 )
 from iscat_analysis.pipeline.resume import partial_folder
 from iscat_analysis.records import EVENT_COLUMNS
-from iscat_analysis.simulate import Movie
+from iscat_analysis.study.simulate import Movie
 
 PIXEL_NM = 84.0
 SIDE, FRAMES = 64, 420

@@ -9,10 +9,10 @@ import pytest
 from scenes import PIXEL_NM, gold, make_config
 from scipy.stats import binom, poisson
 
-from iscat_analysis import likelihood as models
 from iscat_analysis._kernels.radial import profile_at
-from iscat_analysis.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference import likelihood as models
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 
 # Sums of a few hundred logarithms of counts near 1e6 carry this much rounding.
 ROUNDING = 1e-7

@@ -15,8 +15,8 @@ import tifffile
 from tiff_files import ASCII, LONG, RATIONAL, SHORT, movie, pages_of, write_tiff
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.load import open_stack
-from iscat_analysis.load.directory import DirectoryReader
+from iscat_analysis.movie import open_stack
+from iscat_analysis.movie.directory import DirectoryReader
 from iscat_analysis.records import FrameSource
 
 

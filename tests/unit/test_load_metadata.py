@@ -10,7 +10,7 @@ import tifffile
 from tiff_files import ASCII, RATIONAL, SHORT, movie, pages_of, write_micro_manager, write_tiff
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.load import open_stack
+from iscat_analysis.movie import open_stack
 from iscat_analysis.records import StackMetadata
 
 FRAMES = 5

@@ -10,14 +10,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.events import read_events, stored_calibration
-from iscat_analysis.mass_calibration import (
+from iscat_analysis.calibration.mass import (
     calibrate_mass,
     find_contrast_peaks,
     mass_from_contrast,
     york_line,
 )
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.movie.event_tables import read_events, stored_calibration
 
 STANDARDS = (66.0, 146.0, 480.0)
 GRADIENT, OFFSET = -3.1e-5, 2e-4

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from iscat_analysis.calibration.camera import CameraCalibration, Estimate, measure_camera
 from iscat_analysis.errors import DataError
-from iscat_analysis.photon_transfer import CameraCalibration, Estimate, measure_camera
 
 GAIN, OFFSET, READ_E = 4.0, 100.0, 20.0
 READ_WITH_ROUNDING_E = math.hypot(READ_E, GAIN / math.sqrt(12))

@@ -16,7 +16,7 @@ from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, Analysis
-from iscat_analysis.simulate import write_stack
+from iscat_analysis.study.simulate import write_stack
 
 SIGMAS = 4.0
 # Smaller tests look at some 60 pulls together: one beyond 5 is a chance of 3e-5.

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scenes import PIXEL_NM, make_config
 
-from iscat_analysis import likelihood as models
-from iscat_analysis import posterior
 from iscat_analysis.config import Config
-from iscat_analysis.fit import fit_particle
-from iscat_analysis.forward import PixelGrid, forward_model
-from iscat_analysis.likelihood import Likelihood
-from iscat_analysis.posterior import sample_posterior
+from iscat_analysis.inference import likelihood as models
+from iscat_analysis.inference import posterior
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.posterior import sample_posterior
+from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import Candidate, FitResult
 
 SIGMAS = 5.0

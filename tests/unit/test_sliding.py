@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from iscat_analysis.background import find_defects
-from iscat_analysis.camera import Camera
-from iscat_analysis.sliding import (
+from iscat_analysis.movie.background import find_defects
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.search.sliding import (
     Chunk,
     NoiseCurve,
     Patch,

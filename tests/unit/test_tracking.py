@@ -11,8 +11,8 @@ import tifffile
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.config import Config
-from iscat_analysis.forward import PixelGrid, forward_model
-from iscat_analysis.load import open_stack
+from iscat_analysis.movie import open_stack
+from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.records import Analysis
 

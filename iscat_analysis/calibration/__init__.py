@@ -1,0 +1,1 @@
+"""What is the instrument?  Its camera from the noise, its mass scale from standards."""

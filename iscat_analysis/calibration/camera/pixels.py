@@ -1,0 +1,141 @@
+"""Pixels that must not be used: saturated, dead, hot, blinking."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from iscat_analysis.calibration.camera.moments import Moments, brightness_bins, robust_sigma
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie.camera import converter_ceiling
+from iscat_analysis.records import BoolArray, FloatArray
+
+_DARK, _BRIGHT = 0.2, 5.0  # of the neighbours' median, as in the stage background
+_OUTLIER_SIGMAS = 8.0
+
+
+def saturated(highest: NDArray[Any], name: str) -> BoolArray:
+    """Find saturated pixels: at the largest number of their type, or of an ADC of 8 to 16 bits.
+
+    Parameters
+    ----------
+    highest : ndarray, shape (y, x)
+        Largest count of each pixel, of the stack's own type.
+    name : str
+        What messages call the stack.
+
+    Returns
+    -------
+    ndarray of bool, shape (y, x)
+        Where they are.
+
+    Raises
+    ------
+    DataError
+        They are more than half of all.
+    """
+    top = float(highest.max())
+    ceiling = converter_ceiling(highest)
+    if np.issubdtype(highest.dtype, np.integer):
+        ceiling = min(ceiling, float(np.iinfo(highest.dtype).max))
+    full: BoolArray = highest >= ceiling
+    if full.mean() > 0.5:
+        raise DataError(
+            f"{name}: {100 * full.mean():.0f} % of the pixels are saturated (count {top:g}); "
+            "lower the exposure or the laser power"
+        )
+    return full
+
+
+def unlike_neighbours(light: FloatArray, *, low: float = _DARK, high: float = _BRIGHT) -> BoolArray:
+    """Find pixels far darker or brighter than their neighbours.
+
+    Parameters
+    ----------
+    light : ndarray, shape (y, x)
+        Counts above the offset.
+    low, high : float
+        Share of the neighbours' median below and above which a pixel is unlike them.
+
+    Returns
+    -------
+    ndarray of bool, shape (y, x)
+        Where they are.
+    """
+    local = np.maximum(median_filter(light, size=5, mode="nearest"), 0.0)
+    with np.errstate(invalid="ignore"):
+        found: BoolArray = (light < low * local) | (light > high * local)
+    return np.asarray(found & (local > 0), dtype=np.bool_)
+
+
+def stand_out(values: FloatArray) -> BoolArray:
+    """Find pixels far above the others, in robust standard deviations.
+
+    Parameters
+    ----------
+    values : ndarray, shape (y, x)
+        Mean or variance of a dark.
+
+    Returns
+    -------
+    ndarray of bool, shape (y, x)
+        Where they are.
+    """
+    centre = float(np.median(values))
+    spread = robust_sigma(values - centre)
+    return np.asarray(values > centre + _OUTLIER_SIGMAS * max(spread, 1e-3), dtype=np.bool_)
+
+
+def unsteady(found: Sequence[Moments], used: BoolArray) -> BoolArray:
+    """Find pixels that blink, or through which a particle moved.
+
+    Parameters
+    ----------
+    found : sequence of Moments
+        One per stack of light.
+    used : ndarray of bool, shape (y, x)
+        Among which to look.
+
+    Returns
+    -------
+    ndarray of bool, shape (y, x)
+        Where the variance is far above that of pixels as bright.
+    """
+    out = np.zeros(used.shape, dtype=np.bool_)
+    for item in found:
+        mean, variance = item.mean[used], item.variance[used]
+        smooth = np.empty(mean.size)
+        for part in brightness_bins(mean):
+            smooth[part] = np.median(variance[part])
+        limit = 1 + _OUTLIER_SIGMAS * item.relative_se
+        out[used] |= variance > limit * smooth
+    return out
+
+
+def mask_notes(masked: Mapping[str, BoolArray]) -> list[str]:
+    """Say how many pixels are left out, and where.
+
+    Parameters
+    ----------
+    masked : mapping of str to ndarray of bool, shape (y, x)
+        By what is wrong with them.
+
+    Returns
+    -------
+    list of str
+        One sentence for each kind that there is.
+    """
+    notes = []
+    for name, mask in masked.items():
+        count = int(mask.sum())
+        if count:
+            place = np.argwhere(mask)[0]
+            notes.append(
+                f"{count} of {mask.size} pixels {'is' if count == 1 else 'are'} {name} and left "
+                f"out, the first at y = {place[0]}, x = {place[1]}"
+            )
+    return notes

@@ -1,0 +1,309 @@
+"""From moments to a camera: variance against mean, and where the light is zero."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from iscat_analysis.calibration.camera.moments import Moments, robust_sigma
+from iscat_analysis.calibration.camera.result import Estimate
+from iscat_analysis.errors import DataError
+from iscat_analysis.records import BoolArray, FloatArray
+
+_Z95_ONE_SIDED = 1.644854
+_SIGMAS = 3.0
+_USABLE_SLOPE = 0.30  # relative standard error beyond which a gain is none
+_GOOD_SLOPE = 0.05
+_USABLE_OFFSET = 0.05  # standard error over the light level
+_STEADY = 2.0  # robust χ² of the flicker line beyond which the scene has moved
+_LEAST_RELIABILITY = 0.9  # of the spread of the means that is not their own noise
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A camera, and the line of variance against mean that it stands for.
+
+    Attributes
+    ----------
+    gain, offset : Estimate
+        [e/count] and [counts].
+    offset_from : str
+        As in `CameraCalibration`.
+    read_adu, read_e : Estimate or None
+        Read noise [counts] and [e]; None where not identifiable.
+    read_below_e : float or None
+        95 % upper limit where it is too small to be seen [e].
+    intercept, slope : float
+        Of the fitted variance against the mean [counts²] and [counts].
+    """
+
+    gain: Estimate
+    offset: Estimate
+    offset_from: str
+    read_adu: Estimate | None
+    read_e: Estimate | None
+    read_below_e: float | None
+    intercept: float
+    slope: float
+
+
+def solve(
+    found: Sequence[Moments],
+    used: BoolArray,
+    dark: Moments | None,
+    given: float | None,
+    notes: list[str],
+) -> Solution:
+    """Solve for the camera, as far as the recordings allow.
+
+    Parameters
+    ----------
+    found : sequence of Moments
+        One per stack of light.
+    used : ndarray of bool, shape (y, x)
+        Pixels to use.
+    dark : Moments or None
+        Of the dark; it gives offset and read noise by itself.
+    given : float or None
+        The offset, where it is known [counts].
+    notes : list of str
+        Gets what the user should know.
+
+    Returns
+    -------
+    Solution
+        Standard errors are from the scatter over pixels.
+
+    Raises
+    ------
+    DataError
+        The noise does not grow with the light, or the recordings leave the gain open.
+    """
+    mean = np.concatenate([item.mean[used] for item in found])
+    variance = np.concatenate([item.variance[used] for item in found])
+    frames = np.concatenate([np.full(used.sum(), item.n_frames - 1.0) for item in found])
+    if dark is not None:
+        return _with_dark(mean, variance, frames, dark, used, len(found))
+
+    offset, source = _offset(found, used, given, notes)
+    own = float((variance / (frames + 1)).mean())
+    reliability = 1 - own / float(mean.var()) if mean.var() > 0 else 0.0
+    line = None
+    if reliability > _LEAST_RELIABILITY:
+        (intercept, slope), cov = _line(mean, variance, frames)
+        if slope > 0 and math.sqrt(cov[1, 1]) / slope < _USABLE_SLOPE:
+            line = intercept, slope, cov
+        elif slope <= 0 and -slope > _SIGMAS * math.sqrt(cov[1, 1]):
+            raise DataError(
+                "the noise falls as the light rises: the frames were processed, or are saturated; "
+                "give raw counts"
+            )
+    if line is None or (offset is not None and math.sqrt(line[2][1, 1]) / line[1] > _GOOD_SLOPE):
+        return _ratio(mean, variance, offset, source, notes)
+    intercept, slope, cov = line
+    relative = math.sqrt(cov[1, 1]) / slope
+    gain = Estimate(1 / slope, relative / slope)
+    if relative > _GOOD_SLOPE:
+        notes.append(
+            f"the pixels are too alike in brightness: the gain is known to {100 * relative:.0f} % "
+            "only; give a dark, or a second level"
+        )
+    if offset is None:
+        zero = -intercept / slope
+        gradient = np.array([-1 / slope, intercept / slope**2])
+        offset = Estimate(zero, math.sqrt(gradient @ cov @ gradient))
+        notes.append(
+            "offset and read noise cannot be told apart without a dark or a flickering laser: "
+            "offset_adu is where the variance would vanish, o − σ_r²/g, and with it "
+            "read_noise_e = 0 predicts the noise that was measured"
+        )
+        return Solution(gain, offset, "line", None, None, None, intercept, slope)
+    read = intercept + slope * offset.value
+    gradient = np.array([1.0, offset.value])
+    read_se = math.sqrt(gradient @ cov @ gradient + (slope * offset.se) ** 2)
+    if read > 2 * read_se:
+        root = math.sqrt(read)
+        adu = Estimate(root, read_se / (2 * root))
+        electrons = Estimate(root / slope, math.hypot(adu.se / slope, root * relative / slope))
+        return Solution(gain, offset, source, adu, electrons, None, intercept, slope)
+    below = math.sqrt(max(read, 0.0) + _Z95_ONE_SIDED * read_se) / slope
+    notes.append(
+        f"the read noise is too small beside the shot noise to be seen: below {below:.3g} e "
+        "(95 %); a dark would measure it"
+    )
+    return Solution(gain, offset, source, None, None, below, intercept, slope)
+
+
+def _with_dark(
+    mean: FloatArray,
+    variance: FloatArray,
+    frames: FloatArray,
+    dark: Moments,
+    used: BoolArray,
+    n: int,
+) -> Solution:
+    """Fit the slope alone: the dark gives every pixel's own offset and read noise."""
+    light = mean - np.tile(dark.mean[used], n)
+    shot = variance - np.tile(dark.variance[used], n)
+    if light.mean() <= 0:
+        raise DataError(
+            "the dark is no darker than the light frames; give the frames without light"
+        )
+    slope = float(shot.sum() / light.sum())
+    for _ in range(20):
+        if slope <= 0:
+            raise DataError("the light adds no noise: these are not raw counts; give raw frames")
+        weight = frames / np.square(np.maximum(slope * light, 1e-12) + variance.min())
+        new = float(np.sum(weight * light * shot) / np.sum(weight * light**2))
+        done = abs(new - slope) < 1e-12 * slope
+        slope = new
+        if done:
+            break
+    se = math.sqrt(float(np.sum((weight * light * (shot - slope * light)) ** 2))) / float(
+        np.sum(weight * light**2)
+    )
+    gain = Estimate(1 / slope, se / slope**2)
+    offset, read = dark_numbers(dark, used)
+    electrons = Estimate(
+        read.value / slope, math.hypot(read.se / slope, read.value * se / slope**2)
+    )
+    intercept = read.value**2 - slope * offset.value
+    return Solution(gain, offset, "dark", read, electrons, None, intercept, slope)
+
+
+def dark_numbers(dark: Moments, used: BoolArray) -> tuple[Estimate, Estimate]:
+    """Average a dark over its pixels, with standard errors from their scatter.
+
+    Parameters
+    ----------
+    dark : Moments
+        Of the dark.
+    used : ndarray of bool, shape (y, x)
+        Pixels to use.
+
+    Returns
+    -------
+    offset, read_noise : Estimate
+        [counts].
+    """
+    pixels = math.sqrt(np.count_nonzero(used))
+    mean, variance = dark.mean[used], dark.variance[used]
+    root = math.sqrt(float(variance.mean()))
+    return (
+        Estimate(float(mean.mean()), float(mean.std(ddof=1)) / pixels),
+        Estimate(root, float(variance.std(ddof=1)) / pixels / (2 * root)),
+    )
+
+
+def _ratio(
+    mean: FloatArray, variance: FloatArray, offset: Estimate | None, source: str, notes: list[str]
+) -> Solution:
+    """One level only: the gain follows if the offset is known and the read noise is small."""
+    if offset is None:
+        raise DataError(
+            "the pixels are too alike in brightness for variance against mean, and the offset is "
+            "not known: give a dark (--dark), the offset (--offset), or a second level"
+        )
+    light = mean - offset.value
+    if light.mean() <= 0:
+        raise DataError(
+            f"the offset of {offset.value:g} counts is not below the frames' mean of "
+            f"{mean.mean():g}; correct --offset"
+        )
+    ratio = float(variance.sum() / light.sum())
+    scatter = float(np.sum((variance - ratio * light) ** 2))
+    se = math.hypot(
+        math.sqrt(scatter) / float(light.sum()), ratio * offset.se / float(light.mean())
+    )
+    notes.append(
+        "there is one level of light only: the read noise is taken as zero, and the gain is too "
+        "small by the factor 1 + σ_r²/μ; a dark removes the assumption"
+    )
+    return Solution(
+        Estimate(1 / ratio, se / ratio**2), offset, source, None, None, None,
+        -ratio * offset.value, ratio,
+    )  # fmt: skip
+
+
+def _line(x: FloatArray, y: FloatArray, frames: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Fit y = a + b·x with the variance of y as (fit)²/frames; sandwich covariance."""
+    centre, scale = float(x.mean()), float(x.std())
+    design = np.stack([np.ones_like(x), (x - centre) / scale], axis=1)
+    fit = np.full(x.shape, y.mean())
+    for _ in range(25):
+        weight = frames / np.square(np.maximum(fit, 0.05 * y.mean()))
+        normal = design.T @ (design * weight[:, np.newaxis])
+        theta = np.linalg.solve(normal, design.T @ (weight * y))
+        new = design @ theta
+        done = np.max(np.abs(new - fit)) < 1e-10 * y.mean()
+        fit = new
+        if done:
+            break
+    inverse = np.linalg.inv(normal)
+    score = design * (weight * (y - fit))[:, np.newaxis]
+    cov = inverse @ (score.T @ score) @ inverse
+    back = np.array([[1.0, -centre / scale], [0.0, 1 / scale]])
+    return back @ theta, back @ cov @ back.T
+
+
+def _offset(
+    found: Sequence[Moments], used: BoolArray, given: float | None, notes: list[str]
+) -> tuple[Estimate | None, str]:
+    """Where the pixels' response to the laser's power vanishes; combined over all that know."""
+    if given is not None:
+        return Estimate(given, 0.0), "given"
+    estimates = [
+        _zero(item.slope[used], item.slope_variance[used], item.mean[used]) for item in found
+    ]
+    order = sorted(found, key=lambda item: float(item.mean[used].mean()))
+    for low, high in pairwise(order):
+        rise = float((high.mean - low.mean)[used].mean())
+        noise = (low.variance / low.n_frames + high.variance / high.n_frames)[used]
+        if rise > 0:
+            slope = (high.mean - low.mean)[used] / rise
+            estimates.append(_zero(slope, noise / rise**2, low.mean[used]))
+    known = [item for item in estimates if item is not None]
+    if not known:
+        return None, "line"
+    weights = np.array([1 / item.se**2 for item in known])
+    value = float(np.sum(weights * [item.value for item in known]) / weights.sum())
+    se = float(1 / math.sqrt(weights.sum()))
+    level = float(np.mean([item.mean[used].mean() for item in found]))
+    if se > _USABLE_OFFSET * abs(level - value):
+        return None, "line"
+    notes.append(
+        "the offset is that of the light which follows the laser's power: stray light that "
+        "flickers with it is not part of it"
+    )
+    return Estimate(value, se), "flicker"
+
+
+def _zero(slope: FloatArray, variance: FloatArray, mean: FloatArray) -> Estimate | None:
+    """Mean at which the slope is zero, from a weighted line of slope against mean."""
+    if not np.isfinite(slope).all() or mean.std() == 0:
+        return None
+    weight = 1 / variance
+    kept = np.ones(slope.shape, dtype=np.bool_)
+    for _ in range(4):
+        w = np.where(kept, weight, 0.0)
+        centre = float(np.sum(w * mean) / w.sum())
+        x = mean - centre
+        level = float(np.sum(w * slope) / w.sum())
+        gradient = float(np.sum(w * x * slope) / np.sum(w * x * x))
+        residual = (slope - level - gradient * x) * np.sqrt(weight)
+        robust = robust_sigma(residual)
+        kept = np.abs(residual) < 5 * max(robust, 1e-12)
+    if robust**2 > _STEADY or gradient <= 0:
+        return None
+    score_level = w * (slope - level - gradient * x)
+    gradient_se = math.sqrt(float(np.sum((score_level * x) ** 2))) / float(np.sum(w * x * x))
+    level_se = math.sqrt(float(np.sum(score_level**2))) / float(w.sum())
+    if gradient < 5 * gradient_se:
+        return None
+    zero = centre - level / gradient
+    se = math.hypot(level_se / gradient, level / gradient**2 * gradient_se)
+    return Estimate(zero, se)

@@ -1,0 +1,34 @@
+"""Contrast becomes mass: a line through standards, with errors in both coordinates.
+
+The calibration is odd-symmetric, so that a particle that leaves weighs what it weighed when it
+landed: a landing particle of mass m has the contrast c = s·m + o, a leaving one −c.  Where landing
+darkens (s < 0) that is m = sign(−c)·(−|c| − o)/s, as Refeyn's programs have it.  A plain line
+through both branches is wrong by 2|o/s| on one of them.
+
+Peaks are fitted to events, not to bins: a normal distribution on a flat background, by maximum
+likelihood inside the peak's own window.  The line through the peaks is that of York et al., Am. J.
+Phys. 72, 367 (2004).
+
+`calibrate` is the whole of it: `peaks` finds them, `matching` says which belongs to which standard,
+`line` fits, and `result` converts.
+"""
+
+from __future__ import annotations
+
+from iscat_analysis.calibration.mass.calibrate import LEAST_EVENTS, STANDARD_ERROR, calibrate_mass
+from iscat_analysis.calibration.mass.line import Line, york_line
+from iscat_analysis.calibration.mass.peaks import Peak, find_contrast_peaks
+from iscat_analysis.calibration.mass.result import Landing, MassCalibration, mass_from_contrast
+
+__all__ = [
+    "LEAST_EVENTS",
+    "STANDARD_ERROR",
+    "Landing",
+    "Line",
+    "MassCalibration",
+    "Peak",
+    "calibrate_mass",
+    "find_contrast_peaks",
+    "mass_from_contrast",
+    "york_line",
+]

@@ -1,0 +1,171 @@
+"""From the contrasts of standards to the line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from iscat_analysis.calibration.mass.line import york_line
+from iscat_analysis.calibration.mass.matching import check_match, match
+from iscat_analysis.calibration.mass.peaks import Peak, find_contrast_peaks
+from iscat_analysis.calibration.mass.result import Landing, MassCalibration
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.records import FloatArray
+
+STANDARD_ERROR = 0.01
+"""Relative uncertainty of a standard's mass, where none is given: sequence, glycans, density."""
+
+LEAST_EVENTS = 30
+"""Fewer events make no histogram."""
+
+_LANDING_SHARE = 0.4
+_DETAILS = (1.0, 2.0, 4.0)
+
+
+def calibrate_mass(
+    contrasts: ArrayLike,
+    standards_kda: Sequence[float],
+    *,
+    standards_se_kda: Sequence[float] | None = None,
+    sigmas: ArrayLike | None = None,
+    landing: Landing = "dark",
+    name: str = "the events",
+) -> MassCalibration:
+    """Calibrate contrast against the masses of standards.
+
+    Parameters
+    ----------
+    contrasts : array_like, shape (n,)
+        Signed peak contrasts of landing and leaving events; the landing ones are used.
+    standards_kda : sequence of float
+        Masses of the standards, two or more [kDa].
+    standards_se_kda : sequence of float, optional
+        Their standard errors [kDa]; default `STANDARD_ERROR` of each.
+    sigmas : array_like, shape (n,), optional
+        Standard deviation of each contrast, where known; then a peak's width is what exceeds them.
+    landing : {"dark", "bright"}
+        What a landing particle does to its place.
+    name : str
+        What messages call the events.
+
+    Returns
+    -------
+    MassCalibration
+        The line, its covariance and the peaks.
+
+    Raises
+    ------
+    ConfigError
+        The standards are not two or more different positive masses.
+    DataError
+        There are too few events, most have the sign of leaving, or no peaks match the standards.
+    """
+    masses, masses_se = _standards(standards_kda, standards_se_kda)
+    signed = np.asarray(contrasts, dtype=np.float64)
+    errors = np.zeros(signed.shape) if sigmas is None else np.asarray(sigmas, dtype=np.float64)
+    finite = np.isfinite(signed) & np.isfinite(errors) & (signed != 0)
+    signed, errors = signed[finite], errors[finite]
+    direction = -1.0 if landing == "dark" else 1.0
+    lands = direction * signed > 0
+    if signed.size >= LEAST_EVENTS and lands.mean() < _LANDING_SHARE:
+        other = "bright" if landing == "dark" else "dark"
+        raise DataError(
+            f"{name}: only {lands.sum()} of {signed.size} events are {landing}, which landing "
+            f"should be: the contrast has the wrong sign; if your particles land {other}, say "
+            f"--landing {other}"
+        )
+    size, size_errors = np.abs(signed[lands]), errors[lands]
+    if size.size < LEAST_EVENTS:
+        raise DataError(
+            f"{name}: holds {size.size} landing events; a calibration needs {LEAST_EVENTS} or more"
+        )
+    # The kernel's width follows the spread of the whole histogram, which is too wide where few
+    # events lie in narrow peaks far apart: finer ones are for those.  Standards chosen at random
+    # hardly pass more often for it, since a line through more peaks must meet the same limits.
+    for detail in _DETAILS:
+        peaks = find_contrast_peaks(size, size_errors, detail=detail)
+        try:
+            chosen = match(peaks, masses, name)
+            line = york_line(
+                masses,
+                masses_se,
+                [direction * p.contrast for p in chosen],
+                [p.contrast_se for p in chosen],
+            )
+            check_match(line, chosen, peaks, masses, name)
+            break
+        except DataError:
+            if detail == _DETAILS[-1]:
+                raise
+    widen = max(1.0, line.chi2 / line.dof) if line.dof else 1.0
+    notes = []
+    if widen > 1:
+        notes.append(
+            f"the standards scatter about the line by more than their errors (χ²/dof = "
+            f"{widen:.3g}); its uncertainty is widened by {math.sqrt(widen):.3g}"
+        )
+    if not line.dof:
+        notes.append("two standards fix a line but cannot test it; a third would")
+    result = MassCalibration(
+        gradient_per_kda=line.slope,
+        offset=line.intercept,
+        covariance=line.covariance * widen,
+        chi2=line.chi2,
+        dof=line.dof,
+        standards=pd.DataFrame(),
+        peaks=tuple(peaks),
+        landing=landing,
+        events=int(size.size),
+        notes=tuple(notes),
+    )
+    return replace(result, standards=_table(result, chosen, masses, masses_se, direction))
+
+
+def _standards(
+    masses: Sequence[float], errors: Sequence[float] | None
+) -> tuple[FloatArray, FloatArray]:
+    values = np.asarray(masses, dtype=np.float64)
+    shown = ",".join(f"{m:g}" for m in values)
+    if values.size < 2 or not np.isfinite(values).all() or (values <= 0).any():
+        raise ConfigError(
+            f"--standards {shown}: needs two or more positive masses in kDa, as in 66,146,480"
+        )
+    if np.unique(values).size < values.size:
+        raise ConfigError(f"--standards {shown}: names a mass twice")
+    se = STANDARD_ERROR * values if errors is None else np.asarray(errors, dtype=np.float64)
+    if se.shape != values.shape or not np.isfinite(se).all() or (se < 0).any():
+        raise ConfigError(f"--standards {shown}: needs one error, not negative, for each mass")
+    order = np.argsort(values)
+    return values[order], se[order]
+
+
+def _table(
+    calibration: MassCalibration,
+    chosen: Sequence[Peak],
+    masses: FloatArray,
+    masses_se: FloatArray,
+    direction: float,
+) -> pd.DataFrame:
+    contrast = direction * np.array([peak.contrast for peak in chosen])
+    errors = np.array([peak.contrast_se for peak in chosen])
+    mass = calibration.mass_kda(contrast)
+    low, high = calibration.prediction_interval(contrast, errors)
+    return pd.DataFrame(
+        {
+            "mass_kda": masses,
+            "mass_se": masses_se,
+            "contrast": contrast,
+            "contrast_se": errors,
+            "width": [peak.width for peak in chosen],
+            "count": [peak.count for peak in chosen],
+            "found_kda": mass,
+            "residual_percent": 100 * (mass / masses - 1),
+            "low_kda": low,
+            "high_kda": high,
+        }
+    )

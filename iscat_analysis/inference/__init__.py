@@ -1,0 +1,1 @@
+"""What do the counts say?  Likelihood, fit, goodness of fit and posterior of one particle."""

@@ -1,0 +1,262 @@
+"""Maximum likelihood for one particle: Fisher scoring from every promising height.
+
+In iSCAT the likelihood along z repeats every λ/(2 n_s), so it is scanned first, with the amplitude
+refitted at each height, and every local maximum starts a fit.  The result carries a `Status`;
+nothing is returned as ok that did not converge inside its bounds and describe the data.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from iscat_analysis.inference.goodness import goodness_of_fit
+from iscat_analysis.inference.likelihood import Likelihood, Optimum
+from iscat_analysis.records import (
+    FREE_PARAMETERS,
+    PARAMETERS,
+    Alternative,
+    Box,
+    Candidate,
+    FitResult,
+    FloatArray,
+    Status,
+)
+
+AMBIGUITY_ODDS = 1000.0
+"""A second height whose odds against the best are shorter than this is reported as ambiguous."""
+
+POOR_FIT_P = 1e-3
+"""p-value below which the model is said not to describe the data: 1 good fit in 1000."""
+
+SCANS_PER_FRINGE = 8
+"""Heights scanned per interference fringe before fitting."""
+
+_STARTS = 8  # local maxima of the scan that are followed
+_WINDOW_NM = 350.0  # how far x and y may move from the start
+
+
+def window_nm(pixel_nm: float) -> float:
+    """How far x and y may move from the start of a fit.
+
+    Parameters
+    ----------
+    pixel_nm : float
+        Pixel side [nm].
+
+    Returns
+    -------
+    float
+        Distance [nm].
+    """
+    return max(_WINDOW_NM, 3 * pixel_nm)
+
+
+def search_box(
+    likelihood: Likelihood,
+    start: Candidate,
+    mode: str,
+    z_range_nm: tuple[float, float],
+    *,
+    level: bool = False,
+) -> Box:
+    """Bounds of the search around a start.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Its grid limits x and y.
+    start : Candidate
+        Where the search begins.
+    mode : str
+        Key of `FREE_PARAMETERS`.
+    z_range_nm : (float, float)
+        Bounds of z where it is free [nm].
+    level : bool
+        Also fit a common background level.
+
+    Returns
+    -------
+    Box
+        Where z is free the amplitude keeps one sign: a change of sign is half a fringe.  What is
+        not free has no width, wherever it lies.
+    """
+    names = FREE_PARAMETERS[mode]
+    grid = likelihood.grid
+    reach = window_nm(grid.pixel_nm)
+    x, y = start.x_px * grid.pixel_nm, start.y_px * grid.pixel_nm
+    amplitude = abs(likelihood.model.scale.amplitude(start.mass_kda))
+    nominal = abs(likelihood.model.scale.amplitude(likelihood.model.material.mass_kda))
+    largest = 100 * max(amplitude, nominal)
+    signed = "z_nm" not in names and likelihood.model.rho > 0
+    half = grid.pixel_nm / 2
+    free = np.array([name in names for name in PARAMETERS] + [level])
+    fixed = start_theta(likelihood, start)
+    lower = np.array([
+        max(x - reach, grid.x_nm[0] - half),
+        max(y - reach, grid.y_nm[0] - half),
+        z_range_nm[0],
+        -largest if signed else 0.0,
+        -1.0,
+    ])  # fmt: skip
+    upper = np.array([
+        min(x + reach, grid.x_nm[-1] + half),
+        min(y + reach, grid.y_nm[-1] + half),
+        z_range_nm[1],
+        largest,
+        1.0,
+    ])  # fmt: skip
+    return Box(free, np.where(free, lower, fixed), np.where(free, upper, fixed))
+
+
+def fit_particle(
+    likelihood: Likelihood,
+    start: Candidate,
+    mode: str,
+    z_range_nm: tuple[float, float],
+    *,
+    level: bool = False,
+) -> FitResult:
+    """Fit one particle.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Of the particle's region.
+    start : Candidate
+        Where the search begins; in mode ``"localize"`` its mass is the fixed one.
+    mode : str
+        ``"mass"``, ``"localize"``, ``"joint"`` or ``"track"``.
+    z_range_nm : (float, float)
+        Bounds of z where it is free [nm]; elsewhere z is the start's.
+    level : bool
+        Also fit a common background level, as a nuisance.
+
+    Returns
+    -------
+    FitResult
+        Estimate, uncertainty, goodness of fit and verdict.
+    """
+    box = search_box(likelihood, start, mode, z_range_nm, level=level)
+    optima = _optima(likelihood, start, box)
+    best = optima[0]
+    alternatives = _alternatives(optima, likelihood.model.fringe_nm)
+    names = tuple(name for name, free in zip(PARAMETERS, box.free[:4], strict=True) if free)
+    sigma, covariance = _uncertainty(likelihood, best, box)
+    chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free)
+    flags = []
+    if not best.converged or not np.all(np.isfinite(sigma[box.free[:4]])):
+        flags.append(Status.NOT_CONVERGED)
+    if _at_bound(best.theta, box):
+        flags.append(Status.AT_BOUND)
+    if alternatives and alternatives[0].log_likelihood_gap < math.log(AMBIGUITY_ODDS):
+        flags.append(Status.AMBIGUOUS_Z)
+    if p_value < POOR_FIT_P:
+        flags.append(Status.POOR_FIT)
+    mass = float(likelihood.model.scale.mass(best.theta[3]))
+    return FitResult(
+        x_nm=float(best.theta[0]),
+        y_nm=float(best.theta[1]),
+        z_nm=float(best.theta[2]),
+        mass_kda=mass,
+        theta=best.theta,
+        box=box,
+        free=names,
+        sigma=sigma,
+        covariance=covariance,
+        contrast=likelihood.model.peak_contrast(float(best.theta[2]), mass),
+        log_likelihood=best.log_likelihood,
+        iterations=best.passes,
+        chi2_reduced=chi2_reduced,
+        p_value=p_value,
+        status=flags[0] if flags else Status.OK,
+        flags=tuple(flags),
+        alternatives=alternatives,
+    )
+
+
+def start_theta(likelihood: Likelihood, start: Candidate) -> FloatArray:
+    """Give a candidate's θ.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Its grid and mass scale are used.
+    start : Candidate
+        The candidate.
+
+    Returns
+    -------
+    ndarray, shape (5,)
+        θ.
+    """
+    pixel = likelihood.grid.pixel_nm
+    amplitude = likelihood.model.scale.amplitude(start.mass_kda)
+    return np.array([start.x_px * pixel, start.y_px * pixel, start.z_nm, amplitude, 0.0])
+
+
+def _optima(likelihood: Likelihood, start: Candidate, box: Box) -> list[Optimum]:
+    """Every optimum that was reached, best first."""
+    theta = start_theta(likelihood, start)
+    theta = np.where(box.free, np.clip(theta, box.lower, box.upper), theta)
+    starts = _heights(likelihood, theta, box) if box.free[2] else [theta]
+    optima = [likelihood.maximize(s, box.free, box.lower, box.upper) for s in starts]
+    return sorted(optima, key=lambda o: (not o.converged, -o.log_likelihood))
+
+
+def _heights(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[FloatArray]:
+    """Start at the local maxima of the likelihood along z, and at the given height."""
+    low, high = box.lower[2], box.upper[2]
+    count = math.ceil((high - low) / likelihood.model.fringe_nm * SCANS_PER_FRINGE) + 1
+    heights = np.linspace(low, high, max(count, 3))
+    bounds = (float(box.lower[3]), float(box.upper[3])) if box.free[3] else None
+    values, amplitudes = likelihood.scan_heights(heights, theta, bounds)
+    padded = np.concatenate([[-np.inf], values, [-np.inf]])
+    peaks = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]))
+    peaks = peaks[np.argsort(-values[peaks])][:_STARTS]
+    starts = [theta]
+    for i in peaks:
+        begin = theta.copy()
+        begin[2], begin[3] = heights[i], amplitudes[i]
+        starts.append(begin)
+    return starts
+
+
+def _alternatives(optima: list[Optimum], fringe_nm: float) -> tuple[Alternative, ...]:
+    """Optima at other heights than the best one and than each other."""
+    best = optima[0]
+    kept: list[Optimum] = [best]
+    for other in optima[1:]:
+        if all(abs(other.theta[2] - o.theta[2]) > fringe_nm / 8 for o in kept):
+            kept.append(other)
+    gaps = [
+        Alternative(float(o.theta[2]), max(best.log_likelihood - o.log_likelihood, 0.0))
+        for o in kept[1:]
+    ]
+    return tuple(sorted(gaps, key=lambda a: a.log_likelihood_gap))
+
+
+def _uncertainty(likelihood: Likelihood, best: Optimum, box: Box) -> tuple[FloatArray, FloatArray]:
+    """σ of (x, y, z, mass) and the covariance of the free ones; NaN unless positive definite."""
+    index = np.flatnonzero(box.free)
+    information = likelihood.observed_information(best.theta)[np.ix_(index, index)]
+    scale = 1 / np.sqrt(np.maximum(np.diag(best.fisher)[index], 1e-300))
+    scaled = information * np.outer(scale, scale)
+    sigma = np.full(4, np.nan)
+    particle = index < 4
+    try:
+        np.linalg.cholesky(scaled)
+        covariance = np.linalg.inv(scaled) * np.outer(scale, scale)
+    except np.linalg.LinAlgError:
+        return sigma, np.full((int(particle.sum()), int(particle.sum())), np.nan)
+    units = np.where(index == 3, abs(likelihood.model.scale.slope(float(best.theta[3]))), 1.0)
+    covariance = (covariance * np.outer(units, units))[np.ix_(particle, particle)]
+    sigma[index[particle]] = np.sqrt(np.diag(covariance))
+    return sigma, covariance
+
+
+def _at_bound(theta: FloatArray, box: Box) -> bool:
+    width = box.upper - box.lower
+    near = (theta - box.lower < 1e-6 * width) | (box.upper - theta < 1e-6 * width)
+    return bool(np.any(near & box.free))

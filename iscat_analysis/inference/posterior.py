@@ -1,0 +1,241 @@
+"""The posterior of one particle, sampled with emcee on the likelihood that was maximised.
+
+The prior is flat inside the box that the fit searched.  Half of the moves propose from a mixture of
+Student t distributions around the optima, which decorrelate in a step or two where the posterior is
+nearly normal; the other half are differential evolution (ter Braak, Stat. Comput. 16, 239, 2006),
+which need no such luck.  A chain grows until its diagnostics hold or its budget ends, and is then
+refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.records import PARAMETERS, FitResult, FloatArray, PosteriorResult
+
+if TYPE_CHECKING:
+    import emcee
+
+MAX_R_HAT = 1.01
+MIN_ESS = 400.0
+MIN_TAUS = 50.0
+"""Autocorrelation times that a chain must last."""
+
+EXTENSIONS = 4
+"""A chain may grow to this many times its configured length before it is refused."""
+
+_DEGREES = 5  # of the Student t proposal: heavier tails than any regular posterior
+_WIDEN = 1.2  # its scale over the posterior's
+
+
+def sample_posterior(
+    likelihood: Likelihood,
+    fit: FitResult,
+    *,
+    walkers: int = 32,
+    steps: int = 2000,
+    seed: int = 0,
+    stopped: Callable[[], bool] = lambda: False,
+) -> PosteriorResult:
+    """Sample the posterior of a fitted particle.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        The one that was maximised.
+    fit : FitResult
+        Its maximum, box and covariance.
+    walkers : int
+        Members of the ensemble.
+    steps : int
+        Steps of each, burn-in included; up to `EXTENSIONS` times as many where the chain asks.
+    seed : int
+        Same seed, same samples.
+    stopped : callable
+        Asked at every step whether to give up; a chain in another thread hears no Ctrl-C.
+
+    Returns
+    -------
+    PosteriorResult
+        Samples in nm and kDa, diagnostics and verdict.
+
+    Raises
+    ------
+    concurrent.futures.CancelledError
+        It was stopped.
+    """
+    import emcee  # takes a third of a second, and only chains need it
+
+    index = np.flatnonzero(fit.box.free)
+    proposal = _Proposal.around(likelihood, fit, index)
+    lower, upper = fit.box.lower[index], fit.box.upper[index]
+
+    def log_probability(points: FloatArray) -> FloatArray:
+        inside = np.all((points >= lower) & (points <= upper), axis=1)
+        out = np.full(len(points), -np.inf)
+        thetas = np.tile(fit.theta, (int(inside.sum()), 1))
+        thetas[:, index] = points[inside]
+        out[inside] = likelihood.values(thetas)
+        return out
+
+    random = np.random.RandomState(np.random.SeedSequence(seed).generate_state(8))
+    sampler = emcee.EnsembleSampler(
+        walkers,
+        index.size,
+        log_probability,
+        moves=[(emcee.moves.MHMove(proposal), 0.5), (emcee.moves.DEMove(), 0.5)],
+        vectorize=True,
+    )
+    sampler.log_prob_fn = log_probability  # emcee's wrapper prints a traceback on Ctrl-C
+    state = emcee.State(
+        _scatter(proposal, walkers, lower, upper, random), random_state=random.get_state()
+    )
+    for _ in range(EXTENSIONS):
+        for latest in sampler.sample(state, iterations=steps):
+            if stopped():
+                raise CancelledError
+            state = latest
+        samples, values = _after_burn_in(sampler)
+        verdict = _diagnose(samples)
+        if verdict.converged:
+            break
+    amplitude = np.flatnonzero(index == 3)
+    for column in amplitude:
+        samples[..., column] = likelihood.model.scale.mass(samples[..., column])
+    # the level of the light, where it is free, says nothing of the particle: it is integrated over
+    told = index < len(PARAMETERS)
+    return PosteriorResult(
+        names=tuple(PARAMETERS[i] for i in index[told]),
+        samples=samples[..., told],
+        log_likelihood=values,
+        tau=verdict.tau[told],
+        r_hat=verdict.r_hat[told],
+        ess_bulk=verdict.ess_bulk[told],
+        ess_tail=verdict.ess_tail[told],
+        acceptance=float(np.mean(sampler.acceptance_fraction)),
+        converged=verdict.converged,
+        message=verdict.message,
+    )
+
+
+@dataclass(frozen=True)
+class _Proposal:
+    """Independent draws from a mixture of Student t distributions; an emcee proposal function."""
+
+    centres: FloatArray  # (modes, d)
+    log_weights: FloatArray  # (modes,)
+    factor: FloatArray  # (d, d), square root of the scale matrix
+    whiten: FloatArray  # (d, d), its inverse
+
+    @classmethod
+    def around(cls, likelihood: Likelihood, fit: FitResult, index: NDArray[np.intp]) -> _Proposal:
+        """Build it from the fit's covariance and its alternative heights."""
+        fisher = likelihood.score_fisher(fit.theta)[2][np.ix_(index, index)]
+        scale = 1 / np.sqrt(np.maximum(np.diag(fisher), 1e-300))
+        values, vectors = np.linalg.eigh(fisher * np.outer(scale, scale))
+        widths = 1 / np.sqrt(np.maximum(values, 1e-4))
+        factor = _WIDEN * scale[:, None] * vectors * widths
+        centres, gaps = [fit.theta[index]], [0.0]
+        for other in fit.alternatives:
+            if other.log_likelihood_gap < 15:
+                theta = np.array(fit.theta)
+                theta[2] = other.z_nm
+                centres.append(theta[index])
+                gaps.append(other.log_likelihood_gap)
+        weights = -np.minimum(gaps, 3.0)
+        return cls(
+            np.array(centres),
+            weights - np.logaddexp.reduce(weights),
+            factor,
+            np.linalg.inv(factor),
+        )
+
+    def draw(self, count: int, random: np.random.RandomState) -> FloatArray:
+        """Draw points, shape (count, d)."""
+        modes = random.choice(len(self.centres), size=count, p=np.exp(self.log_weights))
+        normal = random.standard_normal((count, self.factor.shape[0]))
+        stretch = np.sqrt(_DEGREES / random.chisquare(_DEGREES, count))
+        return self.centres[modes] + stretch[:, None] * (normal @ self.factor.T)
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """Log density of points, shape (n,)."""
+        d = self.factor.shape[0]
+        apart = (points[None] - self.centres[:, None]).reshape(-1, d)
+        squares = np.sum((apart @ self.whiten.T) ** 2, axis=1).reshape(len(self.centres), -1)
+        norm = gammaln((_DEGREES + d) / 2) - gammaln(_DEGREES / 2)
+        log_t = norm - 0.5 * (_DEGREES + d) * np.log1p(squares / _DEGREES)
+        density: FloatArray = np.logaddexp.reduce(log_t + self.log_weights[:, None], axis=0)
+        return density
+
+    def __call__(
+        self, points: FloatArray, random: np.random.RandomState
+    ) -> tuple[FloatArray, FloatArray]:
+        """Propose for every walker: the new points and ln q(old)/q(new)."""
+        fresh = self.draw(len(points), random)
+        return fresh, self.log_density(points) - self.log_density(fresh)
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    tau: FloatArray
+    r_hat: FloatArray
+    ess_bulk: FloatArray
+    ess_tail: FloatArray
+    converged: bool
+    message: str
+
+
+def _scatter(
+    proposal: _Proposal,
+    walkers: int,
+    lower: FloatArray,
+    upper: FloatArray,
+    random: np.random.RandomState,
+) -> FloatArray:
+    """Place the walkers: draws of the proposal, reflected into the box."""
+    points = proposal.draw(walkers, random)
+    width = upper - lower
+    folded = np.mod(points - lower, 2 * width)
+    return lower + np.minimum(folded, 2 * width - folded)
+
+
+def _after_burn_in(sampler: emcee.EnsembleSampler) -> tuple[FloatArray, FloatArray]:
+    """Cut off the burn-in: samples (chain, draw, parameter), log-likelihoods (chain, draw)."""
+    tau = float(np.max(sampler.get_autocorr_time(tol=0, quiet=True)))
+    length = sampler.iteration
+    burn_in = min(max(length // 10, math.ceil(5 * tau) if math.isfinite(tau) else 0), length // 2)
+    samples = np.moveaxis(sampler.get_chain(discard=burn_in), 0, 1)
+    return np.array(samples), np.array(sampler.get_log_prob(discard=burn_in).T)
+
+
+def _diagnose(samples: FloatArray) -> _Verdict:
+    import emcee
+    from arviz_stats.base import array_stats  # takes a second, and only chains need it
+
+    draws = samples.shape[1]
+    tau = emcee.autocorr.integrated_time(np.moveaxis(samples, 0, 1), tol=0, quiet=True)
+    axes = {"chain_axis": 0, "draw_axis": 1}
+    r_hat = np.asarray(array_stats.rhat(samples, **axes))
+    bulk = np.asarray(array_stats.ess(samples, method="bulk", **axes))
+    tail = np.asarray(array_stats.ess(samples, method="tail", prob=(0.05, 0.95), **axes))
+    complaints = []
+    if not np.all(draws > MIN_TAUS * tau):
+        needed = MIN_TAUS * float(tau.max())
+        complaints.append(f"{draws} draws are fewer than {MIN_TAUS:.0f} × τ = {needed:.0f}")
+    if not np.all(r_hat < MAX_R_HAT):
+        complaints.append(f"split R̂ = {r_hat.max():.3f} is not below {MAX_R_HAT}")
+    if not (np.all(bulk > MIN_ESS) and np.all(tail > MIN_ESS)):
+        complaints.append(
+            f"effective sample size {min(bulk.min(), tail.min()):.0f} is not above {MIN_ESS:.0f}"
+        )
+    message = "; ".join(complaints) or "τ, split R̂ and effective sample sizes are good"
+    return _Verdict(tau, r_hat, bulk, tail, not complaints, message)

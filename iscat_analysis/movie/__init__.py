@@ -1,0 +1,87 @@
+"""Movie files become a `Stack`: frames (t, y, x), read lazily, whole or not at all.
+
+Each format is one module that offers `Frames`; `_READERS` names its signature.  What a file says
+of itself is checked against what it holds before any pixel is read: a movie that is cut short, or
+whose description announces more than it holds, is refused and never analysed in part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie.hdf5 import SIGNATURE
+from iscat_analysis.movie.refeyn import open_refeyn
+from iscat_analysis.movie.stack import Frames, Stack
+from iscat_analysis.movie.tiff import open_tiff
+
+__all__ = ["Frames", "Stack", "open_stack"]
+
+_READERS: Mapping[bytes, Callable[[Path], Frames]] = {
+    b"II\x2a\x00": open_tiff,
+    b"MM\x00\x2a": open_tiff,
+    b"II\x2b\x00": open_tiff,
+    b"MM\x00\x2b": open_tiff,
+    SIGNATURE[:4]: open_refeyn,
+}
+"""The first bytes of a file and what opens it."""
+
+_FOREIGN: Mapping[bytes, str] = {
+    b"\x93NUMPY": "a NumPy array",
+    b"\x89PNG": "a PNG picture",
+    b"\xff\xd8\xff": "a JPEG picture",
+    b"PK\x03\x04": "a ZIP archive",
+    b"\x1f\x8b": "a gzip archive",
+    b"RIFF": "an AVI or WAV file",
+    b"SIMPLE": "a FITS file",
+}
+_SIGNATURE_BYTES = 8
+
+
+def open_stack(path: Path) -> Stack:
+    """Open a movie without reading its pixels.
+
+    TIFF, BigTIFF, OME-TIFF, ImageJ and Micro-Manager stacks are read; strips or tiles;
+    uncompressed, LZW, Deflate, Zstandard, PackBits or LZMA.  So are Refeyn's ``.mp`` movies, of
+    OneMP and TwoMP, compressed or not.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    Stack
+        Frames (t, y, x); close it, or use it in a ``with`` statement.
+
+    Raises
+    ------
+    DataError
+        The file is missing, is not a movie, is cut short, contradicts its own description, or has
+        more than one axis besides y and x.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            signature = file.read(_SIGNATURE_BYTES)
+    except FileNotFoundError:
+        raise DataError(f"{path}: there is no such file; check the path") from None
+    except IsADirectoryError:
+        raise DataError(f"{path}: is a folder; give the path of one movie file") from None
+    except OSError as error:
+        if path.is_dir():
+            raise DataError(f"{path}: is a folder; give the path of one movie file") from None
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+    if not signature:
+        raise DataError(f"{path}: is empty (0 bytes); copy it again or export it again")
+    reader = _READERS.get(signature[:4])
+    if reader is None:
+        names = (name for mark, name in _FOREIGN.items() if signature.startswith(mark))
+        found = next(names, "not one")
+        raise DataError(
+            f"{path}: needs to be a TIFF file or a Refeyn .mp movie but is {found}; "
+            "export the movie as TIFF"
+        )
+    return Stack(path, reader(path))

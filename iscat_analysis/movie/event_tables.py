@@ -1,0 +1,301 @@
+"""Event tables of Refeyn's programs: what their fits found, and the calibration they used.
+
+A calibration is odd-symmetric: contrast c and mass m obey c = s·m + sign(m)·o, so that a particle
+that leaves weighs what it weighed when it landed; m = sign(−c)·(−|c| − o)/s.  A plain line through
+both branches is wrong by 2|o/s| on one of them.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from array import array
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie.hdf5 import SIGNATURE, Hdf5Reader
+from iscat_analysis.records import FloatArray
+
+TABLE_COLUMNS = ("frame", "x_px", "y_px", "contrast", "mass_kda")
+"""The columns of `read_events`, in order."""
+
+_NAMES: Mapping[str, tuple[str, ...]] = {
+    "frame": ("frame_indices",),
+    "x_px": ("x_coords",),
+    "y_px": ("y_coords",),
+    "contrast": ("contrasts",),
+    "mass_kda": ("masses_kDa", "calibrated_values"),
+}
+"""What each column is called in the files, newest last."""
+
+_CALIBRATIONS = (
+    ("mass_model/c_1kDa", "mass_model/o_0kDa", "mass_model/contrasts", "mass_model/masses"),
+    (
+        "calibration/gradient",
+        "calibration/offset",
+        "calibration/contrasts",
+        "calibration/calibrated_values",
+    ),
+)
+_GROUPS = ("", "analysis/events/events_fitted/")  # tables of their own, and inside .mpr movies
+_MOVIES = "per_movie_events"
+_MISSING = 1e300  # the largest double stands for "none"
+_LARGEST_CSV = 500_000_000
+_LARGEST_FRAME = 2**53
+
+
+@dataclass(frozen=True)
+class StoredCalibration:
+    """The calibration that a table carries.
+
+    Attributes
+    ----------
+    gradient_per_kda : float
+        Contrast per kDa, s; negative where landing darkens.
+    offset : float
+        Contrast o at zero mass.
+    standard_masses_kda, standard_contrasts : tuple of float
+        What it was fitted to; empty where the table does not say.
+    """
+
+    gradient_per_kda: float
+    offset: float
+    standard_masses_kda: tuple[float, ...] = ()
+    standard_contrasts: tuple[float, ...] = ()
+
+    def mass_kda(self, contrast: FloatArray) -> FloatArray:
+        """Convert contrasts to masses.
+
+        Parameters
+        ----------
+        contrast : ndarray
+            Signed peak contrasts.
+
+        Returns
+        -------
+        ndarray
+            Masses of the same shape, negative for a particle that leaves [kDa].
+        """
+        masses: FloatArray = (
+            np.sign(-contrast) * (-np.abs(contrast) - self.offset) / self.gradient_per_kda
+        )
+        return masses
+
+
+def read_events(path: Path) -> pd.DataFrame:
+    """Read an event table written by Refeyn's programs.
+
+    HDF5 (``masses_kDa`` with ``mass_model``, or ``calibrated_values`` with ``calibration``; also
+    inside ``.mpr`` movies) or CSV (``eventsFitted.csv``), told apart by their first bytes.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per event: frame (int), x_px, y_px, contrast, mass_kda [kDa], negative for a
+        particle that leaves; NaN where the file has no value.  Masses that are not stored are
+        computed from the stored calibration.  ``attrs["calibration"]`` is that calibration as a
+        mapping (the fields of `StoredCalibration`), or None; `stored_calibration` turns it back.
+
+    Raises
+    ------
+    DataError
+        The file cannot be read, is not such a table, or its columns disagree.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            signature = file.read(len(SIGNATURE))
+        size = path.stat().st_size
+    except OSError as error:
+        what = "is a folder" if path.is_dir() else f"cannot be read ({error.strerror})"
+        raise DataError(f"{path}: {what}; give the path of one event table") from None
+    if signature == SIGNATURE:
+        columns, calibration = _from_hdf5(path)
+    else:
+        columns, calibration = _from_csv(path, size), None
+    return _table(columns, calibration, path)
+
+
+def stored_calibration(table: pd.DataFrame) -> StoredCalibration | None:
+    """Return the calibration that came with a table.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        From `read_events`.
+
+    Returns
+    -------
+    StoredCalibration or None
+        None where the file had none.
+    """
+    fields = table.attrs.get("calibration")
+    if fields is None:
+        return None
+    return StoredCalibration(
+        fields["gradient_per_kda"],
+        fields["offset"],
+        tuple(fields["standard_masses_kda"]),
+        tuple(fields["standard_contrasts"]),
+    )
+
+
+def _table(
+    columns: Mapping[str, FloatArray], calibration: StoredCalibration | None, path: Path
+) -> pd.DataFrame:
+    lengths = {name: len(values) for name, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        shown = ", ".join(f"{_NAMES[name][0]} {length}" for name, length in lengths.items())
+        raise DataError(f"{path}: its columns differ in length ({shown}); export it again")
+    frame = columns["frame"]
+    bad = ~((np.abs(frame) < _LARGEST_FRAME) & (frame >= 0) & (frame == np.floor(frame)))
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise DataError(
+            f"{path}: frame_indices is {frame[row]:g} in row {row}, which is no frame number; "
+            "export the table again"
+        )
+    cleaned = {
+        name: np.where(np.abs(values) < _MISSING, values, np.nan)
+        for name, values in columns.items()
+    }
+    mass = cleaned.get("mass_kda")
+    if mass is None or np.isnan(mass).all():
+        contrast = cleaned["contrast"]
+        mass = np.full(contrast.shape, np.nan)
+        if calibration is not None:
+            mass = calibration.mass_kda(contrast)
+    table = pd.DataFrame({**cleaned, "frame": frame.astype(np.int64), "mass_kda": mass})
+    table = table[list(TABLE_COLUMNS)]
+    table.attrs["calibration"] = None
+    if calibration is not None:
+        table.attrs["calibration"] = {
+            "gradient_per_kda": calibration.gradient_per_kda,
+            "offset": calibration.offset,
+            "standard_masses_kda": list(calibration.standard_masses_kda),
+            "standard_contrasts": list(calibration.standard_contrasts),
+        }
+    return table
+
+
+def _from_hdf5(path: Path) -> tuple[dict[str, FloatArray], StoredCalibration | None]:
+    with Hdf5Reader(path) as reader:
+        try:
+            group = _group(reader, path)
+            columns = {}
+            for column, names in _NAMES.items():
+                values = [_column(reader, f"{group}{name}", path) for name in names]
+                found = next((value for value in values if value is not None), None)
+                if found is not None:
+                    columns[column] = found
+                elif column != "mass_kda":
+                    raise DataError(
+                        f"{path}: lacks {names[0]}; it is not an event table, export it again"
+                    )
+            return columns, _calibration(reader, group, path)
+        finally:
+            reader.data.close()
+
+
+def _group(reader: Hdf5Reader, path: Path) -> str:
+    """Where in the file the table lies."""
+    movies = reader.names(_MOVIES)
+    groups = [*_GROUPS, *(f"{_MOVIES}/{name}/" for name in movies[:2])]
+    found = [group for group in groups if "contrasts" in reader.names(group.rstrip("/"))]
+    if not found:
+        raise DataError(
+            f"{path}: is an HDF5 file without an event table (it lacks contrasts); "
+            "export the fitted events"
+        )
+    if found[0].startswith(_MOVIES) and len(movies) > 1:
+        raise DataError(
+            f"{path}: holds the events of {len(movies)} movies, whose frames cannot be told "
+            "apart; export the events of each movie to a file of its own"
+        )
+    return found[0]
+
+
+def _column(reader: Hdf5Reader, name: str, path: Path) -> FloatArray | None:
+    found = reader.array(name)
+    if found is None:
+        return None
+    long = [n for n in found.shape if n != 1]
+    if len(long) > 1:
+        raise DataError(
+            f"{path}: {name} has the shape {found.shape}, not one value per event; export it again"
+        )
+    values: FloatArray = found.read(0, found.shape[0]).astype(np.float64).reshape(-1)
+    return values
+
+
+def _calibration(reader: Hdf5Reader, group: str, path: Path) -> StoredCalibration | None:
+    for prefix in dict.fromkeys((group, "")):
+        for gradient_name, offset_name, *standards in _CALIBRATIONS:
+            gradient = reader.number(prefix + gradient_name)
+            offset = reader.number(prefix + offset_name)
+            if gradient is None or offset is None:
+                continue
+            if not (math.isfinite(gradient) and math.isfinite(offset)) or gradient == 0:
+                raise DataError(
+                    f"{path}: its calibration ({gradient_name} = {gradient:g}, {offset_name} = "
+                    f"{offset:g}) cannot be used; calibrate again and export the table again"
+                )
+            known = [_column(reader, prefix + name, path) for name in standards]
+            contrasts, masses = (
+                () if values is None else tuple(map(float, values)) for values in known
+            )
+            return StoredCalibration(gradient, offset, masses, contrasts)
+    return None
+
+
+def _from_csv(path: Path, size: int) -> dict[str, FloatArray]:
+    if size > _LARGEST_CSV:
+        raise DataError(f"{path}: is {size} bytes long, which no event table is; check the path")
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.reader(line for line in file if not line.startswith("#"))
+            header = [name.strip() for name in next(rows, [])]
+            places = _places(header, path)
+            columns = {column: array("d") for column in places}
+            for number, row in enumerate(rows):
+                if not any(row):
+                    continue
+                if len(row) != len(header):
+                    raise DataError(
+                        f"{path}: row {number} has {len(row)} values where the first line names "
+                        f"{len(header)}; the copy was interrupted, or the table was edited: "
+                        "export it again"
+                    )
+                for column, place in places.items():
+                    columns[column].append(float(row[place]) if row[place].strip() else math.nan)
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: is neither an HDF5 file nor a text file in UTF-8") from None
+    except (ValueError, MemoryError, csv.Error) as error:
+        raise DataError(f"{path}: cannot be read as a table ({error}); export it again") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+    return {column: np.array(values) for column, values in columns.items()}
+
+
+def _places(header: list[str], path: Path) -> dict[str, int]:
+    places = {}
+    for column, names in _NAMES.items():
+        found = next((name for name in names if name in header), None)
+        if found is not None:
+            places[column] = header.index(found)
+        elif column != "mass_kda":
+            raise DataError(
+                f"{path}: lacks the column {names[0]} in its first line; it is not a table of "
+                "fitted events (eventsFitted.csv), export it again"
+            )
+    return places

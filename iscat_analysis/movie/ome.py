@@ -1,0 +1,250 @@
+"""OME-XML: which image of the file is which frame, the pixel size and the timing.
+
+Schema: https://www.openmicroscopy.org/Schemas/OME/2016-06
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie.axes import time_axis
+from iscat_analysis.movie.hints import LENGTH_NM, TIME_S, Hints, inverse, positive
+
+_OME_ROOT = re.compile(r"<(?:\w+:)?OME[\s>]")
+_AXES = ("T", "Z", "C")
+
+
+@dataclass(frozen=True)
+class OmeMovie:
+    """What OME-XML says of a movie.
+
+    Attributes
+    ----------
+    order : ndarray of int64, shape (t,)
+        Image of the file that holds each frame.
+    hints : Hints
+        Pixel size and timing.
+    """
+
+    order: NDArray[np.int64]
+    hints: Hints
+
+
+def is_ome(text: str) -> bool:
+    """Whether a description is OME-XML.
+
+    Parameters
+    ----------
+    text : str
+        The description.
+
+    Returns
+    -------
+    bool
+        True for anything that looks like an XML document with an ``OME`` element.
+    """
+    return text.startswith("<") and _OME_ROOT.search(text) is not None
+
+
+def read_ome(text: str, n_images: int, path: Path) -> OmeMovie:
+    """Read the OME-XML of a file.
+
+    Parameters
+    ----------
+    text : str
+        The XML.
+    n_images : int
+        Images the file holds.
+    path : Path
+        What messages call it.
+
+    Returns
+    -------
+    OmeMovie
+        Covers every image of the file exactly once.
+
+    Raises
+    ------
+    DataError
+        The XML is damaged or declares entities, describes several files or several series, more
+        or fewer frames than the file holds, or more than one axis besides y and x.
+    """
+    root = _parse(text, path)
+    if next(_children(root, "BinaryOnly"), None) is not None:
+        raise DataError(
+            f"{path}: is one part of an OME set of several files; "
+            "save the whole set as one TIFF file and open that"
+        )
+    images = [
+        (image, pixels)
+        for image in _children(root, "Image")
+        for pixels in _children(image, "Pixels")
+    ]
+    if not images:
+        raise _damaged(path, "it describes no image")
+    _refuse_sets([pixels for _, pixels in images], path)
+    first = images[0][1]
+    if len(images) == 1:
+        order, axis = _order(first, n_images, path)
+    else:
+        order, axis = _order_of_series([pixels for _, pixels in images], n_images, path)
+    if not np.array_equal(np.sort(order), np.arange(n_images)):
+        raise DataError(
+            f"{path}: its OME-XML assigns {len(np.unique(order))} of the file's {n_images} images "
+            f"to {len(order)} frames; export it again so that both agree"
+        )
+    return OmeMovie(order, _hints(first, axis))
+
+
+def _parse(text: str, path: Path) -> ElementTree.Element:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise DataError(
+            f"{path}: its OME-XML declares a document type, which could expand without limit; "
+            "export it again without one"
+        )
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise _damaged(path, str(error)) from None
+
+
+def _children(parent: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]:
+    return (child for child in parent if child.tag.rpartition("}")[2] == name)
+
+
+def _refuse_sets(pixels: list[ElementTree.Element], path: Path) -> None:
+    files = {
+        uuid.get("FileName") or (uuid.text or "").strip(): None
+        for element in pixels
+        for block in _children(element, "TiffData")
+        for uuid in _children(block, "UUID")
+    }
+    if len(files) > 1:
+        shown = ", ".join(list(files)[:3]) + (", …" if len(files) > 3 else "")
+        raise DataError(
+            f"{path}: is one part of an OME set of {len(files)} files ({shown}); "
+            "save the whole set as one TIFF file and open that"
+        )
+
+
+def _integer(element: ElementTree.Element, name: str, path: Path) -> int | None:
+    text = element.get(name)
+    if text is None:
+        return None
+    try:
+        value = int(text)
+    except ValueError:
+        raise _damaged(path, f"{name} is {text[:20]!r}") from None
+    if value < 0:
+        raise _damaged(path, f"{name} is {value}")
+    return value
+
+
+def _sizes(pixels: ElementTree.Element, path: Path) -> dict[str, int]:
+    sizes = {axis: _integer(pixels, f"Size{axis}", path) or 0 for axis in _AXES}
+    if 0 in sizes.values():
+        raise _damaged(path, "SizeT, SizeZ or SizeC is missing or 0")
+    return sizes
+
+
+def _order(pixels: ElementTree.Element, n_images: int, path: Path) -> tuple[NDArray[np.int64], str]:
+    """Assign the images of a file to the frames of its only series."""
+    sizes = _sizes(pixels, path)
+    axis = time_axis(sizes, path) or "T"
+    n_frames = sizes[axis]
+    if n_frames != n_images:
+        raise DataError(
+            f"{path}: its OME-XML describes {n_frames} frames but the file holds {n_images} "
+            "images; the recording or the copy was interrupted, or the description is out of date: "
+            "export it again"
+        )
+    blocks = list(_children(pixels, "TiffData"))
+    if not blocks:
+        return np.arange(n_frames, dtype=np.int64), axis
+    order = np.full(n_frames, -1, dtype=np.int64)
+    for block in blocks:
+        image = _integer(block, "IFD", path)
+        planes = _integer(block, "PlaneCount", path)
+        if planes is None:
+            planes = n_frames if image is None else 1
+        frame = _integer(block, f"First{axis}", path) or 0
+        image = image or 0
+        if frame + planes > n_frames or image + planes > n_images:
+            raise _damaged(path, f"a TiffData block reaches frame {frame + planes} of {n_frames}")
+        order[frame : frame + planes] = np.arange(image, image + planes)
+    return order, axis
+
+
+def _order_of_series(
+    series: list[ElementTree.Element], n_images: int, path: Path
+) -> tuple[NDArray[np.int64], str]:
+    """Take many series of one plane each as a movie: what writing frame by frame leaves behind."""
+    single = all(set(_sizes(pixels, path).values()) == {1} for pixels in series)
+    if not single or len(series) != n_images:
+        raise DataError(
+            f"{path}: holds {len(series)} image series; export the one to analyse to its own file"
+        )
+    order = np.arange(n_images, dtype=np.int64)
+    for frame, pixels in enumerate(series):
+        for block in _children(pixels, "TiffData"):
+            order[frame] = min(_integer(block, "IFD", path) or 0, n_images)
+    return order, "I"
+
+
+def _hints(pixels: ElementTree.Element, axis: str) -> Hints:
+    planes = list(_children(pixels, "Plane"))
+    exposures = (
+        positive(plane.get("ExposureTime"), 1e3 * factor)
+        for plane in planes
+        if (factor := _factor(plane, "ExposureTimeUnit", "s", TIME_S)) is not None
+    )
+    increment_unit = _factor(pixels, "TimeIncrementUnit", "s", TIME_S)
+    increment = positive(pixels.get("TimeIncrement"), increment_unit) if increment_unit else None
+    rate = inverse(increment) or _rate_from_planes(planes, f"The{axis}")
+    return Hints(
+        "ome",
+        pixel_x_nm=_length(pixels, "PhysicalSizeX"),
+        pixel_y_nm=_length(pixels, "PhysicalSizeY"),
+        exposure_ms=next((value for value in exposures if value is not None), None),
+        frame_rate_hz=rate,
+    )
+
+
+def _rate_from_planes(planes: list[ElementTree.Element], name: str) -> float | None:
+    """Mean rate between the first and the last frame that carry a time stamp."""
+    stamps = []
+    for plane in planes:
+        factor = _factor(plane, "DeltaTUnit", "s", TIME_S)
+        try:
+            stamp = (int(plane.get(name, "")), float(plane.get("DeltaT", "")))
+        except ValueError:
+            continue
+        if factor is not None:
+            stamps.append((stamp[0], stamp[1] * factor))
+    if len(stamps) < 2:
+        return None
+    (first, begin), (last, end) = min(stamps), max(stamps)
+    return positive((last - first) / (end - begin)) if end > begin else None
+
+
+def _length(element: ElementTree.Element, name: str) -> float | None:
+    factor = _factor(element, f"{name}Unit", "µm", LENGTH_NM)
+    return None if factor is None else positive(element.get(name), factor)
+
+
+def _factor(
+    element: ElementTree.Element, name: str, default: str, units: dict[str, float]
+) -> float | None:
+    return units.get(element.get(name, default).strip().lower())
+
+
+def _damaged(path: Path, how: str) -> DataError:
+    return DataError(f"{path}: its OME-XML is damaged ({how}); export it again")

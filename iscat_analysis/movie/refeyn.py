@@ -1,0 +1,396 @@
+"""Refeyn ``.mp`` movies: HDF5, plain or as differences from frame to frame.
+
+The layouts are not published; they are read as other open software found them.  OneMP: dataset
+``frame`` with ``configuration/Devices/AcqCam``; TwoMP, format 3: ``movie/frame`` with
+``movie/configuration/acq_camera``; between the two lies a format 3 with OneMP's names.
+In a compressed movie frame 0 is plain and every later one is what must be added, modulo the range
+of the type, to the one before; ``movie/keyframe`` repeats some frames in full: those that its
+attribute ``indices`` names, or else the last one at its end.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie.hdf5 import Hdf5Reader, StoredArray
+from iscat_analysis.movie.hints import Hints, merge, positive
+from iscat_analysis.movie.mapped import refuse_changed
+from iscat_analysis.records import StackMetadata
+
+PIXEL_NM = {"Refeyn OneMP": 19.3, "Refeyn TwoMP": 11.8}
+"""Side of an unbinned pixel by instrument [nm]; the files do not store it."""
+
+_BLOCK_BYTES = 64_000_000
+_ANCHOR_BYTES = 64_000_000  # of decoded frames kept, from which later ones are reached
+_FRAME_BOMB_RATIO = 100  # of one decoded frame over the file
+
+
+@dataclass(frozen=True)
+class _Dialect:
+    """Where one generation of files keeps things."""
+
+    frames: str
+    keyframes: str | None
+    rate: str
+    frame_binning: str
+    pixel_binning: str
+    exposure: str
+    height: str | None
+    width: str | None
+    names: tuple[str, ...]
+    instrument: str | None
+
+
+_DIALECTS = (
+    _Dialect(
+        frames="frame",
+        keyframes=None,
+        rate="configuration/Devices/AcqCam/FrameRate",
+        frame_binning="configuration/Engines/AcqMovieEngine/FrameBinning",
+        pixel_binning="configuration/Engines/AcqMovieEngine/PixelBinning",
+        exposure="configuration/Devices/AcqCam/ExposureTime",
+        height="configuration/Devices/AcqCam/Height",
+        width="configuration/Devices/AcqCam/Width",
+        names=("device_info/InstrumentName",),
+        instrument="Refeyn OneMP",
+    ),
+    _Dialect(
+        frames="movie/frame",
+        keyframes="movie/keyframe",
+        rate="movie/configuration/acq_camera/frame_rate",
+        frame_binning="movie/configuration/acq_camera/frame_binning",
+        pixel_binning="movie/configuration/acq_camera/pixel_binning",
+        exposure="movie/configuration/acq_camera/exposure_time",
+        height=None,
+        width=None,
+        names=("movie/device_serials/InstrumentName", "movie/device_info/InstrumentName"),
+        instrument="Refeyn TwoMP",
+    ),
+    _Dialect(
+        frames="movie/frame",
+        keyframes="movie/keyframe",
+        rate="movie/configuration/Devices/AcqCam/FrameRate",
+        frame_binning="movie/configuration/Devices/AcqCam/SoftwareFrameBinning",
+        pixel_binning="movie/configuration/Devices/AcqCam/SoftwarePixelBinning",
+        exposure="movie/configuration/Devices/AcqCam/ExposureTime",
+        height="movie/configuration/Devices/AcqCam/Height",
+        width="movie/configuration/Devices/AcqCam/Width",
+        names=("movie/device_info/InstrumentName", "movie/device_serials/InstrumentName"),
+        instrument=None,
+    ),
+)
+
+
+class RefeynFrames:
+    """The frames of an ``.mp`` file; `open_refeyn` makes it.
+
+    Parameters
+    ----------
+    stored : StoredArray
+        Frames or differences, shape (t, y, x).
+    reader : Hdf5Reader
+        Of the file; only its mapped bytes are kept.
+    path : Path
+        What messages call it.
+    metadata : StackMetadata
+        What the file says of itself.
+    notes : tuple of str
+        What a user should know about it.
+    """
+
+    def __init__(
+        self,
+        stored: StoredArray,
+        reader: Hdf5Reader,
+        path: Path,
+        *,
+        metadata: StackMetadata,
+        notes: tuple[str, ...],
+    ) -> None:
+        t, y, x = stored.shape
+        self._stored = stored
+        self._data = reader.data
+        self._path = path
+        self._shape = (t, y, x)
+        self._metadata = metadata
+        self._notes = notes
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+        return self._shape
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored numbers, in native byte order."""
+        return self._stored.dtype
+
+    @property
+    def metadata(self) -> StackMetadata:
+        """What the file says of itself."""
+        return self._metadata
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Where the pixel size comes from."""
+        return self._notes
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames.
+
+        Parameters
+        ----------
+        start, stop : int
+            Half-open range inside the movie.
+
+        Returns
+        -------
+        ndarray, shape (stop − start, y, x)
+            A new array in native byte order [counts].
+        """
+        return self._stored.read(start, stop)
+
+    def close(self) -> None:
+        """Release the file."""
+        self._data.close()
+
+
+class DifferenceFrames(RefeynFrames):
+    """A movie stored as differences, summed as it is read.
+
+    Decoded frames are remembered here and there, so that no read starts from the first frame; a
+    movie read in order is summed once.
+
+    Parameters
+    ----------
+    stored : StoredArray
+        Differences, unsigned integers.
+    reader : Hdf5Reader
+        As in `RefeynFrames`.
+    path : Path
+        What messages call the file.
+    metadata : StackMetadata
+        What the file says of itself.
+    notes : tuple of str
+        What a user should know about it.
+    known : (int, ndarray of shape (y, x)) or None
+        Number of a frame, and what it must sum to.
+    """
+
+    def __init__(
+        self,
+        stored: StoredArray,
+        reader: Hdf5Reader,
+        path: Path,
+        *,
+        metadata: StackMetadata,
+        notes: tuple[str, ...],
+        known: tuple[int, NDArray[Any]] | None,
+    ) -> None:
+        super().__init__(stored, reader, path, metadata=metadata, notes=notes)
+        self._known = known
+        frame_bytes = self._shape[1] * self._shape[2] * stored.dtype.itemsize
+        kept = max(1, min(self._shape[0], _ANCHOR_BYTES // frame_bytes))
+        self._spacing = -(-self._shape[0] // kept)
+        self._step = max(1, _BLOCK_BYTES // frame_bytes)
+        self._anchors: dict[int, NDArray[Any]] = {}
+        self._newest: tuple[int, NDArray[Any]] | None = None
+        self._lock = threading.Lock()
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames.
+
+        Parameters
+        ----------
+        start, stop : int
+            Half-open range inside the movie.
+
+        Returns
+        -------
+        ndarray, shape (stop − start, y, x)
+            A new array in native byte order [counts].
+
+        Raises
+        ------
+        DataError
+            A frame that the file gives in full is not the sum of the differences.
+        """
+        refuse_changed(self._path, self._data)
+        block = np.empty((stop - start, *self._shape[1:]), dtype=self.dtype)
+        if start == stop:
+            return block
+        with self._lock:
+            known, frame = self._nearest(start)
+            first = known + 1
+            while first < stop:
+                end = min(first + self._step, stop)
+                if first < start:
+                    end = min(end, start)
+                part = self._stored.read(first, end)
+                if frame is not None:
+                    part[0] += frame
+                np.cumsum(part, axis=0, dtype=part.dtype, out=part)
+                self._remember(first, part)
+                frame = part[-1]
+                if first >= start:
+                    block[first - start : end - start] = part
+                first = end
+        return block
+
+    def _nearest(self, start: int) -> tuple[int, NDArray[Any] | None]:
+        """Find the last remembered frame before `start`; −1 and None where there is none."""
+        before = [number for number in self._anchors if number < start]
+        found = max(before, default=-1)
+        if self._newest is not None and found < self._newest[0] < start:
+            return self._newest
+        return found, self._anchors.get(found)
+
+    def _remember(self, first: int, part: NDArray[Any]) -> None:
+        end = first + len(part)
+        for number in range(-(-first // self._spacing) * self._spacing, end, self._spacing):
+            self._anchors.setdefault(number, part[number - first].copy())
+        self._newest = (end - 1, part[-1].copy())
+        if self._known is None or not first <= self._known[0] < end:
+            return
+        if not np.array_equal(part[self._known[0] - first], self._known[1]):
+            raise DataError(
+                f"{self._path}: its frames do not add up to its last keyframe; "
+                "copy the file again or export it again"
+            )
+
+
+def open_refeyn(path: Path) -> RefeynFrames:
+    """Open a Refeyn ``.mp`` movie, or ``.mpr``, which holds one.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    RefeynFrames
+        Every frame of it.
+
+    Raises
+    ------
+    DataError
+        It is not such a movie, is incomplete, or contradicts itself.
+    """
+    with Hdf5Reader(path) as reader:
+        try:
+            return _open(reader, path)
+        except BaseException:
+            reader.data.close()
+            raise
+
+
+def _open(reader: Hdf5Reader, path: Path) -> RefeynFrames:
+    found = [dialect for dialect in _DIALECTS if reader.array(dialect.frames) is not None]
+    if not found:
+        raise DataError(
+            f"{path}: is an HDF5 file but not a Refeyn movie (it has neither frame nor "
+            "movie/frame); export the movie as TIFF"
+        )
+    dialect = next((d for d in found if reader.number(d.rate) is not None), found[0])
+    stored = reader.array(dialect.frames)
+    if stored is None or len(stored.shape) != 3 or 0 in stored.shape:
+        shape = stored.shape if stored is not None else ()
+        raise DataError(
+            f"{path}: {dialect.frames} has the shape {shape}, not frames of rows and columns; "
+            "export it again"
+        )
+    _, rows, columns = stored.shape
+    if stored.shape[0] < 2:
+        raise DataError(
+            f"{path}: holds a single frame; a movie needs frames before and after a particle binds"
+        )
+    frame_bytes = rows * columns * stored.dtype.itemsize
+    if frame_bytes > max(_BLOCK_BYTES, _FRAME_BOMB_RATIO * len(reader.data)):
+        raise DataError(
+            f"{path}: a frame of {rows} x {columns} pixels would be {frame_bytes} bytes, from a "
+            f"file of {len(reader.data)}; the file is damaged, export it again"
+        )
+    hints, notes = _hints(reader, dialect)
+    metadata = merge([hints], path)
+    if stored.dtype.kind == "u" and dialect.keyframes is not None:
+        frames = _differences(reader, dialect, stored, path, metadata, notes)
+        if frames is not None:
+            return frames
+    return RefeynFrames(stored, reader, path, metadata=metadata, notes=notes)
+
+
+def _differences(
+    reader: Hdf5Reader,
+    dialect: _Dialect,
+    stored: StoredArray,
+    path: Path,
+    metadata: StackMetadata,
+    notes: tuple[str, ...],
+) -> DifferenceFrames | None:
+    """Decide how the frames are encoded; None for plain ones.
+
+    The last keyframe decides: it is among plain frames as it is, and differences must add up to
+    it.  Without keyframes, an attribute ``encoding`` marks differences.
+    """
+    known = _last_keyframe(reader, dialect.keyframes or "", stored, path)
+    if known is not None and np.array_equal(stored.read(known[0], known[0] + 1)[0], known[1]):
+        return None
+    if known is None and not reader.has_attribute(dialect.frames, "encoding"):
+        return None
+    frames = DifferenceFrames(stored, reader, path, metadata=metadata, notes=notes, known=known)
+    if known is not None:
+        frames.read(known[0], known[0] + 1)
+    return frames
+
+
+def _last_keyframe(
+    reader: Hdf5Reader, name: str, stored: StoredArray, path: Path
+) -> tuple[int, NDArray[Any]] | None:
+    """Which frame the last keyframe repeats, and its pixels; None where that tells nothing."""
+    keyframes = reader.array(name)
+    if keyframes is None or not keyframes.shape[0]:
+        return None
+    if keyframes.shape[1:] != stored.shape[1:]:
+        raise DataError(
+            f"{path}: its keyframes have the shape {keyframes.shape[1:]} but its frames "
+            f"{stored.shape[1:]}; export it again"
+        )
+    indices = reader.numbers(name, "indices")
+    number = indices[-1] if indices else stored.shape[0] - 1
+    if not 0 <= number < stored.shape[0]:
+        raise DataError(
+            f"{path}: its last keyframe should be frame {number} of {stored.shape[0]}; "
+            "the recording or the copy was interrupted: export it again"
+        )
+    if number == 0:  # stored in full either way
+        return None
+    last = len(indices) - 1 if indices else keyframes.shape[0] - 1
+    if last >= keyframes.shape[0]:
+        raise DataError(f"{path}: lacks some of its keyframes; export it again")
+    return number, keyframes.read(last, last + 1)[0]
+
+
+def _hints(reader: Hdf5Reader, dialect: _Dialect) -> tuple[Hints, tuple[str, ...]]:
+    named = (reader.text(name) for name in dialect.names)
+    instrument = next((name for name in named if name), dialect.instrument)
+    frame_binning = positive(reader.number(dialect.frame_binning)) or 1.0
+    pixel_binning = positive(reader.number(dialect.pixel_binning))
+    rate = positive(reader.number(dialect.rate), 1 / frame_binning)
+    exposure = positive(reader.number(dialect.exposure), frame_binning)
+    unbinned = PIXEL_NM.get(instrument or "")
+    if unbinned is None or pixel_binning is None:
+        return Hints("refeyn", exposure_ms=exposure, frame_rate_hz=rate), ()
+    pixel = unbinned * pixel_binning
+    note = (
+        f"the pixel size is taken to be {pixel:g} nm, as for every {instrument}: {unbinned:g} nm "
+        f"times the pixel binning of {pixel_binning:g}; the file does not store it"
+    )
+    return Hints("refeyn", pixel, pixel, exposure, rate), (note,)

@@ -1,0 +1,201 @@
+"""`Stack`, the movie that every later stage reads, and `Frames`, what each file format provides."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.records import StackMetadata
+
+_MB = 1_000_000
+
+
+class Frames(Protocol):
+    """The pixels of one open file, whatever its format."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored numbers, in native byte order."""
+
+    @property
+    def metadata(self) -> StackMetadata:
+        """What the file says of itself."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of how the metadata came about."""
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Frames ``[start, stop)``, already known to exist, as a new array (t, y, x)."""
+
+    def close(self) -> None:
+        """Release the file."""
+
+
+class Stack:
+    """A movie on disk; `iscat_analysis.movie.open_stack` makes it.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    frames : Frames
+        Its pixels.
+    """
+
+    def __init__(self, path: Path, frames: Frames) -> None:
+        self._path = path
+        self._frames = frames
+        self._closed = False
+
+    def __repr__(self) -> str:
+        t, y, x = self.shape
+        state = ", closed" if self._closed else ""
+        return f"<Stack {self.name}: {t} frames of {y} x {x} pixels, {self.dtype}{state}>"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self._path
+
+    @property
+    def name(self) -> str:
+        """The file's name, without its folder."""
+        return self._path.name
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+        return self._frames.shape
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored counts, in native byte order."""
+        return self._frames.dtype
+
+    @property
+    def metadata(self) -> StackMetadata:
+        """Pixel size, exposure and frame rate, as far as the file gives them."""
+        return self._frames.metadata
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """One sentence for each metadata value that the file implies but does not state."""
+        return self._frames.notes
+
+    def close(self) -> None:
+        """Release the file; closing twice is harmless."""
+        if not self._closed:
+            self._closed = True
+            self._frames.close()
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames.
+
+        Parameters
+        ----------
+        start, stop : int
+            Half-open range ``[start, stop)``.
+
+        Returns
+        -------
+        ndarray, shape (stop − start, y, x)
+            A new array of the stored counts, in native byte order.
+
+        Raises
+        ------
+        DataError
+            The range leaves the movie, or the pixels cannot be decoded.
+        ValueError
+            The stack was closed.
+        """
+        if self._closed:
+            raise ValueError(f"{self.name} was closed; open it again to read from it")
+        self._check_range(start, stop)
+        return self._frames.read(start, stop)
+
+    def chunks(
+        self, start: int = 0, stop: int | None = None, memory_mb: float = 64.0
+    ) -> Iterator[tuple[int, NDArray[Any]]]:
+        """Read frames in blocks of bounded size.
+
+        Parameters
+        ----------
+        start : int
+            First frame.
+        stop : int, optional
+            One past the last frame; without it, to the end.
+        memory_mb : float
+            Largest size of a block [10⁶ bytes]; a block always holds at least one frame.
+
+        Yields
+        ------
+        int
+            Number of the block's first frame.
+        ndarray, shape (t, y, x)
+            The block [counts].
+
+        Raises
+        ------
+        DataError
+            As for `read`.
+        ValueError
+            `memory_mb` is not positive, or the stack was closed.
+        """
+        if not memory_mb > 0:
+            raise ValueError(f"memory_mb = {memory_mb} must be positive")
+        end = self.shape[0] if stop is None else stop
+        self._check_range(start, end)
+        _, y, x = self.shape
+        step = max(1, int(memory_mb * _MB // (y * x * self.dtype.itemsize)))
+        for first in range(start, end, step):
+            yield first, self.read(first, min(first + step, end))
+
+    def sha256(self) -> str:
+        """Hash the bytes of the file, without holding them in memory.
+
+        Returns
+        -------
+        str
+            SHA-256 as 64 hexadecimal digits.
+
+        Raises
+        ------
+        DataError
+            The file can no longer be read.
+        """
+        try:
+            with self._path.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            raise DataError(f"{self._path}: cannot be read ({error.strerror})") from None
+
+    def _check_range(self, start: int, stop: int) -> None:
+        total = self.shape[0]
+        if not 0 <= start <= stop <= total:
+            raise DataError(
+                f"{self._path}: frames [{start}, {stop}) were asked for, but it holds "
+                f"[0, {total}); choose frames inside that range"
+            )

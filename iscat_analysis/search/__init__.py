@@ -1,0 +1,1 @@
+"""Where and when is a particle?  Matched filters over a field, and over time."""

@@ -1,0 +1,58 @@
+"""Landing movies: sums that slide over the frames, where they jump, and at which frame.
+
+`frames` sums the movie once, in blocks of w/4 frames; `noise` says how long a window w is worth
+having; `search` sets the w frames after every boundary between blocks against the w before it;
+`dating` finds the frame of a step.
+"""
+
+from __future__ import annotations
+
+from iscat_analysis.search.sliding.dating import CREDIBLE, StepFrame, crosstalk, locate_step
+from iscat_analysis.search.sliding.frames import Chunk, Patch, make_chunk, measure_frames
+from iscat_analysis.search.sliding.noise import (
+    LONGEST_WINDOW,
+    MOVIE_SHARE,
+    SHORTEST_MOVIE,
+    SHORTEST_WINDOW,
+    SHOT_LIMITED,
+    NoiseCurve,
+    choose_window,
+    longest_window,
+    measure_noise,
+)
+from iscat_analysis.search.sliding.search import (
+    STRIDES,
+    Filter,
+    MapArray,
+    Peak,
+    find_steps,
+    make_filter,
+    sliding_maps,
+)
+
+__all__ = [
+    "CREDIBLE",
+    "LONGEST_WINDOW",
+    "MOVIE_SHARE",
+    "SHORTEST_MOVIE",
+    "SHORTEST_WINDOW",
+    "SHOT_LIMITED",
+    "STRIDES",
+    "Chunk",
+    "Filter",
+    "MapArray",
+    "NoiseCurve",
+    "Patch",
+    "Peak",
+    "StepFrame",
+    "choose_window",
+    "crosstalk",
+    "find_steps",
+    "locate_step",
+    "longest_window",
+    "make_chunk",
+    "make_filter",
+    "measure_frames",
+    "measure_noise",
+    "sliding_maps",
+]

@@ -1,0 +1,172 @@
+"""At which frame a step lies, and how surely.
+
+The likelihood of the amplitude of every single frame, Gaussian with known noise, with one change
+of mean: its posterior over the frames (flat prior, amplitudes profiled) gives the estimate and its
+interval (D. V. Hinkley, Biometrika 57, 1, 1970).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iscat_analysis._kernels.sliding import region_scores
+from iscat_analysis.records import FloatArray
+from iscat_analysis.search.sliding.frames import Patch
+
+CREDIBLE = 0.95
+"""Posterior probability inside the interval of a step's frame."""
+
+_STEEP = 4.0  # (per-frame SNR)² at which about one frame around a step is doubtful
+
+
+@dataclass(frozen=True)
+class StepFrame:
+    """The frame of a step.
+
+    Attributes
+    ----------
+    frame : int
+        First frame of the new state.
+    half_width : int
+        The interval `frame` ± `half_width` holds at least 95 % of the posterior.
+    height : float
+        Step in units of the template that was used.
+    per_frame_snr : float
+        Its height over the noise of one frame.
+    p_constant : float
+        Chance that a height which is constant before the step and after it changes as much as
+        this one does within either side.
+    """
+
+    frame: int
+    half_width: int
+    height: float
+    per_frame_snr: float
+    p_constant: float
+
+    @property
+    def gap(self) -> int:
+        """Frames on either side of the step that may belong to the other state.
+
+        They stay out of the fit: where the frame was chosen by their noise, that noise would
+        count as signal.
+        """
+        return round(_STEEP / max(self.per_frame_snr, 0.5) ** 2)
+
+
+def locate_step(
+    patch: Patch,
+    image: FloatArray,
+    search: tuple[int, int],
+    *,
+    known: FloatArray | None = None,
+) -> StepFrame:
+    """Find the frame of a step by the likelihood of the frames around it.
+
+    Parameters
+    ----------
+    patch : Patch
+        The frames; one step alone must lie in them.
+    image : ndarray, shape (ny, nx)
+        Contrast that appears.
+    search : (int, int)
+        Frames that may be the first of the new state, half-open.
+    known : ndarray, shape (t,), optional
+        Height that other events add to each frame, in units of `image`; from `crosstalk`.
+
+    Returns
+    -------
+    StepFrame
+        The most likely frame and its interval.
+    """
+    weights, scale = _projector(patch, image)
+    scores = np.empty(len(patch.counts))
+    region_scores(patch.counts, weights * patch.gain, scores)
+    power = patch.power
+    lit = power > 0
+    zero = float(np.sum(weights * patch.gain * patch.offset))
+    heights = (scores - zero) / np.where(lit, power, 1.0) / scale
+    if known is not None:
+        heights = heights - known
+    weight = np.where(lit, power, 0.0) * scale
+    n = np.cumsum(weight)
+    total = np.cumsum(weight * heights)
+    before, after = n[:-1], n[-1] - n[:-1]
+    usable = (before > 0) & (after > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        jump = np.where(usable, (total[-1] - total[:-1]) / after - total[:-1] / before, 0.0)
+    gain_in_log = 0.5 * before * after / n[-1] * jump**2 * (jump > 0)
+    frames = np.arange(patch.first + 1, patch.first + heights.size)
+    inside = (frames >= search[0]) & (frames < search[1]) & usable
+    if not inside.any():
+        middle = int(np.clip((search[0] + search[1]) // 2, frames[0], frames[-1]))
+        return StepFrame(middle, search[1] - search[0], 0.0, 0.0, 1.0)
+    log = np.where(inside, gain_in_log, -np.inf)
+    best = int(np.argmax(log))
+    posterior = np.exp(log - log[best])
+    posterior /= posterior.sum()
+    distance = np.abs(frames - frames[best])
+    order = np.argsort(distance, kind="stable")
+    held = np.cumsum(posterior[order])
+    half_width = int(distance[order][np.searchsorted(held, CREDIBLE * (1 - 1e-12))])
+    height = float(jump[best])
+    found = StepFrame(int(frames[best]), half_width, height, abs(height) * math.sqrt(scale), 1.0)
+    turn = best + 1
+    sides = (slice(0, max(turn - found.gap, 0)), slice(turn + found.gap, None))
+    p = min(_p_constant(heights[side], weight[side]) for side in sides)
+    return replace(found, p_constant=1 - (1 - p) ** 2)
+
+
+def _p_constant(heights: FloatArray, weight: FloatArray) -> float:
+    """Chance that constant heights, of variance 1/weight, seem to change as much at some frame.
+
+    Notes
+    -----
+    Tail of the likelihood ratio of one change of mean anywhere: B. James, K. L. James and
+    D. Siegmund, Biometrika 74, 71 (1987), eq. (4).
+    """
+    lit = weight > 0
+    heights, weight = heights[lit], weight[lit]
+    if heights.size < 3:
+        return 1.0
+    n, total = np.cumsum(weight), np.cumsum(weight * heights)
+    before, after = n[:-1], n[-1] - n[:-1]
+    jump = (total[-1] - total[:-1]) / after - total[:-1] / before
+    b = math.sqrt(float(np.max(before * after / n[-1] * jump**2)))
+    density = math.exp(-0.5 * b * b) / math.sqrt(2 * math.pi)
+    widest = 2 * math.log(heights.size - 1)  # ln of the odds of the last split over the first
+    tail = density * ((b - 1 / b) * widest + 4 / b) if b > 1 else 1.0
+    return min(tail, 1.0)
+
+
+def crosstalk(patch: Patch, image: FloatArray, other: FloatArray) -> float:
+    """Height that another particle's contrast adds to a frame, in units of `image`.
+
+    Parameters
+    ----------
+    patch : Patch
+        Gives the weights.
+    image, other : ndarray, shape (ny, nx)
+        Contrasts.
+
+    Returns
+    -------
+    float
+        To be taken off in `locate_step`.
+    """
+    weights, scale = _projector(patch, image)
+    return float(np.sum(weights * patch.mean_e * other)) / scale
+
+
+def _projector(patch: Patch, image: FloatArray) -> tuple[FloatArray, float]:
+    """Weights that measure the amplitude of an image and ignore a common level, and their scale."""
+    used = patch.usable
+    mean = np.where(used, patch.mean_e, 0.0)
+    share = mean / np.where(used, mean + np.square(patch.read_noise_e), 1.0)
+    light = mean * share
+    level = float(np.sum(light * image)) / max(float(light.sum()), 1e-300)
+    weights = np.where(used, share * (image - level), 0.0)
+    return weights, max(float(np.sum(weights * mean * image)), 1e-300)

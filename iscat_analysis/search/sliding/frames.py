@@ -1,0 +1,275 @@
+"""Consecutive frames in memory: their light, their sums in blocks, regions of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.sliding import block_sums, frame_totals, region_sum
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.records import BoolArray, FloatArray, Mapper
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Consecutive frames in memory, with their power.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first frame.
+    counts : ndarray, shape (t, y, x)
+        Stored counts.
+    good : ndarray of bool, shape (t,)
+        Frames that may be used; others are as if they did not exist.
+    power : ndarray, shape (t,)
+        Light of every frame over the mean; 0 where not good.
+    camera : Camera
+        Counts → photoelectrons.
+    mean_e : ndarray, shape (y, x)
+        Mean photoelectrons of a frame of unit power.
+    usable : ndarray of bool, shape (y, x)
+        Pixels that are neither defective nor saturated.
+    saturated : ndarray of bool, shape (y, x)
+        Pixels that were saturated in some frame.
+    edges : ndarray of int, shape (k + 1,)
+        Blocks, relative to `first`.
+    blocks_e : ndarray, shape (k, y, x)
+        Photoelectrons summed over each block.
+    """
+
+    first: int
+    counts: NDArray[Any]
+    good: BoolArray
+    power: FloatArray
+    camera: Camera
+    mean_e: FloatArray
+    usable: BoolArray
+    saturated: BoolArray
+    edges: NDArray[np.int64]
+    blocks_e: FloatArray
+
+    @property
+    def stop(self) -> int:
+        """One past the last frame."""
+        return self.first + len(self.counts)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows, columns."""
+        return int(self.counts.shape[1]), int(self.counts.shape[2])
+
+    def cut(self, start: int, stop: int) -> slice:
+        """Index of frames [start, stop), clipped to those held."""
+        return slice(max(start - self.first, 0), max(min(stop, self.stop) - self.first, 0))
+
+    def patch(
+        self, start: int, stop: int, rows: tuple[int, int], columns: tuple[int, int]
+    ) -> Patch:
+        """Copy a region of frames together, for all that is asked of it.
+
+        Parameters
+        ----------
+        start, stop : int
+            Half-open range of frames, clipped to those held.
+        rows, columns : (int, int)
+            Half-open ranges of pixels.
+
+        Returns
+        -------
+        Patch
+            See there.
+        """
+        here, pixels = self.cut(start, stop), (slice(*rows), slice(*columns))
+        camera = self.camera
+        return Patch(
+            first=self.first + here.start,
+            counts=np.ascontiguousarray(self.counts[(here, *pixels)]),
+            good=self.good[here],
+            power=self.power[here],
+            gain=_at(camera.gain_e_per_adu, pixels),
+            offset=_at(camera.offset_adu, pixels),
+            read_noise_e=_at(camera.read_noise_e, pixels),
+            mean_e=self.mean_e[pixels],
+            usable=self.usable[pixels],
+        )
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A region of consecutive frames.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first frame.
+    counts : ndarray, shape (t, ny, nx)
+        Stored counts.
+    good, power : ndarray, shape (t,)
+        As in `Chunk`.
+    gain, offset, read_noise_e : float or ndarray, shape (ny, nx)
+        Of the camera.
+    mean_e, usable : ndarray, shape (ny, nx)
+        As in `Chunk`.
+    """
+
+    first: int
+    counts: NDArray[Any]
+    good: BoolArray
+    power: FloatArray
+    gain: float | FloatArray
+    offset: float | FloatArray
+    read_noise_e: float | FloatArray
+    mean_e: FloatArray
+    usable: BoolArray
+
+    def window(self, start: int, stop: int) -> tuple[FloatArray, int, float]:
+        """Sum frames.
+
+        Parameters
+        ----------
+        start, stop : int
+            Half-open range, clipped to those held.
+
+        Returns
+        -------
+        electrons : ndarray, shape (ny, nx)
+            Summed photoelectrons [e].
+        frames : int
+            Good frames in the range.
+        power : float
+            Their power.
+        """
+        here = slice(max(start - self.first, 0), max(stop - self.first, 0))
+        out = np.zeros(self.mean_e.shape)
+        region_sum(self.counts[here], self.good[here], out)
+        frames = int(np.count_nonzero(self.good[here]))
+        return self.gain * (out - frames * self.offset), frames, float(self.power[here].sum())
+
+
+def measure_frames(
+    counts: NDArray[Any], camera: Camera, *, mapper: Mapper = map
+) -> tuple[FloatArray, BoolArray]:
+    """Light of every frame, and which frames repeat the one before them.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Consecutive frames.
+    camera : Camera
+        Counts → photoelectrons.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    light_e : ndarray, shape (t,)
+        Mean photoelectrons per pixel; a frame that is zero throughout has −∞.
+    repeats : ndarray of bool, shape (t,)
+        Bytes equal to the frame before.
+    """
+    whole = np.issubdtype(counts.dtype, np.integer)
+    totals = np.empty(len(counts), dtype=np.int64 if whole else np.float64)
+    repeats = np.zeros(len(counts), dtype=np.bool_)
+    zero = totals.dtype.type(0)
+
+    def some(start: int) -> None:
+        # one frame more in front, so that the first of these is compared as well
+        begin = max(start - 1, 0)
+        part = counts[begin : start + 64]
+        sums, same = np.empty(len(part), dtype=totals.dtype), np.empty(len(part), dtype=np.bool_)
+        frame_totals(part, zero, sums, same)
+        skip = start - begin
+        totals[start : start + len(part) - skip] = sums[skip:]
+        repeats[start : start + len(part) - skip] = same[skip:]
+
+    for _ in mapper(some, range(0, len(counts), 64)):
+        pass
+    pixels = counts.shape[1] * counts.shape[2]
+    maps = np.ndim(camera.gain_e_per_adu) > 0
+    if maps:
+        gain = np.asarray(camera.gain_e_per_adu, dtype=np.float64)
+        weighted = np.array([float(np.vdot(gain, frame)) for frame in counts])
+        light = (weighted - float(np.sum(gain * camera.offset_adu))) / pixels
+    else:
+        light = camera.gain_e_per_adu * (totals / pixels - float(np.mean(camera.offset_adu)))
+    return np.where(totals == 0, -np.inf, light), repeats
+
+
+def make_chunk(
+    first: int,
+    counts: NDArray[Any],
+    good: BoolArray,
+    light_e: FloatArray,
+    camera: Camera,
+    *,
+    stride: int,
+    defects: Callable[[FloatArray, FloatArray], BoolArray],
+    mapper: Mapper = map,
+) -> Chunk:
+    """Sum consecutive frames in blocks.
+
+    Parameters
+    ----------
+    first : int
+        Number of the first frame.
+    counts : ndarray, shape (t, y, x)
+        The frames.
+    good : ndarray of bool, shape (t,)
+        Frames that may be used.
+    light_e : ndarray, shape (t,)
+        From `measure_frames`.
+    camera : Camera
+        Counts → photoelectrons.
+    stride : int
+        Frames per block; the last may be shorter.
+    defects : callable
+        Summed photoelectrons and their read-noise variance → dead and hot pixels.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    Chunk
+        Ready to be searched.
+    """
+    frames, rows, columns = counts.shape
+    edges = np.append(np.arange(0, frames, stride), frames).astype(np.int64)
+    blocks = np.empty((edges.size - 1, rows, columns))
+    whole = np.issubdtype(counts.dtype, np.integer)
+    narrow = counts.dtype.itemsize <= 2
+    scratch = (np.uint32 if narrow else np.int64) if whole else np.float64
+    highest = np.empty((edges.size - 1, rows, columns), dtype=counts.dtype)
+
+    def one(k: int) -> None:
+        part = slice(edges[k], edges[k + 1])
+        start = int(np.argmax(good[part])) + int(edges[k])
+        highest[k] = counts[start]
+        block_sums(
+            counts[part], good[part], np.empty((rows, columns), dtype=scratch),
+            blocks[k], highest[k],
+        )  # fmt: skip
+
+    for _ in mapper(one, range(edges.size - 1)):
+        pass
+    saturated = camera.saturated(highest.max(axis=0))
+    n = np.add.reduceat(good.astype(np.int64), edges[:-1])
+    blocks -= n[:, None, None] * np.asarray(camera.offset_adu)
+    blocks *= camera.gain_e_per_adu
+    power = np.where(good, light_e, 0.0)
+    power /= power[good].mean()
+    total = blocks.sum(axis=0)
+    variance = camera.read_variance_e2((rows, columns))
+    usable = ~(saturated | defects(total, n.sum() * variance)) & (total > 0)
+    return Chunk(
+        first, counts, good, power, camera, total / power.sum(), usable, saturated, edges, blocks
+    )
+
+
+def _at(value: float | FloatArray, here: tuple[slice, slice]) -> Any:
+    """Return a number, or the region of a map."""
+    return value[here] if isinstance(value, np.ndarray) else value

@@ -1,0 +1,249 @@
+"""Where the sums jump: the matched filter at every boundary between blocks.
+
+The w frames after a boundary are set against the w before it; a particle that lands or leaves
+shows as a contrast that rises and falls linearly within w frames of its step.  The statistic is
+the matched filter's signal-to-noise ratio with the model's image, the root of twice the gain in
+log-likelihood.  Noise of neighbouring boundaries is correlated by 5/8 only, so above any useful
+threshold each boundary counts as an independent search.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from iscat_analysis._kernels.sliding import contrast_map, step_peaks
+from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.search.sliding.frames import Chunk
+
+MapArray = NDArray[np.float32]
+
+STRIDES = 4
+"""Boundaries searched per window: a step midway between two loses an eighth of its height."""
+
+_SAMPLED = 0.85  # of a peak's height that the pixel next to it has at least
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Matched filter of one chunk; the weights are those of its mean image.
+
+    Attributes
+    ----------
+    spectrum : ndarray
+        Of the reversed template.
+    size : (int, int)
+        Of the transforms.
+    half : int
+        Half the template's side [pixels].
+    weight : ndarray, shape (y, x)
+        Information of a pixel about its contrast, per frame of unit power; 0 where not used.
+    norm : ndarray, shape (y, x)
+        Information about the amplitude, per frame.
+    """
+
+    spectrum: NDArray[np.complex64]
+    size: tuple[int, int]
+    half: int
+    weight: MapArray
+    norm: MapArray
+
+
+def make_filter(chunk: Chunk, template: FloatArray) -> Filter:
+    """Prepare the matched filter.
+
+    Parameters
+    ----------
+    chunk : Chunk
+        Gives the weights.
+    template : ndarray, shape (k, k)
+        Contrast per unit amplitude, k odd.
+
+    Returns
+    -------
+    Filter
+        See there.
+    """
+    rows, columns = chunk.shape
+    half = template.shape[0] // 2
+    size = (
+        fft.next_fast_len(rows + half, real=True),
+        fft.next_fast_len(columns + half, real=True),
+    )
+    mean = np.where(chunk.usable, chunk.mean_e, 0.0)
+    read = chunk.camera.read_variance_e2(chunk.shape)
+    weight = np.zeros(size)
+    weight[:rows, :columns] = mean**2 / np.where(chunk.usable, mean + read, 1.0)
+    scale = math.sqrt(float(np.sum(template**2)))  # keeps single precision in range
+    reversed_ = np.zeros((2, *size))
+    k = template.shape[0]
+    flipped = template[::-1, ::-1]
+    reversed_[0, :k, :k] = flipped
+    reversed_[1, :k, :k] = (flipped / scale) ** 2
+    # the template's centre belongs at the origin, so that nothing is shifted
+    spectra = fft.rfft2(np.roll(reversed_, (-half, -half), axis=(1, 2)))
+    norm = fft.irfft2(fft.rfft2(weight) * spectra[1], s=size)[:rows, :columns] * scale**2
+    norm = np.maximum(norm, 1e-6 * norm.max())
+    return Filter(
+        spectra[0].astype(np.complex64),
+        size,
+        half,
+        weight[:rows, :columns].astype(np.float32),
+        norm.astype(np.float32),
+    )
+
+
+def sliding_maps(
+    chunk: Chunk,
+    matched: Filter,
+    strides: int,
+    *,
+    explained: Callable[[int, slice, slice], FloatArray | None] | None = None,
+    earlier: tuple[MapArray, FloatArray] | None = None,
+    changed: Sequence[int] = (),
+    mapper: Mapper = map,
+) -> tuple[MapArray, FloatArray]:
+    """Signal-to-noise ratio of a step at every boundary between blocks and every pixel.
+
+    Parameters
+    ----------
+    chunk : Chunk
+        The sums.
+    matched : Filter
+        From `make_filter`.
+    strides : int
+        Blocks in a window; fewer near the ends.
+    explained : callable, optional
+        Boundary, and the frames before and after → contrast of known events, or None for none.
+    earlier : (ndarray, ndarray), optional
+        What an earlier call returned; overwritten where `changed`, and returned.
+    changed : sequence of int
+        Boundaries at which what is explained has changed since.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    snr : ndarray of float32, shape (k − 1, y, x)
+        Map j belongs to a step at ``edges[j + 1]``.
+    frames : ndarray, shape (k − 1,)
+        Effective frames: information at a boundary is `Filter.norm` times this.
+    """
+    count = chunk.edges.size - 2
+    rows, columns = chunk.shape
+    block_power = np.add.reduceat(chunk.power, chunk.edges[:-1])
+    if earlier is None:
+        earlier = np.empty((count, rows, columns), dtype=np.float32), np.zeros(count)
+        changed = range(count)
+    snr, effective = earlier
+
+    def one(j: int) -> None:
+        low, middle, high = max(j + 1 - strides, 0), j + 1, min(j + 1 + strides, count + 1)
+        powers = block_power[low:middle].sum(), block_power[middle:high].sum()
+        if min(powers) <= 0:
+            snr[j] = 0.0
+            return
+        before = chunk.blocks_e[low:middle].sum(axis=0)
+        after = chunk.blocks_e[middle:high].sum(axis=0)
+        image = np.zeros(matched.size, dtype=np.float32)
+        contrast_map(before, after, matched.weight, image)
+        if explained is not None:
+            known = explained(
+                j,
+                slice(int(chunk.edges[low]), int(chunk.edges[middle])),
+                slice(int(chunk.edges[middle]), int(chunk.edges[high])),
+            )
+            if known is not None:
+                image[:rows, :columns] -= (matched.weight * known).astype(np.float32)
+        spectrum = fft.rfft2(image)
+        spectrum *= matched.spectrum
+        overlap = fft.irfft2(spectrum, s=matched.size)[:rows, :columns]
+        effective[j] = powers[0] * powers[1] / (powers[0] + powers[1])
+        np.divide(overlap * math.sqrt(effective[j]), np.sqrt(matched.norm), out=snr[j])
+
+    for _ in mapper(one, changed):
+        pass
+    return snr, effective
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A place and a boundary at which the contrast seems to step.
+
+    Attributes
+    ----------
+    frame : int
+        The boundary.
+    x_px, y_px : float
+        Sub-pixel position.
+    snr : float
+        With its sign.
+    amplitude : float
+        Linear estimate, with its sign.
+    """
+
+    frame: int
+    x_px: float
+    y_px: float
+    snr: float
+    amplitude: float
+
+
+def find_steps(
+    chunk: Chunk,
+    matched: Filter,
+    snr: MapArray,
+    effective: FloatArray,
+    threshold: float,
+) -> list[Peak]:
+    """Peaks in (t, y, x) above the threshold, strongest first.
+
+    Parameters
+    ----------
+    chunk : Chunk
+        The sums.
+    matched : Filter
+        From `make_filter`.
+    snr : ndarray, shape (n, y, x)
+        From `sliding_maps`.
+    effective : ndarray
+        From `sliding_maps`.
+    threshold : float
+        Least signal-to-noise ratio, between the pixels: where the field peaks, not where it is
+        sampled, it exceeds the threshold as often as the theory of smooth fields has it.
+
+    Returns
+    -------
+    list of Peak
+        With sub-pixel positions.
+    """
+    peaks = []
+    for k, i, j in step_peaks(snr, _SAMPLED * threshold):
+        value = float(snr[k, i, j])
+        image = snr[k] * np.sign(value)
+        (dy, above), (dx, beside) = _vertex(image[:, j], int(i)), _vertex(image[i], int(j))
+        height = math.copysign(abs(value) + above + beside, value)
+        if abs(height) <= threshold:
+            continue
+        amplitude = height / math.sqrt(float(effective[k]) * float(matched.norm[i, j]))
+        boundary = chunk.first + int(chunk.edges[k + 1])
+        peaks.append(Peak(boundary, float(j + dx), float(i + dy), height, amplitude))
+    return sorted(peaks, key=lambda p: -abs(p.snr))
+
+
+def _vertex(line: NDArray[Any], index: int) -> tuple[float, float]:
+    """Vertex of the parabola through a maximum and its neighbours, and its height above it."""
+    if not 0 < index < line.size - 1:
+        return 0.0, 0.0
+    low, mid, high = (float(v) for v in line[index - 1 : index + 2])
+    bend = low - 2 * mid + high
+    if bend >= 0:
+        return 0.0, 0.0
+    shift = float(np.clip(0.5 * (low - high) / bend, -0.5, 0.5))
+    return shift, 0.25 * (high - low) * shift

@@ -1,0 +1,298 @@
+"""Where something landed: a matched filter with the model's own image.
+
+The statistic at a pixel is the signal-to-noise ratio Σ w T c/√(Σ w T²) of the template T in the
+measured signal c, w the information per pixel: twice the gain in log-likelihood is its square.  The
+threshold is the height that pure noise exceeds as often as the configured number of false alarms,
+by the expected Euler characteristic of a Gaussian field (Adler and Taylor, Random Fields and
+Geometry, 2007), in the plane, or in the plane and along z where the height is free.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.ndimage import maximum_filter
+
+from iscat_analysis.config import Detection
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid
+from iscat_analysis.records import Candidate, FloatArray
+
+HEIGHTS_PER_FRINGE = 8
+"""Templates per interference fringe where z is free: half-way between two the match loses 4 %."""
+
+SIDELOBE = 0.5
+"""A weaker peak inside the fitted region of a stronger one waits until that one is subtracted,
+unless it reaches this share of it."""
+
+FAR_LOBE = 0.05
+"""The same beyond the region, where the rings go on: 3 % of the peak at 3 µm."""
+
+
+@dataclass(frozen=True)
+class Templates:
+    """The model's images, normalised, at the heights searched.
+
+    Attributes
+    ----------
+    z_nm : ndarray, shape (n,)
+        Heights [nm].
+    images : ndarray, shape (n, k, k)
+        Signal per unit amplitude (dark field: per unit amplitude squared), k odd.
+    signs : ndarray, shape (n,)
+        Sign of the signal's peak.
+    quadratic : bool
+        Whether the signal grows with the square of the mass (dark field).
+    threshold : float
+        Signal-to-noise ratio that noise reaches as often as configured.
+    two_sided : bool
+        Whether negative amplitudes count.
+    """
+
+    z_nm: FloatArray
+    images: FloatArray
+    signs: FloatArray
+    quadratic: bool
+    threshold: float
+    two_sided: bool
+
+
+def make_templates(
+    model: ForwardModel,
+    detection: Detection,
+    *,
+    pixel_nm: float,
+    roi_nm: float,
+    z_range_nm: tuple[float, float] | None,
+    field_px: tuple[int, int],
+) -> Templates:
+    """Prepare the matched filter for a field.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Its reach must cover the region's diagonal.
+    detection : Detection
+        Polarity and expected false alarms.
+    pixel_nm : float
+        Pixel side [nm].
+    roi_nm : float
+        Side of the template [nm].
+    z_range_nm : (float, float) or None
+        Heights to search; None for the nominal height alone.
+    field_px : (int, int)
+        Rows and columns of the field.
+
+    Returns
+    -------
+    Templates
+        Images and threshold.
+    """
+    half = max(2, int(roi_nm / 2 / pixel_nm))
+    grid = PixelGrid.centred(2 * half + 1, pixel_nm)
+    if z_range_nm is None:
+        heights = np.array([model.height_nm])
+    else:
+        low, high = z_range_nm
+        count = math.ceil((high - low) / model.fringe_nm * HEIGHTS_PER_FRINGE) + 1
+        heights = np.linspace(low, high, count)
+    bare = replace(model, scale=MassScale())
+    weak = _weak_amplitude(bare)
+    images, roughness = [], []
+    for z in heights:
+        signal, gradient = bare.gradient(grid, 0.0, 0.0, float(z), weak)
+        images.append(signal / (weak**2 if bare.rho == 0 else weak))
+        roughness.append(_roughness(signal, gradient[: 2 if z_range_nm is None else 3]))
+    stacked = np.stack(images)
+    extremes = np.take_along_axis(
+        stacked.reshape(heights.size, -1),
+        np.abs(stacked.reshape(heights.size, -1)).argmax(axis=1)[:, None],
+        axis=1,
+    )[:, 0]
+    two_sided = z_range_nm is None and model.rho > 0 and detection.polarity == "both"
+    area = field_px[0] * field_px[1] * pixel_nm**2
+    depth = float(heights[-1] - heights[0])
+    return Templates(
+        z_nm=heights,
+        images=stacked,
+        signs=np.sign(extremes),
+        quadratic=model.rho == 0,
+        threshold=_threshold(
+            detection.false_alarms_per_movie, np.mean(roughness, axis=0), area, depth, two_sided
+        ),
+        two_sided=two_sided,
+    )
+
+
+def signal_to_noise(
+    likelihood: Likelihood, templates: Templates, explained: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Matched-filter maps.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Of the whole field.
+    templates : Templates
+        From `make_templates`.
+    explained : ndarray, shape (y, x), optional
+        Signal of particles already known, to be taken off.
+
+    Returns
+    -------
+    snr : ndarray, shape (n, y, x)
+        Signal-to-noise ratio at every height and pixel.
+    strength : ndarray, shape (n, y, x)
+        Linear estimate of the amplitude, in dark field of its square.
+    """
+    weight = likelihood.signal_information(explained)
+    signal = np.nan_to_num(likelihood.measured_signal())
+    if explained is not None:
+        signal = signal - explained
+    weighted = np.where(weight > 0, weight * signal, 0.0)
+    overlap = _correlate(weighted, templates.images)
+    norm = _correlate(weight, templates.images**2)
+    norm = np.maximum(norm, 1e-9 * norm.max() if norm.max() > 0 else 1.0)
+    return overlap / np.sqrt(norm), overlap / norm
+
+
+def find_particles(
+    likelihood: Likelihood,
+    templates: Templates,
+    detection: Detection,
+    *,
+    roi_px: float,
+    explained: FloatArray | None = None,
+) -> tuple[Candidate, ...]:
+    """Peaks of the matched filter above the threshold, strongest first.
+
+    A peak much weaker than another may be its side lobe and is held back, a little weaker inside
+    its region, far weaker anywhere; call again with the strong one explained.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Of the whole field.
+    templates : Templates
+        From `make_templates`.
+    detection : Detection
+        Polarity.
+    roi_px : float
+        Side of the fitted region [pixels].
+    explained : ndarray, shape (y, x), optional
+        Signal of particles already known.
+
+    Returns
+    -------
+    tuple of Candidate
+        With sub-pixel positions.
+    """
+    snr, strength = signal_to_noise(likelihood, templates, explained)
+    ranked = np.abs(snr) if templates.two_sided else snr
+    wanted = {"both": 0, "bright": 1, "dark": -1}[detection.polarity]
+    if wanted:
+        signs = templates.signs[:, None, None] * np.sign(snr)
+        ranked = np.where(signs == wanted, np.abs(snr) if not templates.quadratic else snr, 0.0)
+        if not templates.two_sided and templates.z_nm.size > 1:
+            ranked = np.where(snr > 0, ranked, 0.0)
+    best = ranked.max(axis=0)
+    peaks = (best == maximum_filter(best, size=3)) & (best > templates.threshold)
+    rows, columns = np.nonzero(peaks)
+    found: list[Candidate] = []
+    strongest_first = np.argsort(-best[rows, columns])
+    for row, column in zip(rows[strongest_first], columns[strongest_first], strict=True):
+        height = best[row, column]
+        shadowed = any(
+            height
+            < abs(other.snr)
+            * (
+                SIDELOBE
+                if max(abs(column - other.x_px), abs(row - other.y_px)) < roi_px
+                else FAR_LOBE
+            )
+            for other in found
+        ) or any(math.hypot(column - other.x_px, row - other.y_px) < roi_px / 6 for other in found)
+        if shadowed:
+            continue
+        k = int(ranked[:, row, column].argmax())
+        dy, dx = _subpixel(best, row, column)
+        found.append(
+            Candidate(
+                x_px=float(column + dx),
+                y_px=float(row + dy),
+                z_nm=float(templates.z_nm[k]),
+                mass_kda=_mass(likelihood.model, templates, float(strength[k, row, column])),
+                snr=float(snr[k, row, column]),
+            )
+        )
+    return tuple(found)
+
+
+def _correlate(image: FloatArray, kernels: FloatArray) -> FloatArray:
+    """Cross-correlation of an image with centred kernels (n, k, k), shape (n, y, x)."""
+    rows, columns = image.shape
+    half = kernels.shape[1] // 2
+    padded = [next_fast_len(size + 2 * half, real=True) for size in image.shape]
+    spectrum = rfft2(image, padded)
+    out = np.empty((len(kernels), rows, columns))
+    for k, kernel in enumerate(kernels):
+        full = irfft2(spectrum * rfft2(kernel[::-1, ::-1], padded), padded)
+        out[k] = full[half : half + rows, half : half + columns]
+    return out
+
+
+def _weak_amplitude(bare: ForwardModel) -> float:
+    """Return an amplitude whose signal is linear; in dark field any will do."""
+    nominal = bare.material.mass_kda
+    peak = abs(bare.peak_contrast(bare.height_nm, nominal))
+    return nominal * min(1.0, 1e-4 / max(peak, 1e-30)) if bare.rho else nominal
+
+
+def _mass(model: ForwardModel, templates: Templates, strength: float) -> float:
+    """Mass from the linear estimate: of the amplitude, or of its square in dark field."""
+    amplitude = math.sqrt(max(strength, 0.0)) if templates.quadratic else strength
+    return float(model.scale.mass(np.asarray(amplitude)))
+
+
+def _roughness(signal: FloatArray, gradient: NDArray[np.float64]) -> FloatArray:
+    """Covariance of the gradient of the unit-variance field that the filter makes of noise."""
+    norm = np.sum(signal**2)
+    cross = np.einsum("iyx,jyx->ij", gradient, gradient) / norm
+    along = np.einsum("iyx,yx->i", gradient, signal) / norm
+    covariance: FloatArray = cross - np.outer(along, along)
+    return covariance
+
+
+def _threshold(
+    alarms: float, roughness: FloatArray, area: float, depth: float, two_sided: bool
+) -> float:
+    """Height u at which the expected number of noise peaks is `alarms`."""
+    plane = area * math.sqrt(np.linalg.det(roughness[:2, :2])) / (2 * math.pi) ** 1.5
+    volume = 0.0
+    if roughness.shape[0] == 3:
+        determinant = max(float(np.linalg.det(roughness)), 0.0)
+        volume = area * depth * math.sqrt(determinant) / (2 * math.pi) ** 2
+    sides = 2 if two_sided else 1
+
+    heights = np.linspace(2.0, 30.0, 28001)
+    polynomial = sides * (plane * heights + volume * (heights**2 - 1))
+    expected = np.log(polynomial) - heights**2 / 2
+    return float(np.interp(-math.log(alarms), -expected, heights))
+
+
+def _subpixel(image: FloatArray, row: int, column: int) -> tuple[float, float]:
+    """Vertex of the parabola through a maximum and its neighbours, along each axis."""
+    shifts = []
+    for axis, index in ((0, row), (1, column)):
+        line = image[:, column] if axis == 0 else image[row]
+        if not 0 < index < line.size - 1:
+            shifts.append(0.0)
+            continue
+        low, mid, high = line[index - 1 : index + 2]
+        bend = low - 2 * mid + high
+        shifts.append(float(np.clip(0.5 * (low - high) / bend, -0.5, 0.5)) if bend < 0 else 0.0)
+    return shifts[0], shifts[1]

@@ -1,0 +1,44 @@
+"""What species there are: a mixture fitted to the events themselves, each with its own error.
+
+An event of measured mass x_i and standard deviation σ_i comes from species k with
+
+    x_i ~ N(μ_k, τ_k² + σ_i²),
+
+so the width τ_k is what exceeds the measurement error: extreme deconvolution in one dimension
+(Bovy, Hogg & Roweis, Ann. Appl. Stat. 5, 1657, 2011).  Nothing is binned.
+
+Light particles are missed.  The matched filter accepts a particle of mass m if its estimate
+y ~ N(m, σ_d²) exceeds u·σ_d, and the fit's x uses the same light at least as well, so that y is x
+with further noise: given x, selection no longer depends on m.  The likelihood of the events seen is
+
+    Π_i [Σ_k w_k N(x_i; μ_k, τ_k² + σ_i²)] / Z_i,    Z_i = Σ_k w_k Φ((μ_k − u σ_d)/√(τ_k² + s_i²)),
+
+s_i = max(σ_d, σ_i), and the weights w_k are those of the particles that came, seen or not.
+
+The number of species has the least BIC; a parametric bootstrap gives the intervals and says how
+often it would choose that number again.
+
+`describe` is the whole of it.  `events` says what is seen and what is missed, `mixture` maximises
+the likelihood above, `search` tries numbers of species, `bootstrap` repeats the measurement, and
+`curves` holds what is drawn.
+"""
+
+from __future__ import annotations
+
+from iscat_analysis.species.describe import (
+    LEAST_EVENTS,
+    LEAST_SPECIES,
+    SPECIES_COLUMNS,
+    Distribution,
+    describe,
+)
+from iscat_analysis.species.events import Efficiency
+
+__all__ = [
+    "LEAST_EVENTS",
+    "LEAST_SPECIES",
+    "SPECIES_COLUMNS",
+    "Distribution",
+    "Efficiency",
+    "describe",
+]

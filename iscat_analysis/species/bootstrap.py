@@ -1,0 +1,132 @@
+"""The measurement again and again, as the fitted species would give it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import log_ndtr, ndtri_exp
+
+from iscat_analysis.records import FloatArray
+from iscat_analysis.species.events import Events
+from iscat_analysis.species.mixture import Mixture, climb, height, polish
+from iscat_analysis.species.search import joined_starts, split_starts
+
+_SUPPORT_DRAWS = 20
+_RIVAL_EVALUATIONS = 150
+_TOLERANCE = 1e-6  # of the log-likelihood per event: a tenth of a standard error for hundreds
+
+
+@dataclass(frozen=True, eq=False)
+class Repeat:
+    """One repetition.
+
+    Attributes
+    ----------
+    mixture : Mixture
+        Fitted to it.
+    count, corrected : ndarray, shape (k,)
+        Events of each species that were seen, and that came.
+    """
+
+    mixture: Mixture
+    count: FloatArray
+    corrected: FloatArray
+
+
+def bootstrap(
+    events: Events, best: Mixture, *, draws: int, least: int, seed: int
+) -> tuple[list[Repeat], float]:
+    """Fit simulated repetitions; in some of them let BIC choose between neighbouring numbers.
+
+    Parameters
+    ----------
+    events : Events
+        What was seen.
+    best : Mixture
+        By rising mass.
+    draws : int
+        Repetitions.
+    least : int
+        Events in a repetition, at least.
+    seed : int
+        Chooses the random numbers.
+
+    Returns
+    -------
+    repeats : list of Repeat
+        Their species in the order of `best`.
+    support : float
+        Share of those asked in which BIC chose the same number; NaN where none was.
+    """
+    rng = np.random.default_rng(seed)
+    repeats, agreed = [], []
+    for number in range(draws):
+        drawn = draw_events(events, best, max(least, int(rng.poisson(events.x.size))), rng)
+        # from the estimate, so that species keep their places
+        fit = polish(drawn, best, tolerance=_TOLERANCE)
+        repeats.append(Repeat(fit, fit.shares(drawn).sum(axis=0), fit.weight * fit.arrived(drawn)))
+        if number < _SUPPORT_DRAWS:
+            n = drawn.x.size
+            agreed.append(
+                all(fit.bic(n) <= rival.bic(n) for rival in _rivals(drawn, fit.by_mass()))
+            )
+    return repeats, float(np.mean(agreed)) if agreed else math.nan
+
+
+def draw_events(events: Events, mixture: Mixture, n: int, rng: np.random.Generator) -> Events:
+    """Draw events as the mixture would give them, each detected and with a real event's noise.
+
+    Parameters
+    ----------
+    events : Events
+        Whose noise and detector to take.
+    mixture : Mixture
+        The species.
+    n : int
+        Events to draw.
+    rng : numpy.random.Generator
+        Random numbers.
+
+    Returns
+    -------
+    Events
+        Exactly n.
+
+    Notes
+    -----
+    Species and the filter's estimate y are drawn given detection, y > u·σ_d, and x given y: however
+    unlikely a species is to be seen, no draw is thrown away.
+    """
+    which = rng.integers(events.x.size, size=n)
+    sigma, efficiency = events.sigma[which], events.efficiency
+    blank = Events(np.zeros(n), sigma, efficiency)
+    seen = mixture.weight * mixture.chance(blank)
+    steps = np.cumsum(seen, axis=1) / seen.sum(axis=1, keepdims=True)
+    species = (rng.random((n, 1)) > steps[:, :-1]).sum(axis=1)
+    mean, spread = mixture.mean[species], mixture.variance[species] + blank.variance
+    if efficiency is None:
+        return Events(np.abs(rng.normal(mean, np.sqrt(spread))), sigma, None)
+    total = spread + efficiency.extra_sigma(sigma) ** 2
+    reach = np.sqrt(total)
+    tail = np.log1p(-rng.random(n)) + log_ndtr((mean - efficiency.threshold_kda) / reach)
+    estimate = -reach * ndtri_exp(tail)  # less the mean
+    left = np.sqrt(spread * (total - spread) / total)
+    x = rng.normal(mean + spread / total * estimate, left)
+    return Events(np.abs(x), sigma, efficiency)
+
+
+def _rivals(events: Events, fit: Mixture) -> list[Mixture]:
+    """Fit one species more and, where there are two or more, one less."""
+    more = [climb(events, start) for start in split_starts(events, fit)]
+    return [
+        polish(
+            events,
+            max(starts, key=lambda start: height(events, start)),
+            evaluations=_RIVAL_EVALUATIONS,
+            tolerance=_TOLERANCE,
+        )
+        for starts in (more, joined_starts(fit))
+        if starts
+    ]

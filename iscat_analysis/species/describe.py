@@ -1,0 +1,296 @@
+"""From masses and their errors to species, curves and verdicts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.species.bootstrap import Repeat, bootstrap
+from iscat_analysis.species.curves import (
+    CURVE_COLUMNS,
+    HISTOGRAM_COLUMNS,
+    bandwidth_of,
+    curves_of,
+    histogram_of,
+)
+from iscat_analysis.species.events import Efficiency, Events
+from iscat_analysis.species.mixture import Mixture
+from iscat_analysis.species.search import fit_species
+
+Branch = Literal["magnitude", "landing", "leaving"]
+
+LEAST_SPECIES = 3
+"""Fewer events apart from all others are outliers and no species."""
+
+LEAST_EVENTS = 10
+"""Fewer are listed, not described."""
+
+SPECIES_COLUMNS = (
+    "mass_kda", "mass_se", "mass_low", "mass_high", "width_kda", "width_low", "width_high",
+    "fraction", "fraction_low", "fraction_high", "count", "count_low", "count_high",
+    "landing", "leaving", "efficiency", "count_corrected", "corrected_low", "corrected_high",
+    "outlier",
+)  # fmt: skip
+"""Columns of the table of species: intervals are 95 %, `fraction` and `count_corrected` are of the
+particles that came, the other counts of those that were seen; `outlier` where these are fewer than
+`LEAST_SPECIES`."""
+
+_BROAD = 0.4  # width over mass
+_DIGITS = 6  # of the curves in summary.json
+
+
+@dataclass(frozen=True, eq=False)
+class Distribution:
+    """Species, curves and verdicts of one set of events; `describe` makes it.
+
+    Attributes
+    ----------
+    species : pandas.DataFrame
+        One row per species by rising mass, columns `SPECIES_COLUMNS`; empty for too few events.
+    selection : pandas.DataFrame
+        species, log_likelihood, bic, delta_bic of every number of species tried.
+    support : float
+        Share of simulated repetitions in which BIC chose the same number; NaN without bootstrap.
+    histogram : pandas.DataFrame
+        low_kda, high_kda, count, count_low, count_high (95 % Poisson).
+    curves : pandas.DataFrame
+        mass_kda and per kDa: density (kernel), density_se (Poisson), model, model_corrected (of the
+        particles that came), efficiency.
+    bandwidth_kda : float
+        Of the kernel density [kDa].
+    events : int
+        Events used.
+    branch : str
+        ``"magnitude"``, ``"landing"`` or ``"leaving"``.
+    draws, seed : int
+        Of the bootstrap.
+    notes : tuple of str
+        What the user should know, one sentence each.
+    """
+
+    species: pd.DataFrame
+    selection: pd.DataFrame
+    support: float
+    histogram: pd.DataFrame
+    curves: pd.DataFrame
+    bandwidth_kda: float
+    events: int
+    branch: Branch
+    draws: int
+    seed: int
+    notes: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give what ``summary.json`` holds under ``distribution``.
+
+        Returns
+        -------
+        dict
+            Nested plain values, curves by column.
+        """
+        return {
+            "branch": self.branch,
+            "events": self.events,
+            "species": self.species.to_dict("records"),
+            "selection": self.selection.to_dict("records"),
+            "support": self.support,
+            "histogram": self.histogram.to_dict("list"),
+            "curves": {
+                name: [float(f"{value:.{_DIGITS}g}") for value in column]
+                for name, column in self.curves.items()
+            },
+            "bandwidth_kda": self.bandwidth_kda,
+            "draws": self.draws,
+            "seed": self.seed,
+            "notes": list(self.notes),
+        }
+
+
+def describe(
+    masses: ArrayLike,
+    sigmas: ArrayLike,
+    *,
+    efficiency: Efficiency | None = None,
+    max_species: int = 6,
+    seed: int,
+    branch: Branch = "magnitude",
+    draws: int = 100,
+) -> Distribution:
+    """Describe a set of masses as a mixture of species.
+
+    Parameters
+    ----------
+    masses : array_like, shape (n,)
+        Masses, negative for particles that leave [kDa]; NaN is left out.
+    sigmas : array_like, shape (n,)
+        Standard deviation of each, positive [kDa].
+    efficiency : Efficiency, optional
+        Corrects for what was missed; without it nothing was.
+    max_species : int
+        Largest number to try.
+    seed : int
+        Of the bootstrap.
+    branch : {"magnitude", "landing", "leaving"}
+        Which events: |mass| of all, or one side.
+    draws : int
+        Simulated repetitions for the intervals; 0 for none.
+
+    Returns
+    -------
+    Distribution
+        With an empty table of species where there are fewer than `LEAST_EVENTS` events.
+
+    Raises
+    ------
+    ValueError
+        The arrays differ in shape, or an option is impossible.
+
+    Notes
+    -----
+    Intervals are the 2.5 and 97.5 % quantiles of the bootstrap, which draws the number of events
+    from its own Poisson distribution.
+    """
+    mass, sigma = (np.asarray(v, dtype=np.float64).reshape(-1) for v in (masses, sigmas))
+    if mass.shape != sigma.shape:
+        raise ValueError(f"{mass.size} masses but {sigma.size} sigmas")
+    if max_species < 1 or draws < 0 or branch not in ("magnitude", "landing", "leaving"):
+        raise ValueError(
+            f"max_species = {max_species} and draws = {draws} must be positive, and branch = "
+            f"{branch!r} one of magnitude, landing, leaving"
+        )
+    usable = np.isfinite(mass) & np.isfinite(sigma) & (sigma > 0)
+    if branch != "magnitude":
+        usable &= (mass > 0) == (branch == "landing")
+    notes = []
+    if branch == "magnitude" and np.count_nonzero(~usable):
+        notes.append(f"{np.count_nonzero(~usable)} events without a mass and an error are left out")
+    events = Events(np.abs(mass[usable]), sigma[usable], efficiency)
+    if events.x.size < LEAST_EVENTS:
+        notes.append(f"{events.x.size} events are too few for species; {LEAST_EVENTS} are needed")
+        return _undescribed(events, branch, draws, seed, notes)
+
+    fits = fit_species(events, max_species)
+    bic = [fit.bic(events.x.size) for fit in fits]
+    best = fits[int(np.argmin(bic))].by_mass()
+    repeats, support = bootstrap(events, best, draws=draws, least=LEAST_EVENTS, seed=seed)
+    species = _table(events, best, repeats, mass[usable] > 0)
+    bandwidth = bandwidth_of(events, len(species))
+    return Distribution(
+        species=species,
+        selection=pd.DataFrame(
+            {
+                "species": [fit.weight.size for fit in fits],
+                "log_likelihood": [fit.log_likelihood for fit in fits],
+                "bic": bic,
+                "delta_bic": np.subtract(bic, min(bic)),
+            }
+        ),
+        support=support,
+        histogram=histogram_of(events),
+        curves=curves_of(events, best, bandwidth),
+        bandwidth_kda=bandwidth,
+        events=int(events.x.size),
+        branch=branch,
+        draws=draws,
+        seed=seed,
+        notes=(*notes, *_remarks(species)),
+    )
+
+
+def _table(
+    events: Events, best: Mixture, repeats: Sequence[Repeat], lands: BoolArray
+) -> pd.DataFrame:
+    """Lay out the species, with intervals from the repetitions."""
+    share = best.shares(events)
+    seen = share.sum(axis=0)
+
+    def interval(values: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        if not values:
+            nothing = np.full(best.weight.size, math.nan)
+            return nothing, nothing
+        low, high = np.quantile(np.array(values), [0.025, 0.975], axis=0)
+        return low, high
+
+    mass_low, mass_high = interval([r.mixture.mean for r in repeats])
+    width_low, width_high = interval([np.sqrt(r.mixture.variance) for r in repeats])
+    part_low, part_high = interval([r.mixture.weight for r in repeats])
+    count_low, count_high = interval([r.count for r in repeats])
+    came_low, came_high = interval([r.corrected for r in repeats])
+    means = np.array([r.mixture.mean for r in repeats])
+    return pd.DataFrame(
+        {
+            "mass_kda": best.mean,
+            "mass_se": means.std(axis=0, ddof=1) if len(repeats) > 1 else math.nan,
+            "mass_low": mass_low,
+            "mass_high": mass_high,
+            "width_kda": np.sqrt(best.variance),
+            "width_low": width_low,
+            "width_high": width_high,
+            "fraction": best.weight,
+            "fraction_low": part_low,
+            "fraction_high": part_high,
+            "count": seen,
+            "count_low": count_low,
+            "count_high": count_high,
+            "landing": share[lands].sum(axis=0),
+            "leaving": share[~lands].sum(axis=0),
+            "efficiency": best.chance(events).mean(axis=0),
+            "count_corrected": best.weight * best.arrived(events),
+            "corrected_low": came_low,
+            "corrected_high": came_high,
+            "outlier": seen < LEAST_SPECIES - 0.5,
+        },
+        columns=list(SPECIES_COLUMNS),
+    )
+
+
+def _remarks(species: pd.DataFrame) -> list[str]:
+    """Say of which species not to believe everything."""
+    cases = (
+        (
+            species["efficiency"] < 0.5,
+            "fewer than half of the particles of {} kDa are detected: their mass and number rest "
+            "on the detection model",
+        ),
+        (
+            species["outlier"],
+            f"what lies at {{}} kDa is fewer than {LEAST_SPECIES} events: outliers, and no species",
+        ),
+        (
+            species["width_kda"] > _BROAD * species["mass_kda"],
+            "the species at {} kDa is as broad as a background: read it as what the other species "
+            "leave over",
+        ),
+    )
+    return [
+        text.format(", ".join(f"{mass:.3g}" for mass in species["mass_kda"][which]))
+        for which, text in cases
+        if which.any()
+    ]
+
+
+def _undescribed(
+    events: Events, branch: Branch, draws: int, seed: int, notes: Sequence[str]
+) -> Distribution:
+    """Events, but too few to say what they are."""
+    some = events.x.size > 0
+    return Distribution(
+        species=pd.DataFrame(columns=list(SPECIES_COLUMNS)),
+        selection=pd.DataFrame(columns=["species", "log_likelihood", "bic", "delta_bic"]),
+        support=math.nan,
+        histogram=histogram_of(events) if some else pd.DataFrame(columns=list(HISTOGRAM_COLUMNS)),
+        curves=pd.DataFrame(columns=list(CURVE_COLUMNS)),
+        bandwidth_kda=bandwidth_of(events, 1) if some else math.nan,
+        events=int(events.x.size),
+        branch=branch,
+        draws=draws,
+        seed=seed,
+        notes=tuple(notes),
+    )

@@ -1,0 +1,52 @@
+"""How near the bound the fits come: the same experiment again and again, with known truth.
+
+`setting` says what is repeated, `trials` repeats it, `scores` sets the estimates beside the bounds,
+`baselines` are the estimators to be beaten, `calibration` asks whether posteriors are right, and
+`study` is all of it for one configuration, written as a folder.
+"""
+
+from __future__ import annotations
+
+from iscat_analysis.study.baselines import Baselines
+from iscat_analysis.study.calibration import Calibration, calibrate_posterior
+from iscat_analysis.study.scores import (
+    Score,
+    gaussian_posterior,
+    pull_histogram,
+    rank_test,
+    score,
+    share_interval,
+    spread_error,
+    spread_interval,
+    van_trees,
+)
+from iscat_analysis.study.setting import Setting, make_setting
+from iscat_analysis.study.study import (
+    check_benchmark_output,
+    run_benchmark,
+    write_benchmark,
+)
+from iscat_analysis.study.trials import Trials, run_trials, trial_generator
+
+__all__ = [
+    "Baselines",
+    "Calibration",
+    "Score",
+    "Setting",
+    "Trials",
+    "calibrate_posterior",
+    "check_benchmark_output",
+    "gaussian_posterior",
+    "make_setting",
+    "pull_histogram",
+    "rank_test",
+    "run_benchmark",
+    "run_trials",
+    "score",
+    "share_interval",
+    "spread_error",
+    "spread_interval",
+    "trial_generator",
+    "van_trees",
+    "write_benchmark",
+]

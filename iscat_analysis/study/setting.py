@@ -1,0 +1,349 @@
+"""What the trials of a study share: a microscope, a particle, a noise, and the bounds for them.
+
+Counts are drawn from the expected images of the region that is fitted, as `Windows`, and from there
+on everything is the main job's own: `region_likelihood`, `fit_particle`, the bounds of `plan`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from iscat_analysis.bounds import EventBounds, Experiment, plan
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.pipeline.scene import Region, Scene, make_scene, region_likelihood
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Candidate, FloatArray, Windows
+
+CLEARANCE = 8.0
+"""Standard deviations that a height kept by default has to the ends of ``fit.z_range_nm``."""
+
+START_PX = 1.0
+"""How far a start lies from the particle along x and y, at most [pixels]."""
+
+START_MASS = 1.5
+"""Factor between a start's mass and the particle's, at most."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One experiment to be repeated; build it with `make_setting`.
+
+    Attributes
+    ----------
+    config : Config
+        Resolved for the mode, the photons and the height of this experiment.
+    scene : Scene
+        The main job's models.
+    region : Region
+        The pixels that are fitted.
+    experiment : Experiment
+        Gives the bounds.
+    truth : ndarray, shape (4,)
+        x, y, z [nm], mass [kDa], in the frame of the region.
+    read_variance_e2 : float
+        Read-noise variance of a frame [e²].
+    """
+
+    config: Config
+    scene: Scene
+    region: Region
+    experiment: Experiment
+    truth: FloatArray
+    read_variance_e2: float
+
+    @property
+    def mode(self) -> str:
+        """Key of `FREE_PARAMETERS`."""
+        return self.scene.mode
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return FREE_PARAMETERS[self.mode]
+
+    @property
+    def pixels(self) -> int:
+        """Side of the fitted square [pixels]."""
+        return self.region.rows[1]
+
+    @property
+    def bounds(self) -> EventBounds:
+        """Bounds over the free parameters, for all frames."""
+        return self.experiment.bounds(self.free)
+
+    def level_e(self) -> float:
+        """Return the expected background per pixel and frame [e]."""
+        if self.scene.additive:
+            return self.config.background.level_e or 0.0
+        return self.config.bounds.photons_per_pixel
+
+    def signal_e(self, truth: FloatArray) -> FloatArray:
+        """Return the counts that the particle adds to one frame, shape (ny, nx) [e]."""
+        model = self.scene.model
+        grid = PixelGrid.region(self.region.rows, self.region.columns, self.scene.pixel_nm)
+        signal = model.image(grid, *(float(v) for v in truth))
+        if self.scene.additive:
+            photons = self.config.bounds.photons_per_pixel
+            return signal * model.photons_per_intensity(photons, self.scene.pixel_nm)
+        return signal * self.config.bounds.photons_per_pixel
+
+    def draw(self, truth: FloatArray, random: np.random.Generator | None) -> Windows:
+        """Draw the counts of one experiment.
+
+        Parameters
+        ----------
+        truth : ndarray, shape (4,)
+            Particle, in the frame of the region.
+        random : numpy.random.Generator or None
+            Its own for every trial; None gives the expectations.
+
+        Returns
+        -------
+        Windows
+            Sums before and after, as `measure_windows` makes them of a movie.
+        """
+        return self.windows(self.level_e() + self.signal_e(truth), random)
+
+    def windows(
+        self, frame_e: FloatArray, random: np.random.Generator | None, *, gain: float = 1.0
+    ) -> Windows:
+        """Draw counts around any expected frame, for studies of wrong models.
+
+        Parameters
+        ----------
+        frame_e : ndarray, shape (ny, nx)
+            Expected counts per frame after landing [e].
+        random : numpy.random.Generator or None
+            Its own for every trial; None gives the expectations.
+        gain : float
+            Factor by which the camera's gain was misjudged: counts are multiplied by it.
+
+        Returns
+        -------
+        Windows
+            Sums before and after.
+        """
+        at, shape = self.config.bounds, frame_e.shape
+        level, read = np.full(shape, self.level_e()), self.read_variance_e2
+
+        def sums(expected: FloatArray, frames: int) -> FloatArray:
+            if random is None:
+                return expected
+            counts = random.poisson(expected).astype(float)
+            return counts + random.normal(0, math.sqrt(frames * read), shape) if read else counts
+
+        after = sums(at.n_after * frame_e, at.n_after)
+        before = sums(at.n_before * level, at.n_before) if at.n_before else level
+        nothing = np.zeros(shape, dtype=bool)
+        first = max(at.n_before, 1)
+        return Windows(
+            before_e=before * gain,
+            after_e=after * gain,
+            n_before=first,
+            n_after=at.n_after,
+            power_ratio=at.n_after / first,
+            read_variance_before_e2=np.full(shape, at.n_before * read),
+            read_variance_after_e2=np.full(shape, at.n_after * read),
+            masked=nothing,
+            saturated=nothing,
+            frames_before=(0, at.n_before),
+            frames_after=(at.n_before, at.n_before + at.n_after),
+            power=np.ones(0),
+        )
+
+    def likelihood(self, windows: Windows) -> Likelihood:
+        """Likelihood of drawn counts, as the main job makes it."""
+        return region_likelihood(self.scene, windows, self.region, None)
+
+    def start(self, truth: FloatArray, random: np.random.Generator) -> Candidate:
+        """Where a fit begins: near the particle, as a detection would be.
+
+        Parameters
+        ----------
+        truth : ndarray, shape (4,)
+            The particle.
+        random : numpy.random.Generator
+            Its own for every trial.
+
+        Returns
+        -------
+        Candidate
+            What is not free is known.
+        """
+        shift = random.uniform(-START_PX, START_PX, 2)
+        place = truth[:2] / self.scene.pixel_nm + shift
+        factor = START_MASS ** random.uniform(-1, 1)
+        low, high = self.config.fit.z_range_nm
+        z = random.uniform(low, high)
+        return Candidate(
+            x_px=float(place[0]),
+            y_px=float(place[1]),
+            z_nm=float(z if "z_nm" in self.free else truth[2]),
+            mass_kda=float(truth[3] * (factor if "mass_kda" in self.free else 1.0)),
+            snr=0.0,
+        )
+
+    def described(self) -> dict[str, Any]:
+        """Say what was simulated, as plain values."""
+        at, optics, e = self.config.bounds, self.config.optics, self.experiment
+        centre = (self.pixels - 1) / 2 * self.scene.pixel_nm
+        return {
+            "scheme": optics.scheme,
+            "mode": self.mode,
+            "x_nm": float(self.truth[0] - centre),
+            "y_nm": float(self.truth[1] - centre),
+            "z_nm": float(self.truth[2]),
+            "mass_kda": float(self.truth[3]),
+            "focus_nm": optics.focus_nm,
+            "attenuation": optics.attenuation if self.scene.model.rho else 0.0,
+            "na": optics.na,
+            "pixel_size_nm": self.scene.pixel_nm,
+            "pixels": self.pixels,
+            "photons_per_pixel": at.photons_per_pixel,
+            "n_before": at.n_before,
+            "n_after": at.n_after,
+            "read_noise_e": math.sqrt(self.read_variance_e2),
+            "n_scattered": {"camera": e.on_camera, "collected": e.collected},
+        }
+
+
+def make_setting(
+    config: Config,
+    mode: str,
+    *,
+    collected: float | None = None,
+    z_nm: float | None = None,
+    scene: Scene | None = None,
+) -> Setting:
+    """Set up one experiment.
+
+    Parameters
+    ----------
+    config : Config
+        ``[bounds]`` gives photons and frames; ``fit.roi_nm`` the region.
+    mode : str
+        ``"mass"``, ``"localize"`` or ``"joint"``.
+    collected : float, optional
+        Scattered photons collected in all frames; ``bounds.photons_per_pixel`` is scaled to it.
+    z_nm : float, optional
+        Height of the particle; default ``bounds.z_nm``, or ``particle.height_nm``, raised where z
+        is free until it lies `CLEARANCE` standard deviations inside ``fit.z_range_nm``.
+    scene : Scene, optional
+        The models of an earlier setting of the same optics and mode.
+
+    Returns
+    -------
+    Setting
+        Ready to draw from.
+
+    Raises
+    ------
+    ConfigError
+        The particle lies outside the region or the heights that fits search, and as in `plan` and
+        `make_scene`.
+    """
+    pixel_nm = config.camera.pixel_size_nm
+    side = max(5, round(config.fit.roi_nm / pixel_nm)) if pixel_nm else config.bounds.pixels
+    changes: dict[str, Mapping[str, Any]] = {
+        "bounds": {"pixels": side},
+        "fit": {"mode": mode},
+    }
+    config = _changed(config, changes)
+    if pixel_nm:
+        _check_place(config, side * pixel_nm / 2)
+    asked = z_nm if z_nm is not None else config.bounds.z_nm
+    height = config.particle.height_nm if asked is None else asked
+    config = _changed(config, {"background": _background(config)})
+    if scene is None:
+        scene = make_scene(config, (side, side))
+    if asked is not None:
+        _check_height(config, scene, asked)
+    experiment = _experiment(config, scene, height, collected)
+    if asked is None and "z_nm" in FREE_PARAMETERS[mode]:
+        height = _clear_of_ends(config, scene, collected, mode, height)
+        experiment = _experiment(config, scene, height, collected)
+    config = _changed(
+        experiment.config,
+        {"simulation": {"photons_per_pixel": experiment.config.bounds.photons_per_pixel}},
+    )
+    centre = (side - 1) / 2 * scene.pixel_nm
+    at = config.bounds
+    read = config.camera.read_noise_e
+    return Setting(
+        config=config,
+        scene=replace(scene, config=config),
+        region=Region((0, side), (0, side)),
+        experiment=experiment,
+        truth=np.array([at.x_nm + centre, at.y_nm + centre, height, experiment.mass_kda]),
+        read_variance_e2=float(read) ** 2 if not isinstance(read, str) else 0.0,
+    )
+
+
+def _background(config: Config) -> dict[str, Any]:
+    """Tell the fits what ``[bounds]`` says of the background: measured beforehand, or known."""
+    at = config.bounds
+    if at.n_before:
+        return {"method": "mean"}
+    dark = config.optics.scheme == "darkfield"
+    level = (config.background.level_e or 0.0) if dark else at.photons_per_pixel
+    return {"method": "none", "frames": None, "level_e": level}
+
+
+def _check_place(config: Config, half_nm: float) -> None:
+    at = config.bounds
+    if max(abs(at.x_nm), abs(at.y_nm)) > half_nm:
+        raise ConfigError(
+            f"bounds.x_nm = {at.x_nm:g}, bounds.y_nm = {at.y_nm:g} lies outside the fitted region "
+            f"of ±{half_nm:g} nm: move the particle, or enlarge fit.roi_nm"
+        )
+
+
+def _check_height(config: Config, scene: Scene, z_nm: float) -> None:
+    """Refuse heights at which no fit can find the particle: the model's profiles end there."""
+    free = "z_nm" in FREE_PARAMETERS[scene.mode]
+    low, high = config.fit.z_range_nm if free else scene.model.z_range_nm
+    if not low <= z_nm <= high:
+        raise ConfigError(
+            f"bounds.z_nm = {z_nm:g} lies outside the heights that are searched, fit.z_range_nm = "
+            f"[{low:g}, {high:g}]: move the particle, or widen the range"
+        )
+
+
+def _experiment(config: Config, scene: Scene, z_nm: float, collected: float | None) -> Experiment:
+    experiment = plan(_changed(config, {"bounds": {"z_nm": z_nm}}), model=scene.model)
+    if collected is None:
+        return experiment
+    photons = config.bounds.photons_per_pixel * collected / experiment.collected
+    changes = {"bounds": {"z_nm": z_nm, "photons_per_pixel": photons}}
+    return plan(_changed(config, changes), model=scene.model)
+
+
+def _clear_of_ends(
+    config: Config, scene: Scene, collected: float | None, mode: str, height: float
+) -> float:
+    """Find the lowest height from `height` up that the ends of the range do not touch."""
+    low, high = config.fit.z_range_nm
+    z = PARAMETERS.index("z_nm")
+    step = scene.model.fringe_nm / 16
+    for candidate in np.arange(max(height, low), high, step):
+        bounds = _experiment(config, scene, candidate, collected).bounds(FREE_PARAMETERS[mode])
+        margin = CLEARANCE * bounds.crb_joint[z]
+        if candidate - low > margin and high - candidate > margin:
+            return float(candidate)
+    return (low + high) / 2
+
+
+def _changed(config: Config, changes: Mapping[str, Mapping[str, Any]]) -> Config:
+    """Copy a configuration with some keys changed; the values are known to be valid."""
+    sections = {
+        name: getattr(config, name).model_copy(update=dict(values))
+        for name, values in changes.items()
+    }
+    return config.model_copy(update=sections)

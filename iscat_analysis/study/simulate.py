@@ -1,0 +1,425 @@
+"""Movies with known truth: Poisson counts of the forward model on a static background.
+
+The expected photoelectrons of frame t are P_t·B·|1 + Σ e_i|², with P_t the laser power, B the
+static background and e_i the fields of the particles present, which add coherently; in dark field
+P_t·(b + s·|Σ E_i|²).  Where the sample drifts, background and particles move together: both are
+made on a field larger by the way they go, and its expectation is shifted by the phase of its
+Fourier transform, exact for an image that the pixels resolve.  Every frame draws from a generator
+of its own, derived from the seed and the frame number, so the bytes do not depend on how the work
+is divided.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import tifffile
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.ndimage import gaussian_filter
+
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.movie.camera import camera_from_config, read_map
+from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.optics.materials import material
+from iscat_analysis.records import FloatArray, Progress, silent
+
+ComplexArray = NDArray[np.complex128]
+
+TRUTH_COLUMNS = (
+    "event", "frame", "leave", "x_px", "y_px", "x_nm", "y_nm", "z_nm", "mass_kda", "contrast",
+)  # fmt: skip
+"""The columns of ``STACK.truth.csv``."""
+
+_STREAMS = {"background": 0, "power": 1, "events": 2, "frames": 3}
+_BATCH = 32  # frames drawn at once
+_MARGIN_PX = 8  # around what is ever seen of a sample that drifts
+_NO_UUID = "urn:uuid:00000000-0000-0000-0000-000000000000"
+
+
+@dataclass(frozen=True)
+class Particle:
+    """One simulated particle: where, when, how heavy; its place is that in the frame it lands."""
+
+    frame: int
+    leave: int | None
+    x_px: float
+    y_px: float
+    z_nm: float
+    mass_kda: float
+
+
+def write_stack(
+    config: Config,
+    path: Path,
+    *,
+    seed: int | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> pd.DataFrame:
+    """Simulate a movie into a TIFF file, with its truth in ``<stem>.truth.csv`` beside it.
+
+    Parameters
+    ----------
+    config : Config
+        ``[simulation]`` and everything the forward model reads.
+    path : Path
+        Where the movie goes: OME-TIFF metadata, 16-bit counts, BigTIFF where needed.
+    seed : int, optional
+        In place of ``simulation.seed``; the same seed gives the same bytes.
+    overwrite : bool
+        Replace an existing file.
+    progress : Progress
+        Told how many frames are done.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per particle, columns `TRUTH_COLUMNS`.
+
+    Raises
+    ------
+    ConfigError
+        The pixel size is missing, or the counts do not fit into 16 bits.
+    DataError
+        The file exists, or cannot be written.
+    """
+    if config.camera.pixel_size_nm is None:
+        raise ConfigError(
+            "camera.pixel_size_nm is needed to simulate: add it, as in "
+            "--set camera.pixel_size_nm=84.4"
+        )
+    truth_path = path.with_suffix(".truth.csv")
+    if not overwrite and (path.exists() or truth_path.exists()):
+        found = path if path.exists() else truth_path
+        raise DataError(f"{found}: exists already; give another name, or --overwrite")
+    movie = Movie(config, config.simulation.seed if seed is None else seed)
+    shape = (config.simulation.frames, *config.simulation.shape)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    partial_truth = path.with_name(f"{truth_path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tifffile.imwrite(
+            partial,
+            _counted(movie.frames(config.compute.workers), shape[0], progress),
+            shape=shape,
+            dtype=np.uint16,
+            photometric="minisblack",
+            bigtiff=2 * math.prod(shape) > 2**31,
+            ome=True,
+            metadata=_metadata(config),
+        )
+        movie.truth.to_csv(partial_truth, index=False, float_format="%.10g")
+        partial.replace(path)
+        partial_truth.replace(truth_path)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror or error})") from None
+    finally:
+        partial.unlink(missing_ok=True)
+        partial_truth.unlink(missing_ok=True)
+    return movie.truth
+
+
+class Movie:
+    """A simulated movie, made frame by frame.
+
+    Parameters
+    ----------
+    config : Config
+        Validated, with a pixel size.
+    seed : int
+        Of every random number in it.
+
+    Attributes
+    ----------
+    background_e : ndarray, shape (y, x)
+        Expected photoelectrons without particles, per frame; the first frame's where it drifts.
+    drift_px : ndarray, shape (t, 2)
+        How far the sample has moved since the first frame, along y and x.
+    power : ndarray, shape (t,)
+        Laser power of each frame, mean 1.
+    particles : tuple of Particle
+        In order of landing.
+    """
+
+    def __init__(self, config: Config, seed: int) -> None:
+        simulation = config.simulation
+        self._config = config
+        self._seed = seed
+        self._pixel_nm = config.camera.pixel_size_nm or 0.0
+        rate = np.array(simulation.drift_px_per_frame[::-1])
+        self.drift_px = np.arange(simulation.frames)[:, None] * rate
+        self._margins = self._margins_px()
+        rows, columns = (
+            (-low, size + high)
+            for (low, high), size in zip(self._margins, simulation.shape, strict=True)
+        )
+        self._grid = PixelGrid.region(rows, columns, self._pixel_nm)
+        self.particles = self._place()
+        heights = [p.z_nm for p in self.particles]
+        self._model = forward_model(
+            config,
+            self._grid.diagonal_nm + self._pixel_nm,
+            z_max_nm=max([config.particle.height_nm, *heights]),
+        )
+        self._camera = camera_from_config(config.camera, simulation.shape, np.uint16)
+        self._sample_e = self._background()
+        self.background_e = self._sample_e[self._field]
+        noise = self._generator("power").standard_normal(simulation.frames)
+        self.power = np.maximum(1 + simulation.power_noise * noise, 0.0)
+        self._signal_scale = self._scale()
+        self._check_range()
+
+    @property
+    def truth(self) -> pd.DataFrame:
+        """What was put into the movie."""
+        peaks = self._peak_contrasts() if self._model.rho else {}
+        rows = [
+            (
+                i, p.frame, p.leave, p.x_px, p.y_px, p.x_px * self._pixel_nm,
+                p.y_px * self._pixel_nm, p.z_nm, p.mass_kda,
+                peaks.get((p.z_nm, p.mass_kda)),
+            )
+            for i, p in enumerate(self.particles)
+        ]  # fmt: skip
+        table = pd.DataFrame(rows, columns=list(TRUTH_COLUMNS))
+        return table.astype({"leave": "Int64"})
+
+    def frames(self, workers: int = 1) -> Iterator[NDArray[np.uint16]]:
+        """Draw the frames in order; the result does not depend on `workers`."""
+        expected = self.expected_frames()
+        with ThreadPoolExecutor(workers) as pool:
+            for start in range(0, self.power.size, _BATCH):
+                stop = min(start + _BATCH, self.power.size)
+                batch = [(t, next(expected)) for t in range(start, stop)]
+                yield from pool.map(self._draw, batch)
+
+    def expected_frames(self) -> Iterator[FloatArray]:
+        """Yield the expected photoelectrons of each frame in order, shape (y, x)."""
+        q = self._model.samples[1].size
+        rows, columns = self._grid.shape
+        field = np.zeros((2, rows * q, columns * q), dtype=complex)
+        present: dict[int, ComplexArray] = {}
+        changed = True
+        for t in range(self.power.size):
+            for i, particle in enumerate(self.particles):
+                if particle.frame == t:
+                    present[i] = self._field_of(particle)
+                    field = field + present[i]
+                    changed = True
+                if particle.leave == t and i in present:
+                    field = field - present.pop(i)
+                    changed = True
+            if changed:
+                current, changed = self._expected(field), False
+                spectrum = fft.rfft2(current) if self.drift_px.any() else None
+            if spectrum is None:
+                yield self.power[t] * current
+            else:
+                yield self.power[t] * self._shifted(spectrum, t)
+
+    def _expected(self, field: ComplexArray) -> FloatArray:
+        """Average over the samples inside each pixel, on which `field` is given."""
+        weights = self._model.samples[1]
+        q = weights.size
+        rows, columns = self._grid.shape
+        reference = np.array([self._model.rho, 0.0])[:, None, None]
+        intensity = np.sum(np.abs(reference + field) ** 2, axis=0).reshape(rows, q, columns, q)
+        signal = np.einsum("yixj,i,j->yx", intensity, weights, weights)
+        if self._model.rho:
+            return np.asarray(self._sample_e * signal)
+        return np.asarray(self._sample_e + self._signal_scale * signal)
+
+    @property
+    def _field(self) -> tuple[slice, slice]:
+        """Where the camera's field lies in the sample."""
+        (top, _), (left, _) = self._margins
+        rows, columns = self._config.simulation.shape
+        return slice(top, top + rows), slice(left, left + columns)
+
+    def _margins_px(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Pixels of sample before and after the camera's rows and columns."""
+        simulation = self._config.simulation
+        measured = simulation.background not in ("flat", "speckle")
+        margins = []
+        for way, size in zip(self.drift_px.T, simulation.shape, strict=True):
+            if not way.any():
+                margins.append((0, 0))
+                continue
+            low, high = math.ceil(max(way.max(), 0)), math.ceil(max(-way.min(), 0))
+            if max(low, high) > size:
+                raise ConfigError(
+                    f"simulation.drift_px_per_frame moves the sample by {max(low, high)} pixels, "
+                    f"out of a field of {size}: lower it, or simulate fewer frames"
+                )
+            # a measured image is continued by its reflection, of which a whole period closes
+            spare = size - low - high if measured else 2 * _MARGIN_PX
+            margins.append((low + spare // 2, high + spare - spare // 2))
+        return margins[0], margins[1]
+
+    def _shifted(self, spectrum: ComplexArray, frame: int) -> FloatArray:
+        """Give what the camera sees of the sample in a frame."""
+        rows, columns = self._grid.shape
+        dy, dx = self.drift_px[frame]
+        phase_y = np.exp(-2j * np.pi * dy * fft.fftfreq(rows))
+        phase_x = np.exp(-2j * np.pi * dx * fft.rfftfreq(columns))
+        moved = fft.irfft2(spectrum * phase_y[:, None] * phase_x, s=(rows, columns))
+        return np.asarray(np.maximum(moved[self._field], 0.0))
+
+    def _field_of(self, particle: Particle) -> ComplexArray:
+        offsets = self._model.samples[0] * self._pixel_nm
+        dy, dx = self.drift_px[particle.frame]
+        x = (self._grid.x_nm[:, None] + offsets).ravel() - (particle.x_px - dx) * self._pixel_nm
+        y = (self._grid.y_nm[:, None] + offsets).ravel() - (particle.y_px - dy) * self._pixel_nm
+        dx, dy = np.meshgrid(x, y)
+        return self._model.field(dx, dy, particle.z_nm, particle.mass_kda)
+
+    def _draw(self, job: tuple[int, FloatArray]) -> NDArray[np.uint16]:
+        frame, expected = job
+        rng = self._generator("frames", frame)
+        camera = self._camera
+        electrons = rng.poisson(expected).astype(float)
+        if camera.well_depth_e is not None:
+            electrons = np.minimum(electrons, camera.well_depth_e)
+        if np.any(np.asarray(camera.read_noise_e) > 0):
+            electrons += camera.read_noise_e * rng.standard_normal(electrons.shape)
+        counts = np.rint(electrons / camera.gain_e_per_adu + camera.offset_adu)
+        return np.clip(counts, 0, np.iinfo(np.uint16).max).astype(np.uint16)
+
+    def _generator(self, stream: str, index: int = 0) -> np.random.Generator:
+        return np.random.default_rng(
+            np.random.SeedSequence(self._seed, spawn_key=(_STREAMS[stream], index))
+        )
+
+    def _background(self) -> FloatArray:
+        simulation = self._config.simulation
+        shape = self._grid.shape
+        if self._config.optics.scheme == "darkfield":
+            level = self._config.background.level_e or 0.0
+        else:
+            level = simulation.photons_per_pixel
+        if simulation.background == "flat":
+            return np.full(shape, level)
+        if simulation.background == "speckle":
+            optics = self._config.optics
+            grain_px = 0.21 * optics.wavelength_nm / optics.na / self._pixel_nm
+            noise = gaussian_filter(
+                self._generator("background").standard_normal(shape),
+                max(grain_px, 0.5),
+                mode="wrap",
+            )
+            if self.drift_px.any():
+                noise = self._resolved(noise)
+            pattern = 1 + simulation.speckle_contrast * (noise - noise.mean()) / noise.std()
+            return np.asarray(level * np.maximum(pattern, 0.05))
+        image = read_map(Path(simulation.background), "simulation.background", simulation.shape)
+        if not image.mean() > 0 or (image < 0).any():
+            raise ConfigError(
+                f"{simulation.background}: simulation.background needs a non-negative image"
+            )
+        around = np.pad(image, self._margins, mode="symmetric")
+        return np.asarray(around * (level / image.mean()))
+
+    def _resolved(self, image: FloatArray) -> FloatArray:
+        """Take off detail finer than the optics pass, 2 NA/λ: moved, it would not be the same."""
+        optics, spectrum = self._config.optics, fft.rfft2(image)
+        rows, columns = image.shape
+        finest = 2 * optics.na / optics.wavelength_nm * self._pixel_nm
+        detail = np.hypot(fft.fftfreq(rows)[:, None], fft.rfftfreq(columns))
+        return np.asarray(fft.irfft2(np.where(detail < finest, spectrum, 0.0), s=(rows, columns)))
+
+    def _scale(self) -> float:
+        if self._model.rho:
+            return 1.0
+        return self._model.photons_per_intensity(
+            self._config.simulation.photons_per_pixel, self._pixel_nm
+        )
+
+    def _peak_contrasts(self) -> dict[tuple[float, float], float]:
+        """Peak contrast for every height and mass that occurs."""
+        kinds = {(p.z_nm, p.mass_kda) for p in self.particles}
+        return {kind: self._model.peak_contrast(*kind) for kind in kinds}
+
+    def _check_range(self) -> None:
+        camera = self._camera
+        peak = max((0.0, *self._peak_contrasts().values()))
+        level = float(self._sample_e.max())
+        top = level * (1 + peak) if self._model.rho else level + self._signal_scale * peak
+        top *= float(self.power.max())
+        top = (top + 6 * math.sqrt(top)) / np.min(camera.gain_e_per_adu) + np.max(camera.offset_adu)
+        if top > np.iinfo(np.uint16).max and camera.well_depth_e is None:
+            raise ConfigError(
+                f"the brightest pixel would hold {top:.0f} counts, more than 16 bits: raise "
+                "camera.gain_e_per_adu or lower simulation.photons_per_pixel"
+            )
+
+    def _place(self) -> tuple[Particle, ...]:
+        simulation, particle = self._config.simulation, self._config.particle
+        nominal = material(particle, self._config.optics.wavelength_nm).mass_kda
+        if simulation.count is None:
+            return tuple(
+                Particle(
+                    e.frame, e.leave, e.x_px, e.y_px,
+                    particle.height_nm if e.z_nm is None else e.z_nm,
+                    nominal if e.mass_kda is None else e.mass_kda,
+                )
+                for e in sorted(simulation.events, key=lambda e: e.frame)
+            )  # fmt: skip
+        rng = self._generator("events")
+        margin = min(self._config.fit.roi_nm / 2 / self._pixel_nm, (min(simulation.shape) - 1) / 2)
+        rows, columns = simulation.shape
+        count = simulation.count
+        x = rng.uniform(margin, columns - 1 - margin, count)
+        y = rng.uniform(margin, rows - 1 - margin, count)
+        first = self._config.background.frames
+        start = first[1] if first is not None else simulation.frames // 20
+        landing = np.sort(
+            rng.integers(start, max(simulation.frames - start // 2, start + 1), count)
+        )
+        species = np.array(simulation.species or (nominal,))
+        mass = rng.permutation(species[np.arange(count) % species.size])
+        leavers = set(rng.choice(count, simulation.leavings, replace=False).tolist())
+        particles = []
+        for i in range(count):
+            latest = simulation.frames - 1
+            leaves = i in leavers and landing[i] + 1 <= latest
+            leave = int(rng.integers(landing[i] + 1, latest + 1)) if leaves else None
+            particles.append(
+                Particle(
+                    int(landing[i]), leave, float(x[i]), float(y[i]), particle.height_nm,
+                    float(mass[i]),
+                )
+            )  # fmt: skip
+        return tuple(particles)
+
+
+def _counted(
+    frames: Iterator[NDArray[np.uint16]], total: int, progress: Progress
+) -> Iterator[NDArray[np.uint16]]:
+    for done, frame in enumerate(frames, 1):
+        yield frame
+        progress("simulate", done, total)
+
+
+def _metadata(config: Config) -> dict[str, object]:
+    camera = config.camera
+    pixel_um = (camera.pixel_size_nm or 0.0) / 1000
+    metadata: dict[str, object] = {
+        "axes": "TYX",
+        "UUID": _NO_UUID,  # a random one would make every file different
+        "PhysicalSizeX": pixel_um,
+        "PhysicalSizeXUnit": "µm",
+        "PhysicalSizeY": pixel_um,
+        "PhysicalSizeYUnit": "µm",
+    }
+    if camera.frame_rate_hz is not None:
+        metadata |= {"TimeIncrement": 1 / camera.frame_rate_hz, "TimeIncrementUnit": "s"}
+    return metadata

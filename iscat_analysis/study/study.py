@@ -1,0 +1,367 @@
+"""`iscat benchmark`: everything one configuration can say about its own estimators, as a folder."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+import threading
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from iscat_analysis.config import Config, config_to_toml
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.records import PARAMETERS, FloatArray, Progress, Status, silent
+from iscat_analysis.report import atomic_folder, check_output, jsonable
+from iscat_analysis.report.benchmark import BENCHMARK_NAMES, draw_benchmark, render_benchmark
+from iscat_analysis.study.baselines import Baselines
+from iscat_analysis.study.calibration import RANKS, Calibration, calibrate_posterior
+from iscat_analysis.study.scores import (
+    MIN_TRIALS,
+    pull_histogram,
+    rank_test,
+    score,
+    share,
+    share_interval,
+    spread_interval,
+)
+from iscat_analysis.study.setting import Setting, make_setting
+from iscat_analysis.study.trials import Trials, run_trials
+
+MODES = ("mass", "localize", "joint")
+"""What is studied, always in this order."""
+
+PHOTONS = (100.0, 300.0, 1e3, 3e3, 1e4, 3e4)
+"""Collected scattered photons of the first curve."""
+
+HEIGHTS = 9
+"""Heights of the second curve, spread over ``fit.z_range_nm``."""
+
+FINE_HEIGHTS = 161
+"""Heights at which the bounds are drawn."""
+
+CURVE_SHARE = 4
+"""A point of a curve has this many times fewer trials than the table."""
+
+POSTERIOR_SHARE = 20
+"""A posterior is sampled for one in this many trials."""
+
+PRIOR_XY_NM = 100.0
+PRIOR_Z_NM = 60.0
+PRIOR_MASS = 2.0
+"""Half-widths, and factor, of the prior that particles are drawn from for the posteriors."""
+
+LEAST_TRIALS = 20
+
+
+def run_benchmark(
+    config: Config,
+    *,
+    trials: int = 1000,
+    seed: int = 1,
+    workers: int | None = None,
+    posterior: bool = True,
+    command: str = "",
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Measure what the fits achieve, in every mode, on synthetic shot noise.
+
+    Parameters
+    ----------
+    config : Config
+        ``[bounds]`` describes the particle, the light and the frames, ``fit.roi_nm`` the region.
+    trials : int
+        Repetitions of the experiment in the table.
+    seed : int
+        Same seed, same numbers.
+    workers : int, optional
+        Threads; default ``compute.workers``.  Without influence on the result, timings apart.
+    posterior : bool
+        Also sample posteriors, one in `POSTERIOR_SHARE` trials.
+    command : str
+        The command line, for the record.
+    progress : Progress
+        Told how far the study is.
+
+    Returns
+    -------
+    dict
+        What ``benchmark.json`` holds: for ``"mass"``, ``"localize"`` and ``"joint"`` one entry for
+        each free parameter (the fields of `Score`, posterior coverage, baselines) and the counts;
+        curves, histograms and provenance beside them.
+
+    Raises
+    ------
+    ConfigError
+        Fewer than `LEAST_TRIALS` trials, or the configuration does not describe an experiment.
+    """
+    if trials < LEAST_TRIALS:
+        raise ConfigError(
+            f"trials = {trials} say nothing about a spread: give at least {LEAST_TRIALS}"
+        )
+    threads = config.compute.workers if workers is None else workers
+    fewer = max(trials // CURVE_SHARE, LEAST_TRIALS)
+    posteriors = max(trials // POSTERIOR_SHARE, MIN_TRIALS) if posterior else 0
+    settings = {mode: make_setting(config, mode) for mode in MODES}
+    tally = _Tally(
+        progress, len(MODES) * (trials + fewer * (len(PHOTONS) + HEIGHTS) + posteriors * 4)
+    )
+    study: dict[str, Any] = {}
+    curves: dict[str, dict[str, Any]] = {"photons": {}, "z": {}}
+    histograms: dict[str, dict[str, Any]] = {"pulls": {}, "ranks": {}}
+    for number, (mode, setting) in enumerate(settings.items()):
+        stream = 100 * number
+        found = run_trials(
+            setting, trials, seed=seed, stream=stream, workers=threads,
+            baselines=Baselines.calibrated(setting), advance=tally,
+        )  # fmt: skip
+        lower, upper = _prior(setting)
+        ranked = calibrate_posterior(
+            setting, posteriors, lower=lower, upper=upper, seed=seed, stream=stream + 1,
+            workers=threads, advance=lambda n: tally(4 * n),
+        )  # fmt: skip
+        study[mode] = {
+            **_parameters(setting, found, ranked),
+            "trials": trials,
+            "failed": int(found.failed.sum()),
+            "flagged": {str(s): int(found.flagged(s).sum()) for s in Status if s != Status.OK},
+            "fits_per_second": trials / found.seconds if found.seconds else math.nan,
+            "posteriors": posteriors,
+            "posteriors_refused": ranked.refused,
+            "seed": seed,
+            "at": setting.described(),
+        }
+        histograms["pulls"][mode] = {
+            name: pull_histogram(_pull(found, PARAMETERS.index(name))) for name in setting.free
+        }
+        histograms["ranks"][mode] = _rank_histograms(ranked)
+        faintest = make_setting(config, mode, collected=PHOTONS[0], scene=setting.scene)
+        clear = float(faintest.truth[2])  # of the range's ends, for any of the photons
+        curves["photons"][mode] = _curve(
+            list(PHOTONS),
+            [make_setting(config, mode, collected=n, z_nm=clear, scene=setting.scene)
+             for n in PHOTONS],
+            fewer, seed, stream + 10, threads, tally,
+        )  # fmt: skip
+        heights = _heights(config)
+        curves["z"][mode] = _curve(
+            heights,
+            [make_setting(config, mode, z_nm=z, scene=setting.scene) for z in heights],
+            fewer, seed, stream + 40, threads, tally,
+        )  # fmt: skip
+        curves["z"][mode]["bounds"] = _bounds_along(config, setting)
+    return {
+        **study,
+        "curves": curves,
+        "histograms": histograms,
+        "trials": trials,
+        "seed": seed,
+        "scheme": config.optics.scheme,
+        "emission": config.optics.emission,
+        "convention": config.optics.convention,
+        "command": command or "iscat_analysis.study.run_benchmark",
+        "config": config_to_toml(config),
+        "versions": {
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("iscat-analysis", "numpy", "scipy", "numba")},
+        },
+    }
+
+
+def write_benchmark(study: Mapping[str, Any], folder: Path, *, overwrite: bool = False) -> Path:
+    """Write ``benchmark.json``, ``benchmark.html``, ``config.toml`` and ``figures/``.
+
+    Parameters
+    ----------
+    study : mapping
+        From `run_benchmark`.
+    folder : Path
+        Appears complete or not at all.
+    overwrite : bool
+        Whether an earlier result may be replaced.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    DataError
+        The folder exists and may not be replaced, or cannot be written.
+    """
+    with atomic_folder(folder, overwrite, known=BENCHMARK_NAMES) as building:
+        plain = jsonable(study)
+        text = json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
+        (building / "benchmark.json").write_text(text + "\n", encoding="utf-8")
+        (building / "config.toml").write_text(study["config"], encoding="utf-8")
+        (building / "benchmark.html").write_text(render_benchmark(study), encoding="utf-8")
+        draw_benchmark(study, building / "figures")
+    return folder
+
+
+def check_benchmark_output(folder: Path, overwrite: bool) -> None:
+    """Refuse a folder that must not be written, before any work is done.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the results shall go.
+    overwrite : bool
+        Whether an earlier result may be replaced.
+
+    Raises
+    ------
+    DataError
+        As in `write_benchmark`.
+    """
+    check_output(folder, overwrite, known=BENCHMARK_NAMES)
+
+
+def _pull(trials: Trials, k: int) -> FloatArray:
+    kept = trials.usable
+    pull: FloatArray = (trials.estimate[kept, k] - trials.truth[kept, k]) / trials.sigma[kept, k]
+    return pull
+
+
+def _parameters(setting: Setting, found: Trials, ranked: Calibration) -> dict[str, Any]:
+    """Score every free parameter."""
+    bounds, kept = setting.bounds, found.usable
+    error = found.estimate - found.truth
+    out: dict[str, Any] = {}
+    for i, name in enumerate(setting.free):
+        k = PARAMETERS.index(name)
+        crb, qcrb = float(bounds.crb_joint[k]), float(bounds.qcrb[k])
+        own = score(error[kept, k], found.sigma[kept, k], crb, qcrb)
+        baselines = {}
+        for label, other in (("gaussian", found.gauss), ("peak", found.peak)):
+            if label == "peak" and name != "mass_kda":
+                continue  # a peak's pixel is no position to compare with
+            miss = other[:, k] - found.truth[:, k]
+            finite = miss[np.isfinite(miss)]
+            if finite.size >= MIN_TRIALS:
+                scored = score(miss, np.full(miss.size, np.nan), crb, qcrb)
+                baselines[label] = {
+                    "bias": scored.bias,
+                    "bias_se": scored.bias_se,
+                    "spread": scored.spread,
+                    "spread_robust": scored.spread_robust,
+                    "spread_over_crb": scored.spread_over_crb,
+                    "robust_over_crb": scored.spread_robust / crb,
+                    "rmse_over_crb": float(np.sqrt(np.mean(finite**2))) / crb,
+                    "failed": int(miss.size - finite.size),
+                }
+        out[name] = {
+            **own.plain(),
+            "posterior_coverage68": share(ranked.inside68[ranked.kept, i]),
+            "posterior_coverage68_ci95": share_interval(ranked.inside68[ranked.kept, i]),
+            "posterior_coverage95": share(ranked.inside95[ranked.kept, i]),
+            "posterior_coverage95_ci95": share_interval(ranked.inside95[ranked.kept, i]),
+            "posterior_width_over_crb": _mean(ranked.width_over_crb[ranked.kept, i]),
+            "baselines": baselines,
+        }
+    return out
+
+
+def _rank_histograms(ranked: Calibration) -> dict[str, Any]:
+    kept = ranked.ranks[ranked.kept]
+    if not len(kept):
+        return {}
+    bins = 20 if len(kept) >= 100 else 10 if len(kept) >= 50 else 5
+    out = {}
+    for i, name in enumerate(ranked.names):
+        p_value, counts = rank_test(kept[:, i], RANKS, bins)
+        out[name] = {"counts": counts.tolist(), "possible": RANKS, "p_value": p_value}
+    return out
+
+
+def _curve(
+    values: list[float],
+    settings: list[Setting],
+    trials: int,
+    seed: int,
+    stream: int,
+    workers: int,
+    tally: _Tally,
+) -> dict[str, Any]:
+    """Tabulate spread and bounds along an axis, for every free parameter."""
+    free = settings[0].free
+    out: dict[str, Any] = {"at": values, "trials": trials, "failed": [], "ambiguous": []}
+    kinds = ("spread", "spread_ci95", "bias", "crb", "qcrb")
+    lines: dict[str, dict[str, list[Any]]] = {n: {kind: [] for kind in kinds} for n in free}
+    for number, setting in enumerate(settings):
+        found = run_trials(
+            setting, trials, seed=seed, stream=stream + number, workers=workers, advance=tally
+        )
+        out["failed"].append(int(found.failed.sum()))
+        out["ambiguous"].append(int(found.flagged(Status.AMBIGUOUS_Z).sum()))
+        bounds, kept = setting.bounds, found.usable
+        for name in free:
+            k = PARAMETERS.index(name)
+            error = found.estimate[kept, k] - found.truth[kept, k]
+            enough = error.size >= MIN_TRIALS
+            line = lines[name]
+            line["spread"].append(float(np.std(error, ddof=1)) if enough else math.nan)
+            line["spread_ci95"].append(spread_interval(error) if enough else (math.nan, math.nan))
+            line["bias"].append(float(np.mean(error)) if enough else math.nan)
+            line["crb"].append(float(bounds.crb_joint[k]))
+            line["qcrb"].append(float(bounds.qcrb[k]))
+    return {**out, **lines}
+
+
+def _bounds_along(config: Config, setting: Setting) -> dict[str, Any]:
+    """Tabulate the bounds between the heights of the curve: fringes are narrower than its steps."""
+    heights = np.linspace(*config.fit.z_range_nm, FINE_HEIGHTS)
+    bounds = [
+        make_setting(config, setting.mode, z_nm=float(z), scene=setting.scene).bounds
+        for z in heights
+    ]
+    lines = {
+        name: {
+            "crb": [float(b.crb_joint[PARAMETERS.index(name)]) for b in bounds],
+            "qcrb": [float(b.qcrb[PARAMETERS.index(name)]) for b in bounds],
+        }
+        for name in setting.free
+    }
+    return {"at": heights.tolist(), **lines}
+
+
+def _heights(config: Config) -> list[float]:
+    low, high = config.fit.z_range_nm
+    inset = (high - low) / (2 * HEIGHTS)
+    return [float(z) for z in np.linspace(low + inset, high - inset, HEIGHTS)]
+
+
+def _prior(setting: Setting) -> tuple[FloatArray, FloatArray]:
+    """Box of the prior around a setting's particle; no width where a parameter is fixed."""
+    free = np.array([name in setting.free for name in PARAMETERS])
+    low, high = setting.config.fit.z_range_nm
+    x, y, z, mass = setting.truth
+    lower = np.array(
+        [x - PRIOR_XY_NM, y - PRIOR_XY_NM, max(z - PRIOR_Z_NM, low), mass / PRIOR_MASS]
+    )
+    upper = np.array(
+        [x + PRIOR_XY_NM, y + PRIOR_XY_NM, min(z + PRIOR_Z_NM, high), mass * PRIOR_MASS]
+    )
+    return np.where(free, lower, setting.truth), np.where(free, upper, setting.truth)
+
+
+class _Tally:
+    """Counts trials of several threads for one progress bar."""
+
+    def __init__(self, progress: Progress, total: int) -> None:
+        self._progress, self._total, self._done = progress, total, 0
+        self._lock = threading.Lock()
+
+    def __call__(self, more: int) -> None:
+        with self._lock:
+            self._done += more
+            self._progress("benchmark", self._done, self._total)
+
+
+def _mean(values: FloatArray) -> float:
+    return float(np.mean(values)) if values.size else math.nan

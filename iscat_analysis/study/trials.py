@@ -1,0 +1,188 @@
+"""Repeat an experiment: draw counts, fit them, keep the estimates.
+
+Every trial has a generator of its own, so that the result depends on the seed alone, neither on the
+number of threads nor on how the trials are dealt to them.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.likelihood import Likelihood, compile_kernels
+from iscat_analysis.records import BoolArray, Candidate, FitResult, FloatArray, Status
+from iscat_analysis.study.baselines import Baselines
+from iscat_analysis.study.setting import Setting
+
+CHUNK = 16
+"""Trials that a thread takes at a time."""
+
+Draw = Callable[[np.random.Generator], tuple[Likelihood, Candidate]]
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Estimates of repeated experiments.
+
+    Attributes
+    ----------
+    truth : ndarray, shape (n, 4)
+        What was simulated, in the order of `PARAMETERS`.
+    estimate, sigma : ndarray, shape (n, 4)
+        What was found, and its stated standard deviation.
+    status : ndarray of str, shape (n,)
+        Verdict of each fit; `Status.POOR_FIT` only where nothing else was flagged.
+    flags : tuple of frozenset of str
+        Every flag of each fit.
+    p_value, chi2_reduced, gap : ndarray, shape (n,)
+        Goodness of fit, and log-likelihood ahead of the next height (infinite without one).
+    gauss : ndarray, shape (n, 4)
+        Gaussian least squares: x, y [nm], NaN, mass [kDa]; NaN where not run or failed.
+    peak : ndarray, shape (n, 4)
+        Peak contrast, likewise.
+    seconds : float
+        Processor time spent in the fits, summed over threads.
+    """
+
+    truth: FloatArray
+    estimate: FloatArray
+    sigma: FloatArray
+    status: NDArray[np.str_]
+    flags: tuple[frozenset[str], ...]
+    p_value: FloatArray
+    chi2_reduced: FloatArray
+    gap: FloatArray
+    gauss: FloatArray
+    peak: FloatArray
+    seconds: float
+
+    def __len__(self) -> int:
+        return len(self.truth)
+
+    @property
+    def failed(self) -> BoolArray:
+        """Fits without a usable estimate: not converged or at a bound, shape (n,)."""
+        return self.flagged(Status.NOT_CONVERGED) | self.flagged(Status.AT_BOUND)
+
+    @property
+    def usable(self) -> BoolArray:
+        """Fits that a user would keep: neither failed nor of ambiguous height, shape (n,)."""
+        return ~self.failed & ~self.flagged(Status.AMBIGUOUS_Z)
+
+    @property
+    def unflagged(self) -> BoolArray:
+        """Fits with nothing to remark, shape (n,)."""
+        return np.array([not f for f in self.flags])
+
+    def flagged(self, status: Status) -> BoolArray:
+        """Which fits carry a flag, shape (n,)."""
+        return np.array([status in f for f in self.flags])
+
+
+def trial_generator(seed: int, stream: int, trial: int) -> np.random.Generator:
+    """Random numbers of one trial.
+
+    Parameters
+    ----------
+    seed : int
+        Of the whole study.
+    stream : int
+        Which setting of the study.
+    trial : int
+        Number of the trial.
+
+    Returns
+    -------
+    numpy.random.Generator
+        Independent of every other trial's.
+    """
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, stream, trial])))
+
+
+def run_trials(
+    setting: Setting,
+    count: int,
+    *,
+    seed: int,
+    stream: int = 0,
+    workers: int = 1,
+    chunk: int = CHUNK,
+    truths: FloatArray | None = None,
+    baselines: Baselines | None = None,
+    advance: Callable[[int], None] | None = None,
+) -> Trials:
+    """Draw and fit.
+
+    Parameters
+    ----------
+    setting : Setting
+        The experiment.
+    count : int
+        Trials.
+    seed, stream : int
+        Choose the random numbers.
+    workers, chunk : int
+        Threads, and trials that one takes at a time; without influence on the result.
+    truths : ndarray, shape (count, 4), optional
+        A particle for each trial, in place of the setting's.
+    baselines : Baselines, optional
+        Also run the estimators that labs use.
+    advance : callable, optional
+        Told how many more trials are done.
+
+    Returns
+    -------
+    Trials
+        In the order of their numbers.
+    """
+    truth = np.tile(setting.truth, (count, 1)) if truths is None else np.array(truths, dtype=float)
+    estimate, sigma = np.full((count, 4), np.nan), np.full((count, 4), np.nan)
+    gauss, peak = np.full((count, 4), np.nan), np.full((count, 4), np.nan)
+    p_value, chi2, gap = (np.full(count, np.nan) for _ in range(3))
+    fits: list[FitResult | None] = [None] * count
+    compile_kernels(setting.scene.model)
+
+    def work(first: int) -> float:
+        spent = 0.0
+        last = min(first + chunk, count)
+        for i in range(first, last):
+            random = trial_generator(seed, stream, i)
+            likelihood = setting.likelihood(setting.draw(truth[i], random))
+            start = setting.start(truth[i], random)
+            begun = time.thread_time()
+            fit = fit_particle(likelihood, start, setting.mode, setting.config.fit.z_range_nm)
+            spent += time.thread_time() - begun
+            fits[i] = fit
+            estimate[i] = fit.x_nm, fit.y_nm, fit.z_nm, fit.mass_kda
+            sigma[i] = fit.sigma
+            p_value[i], chi2[i] = fit.p_value, fit.chi2_reduced
+            gap[i] = fit.alternatives[0].log_likelihood_gap if fit.alternatives else math.inf
+            if baselines is not None:
+                gauss[i], peak[i] = baselines.measure(likelihood, start)
+        if advance is not None:
+            advance(last - first)
+        return spent
+
+    with ThreadPoolExecutor(workers) as pool:
+        seconds = sum(pool.map(work, range(0, count, chunk)))
+    found = [fit for fit in fits if fit is not None]
+    return Trials(
+        truth=truth,
+        estimate=estimate,
+        sigma=sigma,
+        status=np.array([str(fit.status) for fit in found]),
+        flags=tuple(frozenset(str(flag) for flag in fit.flags) for fit in found),
+        p_value=p_value,
+        chi2_reduced=chi2,
+        gap=gap,
+        gauss=gauss,
+        peak=peak,
+        seconds=seconds,
+    )
