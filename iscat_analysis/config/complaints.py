@@ -36,7 +36,7 @@ def complaint(item: Mapping[str, Any], called: Mapping[str, str]) -> str:
         hint = f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known)}"
         kind = "section" if len(location) == 1 else "key"
         return f"unknown {kind} {key}{hint}"
-    message = item["msg"].removeprefix("Value error, ")
+    message = str(item["msg"]).removeprefix("Value error, ")
     if not key:
         return message
     if item["type"] == "missing":
@@ -46,8 +46,8 @@ def complaint(item: Mapping[str, Any], called: Mapping[str, str]) -> str:
     if comma:
         return f"{key}: write {comma[1]}.{comma[2]}, with a decimal point (got {given!r})"
     shown = f" (got {given!r})" if isinstance(given, (str, int, float, list)) else ""
-    if isinstance(given, float) and math.isnan(given):
-        shown = " (got nan)"
+    if isinstance(given, float) and math.isfinite(given) and f"{given:g} " in message:
+        shown = ""
     return f"{key}: {message[:1].lower()}{message[1:]}{shown}"
 
 

@@ -86,13 +86,7 @@ def configure(
         _change(values, section, key, value)
     if any(change[:2] in _METHOD_FOLLOWS for change in changes):
         _choose_method_again(values, changes)
-    rename(values)
-    _merge_optics_file(values, changes)
-    try:
-        return Config.model_validate(values)
-    except ValidationError as error:
-        found = (complaint(item, called or {}) for item in error.errors())
-        raise ConfigError(f"{where}: {'; '.join(dict.fromkeys(found))}") from None
+    return _validated(values, changes, where, called or {})
 
 
 def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -> Config:
@@ -118,13 +112,15 @@ def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -
     return configure(path, settings=list(overrides))
 
 
-def parse_config(values: Mapping[str, Any]) -> Config:
+def parse_config(values: Mapping[str, Any], *, where: str = "configuration") -> Config:
     """Validate a nested mapping, as `tomllib` returns it.
 
     Parameters
     ----------
     values : mapping
         Sections of keys.
+    where : str
+        What messages call it.
 
     Returns
     -------
@@ -136,10 +132,22 @@ def parse_config(values: Mapping[str, Any]) -> Config:
     ConfigError
         One line that names each offending key.
     """
-    return configure(values)
+    return _validated(_nested(values), [], where, {})
 
 
 Change = tuple[str, str, Any]
+
+
+def _validated(
+    values: dict[str, Any], changes: Iterable[Change], where: str, called: Mapping[str, str]
+) -> Config:
+    rename(values)
+    _merge_optics_file(values, changes)
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        found = (complaint(item, called) for item in error.errors())
+        raise ConfigError(f"{where}: {'; '.join(dict.fromkeys(found))}") from None
 
 
 def _changes(settings: Mapping[str, Any] | Iterable[str] | None) -> list[Change]:
@@ -225,7 +233,7 @@ def _choose_method_again(values: dict[str, Any], changes: Iterable[Change]) -> N
         if named["method"] == "sliding" and "frames" not in named:
             background.pop("frames", None)
     elif background.get("method") == "sliding" or (
-        background.get("method") == "fixed" and "frames" not in background
+        background.get("method") == "fixed" and background.get("frames") is None
     ):
         del background["method"]
 

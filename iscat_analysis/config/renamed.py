@@ -31,8 +31,8 @@ def rename(values: dict[str, Any]) -> None:
         table = values.get(section)
         old = table.get(key) if isinstance(table, dict) else None
         if isinstance(table, dict) and isinstance(old, str) and old in names:
-            if (section, key, old) == ("background", "method", "mean") and "frames" not in table:
-                # Without frames this meant that the windows slide, where the scheme allows it.
+            if old == "mean" and table.get("frames") is None:
+                # Without frames the mean meant that the windows slide, where the scheme allows it.
                 del table[key]
                 _notice('background.method = "mean" without background.frames', '"sliding"')
                 continue

@@ -29,6 +29,15 @@ Scheme = Annotated[Literal["iscat", "cobri", "darkfield"], BeforeValidator(_lowe
 Method = Literal["fixed", "sliding", "tracks", "median", "known"]
 
 
+def _two(frames: Any) -> Any:
+    if isinstance(frames, (list, tuple)) and len(frames) == 2:
+        return frames
+    raise ValueError(
+        "[start, stop) takes two numbers, the first frame and the one after the last, as in "
+        "[0, 200]"
+    )
+
+
 def _ordered(frames: tuple[int, int]) -> tuple[int, int]:
     if not 0 <= frames[0] < frames[1]:
         raise ValueError(f"[start, stop) needs 0 <= start < stop, got {list(frames)}")
@@ -108,7 +117,7 @@ def _length(low_nm: float, high_nm: float) -> AfterValidator:
     return AfterValidator(check)
 
 
-Frames = Annotated[tuple[int, int], AfterValidator(_ordered)]
+Frames = Annotated[tuple[int, int], BeforeValidator(_two), AfterValidator(_ordered)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
