@@ -1,9 +1,9 @@
 """Bright steps of any shape: where the contrast changes by more than noise, whatever it looks like.
 
 No picture of a particle is needed.  At every boundary between blocks the squared contrast over its
-variance, less one, is averaged over a spot of the size of the diffraction limit; noise averages to zero
-there and a step does not.  It takes a step some three times brighter than a matched filter needs,
-and it finds it with a microscope of which nothing is known.
+variance, less one, is averaged over a spot of the size of the diffraction limit; noise averages to
+zero there and a step does not.  It takes a step some three times brighter than a matched filter
+needs, and it finds it with a microscope of which nothing is known.
 """
 
 from __future__ import annotations
@@ -57,6 +57,8 @@ class BrightStep:
         Power after over power before.
     usable : ndarray of bool, shape (ny, nx)
         Pixels that are neither defective nor saturated.
+    read_variance_e2 : ndarray, shape (ny, nx)
+        Of one frame [e²].
     """
 
     frame: int
@@ -71,6 +73,7 @@ class BrightStep:
     n_after: int
     power_ratio: float
     usable: BoolArray
+    read_variance_e2: FloatArray
 
 
 @dataclass(frozen=True)
@@ -135,8 +138,6 @@ def _spots(chunk: Chunk, spot_px: float, shadow_px: float, mapper: Mapper) -> li
     frames = np.diff(chunk.edges)
     read = chunk.camera.read_variance_e2(chunk.shape)
     used = chunk.usable
-    coverage = np.maximum(gaussian_filter(used.astype(float), spot_px), 1e-3)
-    noise = math.sqrt(2 / (4 * math.pi * spot_px**2))
 
     def one(j: int) -> FloatArray:
         low, middle, high = max(j + 1 - STRIDES, 0), j + 1, min(j + 1 + STRIDES, count + 1)
@@ -150,25 +151,84 @@ def _spots(chunk: Chunk, spot_px: float, shadow_px: float, mapper: Mapper) -> li
         change -= before * (change[lit].sum() / before[lit].sum())
         variance = after + ratio**2 * before
         variance += read * (frames[middle:high].sum() + ratio**2 * frames[low:middle].sum())
-        excess = np.where(lit, change**2 / np.where(lit, variance, 1.0) - 1, 0.0)
-        return (gaussian_filter(excess, spot_px) / coverage / noise).astype(np.float32)
+        return energy_of(change, variance, lit, spot_px)
 
     energy = np.stack(list(mapper(one, range(count))))
+    return [
+        _Spot(chunk.first + int(chunk.edges[k + 1]), i, j, float(energy[k, i, j]))
+        for k, i, j in _maxima(energy, shadow_px)
+    ]
+
+
+def energy_of(
+    change: FloatArray, variance: FloatArray, used: BoolArray, spot_px: float
+) -> FloatArray:
+    """Smoothed energy of a change of the image, in standard deviations of its noise.
+
+    Parameters
+    ----------
+    change, variance : ndarray, shape (y, x)
+        The change and the variance of its noise, in any unit and its square.
+    used : ndarray of bool, shape (y, x)
+        Pixels to use.
+    spot_px : float
+        Standard deviation of the smoothing [pixels].
+
+    Returns
+    -------
+    ndarray of float32, shape (y, x)
+        About 0 where there is only noise.
+    """
+    excess = np.where(used, change**2 / np.where(used, variance, 1.0) - 1, 0.0)
+    coverage = np.maximum(gaussian_filter(used.astype(float), spot_px), 1e-3)
+    noise = math.sqrt(2 / (4 * math.pi * spot_px**2))
+    return np.asarray(gaussian_filter(excess, spot_px) / coverage / noise, dtype=np.float32)
+
+
+def find_bright_places(
+    energy: FloatArray, *, pixel_nm: float, alone_nm: float, roi_px: int
+) -> list[tuple[int, int]]:
+    """Places where a single map of the energy has a maximum with no other near.
+
+    Parameters
+    ----------
+    energy : ndarray, shape (y, x)
+        From `energy_of`.
+    pixel_nm : float
+        Pixel side [nm].
+    alone_nm : float
+        Distance within which there is no other [nm].
+    roi_px : int
+        Side of the region that must lie inside the field.
+
+    Returns
+    -------
+    list of (int, int)
+        Row and column, brightest first.
+    """
+    found = [(i, j) for _, i, j in _maxima(energy[None], _SHADOW_NM / pixel_nm)]
+    room = roi_px // 2 + 1
+    return [
+        (i, j)
+        for i, j in found
+        if room <= i < energy.shape[0] - room
+        and room <= j < energy.shape[1] - room
+        and sum(math.hypot(i - k, j - m) * pixel_nm < alone_nm for k, m in found) == 1
+    ]
+
+
+def _maxima(energy: FloatArray, shadow_px: float) -> list[tuple[int, int, int]]:
+    """Maxima of a stack of maps, brightest first, without what belongs to a brighter one."""
     peaks = (energy > THRESHOLD) & (energy == maximum_filter(energy, size=(3, 5, 5)))
-    places = np.argwhere(peaks)
     order = np.argsort(-energy[peaks], kind="stable")
-    kept: list[_Spot] = []
     taken: list[tuple[int, int, int]] = []
-    for k, i, j in places[order]:
-        shadowed = any(
+    for k, i, j in np.argwhere(peaks)[order]:
+        if not any(
             abs(k - kk) < 2 * STRIDES and math.hypot(i - ii, j - jj) < shadow_px
             for kk, ii, jj in taken
-        )
-        if not shadowed:
+        ):
             taken.append((int(k), int(i), int(j)))
-            frame = chunk.first + int(chunk.edges[k + 1])
-            kept.append(_Spot(frame, int(i), int(j), float(energy[k, i, j])))
-    return kept
+    return taken
 
 
 def _cut(
@@ -212,15 +272,12 @@ def _cut(
             frame=frame, x_px=column, y_px=row, snr=0.0, rows=rows, columns=columns,
             before_e=before, after_e=after, n_before=n_before, n_after=n_after,
             power_ratio=power_after / power_before, usable=patch.usable,
+            read_variance_e2=np.full(before.shape, np.square(patch.read_noise_e)),
         )  # fmt: skip
-        y_px, x_px = _centre(step, pixel_nm)
-        step = replace(step, x_px=x_px, y_px=y_px)
-        row, column = round(y_px), round(x_px)
-    if step is None:
-        return None
-    contrast, variance = measured_contrast(step)
-    excess = float(np.sum(contrast**2 / variance) - contrast.size)
-    return replace(step, snr=math.sqrt(max(excess, 0.0)))
+        y_px, x_px, snr = centre_of_energy(*measured_contrast(step), pixel_nm)
+        step = replace(step, y_px=y_px + rows[0], x_px=x_px + columns[0], snr=snr)
+        row, column = round(step.y_px), round(step.x_px)
+    return step
 
 
 def _distance(one: _Spot, other: _Spot) -> float:
@@ -255,26 +312,38 @@ def measured_contrast(step: BrightStep) -> tuple[FloatArray, FloatArray]:
 def _core(step: BrightStep, pixel_nm: float) -> FloatArray:
     """Give the smoothed contrast of a step around its centre, as the template that dates it."""
     contrast, _ = measured_contrast(step)
-    distance = _radius_px(step, step.y_px, step.x_px) * pixel_nm
+    y, x = np.mgrid[slice(*step.rows), slice(*step.columns)]
+    distance = np.hypot(y - step.y_px, x - step.x_px) * pixel_nm
     return np.asarray(gaussian_filter(contrast, 0.7) * (distance < _CORE_NM))
 
 
-def _centre(step: BrightStep, pixel_nm: float) -> tuple[float, float]:
-    """Centre of the energy, in a shrinking neighbourhood; y and x in pixels of the field."""
-    contrast, variance = measured_contrast(step)
+def centre_of_energy(
+    contrast: FloatArray, variance: FloatArray, pixel_nm: float
+) -> tuple[float, float, float]:
+    """Centre of a picture's energy, found in a shrinking neighbourhood.
+
+    Parameters
+    ----------
+    contrast, variance : ndarray, shape (ny, nx)
+        The picture, its level taken off, and the variance of its noise.
+    pixel_nm : float
+        Pixel side [nm].
+
+    Returns
+    -------
+    row, column : float
+        Where it lies, counted from the first pixel.
+    snr : float
+        Root of the χ² in excess of noise.
+    """
     energy = np.maximum(gaussian_filter(contrast**2 / variance - 1, 0.7), 0.0)
-    y = np.arange(*step.rows)[:, None] + 0.0 * energy
-    x = np.arange(*step.columns)[None, :] + 0.0 * energy
-    at = (float(step.y_px), float(step.x_px))
+    y, x = np.mgrid[: contrast.shape[0], : contrast.shape[1]]
+    row, column = (contrast.shape[0] - 1) / 2, (contrast.shape[1] - 1) / 2
     for reach_nm in (900.0, 700.0, 600.0, 500.0):
-        weight = energy * (_radius_px(step, *at) * pixel_nm < reach_nm)
+        weight = energy * (np.hypot(y - row, x - column) * pixel_nm < reach_nm)
         total = float(weight.sum())
         if total <= 0:
             break
-        at = float((weight * y).sum()) / total, float((weight * x).sum()) / total
-    return at
-
-
-def _radius_px(step: BrightStep, y_px: float, x_px: float) -> FloatArray:
-    y, x = np.arange(*step.rows)[:, None] - y_px, np.arange(*step.columns)[None, :] - x_px
-    return np.asarray(np.hypot(y, x))
+        row, column = float((weight * y).sum()) / total, float((weight * x).sum()) / total
+    excess = float(np.sum(contrast**2 / variance) - contrast.size)
+    return row, column, math.sqrt(max(excess, 0.0))

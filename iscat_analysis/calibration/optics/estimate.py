@@ -142,6 +142,9 @@ class Estimate:
         The sights, each with its own unknowns at their estimates.
     information : ndarray, shape (n, n)
         Fisher information about the free parameters with every private unknown eliminated.
+    scatter : ndarray, shape (n, n)
+        Covariance of the score as the residuals of the pixels have it; equal to `information` where
+        the noise is the camera's.
     log_likelihood : float
         Relative to no particle.
     converged : bool
@@ -154,16 +157,27 @@ class Estimate:
     values: Settings
     sights: tuple[Sight, ...]
     information: FloatArray
+    scatter: FloatArray
     log_likelihood: float
     converged: bool
     passes: int
 
     @property
-    def covariance(self) -> FloatArray:
-        """Inverse of the information, shape (n, n)."""
+    def bound(self) -> FloatArray:
+        """Cramér–Rao bound of the covariance: the inverse information, shape (n, n)."""
         scale = np.array([prior_range(name) for name in self.names])
         scaled = self.information * np.outer(scale, scale)
         return np.asarray(np.linalg.pinv(scaled, hermitian=True) * np.outer(scale, scale))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the estimates from the residuals themselves, shape (n, n).
+
+        Notes
+        -----
+        H. White, Econometrica 50, 1 (1982): right where the noise is not quite that of the model.
+        """
+        return np.asarray(self.bound @ self.scatter @ self.bound)
 
 
 def prior_range(name: str) -> float:
@@ -231,6 +245,7 @@ def maximise(
         values=values,
         sights=tuple(s.moved(p) for s, p in zip(sights, private, strict=True)),
         information=at.reduced(0.0)[0],
+        scatter=at.scatter(),
         log_likelihood=at.value,
         converged=converged,
         passes=used,
@@ -248,6 +263,8 @@ def _limited(
     for name, move in zip(names, step, strict=True):
         low, high = limits.get(name, (-math.inf, math.inf))
         out[name] = float(min(max(values[name] + move, low), high))
+    if "mask_na" in names:
+        out["mask_na"] = min(out["mask_na"], out["na"] - _MASK_NA)
     return out
 
 
@@ -279,6 +296,7 @@ class _Point:
     value: float
     score: FloatArray  # (n, k + 4)
     fisher: FloatArray  # (n, k + 4, k + 4)
+    squares: FloatArray  # the same, with squared residuals in place of their expectation
 
     @classmethod
     def evaluate(
@@ -297,17 +315,23 @@ class _Point:
                 shifted["focus_nm"] = shifted["focus_nm"] + offset
             models[offset] = build(shifted)
 
-        def one(index: int) -> tuple[float, FloatArray, FloatArray]:
+        def one(index: int) -> tuple[float, FloatArray, FloatArray, FloatArray]:
             sight = sights[index]
             return _scores(sight, models[sight.focus_offset_nm], names, private[index])
 
         found = list(mapper(one, range(len(sights))))
-        value = math.fsum(v for v, _, _ in found)
+        value = math.fsum(each[0] for each in found)
         return cls(
             value if math.isfinite(value) else -math.inf,
-            np.array([g for _, g, _ in found]),
-            np.array([f for _, _, f in found]),
+            *(np.array([each[part] for each in found]) for part in (1, 2, 3)),
         )
+
+    def scatter(self) -> FloatArray:
+        """Covariance of the reduced score from the residuals, shape (k, k)."""
+        k = self.score.shape[1] - PRIVATE
+        gains = np.einsum("eij,ejk->eik", self.fisher[:, :k, k:], self.reduced(0.0)[2])
+        reduce = np.concatenate([np.broadcast_to(np.eye(k), (len(gains), k, k)), -gains], axis=2)
+        return np.einsum("eia,eab,ejb->ij", reduce, self.squares, reduce)
 
     def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Information and score of the shared parameters, and the private blocks inverted."""
@@ -361,8 +385,8 @@ def _solve(
 
 def _scores(
     sight: Sight, model: Microscope, names: tuple[str, ...], private: FloatArray
-) -> tuple[float, FloatArray, FloatArray]:
-    """Log-likelihood of one sight, its score and expected information, shared unknowns first."""
+) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+    """Log-likelihood, score, expected information and its observed squares, shared ones first."""
     x, y, mass, level = (float(v) for v in private)
     place = (sight.grid, x, y, sight.z_nm, mass)
     k = len(names)
@@ -380,7 +404,8 @@ def _scores(
     rows[:-1] *= of_signal.ravel()
     rows[-1] = of_level.ravel()
     weighted = rows * weight.ravel()
-    return value, rows @ residual.ravel(), weighted @ rows.T
+    scored = rows * residual.ravel()
+    return value, scored.sum(axis=1), weighted @ rows.T, scored @ scored.T
 
 
 def pixel_terms(
@@ -388,8 +413,8 @@ def pixel_terms(
 ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Log-likelihood of a region and what its derivatives are made of.
 
-    Each pixel's law has one natural coordinate η: the logarithm of the odds of a count to come after
-    the step (CONDITIONAL), or the expected counts (POISSON).
+    Each pixel's law has one natural coordinate η: the logarithm of the odds of a count to come
+    after the step (CONDITIONAL), or the expected counts (POISSON).
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """From pictures of particles to the microscope that made them, and a verdict on it.
 
-Two thirds of the pictures are fitted and a third decides: how many aberrations are worth having, and
-whether the result describes pictures that it has not seen.  Directions in the space of
+Two thirds of the pictures are fitted and a third decides: how many aberrations are worth having,
+and whether the result describes pictures that it has not seen.  Directions in the space of
 parameters that the pictures do not determine within the plausible range are named and held at the
 configured values.
 """
@@ -64,7 +64,8 @@ _JOINT = 3  # microscopes that are tried on all pictures
 _MASKS_NA = (0.35, 0.65)
 _MASK_TRANSMITS = 0.3  # where no attenuation is configured
 _CONTAMINATED_SHARE = 0.25  # more than this is the model's fault
-_CLOSE = 0.02  # states whose average is explained this much worse are tried on all pictures
+_TRIAL_PASSES = 12  # of a second microscope on all pictures
+_CLOSE = 0.01  # states whose average is explained this much worse are tried on all pictures
 
 Judge = Callable[[Sight, Settings], tuple[float, float]]
 """Goodness of fit of a sight in a microscope: reduced χ² and p-value."""
@@ -89,7 +90,7 @@ class Judgement:
     @property
     def good(self) -> bool:
         """Whether they agree."""
-        return self.uniform_p >= HELD_OUT_P
+        return bool(self.uniform_p >= HELD_OUT_P)
 
 
 @dataclass(frozen=True)
@@ -208,8 +209,8 @@ def measure_microscope(
     side : int
         Sign of the focus that was configured, which decides between twins; 0 where none was.
     landing : int
-        Sign of the mass of a particle that lands, as more do than leave: 1; 0 where unknown, and the
-        reference phase is taken within 90° of the configured one.
+        1 where more particles land than leave, so that most masses are positive; 0 where that is not
+        known, and the reference phase is taken within 90° of the configured one.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -322,7 +323,7 @@ class _Search:
             far = top - estimate.log_likelihood > max(_CLOSE * top, 2 * TWIN_GAP)
             if not far and not any(_same(estimate, other) for other in near):
                 near.append(estimate)
-        joint = []
+        joint: list[tuple[Estimate, tuple[Sight, ...]]] = []
         for rough in near[:_JOINT]:
             there = rough.sights[0]
             sights = with_masses(
@@ -332,11 +333,12 @@ class _Search:
             )
             fitted = [s for i, s in enumerate(sights) if i % HELD_OUT != 1]
             names = self._names(rough.values, FREE["zernike"])
-            joint.append((self._fit(fitted, rough.values, names), sights[1::HELD_OUT]))
+            passes = _TRIAL_PASSES if joint else 40
+            joint.append((self._fit(fitted, rough.values, names, passes), sights[1::HELD_OUT]))
         return max(joint, key=lambda pair: pair[0].log_likelihood)
 
     def _states(self) -> list[list[dict[str, Any]]]:
-        """Settings to start from, those of one discrete state together."""
+        """Give the settings to start from, those of one discrete state together."""
         now = dict(self.configured)
         lights = ["linear", "circular"] if "polarization" in self.free else [now["polarization"]]
         masks: list[list[dict[str, Any]]] = [[{}]]
@@ -416,7 +418,7 @@ class _Search:
             start = {**best.values, **{n: 0.0 for n in terms if n not in rung}}
             fit = best if rung == terms else self._fit(best.sights, start, names, passes=12)
             tried.append((self._fit(held_out, fit.values, ()).log_likelihood, fit))
-        value, chosen = max(tried, key=lambda pair: pair[0])
+        _, chosen = max(tried, key=lambda pair: pair[0])
         return chosen, tuple(n for n in terms if n not in chosen.names)
 
     def _analyzer(self, best: Estimate) -> tuple[Estimate, tuple[str, ...]]:
@@ -442,7 +444,7 @@ class _Search:
             if is_term(name) and name not in ("z7", "z8", "z9", "z10"):
                 mirrored[name] = -best.values[name]
         turned = [replace(s, mass_kda=-s.mass_kda) for s in best.sights]
-        other = self._fit(turned, mirrored, best.names)
+        other = self._fit(turned, mirrored, best.names, _TRIAL_PASSES)
         gap = best.log_likelihood - other.log_likelihood
         apart = abs(other.values["focus_nm"] - best.values["focus_nm"])
         if abs(gap) >= TWIN_GAP or apart < 1.0:
@@ -453,7 +455,7 @@ class _Search:
         return best, Twin(other.values, gap)
 
     def _signed(self, best: Estimate) -> Estimate:
-        """Choose between a phase and its opposite: landings are more than leavings, or as configured."""
+        """Choose between a phase and its opposite, which a particle that leaves has."""
         if "reference_phase_deg" not in best.names:
             return best
         masses = np.array([s.mass_kda for s in best.sights])

@@ -56,8 +56,8 @@ def free_groups(text: str | Sequence[str] | None) -> tuple[str, ...]:
     unknown = sorted(names - set(FREE))
     if unknown or not names:
         raise ConfigError(
-            f"--free {','.join(given)}: {unknown[0] if unknown else 'nothing'!r} cannot be set free; "
-            f"give some of {', '.join(FREE)}"
+            f"--free {','.join(given)}: {unknown[0] if unknown else 'nothing'!r} cannot be set "
+            f"free; give some of {', '.join(FREE)}"
         )
     return tuple(name for name in FREE if name in names)
 

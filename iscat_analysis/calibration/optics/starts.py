@@ -1,9 +1,9 @@
 """Where the search for the microscope begins: every focus, on the average of all pictures.
 
-The pictures are registered on each other, with the sign of each, and averaged; no model takes part in
-that.  For one focus the contrast of a weak particle is linear in the cosine and the sine of the
-reference phase, so that the phase and the amplitude that fit the average best follow from a
-2 × 2 system at every shift of the picture.
+The pictures are registered on each other, with the sign of each, and averaged; no model takes part
+in that.  For one focus the contrast of a weak particle is linear in the cosine and the sine of the
+reference phase, so that the phase and the amplitude that fit the average best follow from a 2 × 2
+system at every shift of the picture.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def contrast_of(sight: Sight) -> tuple[FloatArray, FloatArray]:
     contrast, variance : ndarray, shape (ny, nx)
         The contrast without its mean; masked pixels hold 0 and a variance of 10⁶.
     """
-    _, score, information, by_signal, _ = pixel_terms(
+    _, _, information, by_signal, _ = pixel_terms(
         sight.kind, sight.data, np.zeros(sight.grid.shape), 0.0
     )
     information = information * by_signal**2
@@ -143,7 +143,7 @@ def contrast_of(sight: Sight) -> tuple[FloatArray, FloatArray]:
 
 
 def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> FloatArray:
-    """Shift of a picture from a template: the peak of the correlation's magnitude, by a parabola."""
+    """Shift of a picture from a template: where the correlation is largest, of either sign."""
     correlation = fft.irfft2(fft.rfft2(contrast) * np.conj(fft.rfft2(template)), s=contrast.shape)
     reach = math.ceil(_SHIFT_PX)
     around = np.abs(np.roll(correlation, (reach, reach), (0, 1)))
