@@ -339,10 +339,10 @@ def _refuse_unread_pixels(page: tifffile.TiffPage, file_size: int, path: Path) -
     needed = math.prod(page.chunked)
     tag = page.tags.get(_TILE_OFFSETS) or page.tags.get(_STRIP_OFFSETS)
     listed = tag.count if tag is not None else 0
-    if listed != needed or len(page.dataoffsets) != needed or len(page.databytecounts) != needed:
-        raise _damaged(
-            path, f"image {number} lists {listed} strips or tiles where it needs {needed}"
-        )
+    if page.compression != 1 and not {_STRIP_SIZES, _TILE_SIZES} & set(page.tags.keys()):
+        raise _damaged(path, f"image {number} does not say how long its pixel data are")
+    if not listed == len(page.dataoffsets) == len(page.databytecounts) == needed:
+        raise _damaged(path, f"image {number} lists {listed} strips or tiles but needs {needed}")
     if min(page.dataoffsets) <= 0 or min(page.databytecounts) <= 0:
         raise DataError(
             f"{path}: image {number} has no pixel data for part of its area; "
