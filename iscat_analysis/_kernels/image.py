@@ -21,8 +21,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lattice_rows import (
-    FAST,
     interpolate_columns,
     lattice_gradient,
     lattice_signal,

@@ -32,6 +32,8 @@ from scipy.special import i0
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+FAST = {"contract", "reassoc", "nsz", "arcp"}
+
 LATTICE_STEP = 1.2
 """Step of the lattice times bandwidth: 4e-8 of the peak in the field, 1e-6 in its gradient."""
 
@@ -107,13 +109,13 @@ def radial_waves(
     fields, count, _ = harmonics.shape
     largest = count // 2
     nodes = np.empty((3, intervals + 1, largest + 1, 4, fields))
-    pairs = np.empty((largest + 1, 4, fields, transverse.size))
+    pairs = np.empty((largest + 1, transverse.size, 4, fields))
     for m in range(largest + 1):
-        plus, minus = harmonics[:, largest + m], harmonics[:, largest - m]
+        plus, minus = harmonics[:, largest + m].T, harmonics[:, largest - m].T
         even = 1j**m * (plus + minus) if m else plus
         odd = 1j ** (m + 1) * (plus - minus)
-        pairs[m] = even.real, even.imag, odd.real, odd.imag
-    rows = pairs.reshape(largest + 1, 4 * fields, -1)
+        pairs[m] = np.stack([even.real, even.imag, odd.real, odd.imag], axis=1)
+    columns = pairs.reshape(largest + 1, transverse.size, -1)
     turn = transverse * step_nm
     for start in range(0, intervals + 1, _BLOCK):
         r = step_nm * np.arange(start, min(start + _BLOCK, intervals + 1))
@@ -127,10 +129,8 @@ def radial_waves(
             bend = (two_below - 2 * bessel[m] + bessel[m + 2]) / 4
             for order, value in enumerate((bessel[m], slope, bend)):
                 scaled = value * (turn**order)[:, None]
-                out = rows[m] @ scaled
-                nodes[order, start : start + r.size, m] = np.moveaxis(
-                    out.reshape(4, fields, r.size), -1, 0
-                )
+                found = scaled.T @ columns[m]
+                nodes[order, start : start + r.size, m] = found.reshape(-1, 4, fields)
     f, d, s = nodes
     rise = f[1:] - f[:-1]
     d0, d1, s0, s1 = d[:-1], d[1:], s[:-1], s[1:]
@@ -180,7 +180,37 @@ def bessel_ladder(x: FloatArray, out: FloatArray) -> None:
             out[m, k] /= total
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _quintic(powers: FloatArray, t: float, out: FloatArray) -> None:
+    """Fill `out` (n) with the polynomials of `powers` (6, n) at t.
+
+    Three rows at a time: against more that might overlap, the compiler gives up on vectors.
+    """
+    a, b, c = powers[3], powers[4], powers[5]
+    for j in range(out.size):
+        out[j] = a[j] + t * (b[j] + t * c[j])
+    a, b, c = powers[0], powers[1], powers[2]
+    cube = t * t * t
+    for j in range(out.size):
+        out[j] = a[j] + t * (b[j] + t * c[j]) + cube * out[j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _sum_azimuths(value: FloatArray, cos: float, sin: float, sums: FloatArray) -> None:
+    """Fill `sums` (2, 2, 2, k): cosine and sine terms, even and odd orders, real and imaginary."""
+    sums[:] = 0.0
+    c, s = 1.0, 0.0
+    for m in range(value.shape[0]):
+        for part in range(2):
+            even, odd = sums[0, m % 2, part], sums[1, m % 2, part]
+            v, w = value[m, part], value[m, 2 + part]
+            for k in range(even.size):
+                even[k] += c * v[k]
+                odd[k] += s * w[k]
+        c, s = c * cos - s * sin, s * cos + c * sin
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def sum_waves(
     waves: FloatArray, inv_step: float, dx: FloatArray, dy: FloatArray, out: FloatArray
 ) -> None:
@@ -198,29 +228,49 @@ def sum_waves(
         Filled; zero beyond the last interval.
     """
     intervals, _, count, _, fields = waves.shape
-    value = np.empty(fields)
+    flat = waves.reshape(intervals, 6, -1)
+    value = np.empty((count, 4, fields))
+    line = value.reshape(-1)
+    sums = np.empty((2, 2, 2, fields))
     for j in range(dx.size):
         r = np.sqrt(dx[j] * dx[j] + dy[j] * dy[j])
         cos, sin = (dx[j] / r, dy[j] / r) if r > 0 else (1.0, 0.0)
-        t = r * inv_step
-        i = int(t)
-        t -= i
+        i = int(r * inv_step)
         out[j] = 0.0
-        if i >= intervals:
-            continue
-        c, s = 1.0, 0.0
-        for m in range(count):
-            for part in range(4 if m else 2):
-                factor = c if part < 2 else s
-                p = waves[i, :, m, part]
-                p0, p1, p2 = p[0], p[1], p[2]
-                for k in range(fields):
-                    value[k] = p0[k] + t * (p1[k] + t * p2[k])
-                p0, p1, p2 = p[3], p[4], p[5]
-                target = out[j, part % 2]
-                for k in range(fields):
-                    target[k] += factor * (value[k] + t * t * t * (p0[k] + t * (p1[k] + t * p2[k])))
-            c, s = c * cos - s * sin, s * cos + c * sin
+        if i < intervals:
+            _quintic(flat[i], r * inv_step - i, line)
+            _sum_azimuths(value, cos, sin, sums)
+            out[j] = sums[0, 0] + sums[0, 1] + sums[1, 0] + sums[1, 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sample(waves: FloatArray, inv_step: float, step: float, out: FloatArray) -> None:
+    """Fill `out` (k, 2, side, side) with the fields at the nodes, four mirror images at a time."""
+    intervals, _, count, _, fields = waves.shape
+    flat = waves.reshape(intervals, 6, -1)
+    value = np.empty((count, 4, fields))
+    line = value.reshape(-1)
+    sums = np.empty((2, 2, 2, fields))
+    half = out.shape[2] // 2
+    out[:] = 0.0
+    for ix in range(half + 1):
+        for iy in range(half + 1):
+            r = step * np.sqrt(float(ix * ix + iy * iy))
+            i = int(r * inv_step)
+            if i >= intervals:
+                continue
+            cos, sin = (ix * step / r, iy * step / r) if r > 0 else (1.0, 0.0)
+            _quintic(flat[i], r * inv_step - i, line)
+            _sum_azimuths(value, cos, sin, sums)
+            right, left, low, high = half + ix, half - ix, half - iy, half + iy
+            for k in range(fields):
+                for part in range(2):
+                    ce, co = sums[0, 0, part, k], sums[0, 1, part, k]
+                    se, so = sums[1, 0, part, k], sums[1, 1, part, k]
+                    out[k, part, right, high] = ce + co + se + so
+                    out[k, part, left, high] = ce - co - se + so
+                    out[k, part, right, low] = ce + co - se - so
+                    out[k, part, left, low] = ce - co + se - so
 
 
 def spread(waves: FloatArray, radial_step_nm: float, step_nm: float, half: int) -> FloatArray:
@@ -240,11 +290,9 @@ def spread(waves: FloatArray, radial_step_nm: float, step_nm: float, half: int) 
     ndarray, shape (k, 2, 2·half + 1, 2·half + 1)
         Real and imaginary parts; x along the third axis, y along the fourth.
     """
-    axis = step_nm * np.arange(-half - _FILTER, half + _FILTER + 1)
-    x, y = np.meshgrid(axis, axis, indexing="ij")
-    samples = np.empty((x.size, 2, waves.shape[4]))
-    sum_waves(waves, 1 / radial_step_nm, x.ravel(), y.ravel(), samples)
-    fields = np.ascontiguousarray(np.moveaxis(samples.reshape(*x.shape, 2, -1), (3, 2), (0, 1)))
+    side = 2 * (half + _FILTER) + 1
+    fields = np.empty((waves.shape[4], 2, side, side))
+    _sample(waves, 1 / radial_step_nm, step_nm, fields)
     _, undo = window()
     inner = slice(_FILTER, -_FILTER)
     along_x = convolve1d(fields, undo, axis=2, mode="constant")[:, :, inner]

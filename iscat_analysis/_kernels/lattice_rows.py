@@ -13,14 +13,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.lattice import TAPS
+from iscat_analysis._kernels.lattice import FAST, TAPS
 
 if TYPE_CHECKING:
     from iscat_analysis._kernels.image import Lens, Pixels
 
 FloatArray = NDArray[np.float64]
-
-FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 FIELDS = 16
 """Rows for a row of pixels: the fields (4), their ∂/∂z, slopes along x and slopes along y."""

@@ -27,7 +27,8 @@ from iscat_analysis._kernels.image import (
     row_signal,
     workspace,
 )
-from iscat_analysis._kernels.lattice_rows import FAST, lattice_span
+from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lattice_rows import lattice_span
 from iscat_analysis._kernels.radial import AxialTable, profile_at
 
 FloatArray = NDArray[np.float64]
@@ -225,7 +226,8 @@ def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int
     x, y = pixels.x, pixels.y
     margin = abs(pixels.offsets[-1])
     if lens.half:
-        return lattice_span(lens, x, margin, theta[0])
+        first, last = lattice_span(lens, x, margin, theta[0])
+        return first, last
     dx = max(abs(x[0] - theta[0]), abs(x[-1] - theta[0])) + margin
     dy = max(abs(y[0] - theta[1]), abs(y[-1] - theta[1])) + margin
     return 0, min(6 * (int(np.sqrt(dx * dx + dy * dy) * lens.inv_step) + 1), width)

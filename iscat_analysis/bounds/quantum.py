@@ -93,8 +93,10 @@ def quantum_information(
     )
     out = np.zeros((4, 4), dtype=np.complex128)
     for i in range(4):
-        for j in range(4):
+        for j in range(i, 4):
             out[i, j] = 4 * np.sum(slopes[i].conj() * slopes[j] * density)
+            out[j, i] = out[i, j].conj()
+    out[np.diag_indices(4)] = out.diagonal().real
     # the pupil is symmetric under reflection through its centre: exact zeros, not rounding
     out[:2, 2:] = out[2:, :2] = 0.0
     return out
@@ -191,8 +193,7 @@ def incompatible_pairs(information: ComplexArray) -> dict[tuple[str, str], float
 
 
 def _azimuths() -> FloatArray:
-    azimuths: FloatArray = np.arange(AZIMUTHS) * (2 * math.pi / AZIMUTHS)
-    return azimuths
+    return np.arange(AZIMUTHS, dtype=np.float64) * (2 * math.pi / AZIMUTHS)
 
 
 def _photons(

@@ -23,7 +23,7 @@ ComplexArray = NDArray[np.complex128]
 NEAR_CRITICAL = 0.98
 """NA over n_sample from which the quadrature minds the critical angle."""
 
-NEGLIGIBLE = 1e-9
+NEGLIGIBLE = 1e-8
 """Share of the pupil's light amplitude below which azimuthal harmonics are left out."""
 
 _FEWEST_AZIMUTHS, _MOST_AZIMUTHS = 64, 1024
@@ -107,14 +107,14 @@ class Aperture:
     def seen(self, phi: FloatArray, *, masked: bool = True) -> ComplexArray:
         """Components that reach the camera, with mask and aberrations, shape (1 or 2, n, m)."""
         components = self.polarised(phi)[: 1 if self.optics.analyzer else 2]
-        wave = components * np.exp(1j * self.wavenumber * self.path_nm(phi))
+        wave: ComplexArray = components * np.exp(1j * self.wavenumber * self.path_nm(phi))
         return wave * self.transmission[:, None] if masked else wave
 
     def azimuths(self) -> FloatArray:
         """Azimuths that resolve the pupil's finest harmonic, equally spaced from 0 [rad]."""
         count = _FEWEST_AZIMUTHS
         while True:
-            phi = np.arange(count) * (2 * math.pi / count)
+            phi: FloatArray = np.arange(count, dtype=np.float64) * (2 * math.pi / count)
             size = np.abs(np.fft.fft(self.seen(phi), axis=2)).sum((0, 1))
             fine = size[count // 4 : -(count // 4)]
             if fine.max() < NEGLIGIBLE * size.sum():

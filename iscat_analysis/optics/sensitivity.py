@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +108,7 @@ def sensitivity_lattices(
     behind = inner * (optics.n_immersion * np.sin(theta) < optics.mask_na)
     field = seen * inner[:, None]
 
-    def change(name: str) -> ComplexArray:
+    def change(name: str) -> Any:
         if name == "focus_nm":
             return field * (-1j * whole.pupil.oil[:, None])
         if name == "na":
@@ -119,8 +120,8 @@ def sensitivity_lattices(
             return clear * ((optics.attenuation - 1) * at_edge[:, None])
         if name == "attenuation":
             return clear * behind[:, None] - field * (rho / (optics.attenuation or 1.0))
-        j = int(name[1:])
-        return field * (1j * k * zernike(j, whole.rho[:, None], phi)[0])
+        path: FloatArray = zernike(int(name[1:]), whole.rho[:, None], phi)[0]
+        return field * (1j * k * path)
 
     waves = np.concatenate([field, *(change(name) for name in names)])
     series = harmonics(waves, np.abs(weight)) * weight

@@ -303,7 +303,7 @@ class LatticeField:
     @cached_property
     def _plane(self):  # type: ignore[no-untyped-def]
         half = int(self.reach_nm / math.sqrt(2) / (self.step_nm * _PEAK_STEP))
-        axis = self.step_nm * _PEAK_STEP * np.arange(-half, half + 1)
+        axis = self.step_nm * _PEAK_STEP * np.arange(-half, half + 1, dtype=np.float64)
         pixels = Pixels(axis, axis, np.zeros(1), np.ones(1))
 
         def at(z_nm: float) -> tuple[Pixels, FloatArray, FloatArray]:
@@ -338,7 +338,7 @@ def axial_table(field: Field, z_range_nm: tuple[float, float]) -> AxialTable:
     kappa = float(field.axial.real.min() + field.axial.real.max()) / 2
     step = STEP / float(np.abs(field.axial - kappa).max())
     count = max(math.ceil((high - low) / step), 1) + 1
-    heights = field.profiles(low + step * np.arange(count), kappa)
+    heights = field.profiles(low + step * np.arange(count, dtype=np.float64), kappa)
     heights *= (step ** np.arange(3))[:, None, None]
     return AxialTable(heights, low, step, kappa)
 
