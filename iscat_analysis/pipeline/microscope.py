@@ -20,6 +20,7 @@ from iscat_analysis.calibration.optics import (
     Sight,
     build_microscope,
     free_groups,
+    make_pictures,
     make_result,
     measure_microscope,
     optics_limits,
@@ -101,8 +102,9 @@ def calibrate_movie(
     groups = free_groups(free)
     given_focus = "focus_nm" in config.optics.model_fields_set
     config, notes = resolve_metadata(config, movie.metadata)
-    for note in notes if notify else ():
-        notify(note)
+    for note in notes:
+        if notify is not None:
+            notify(note)
     refuse_uncalibratable(config)
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     with ThreadPoolExecutor(config.compute.workers) as pool:
@@ -204,7 +206,9 @@ def calibrate_sights(
         landing=1,
         mapper=mapper,
     )
-    return make_result(config, configured, measured, source)
+    estimate = measured.estimate
+    pictures = make_pictures(estimate.sights, build, estimate.values)
+    return make_result(config, configured, measured, pictures, source)
 
 
 def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], ForwardModel]:
@@ -405,6 +409,7 @@ def scan_sights(movie: Stack, config: Config, camera: Camera, focus_step_nm: flo
         energy, pixel_nm=_pixel_nm(config), alone_nm=ALONE_NM, roi_px=_roi_px(config)
     )
     model = build_microscope(config, 1000.0, settings_of(config))
+    saturated: BoolArray = np.asarray(camera.saturated(counts)).any(axis=0)
     sights: list[Sight] = []
     per_place = max(1, MOST_SIGHTS // max(len(places), 1))
     taken = np.unique(np.linspace(0, len(frames) - 1, min(per_place, len(frames))).round())
@@ -412,7 +417,7 @@ def scan_sights(movie: Stack, config: Config, camera: Camera, focus_step_nm: flo
         region = _region(row, column, _roi_px(config))
         grid = PixelGrid.region(*region, _pixel_nm(config))
         cut = slice(*region[0]), slice(*region[1])
-        masked = camera.saturated(counts)[:, *cut].any(axis=0)
+        masked = saturated[cut]
         for index in taken.astype(int):
             frame, ratio = frames[index][cut], float(ratios[index])
             if n_before:

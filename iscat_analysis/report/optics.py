@@ -255,7 +255,9 @@ def _table(parameters: list[Mapping[str, Any]]) -> dict[str, Any]:
         )  # fmt: skip
     return {
         "caption": "Parameters of the optics",
-        "columns": [{"label": c, "numeric": c not in ("parameter", "unit", "state")} for c in columns],
+        "columns": [
+            {"label": c, "numeric": c not in ("parameter", "unit", "state")} for c in columns
+        ],
         "rows": rows,
     }
 

@@ -23,6 +23,7 @@ from iscat_analysis.calibration.optics.measure import (
     judge,
     measure_microscope,
 )
+from iscat_analysis.calibration.optics.pictures import Pictures, make_pictures
 from iscat_analysis.calibration.optics.result import OpticsCalibration, make_result
 from iscat_analysis.calibration.optics.settings import (
     FREE,
@@ -41,6 +42,7 @@ __all__ = [
     "Judgement",
     "Measured",
     "OpticsCalibration",
+    "Pictures",
     "Settings",
     "Sight",
     "Twin",
@@ -48,6 +50,7 @@ __all__ = [
     "free_groups",
     "is_term",
     "judge",
+    "make_pictures",
     "make_result",
     "maximise",
     "measure_microscope",

@@ -331,7 +331,7 @@ class _Point:
         k = self.score.shape[1] - PRIVATE
         gains = np.einsum("eij,ejk->eik", self.fisher[:, :k, k:], self.reduced(0.0)[2])
         reduce = np.concatenate([np.broadcast_to(np.eye(k), (len(gains), k, k)), -gains], axis=2)
-        return np.einsum("eia,eab,ejb->ij", reduce, self.squares, reduce)
+        return np.asarray(np.einsum("eia,eab,ejb->ij", reduce, self.squares, reduce))
 
     def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Information and score of the shared parameters, and the private blocks inverted."""
@@ -453,7 +453,7 @@ def pixel_terms(
     expected = gain * (c1 + c2 * signal)
     rate = expected + c3
     if np.any(rate[used] <= 0):
-        return -math.inf, *(np.zeros(signal.shape) for _ in range(4))
+        return -math.inf, nothing, nothing, nothing, nothing
     rate = np.where(used, rate, 1.0)
     empty = np.where(used, c1 + c3, 1.0)
     value = float(np.sum(np.where(used, c0 * np.log(rate / empty) - rate + empty, 0.0)))

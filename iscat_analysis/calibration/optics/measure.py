@@ -209,8 +209,8 @@ def measure_microscope(
     side : int
         Sign of the focus that was configured, which decides between twins; 0 where none was.
     landing : int
-        1 where more particles land than leave, so that most masses are positive; 0 where that is not
-        known, and the reference phase is taken within 90° of the configured one.
+        1 where more particles land than leave, so that most masses are positive; 0 where that is
+        not known, and the reference phase is taken within 90° of the configured one.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -226,7 +226,7 @@ def measure_microscope(
 
 def _same(one: Estimate, other: Estimate) -> bool:
     """Whether two searches on the average picture ended in the same place."""
-    return (
+    return bool(
         one.values["polarization"] == other.values["polarization"]
         and (one.values["mask_na"] > 0) == (other.values["mask_na"] > 0)
         and abs(one.values["focus_nm"] - other.values["focus_nm"]) < _SAME_FOCUS_NM

@@ -116,7 +116,7 @@ def make_pictures(sights: Sequence[Sight], build: Build, settings: Settings) -> 
         model=fitted,
         residual=(measured - fitted) / sigma,
         pixel_nm=pixel,
-        radius_nm=pixel * np.arange(count.size),
+        radius_nm=pixel * np.arange(count.size, dtype=np.float64),
         radial=ring_mean(measured),
         radial_se=np.sqrt(ring_mean(sigma**2) / count),
         radial_model=ring_mean(fitted),

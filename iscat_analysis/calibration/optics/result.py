@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.calibration.optics.measure import Judgement, Measured
+from iscat_analysis.calibration.optics.pictures import Pictures
 from iscat_analysis.calibration.optics.settings import is_term, with_settings
 from iscat_analysis.config import Config
 from iscat_analysis.records import FloatArray
@@ -36,6 +37,8 @@ class OpticsCalibration:
         Of the measured parameters.
     measured : Measured
         Fits, verdicts and pictures in full.
+    pictures : Pictures
+        What a report shows.
     sights : int
         Pictures used, those that were not fitted included.
     source : mapping of str to str
@@ -49,6 +52,7 @@ class OpticsCalibration:
     names: tuple[str, ...]
     covariance: FloatArray
     measured: Measured
+    pictures: Pictures
     sights: int
     source: Mapping[str, str]
     notes: tuple[str, ...]
@@ -125,7 +129,7 @@ class OpticsCalibration:
             Nested plain values.
         """
         found = self.measured
-        twin = found.twin
+        twin, shown = found.twin, vars(self.pictures)
         return {
             "accepted": self.accepted,
             "refusals": list(found.refusals),
@@ -143,12 +147,17 @@ class OpticsCalibration:
             "particles": self.sights,
             "contaminated": found.contaminated,
             "source": dict(self.source),
+            "pictures": {k: v.tolist() if hasattr(v, "tolist") else v for k, v in shown.items()},
             "notes": list(self.notes),
         }
 
 
 def make_result(
-    config: Config, configured: Mapping[str, Any], measured: Measured, source: Mapping[str, str]
+    config: Config,
+    configured: Mapping[str, Any],
+    measured: Measured,
+    pictures: Pictures,
+    source: Mapping[str, str],
 ) -> OpticsCalibration:
     """Put a result together.
 
@@ -160,6 +169,8 @@ def make_result(
         The parameters in it.
     measured : Measured
         What the pictures say.
+    pictures : Pictures
+        What a report shows.
     source : mapping of str to str
         Where the pictures came from.
 
@@ -191,6 +202,7 @@ def make_result(
         names=estimate.names,
         covariance=covariance,
         measured=measured,
+        pictures=pictures,
         sights=len(estimate.sights),
         source=source,
         notes=_notes(measured),

@@ -156,7 +156,7 @@ def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> 
             low, mid, high = line[index - 1 : index + 2]
             bend = low - 2 * mid + high
             out[axis] += 0.5 * (low - high) / bend if bend < 0 else 0.0
-    return out
+    return np.asarray(out)
 
 
 def with_masses(
