@@ -409,7 +409,7 @@ def scan_sights(movie: Stack, config: Config, camera: Camera, focus_step_nm: flo
         energy, pixel_nm=_pixel_nm(config), alone_nm=ALONE_NM, roi_px=_roi_px(config)
     )
     model = build_microscope(config, 1000.0, settings_of(config))
-    saturated: BoolArray = np.asarray(camera.saturated(counts)).any(axis=0)
+    saturated = np.any(camera.saturated(counts), axis=0)
     sights: list[Sight] = []
     per_place = max(1, MOST_SIGHTS // max(len(places), 1))
     taken = np.unique(np.linspace(0, len(frames) - 1, min(per_place, len(frames))).round())
@@ -417,7 +417,7 @@ def scan_sights(movie: Stack, config: Config, camera: Camera, focus_step_nm: flo
         region = _region(row, column, _roi_px(config))
         grid = PixelGrid.region(*region, _pixel_nm(config))
         cut = slice(*region[0]), slice(*region[1])
-        masked = saturated[cut]
+        masked = np.asarray(saturated)[cut]
         for index in taken.astype(int):
             frame, ratio = frames[index][cut], float(ratios[index])
             if n_before:

@@ -54,9 +54,9 @@ def schema(name: str) -> dict[str, Any]:
     ----------
     name : str
         ``"fit"``, ``"simulate"`` or ``"bounds"`` for what the command prints with ``--json``, and
-        ``"comparison"`` for ``iscat bounds --preset``; ``"summary"``, ``"benchmark"``, ``"camera"``,
-        ``"optics"`` or ``"calibration"`` for the file of that name and what is printed beside
-        it.
+        ``"comparison"`` for ``iscat bounds --preset``; ``"summary"``, ``"benchmark"``,
+        ``"camera"``, ``"optics"`` or ``"calibration"`` for the file of that name and what is
+        printed beside it.
 
     Returns
     -------

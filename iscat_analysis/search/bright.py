@@ -21,7 +21,7 @@ from iscat_analysis.search.sliding import STRIDES, Chunk, locate_step
 THRESHOLD = 7.0
 """Excess of the smoothed energy over its noise; the noise of a movie of 10⁸ pixels stays below."""
 
-ALONE_NM = 4500.0
+ALONE_NM = 3500.0
 """Nothing else may happen nearer than this to a step while its frames are summed."""
 
 LEAST_FRAMES = 8
@@ -241,14 +241,14 @@ def _cut(
 ) -> BrightStep | None:
     """Date a step and sum the frames around it in which nothing else happens; None if too few."""
     low, high = max(chunk.first, spot.frame - window), min(chunk.stop, spot.frame + window)
-    stride = max(1, window // STRIDES)
+    margin = max(1, window // (2 * STRIDES)) + 1  # a spot's frame is known to half a block
     for other in spots:
         if other is spot or _distance(other, spot) * pixel_nm > ALONE_NM:
             continue
         if other.frame <= spot.frame:
-            low = max(low, other.frame + stride)
+            low = max(low, other.frame + margin)
         if other.frame >= spot.frame:
-            high = min(high, other.frame - stride)
+            high = min(high, other.frame - margin)
     row, column = spot.row, spot.column
     step: BrightStep | None = None
     frame = spot.frame

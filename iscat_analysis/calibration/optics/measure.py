@@ -58,9 +58,7 @@ CONTAMINATED_P = 1e-4
 
 _STARTS = 2  # microscopes that are refined on the average picture, per state
 _ROUGH = 1.0  # gain in log-likelihood that ends a search on the average picture
-_ROUGH_PASSES = 15
-_SAME_FOCUS_NM = 20.0
-_JOINT = 3  # microscopes that are tried on all pictures
+_ROUGH_PASSES = 25
 _MASKS_NA = (0.35, 0.65)
 _MASK_TRANSMITS = 0.3  # where no attenuation is configured
 _CONTAMINATED_SHARE = 0.25  # more than this is the model's fault
@@ -224,12 +222,21 @@ def measure_microscope(
     )
 
 
-def _same(one: Estimate, other: Estimate) -> bool:
-    """Whether two searches on the average picture ended in the same place."""
+def _fitted(sights: Sequence[Sight]) -> list[Sight]:
+    """Give the pictures that are fitted."""
+    return [sight for i, sight in enumerate(sights) if i % HELD_OUT != 1]
+
+
+def _held_out(sights: Sequence[Sight]) -> list[Sight]:
+    """Give the pictures that are not."""
+    return list(sights[1::HELD_OUT])
+
+
+def _same_state(one: Estimate, other: Estimate) -> bool:
+    """Whether two microscopes have the same polarisation, and both a mask or none."""
     return bool(
         one.values["polarization"] == other.values["polarization"]
         and (one.values["mask_na"] > 0) == (other.values["mask_na"] > 0)
-        and abs(one.values["focus_nm"] - other.values["focus_nm"]) < _SAME_FOCUS_NM
     )
 
 
@@ -250,7 +257,6 @@ class _Search:
         average, placed = average_sight(sights)
         best, held_out = self._best_state(average, placed)
         best, held = self._identified(best)
-        held_out = self._own(held_out, best.values)
         before = len(best.sights) + len(held_out)
         best, held_out = self._uncontaminated(best, held_out)
         contaminated = before - len(best.sights) - len(held_out)
@@ -307,7 +313,7 @@ class _Search:
 
         def refine(start: Start) -> Estimate:
             there = replace(average, x_nm=start.x_nm, y_nm=start.y_nm, mass_kda=start.mass_kda)
-            names = self._names(start.values, PRIMARY)
+            names = self._names(start.values, PRIMARY + SECONDARY)
             return maximise(
                 [there], self.build, start.values, names,
                 limits=self.limits, tolerance=_ROUGH, passes=_ROUGH_PASSES,
@@ -318,24 +324,27 @@ class _Search:
         refined = list(self.mapper(refine, begun))
         refined.sort(key=lambda e: -e.log_likelihood)
         top = refined[0].log_likelihood
-        near: list[Estimate] = []
-        for estimate in refined:
-            far = top - estimate.log_likelihood > max(_CLOSE * top, 2 * TWIN_GAP)
-            if not far and not any(_same(estimate, other) for other in near):
-                near.append(estimate)
-        joint: list[tuple[Estimate, tuple[Sight, ...]]] = []
-        for rough in near[:_JOINT]:
+        joint: list[tuple[float, Estimate, tuple[Sight, ...]]] = []
+        tried: list[Estimate] = []
+        for rough in refined:
+            far = top - rough.log_likelihood > max(_CLOSE * top, 2 * TWIN_GAP)
+            same = any(_same_state(rough, other) for other in tried)
+            if far or same:
+                continue
             there = rough.sights[0]
             sights = with_masses(
                 [replace(s, x_nm=s.x_nm + there.x_nm, y_nm=s.y_nm + there.y_nm) for s in placed],
                 self.build,
                 rough.values,
             )
-            fitted = [s for i, s in enumerate(sights) if i % HELD_OUT != 1]
             names = self._names(rough.values, FREE["zernike"])
-            passes = _TRIAL_PASSES if joint else 40
-            joint.append((self._fit(fitted, rough.values, names, passes), sights[1::HELD_OUT]))
-        return max(joint, key=lambda pair: pair[0].log_likelihood)
+            passes = _TRIAL_PASSES if tried else 40
+            tried.append(rough)
+            fit = self._fit(_fitted(sights), rough.values, names, passes)
+            judged = self._fit(_held_out(sights), fit.values, ())
+            joint.append((judged.log_likelihood, fit, judged.sights))
+        _, best, held_out = max(joint, key=lambda each: each[0])
+        return best, held_out
 
     def _states(self) -> list[list[dict[str, Any]]]:
         """Give the settings to start from, those of one discrete state together."""

@@ -99,9 +99,10 @@ def make_pictures(sights: Sequence[Sight], build: Build, settings: Settings) -> 
     rings = np.rint(np.hypot(y[:, None], x)).astype(int)
     inside = rings <= min(shape) // 2
     count = np.bincount(rings[inside])
+    first = int(np.argmax(count > 0))
 
     def ring_mean(image: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(rings[inside], image[inside]) / count)
+        return np.asarray(np.bincount(rings[inside], image[inside])[first:] / count[first:])
 
     axis = np.linspace(-1, 1, PUPIL_POINTS)
     rho, phi = np.hypot(axis[:, None], axis), np.arctan2(axis[:, None], axis[None, :])
@@ -116,9 +117,9 @@ def make_pictures(sights: Sequence[Sight], build: Build, settings: Settings) -> 
         model=fitted,
         residual=(measured - fitted) / sigma,
         pixel_nm=pixel,
-        radius_nm=pixel * np.arange(count.size, dtype=np.float64),
+        radius_nm=pixel * np.arange(first, count.size, dtype=np.float64),
         radial=ring_mean(measured),
-        radial_se=np.sqrt(ring_mean(sigma**2) / count),
+        radial_se=np.sqrt(ring_mean(sigma**2) / count[first:]),
         radial_model=ring_mean(fitted),
         wavefront_nm=np.where(disc, wavefront, np.nan),
         transmission=np.where(disc, np.where(masked, settings["attenuation"], 1.0), np.nan),
