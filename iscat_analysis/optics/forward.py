@@ -36,6 +36,9 @@ NEAR_CRITICAL = 0.98
 
 _HEIGHTS_KEPT = 8  # profiles at hand; where z is fixed, every image asks for the same one
 
+TABLE_LIMIT_MB = 400
+"""No table of the model is larger: a length in the wrong unit would fill the memory."""
+
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
 
@@ -153,6 +156,7 @@ class ForwardModel:
         step = STEP / float(np.abs(self.axial - kappa).max())
         count = max(math.ceil((high - low) / step), 1) + 1
         points = self.table.shape[3]
+        check_table("the table along z", 72.0 * count * (points - 1))
         nodes, out = np.empty((12, 3 * points)), np.empty((12, points - 1, 6))
         heights = np.empty((count, 3, 4, 6 * (points - 1)))
         for i in range(count):
@@ -435,11 +439,13 @@ def forward_model(
     alpha = math.asin(optics.na / ni)
     near = NEAR_CRITICAL * ns < optics.na and ns < ni
     critical = math.asin(ns / ni) if near else None
+    step = STEP / (k * optics.na)
+    intervals = math.ceil(reach_nm / step) + 1
+    turns = k * (optics.na * reach_nm + ns * z_max_nm + ni * abs(oil_nm) * (1 - math.cos(alpha)))
+    check_table("the radial table", 6 * (30 + 0.45 * turns) * (intervals + 1))
     if paper:
         theta, weight = rectangle(alpha, nodes or DONG2021_FIELD_NODES)
     else:
-        rise = 1 - math.cos(alpha)
-        turns = k * (optics.na * reach_nm + ns * z_max_nm + ni * abs(oil_nm) * rise)
         beyond = max(0.0, (alpha - critical) / alpha) if critical else 0.0
         theta, weight = gauss_legendre(
             alpha,
@@ -489,8 +495,6 @@ def forward_model(
     common = pupil.weight * pupil.apodization * np.exp(1j * pupil.oil * fixed_oil_nm)
     common = common * front * strength / (reference or 1.0)
     source = np.stack([common * (pupil.t_s + pupil.t_p_cos), common * (pupil.t_s - pupil.t_p_cos)])
-    step = STEP / (k * optics.na)
-    intervals = math.ceil(reach_nm / step) + 1
     same = (
         like is not None
         and like.step_nm == step
@@ -517,6 +521,31 @@ def forward_model(
     if config.calibration is None:
         return model
     return replace(model, scale=_mass_scale(model, config.calibration))
+
+
+def check_table(what: str, numbers: float) -> None:
+    """Refuse a table that would not fit into the memory, before it is allocated.
+
+    Parameters
+    ----------
+    what : str
+        What the message calls it.
+    numbers : float
+        How many 8-byte numbers it holds.
+
+    Raises
+    ------
+    ConfigError
+        It is larger than `TABLE_LIMIT_MB`.
+    """
+    megabytes = 8e-6 * numbers
+    if megabytes > TABLE_LIMIT_MB:
+        raise ConfigError(
+            f"{what} of the model would take {megabytes:,.0f} MB, more than {TABLE_LIMIT_MB} MB: "
+            "check that optics.wavelength_nm, optics.focus_nm, particle.height_nm, "
+            "fit.z_range_nm, fit.roi_nm and camera.pixel_size_nm are in nanometres, or take a "
+            "smaller field or range"
+        )
 
 
 def _mass_scale(model: ForwardModel, line: Calibration) -> MassScale:

@@ -131,6 +131,7 @@ def fit_stack(
         if not analysis.summary["interrupted"]:
             shutil.rmtree(partial_folder(folder.resolve()), ignore_errors=True)
     if analysis.summary["interrupted"]:
+        progress("report", 1, 1)
         notify(f"interrupted; what was finished is in {folder}")
         raise KeyboardInterrupt
     return analysis
@@ -228,6 +229,8 @@ def analyse(
             movie, config, camera, clock, tell=tell, notify=notify, progress=progress
         )
     windows = found.windows
+    if found.interrupted:  # what was finished is now gathered and kept, which takes a moment
+        progress("report", 0, 1)
     summary = summary_of(scene, found.table, windows, clock.seconds)
     sampled = config.samples_posterior
     provenance = Provenance(
