@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -199,7 +200,9 @@ def _ignore(stage: str, done: int, total: int) -> None:
 
 
 @contextmanager
-def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
+def failures(
+    messages: Messages, *, debug: bool, options: Mapping[str, str] | None = None
+) -> Iterator[None]:
     """Turn whatever a command raises into one line and an exit status.
 
     Parameters
@@ -208,6 +211,9 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
         Where the line goes.
     debug : bool
         Show the traceback as well.
+    options : mapping of str to str, optional
+        Argument of the library → option of the command: what the library calls ``name = value`` is
+        shown as ``--option value``.
 
     Yields
     ------
@@ -245,6 +251,8 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
             if debug:
                 _write(sys.stderr, traceback.format_exc())
             line, status = _verdict(error, debug=debug)
+            for argument, option in (options or {}).items():
+                line = re.sub(rf"\b{argument} = ", f"{option} ", line)
             messages.error(line)
             raise typer.Exit(status) from error
 
