@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from iscat_analysis.bounds import bounds_report, parse_scan, scan
 from iscat_analysis.config import Config, configure
-from iscat_analysis.movie import open_stack
+from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Progress, silent
 from iscat_analysis.report import check_output, write_report
@@ -36,8 +36,9 @@ _COLUMNS = ("event", "frame", "x_px", "y_px", "z_nm", "mass_kda")
 
 
 def fit_movie(
-    movie: str | Path,
+    movie: str | Path | ArrayLike,
     *,
+    name: str | None = None,
     config: str | Path | Mapping[str, Any] | Config | None = None,
     settings: Mapping[str, Any] | Iterable[str] | None = None,
     mode: str | None = None,
@@ -54,8 +55,10 @@ def fit_movie(
 
     Parameters
     ----------
-    movie : str or Path
-        A TIFF file, frames (t, y, x) in counts.
+    movie : str, Path or array_like of shape (t, y, x)
+        A file, or the camera's counts as an array of NumPy, Dask, Zarr or h5py; see `open_stack`.
+    name : str, optional
+        What messages and reports call an array; default ``"array"``.
     config : str, Path, mapping or Config, optional
         As for `configure`.
     settings : mapping of str to Any, or iterable of str, optional
@@ -101,13 +104,12 @@ def fit_movie(
         "workers": workers,
     }
     resolved = _with_arguments(configure(config, settings=settings), given)
-    path, folder = Path(movie), _path(out)
+    folder = _path(out)
     if folder is not None:
         check_output(folder, overwrite)
-    with open_stack(path) as stack:
-        analysis = analyse(
-            stack, resolved, progress=progress, command=f"iscat_analysis.fit_movie({str(path)!r})"
-        )
+    with open_stack(movie, name=name) as stack:
+        command = f"iscat_analysis.fit_movie({str(stack.path)!r})"
+        analysis = analyse(stack, resolved, progress=progress, command=command)
     result = Result(analysis)
     if folder is not None:
         result.save(folder, overwrite=overwrite)

@@ -184,8 +184,31 @@ class ForwardModel:
         ndarray, shape (ny, nx)
             Contrast C, or |E_sca|² in dark field.
         """
+        return self.amplitude_image(grid, x_nm, y_nm, z_nm, self.scale.amplitude(mass_kda))
+
+    def amplitude_image(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
+    ) -> FloatArray:
+        """Signal of one particle whose amplitude is known instead of its mass.
+
+        Below the offset of a calibration two amplitudes have one mass, so that what was fitted as
+        an amplitude must be drawn from it.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        ndarray, shape (ny, nx)
+            As `image` gives it.
+        """
         out = np.empty(grid.shape)
-        amplitude = self.scale.amplitude(mass_kda)
         signal_image(self.profile(z_nm, 1), *self._geometry(grid, x_nm, y_nm, amplitude), out)
         return out
 
@@ -211,9 +234,33 @@ class ForwardModel:
             Derivatives with respect to x, y, z [1/nm] and mass [1/kDa].
         """
         amplitude = self.scale.amplitude(mass_kda)
+        signal, gradient = self.amplitude_gradient(grid, x_nm, y_nm, z_nm, amplitude)
+        gradient[3] /= self.scale.slope(amplitude)
+        return signal, gradient
+
+    def amplitude_gradient(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Signal and its derivatives in (x, y, z, a), a the amplitude.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        signal : ndarray, shape (ny, nx)
+            As `image` gives it.
+        gradient : ndarray, shape (4, ny, nx)
+            Derivatives with respect to x, y, z [1/nm] and the amplitude.
+        """
         rows = np.empty((grid.shape[0], 5, grid.shape[1]))
         signal_gradient(self.profile(z_nm, 2), *self._geometry(grid, x_nm, y_nm, amplitude), rows)
-        rows[:, 4] /= self.scale.slope(amplitude)
         out = np.moveaxis(rows, 1, 0)
         return out[0], out[1:]
 
@@ -289,7 +336,24 @@ class ForwardModel:
         float
             Peak contrast, or the peak of |E_sca|² in dark field.
         """
-        linear, quadratic, _ = self._peak(z_nm, self.scale.amplitude(mass_kda))
+        return self.amplitude_contrast(z_nm, self.scale.amplitude(mass_kda))
+
+    def amplitude_contrast(self, z_nm: float, amplitude: float) -> float:
+        """Peak contrast of an amplitude; see `peak_contrast` and `amplitude_image`.
+
+        Parameters
+        ----------
+        z_nm : float
+            Height [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        float
+            Peak contrast, or the peak of |E_sca|² in dark field.
+        """
+        linear, quadratic, _ = self._peak(z_nm, amplitude)
         return linear + quadratic
 
     def collected_area_nm2(self, z_nm: float, mass_kda: float) -> float:

@@ -177,9 +177,8 @@ def analyse(
         warnings.append(text)
         notify(text)
 
-    implied = movie.notes if config.camera.pixel_size_nm is None else ()
     config, notes = resolve_metadata(config, movie.metadata)
-    for note in (*implied, *notes):
+    for note in (*movie.notes, *notes):
         tell(note)
     if config.optics.scheme == "darkfield" and config.particle.photons_per_frame is None:
         photons = config.simulation.photons_per_pixel
