@@ -20,7 +20,7 @@ from iscat_analysis._kernels.hessian import signal_hessian
 from iscat_analysis._kernels.image import Lens, Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.lattice import LATTICE_STEP, reach_of_samples
 from iscat_analysis._kernels.pupil import rectangle
-from iscat_analysis._kernels.radial import AxialTable
+from iscat_analysis._kernels.radial import STEP, AxialTable
 from iscat_analysis.config import Calibration, Config, Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.aperture import (
@@ -44,11 +44,19 @@ from iscat_analysis.optics.waves import (
     LatticeField,
     RadialField,
     axial_table,
+    check_table,
     radial_field,
 )
 from iscat_analysis.units import KILODALTON_KG, NM
 
-__all__ = ["NEAR_CRITICAL", "ForwardModel", "MassScale", "PixelGrid", "forward_model"]
+__all__ = [
+    "NEAR_CRITICAL",
+    "ForwardModel",
+    "MassScale",
+    "PixelGrid",
+    "check_table",
+    "forward_model",
+]
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -555,14 +563,16 @@ def _pupil(
 ) -> Aperture:
     """Pupil with as many nodes as its phase turns; optical paths in sample and oil [nm]."""
     alpha = math.asin(optics.na / optics.n_immersion)
-    if optics.convention == "dong2021":
-        return aperture_on(optics, *rectangle(alpha, nodes or DONG2021_FIELD_NODES))
     k = 2 * math.pi / optics.wavelength_nm
     critical = critical_angle(optics)
     aberrations = sum(abs(size) for size in optics.aberrations_nm.values())
     if aberrations:
         reach_nm = reach_of_samples(reach_nm, LATTICE_STEP / (k * optics.na))
     path = optics.na * reach_nm + sample_nm + oil_nm * (1 - math.cos(alpha)) + 4 * aberrations
+    intervals = math.ceil(reach_nm * k * optics.na / STEP) + 2
+    check_table("the radial table", 6 * (30 + 0.45 * k * path) * intervals)
+    if optics.convention == "dong2021":
+        return aperture_on(optics, *rectangle(alpha, nodes or DONG2021_FIELD_NODES))
     beyond = max(0.0, (alpha - critical) / alpha) if critical else 0.0
     return aperture(
         optics,
