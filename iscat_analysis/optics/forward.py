@@ -20,7 +20,7 @@ from iscat_analysis._kernels.hessian import signal_hessian
 from iscat_analysis._kernels.image import Lens, Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.lattice import LATTICE_STEP, reach_of_samples
 from iscat_analysis._kernels.pupil import rectangle
-from iscat_analysis._kernels.radial import AxialTable
+from iscat_analysis._kernels.radial import STEP, AxialTable
 from iscat_analysis.config import Calibration, Config, Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.aperture import (
@@ -44,11 +44,19 @@ from iscat_analysis.optics.waves import (
     LatticeField,
     RadialField,
     axial_table,
+    check_table,
     radial_field,
 )
 from iscat_analysis.units import KILODALTON_KG, NM
 
-__all__ = ["NEAR_CRITICAL", "ForwardModel", "MassScale", "PixelGrid", "forward_model"]
+__all__ = [
+    "NEAR_CRITICAL",
+    "ForwardModel",
+    "MassScale",
+    "PixelGrid",
+    "check_table",
+    "forward_model",
+]
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -173,8 +181,31 @@ class ForwardModel:
         ndarray, shape (ny, nx)
             Contrast C, or |E_sca|² in dark field.
         """
+        return self.amplitude_image(grid, x_nm, y_nm, z_nm, self.scale.amplitude(mass_kda))
+
+    def amplitude_image(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
+    ) -> FloatArray:
+        """Signal of one particle whose amplitude is known instead of its mass.
+
+        Below the offset of a calibration two amplitudes have one mass, so that what was fitted as
+        an amplitude must be drawn from it.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        ndarray, shape (ny, nx)
+            As `image` gives it.
+        """
         out = np.empty(grid.shape)
-        amplitude = self.scale.amplitude(mass_kda)
         signal_image(self.profile(z_nm, 1), *self._geometry(grid, x_nm, y_nm, amplitude), out)
         return out
 
@@ -200,9 +231,33 @@ class ForwardModel:
             Derivatives with respect to x, y, z [1/nm] and mass [1/kDa].
         """
         amplitude = self.scale.amplitude(mass_kda)
+        signal, gradient = self.amplitude_gradient(grid, x_nm, y_nm, z_nm, amplitude)
+        gradient[3] /= self.scale.slope(amplitude)
+        return signal, gradient
+
+    def amplitude_gradient(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Signal and its derivatives in (x, y, z, a), a the amplitude.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        signal : ndarray, shape (ny, nx)
+            As `image` gives it.
+        gradient : ndarray, shape (4, ny, nx)
+            Derivatives with respect to x, y, z [1/nm] and the amplitude.
+        """
         rows = np.empty((grid.shape[0], 5, grid.shape[1]))
         signal_gradient(self.profile(z_nm, 2), *self._geometry(grid, x_nm, y_nm, amplitude), rows)
-        rows[:, 4] /= self.scale.slope(amplitude)
         out = np.moveaxis(rows, 1, 0)
         return out[0], out[1:]
 
@@ -326,7 +381,24 @@ class ForwardModel:
         float
             Peak contrast, or the peak of |E_sca|² in dark field.
         """
-        return sum(self.wave.peak(z_nm, self.scale.amplitude(mass_kda), self.rho))
+        return self.amplitude_contrast(z_nm, self.scale.amplitude(mass_kda))
+
+    def amplitude_contrast(self, z_nm: float, amplitude: float) -> float:
+        """Peak contrast of an amplitude; see `peak_contrast` and `amplitude_image`.
+
+        Parameters
+        ----------
+        z_nm : float
+            Height [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        float
+            Peak contrast, or the peak of |E_sca|² in dark field.
+        """
+        return sum(self.wave.peak(z_nm, amplitude, self.rho))
 
     def collected_area_nm2(self, z_nm: float, mass_kda: float) -> float:
         """Scattered light that the pupil collects, as an equivalent area of reference.
@@ -491,14 +563,16 @@ def _pupil(
 ) -> Aperture:
     """Pupil with as many nodes as its phase turns; optical paths in sample and oil [nm]."""
     alpha = math.asin(optics.na / optics.n_immersion)
-    if optics.convention == "dong2021":
-        return aperture_on(optics, *rectangle(alpha, nodes or DONG2021_FIELD_NODES))
     k = 2 * math.pi / optics.wavelength_nm
     critical = critical_angle(optics)
     aberrations = sum(abs(size) for size in optics.aberrations_nm.values())
     if aberrations:
         reach_nm = reach_of_samples(reach_nm, LATTICE_STEP / (k * optics.na))
     path = optics.na * reach_nm + sample_nm + oil_nm * (1 - math.cos(alpha)) + 4 * aberrations
+    intervals = math.ceil(reach_nm * k * optics.na / STEP) + 2
+    check_table("the radial table", 6 * (30 + 0.45 * k * path) * intervals)
+    if optics.convention == "dong2021":
+        return aperture_on(optics, *rectangle(alpha, nodes or DONG2021_FIELD_NODES))
     beyond = max(0.0, (alpha - critical) / alpha) if critical else 0.0
     return aperture(
         optics,

@@ -26,14 +26,43 @@ from iscat_analysis._kernels.lattice import (
     window,
 )
 from iscat_analysis._kernels.radial import STEP, AxialTable, bessel_table, radial_profile
+from iscat_analysis.errors import ConfigError
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+
+TABLE_LIMIT_MB = 400
+"""No table of the model is larger: a length in the wrong unit would fill the memory."""
 
 _HEIGHTS_KEPT = 8  # profiles at hand; where z is fixed, every image asks for the same one
 _PEAK_STEP = 1 / 3  # of the lattice: the grid on which the largest signal is looked for
 _NEWTON = 4  # steps from there
 _AT_ONCE = 16  # heights of the axial table made together
+
+
+def check_table(what: str, numbers: float) -> None:
+    """Refuse a table that would not fit into the memory, before it is allocated.
+
+    Parameters
+    ----------
+    what : str
+        What the message calls it.
+    numbers : float
+        How many 8-byte numbers it holds.
+
+    Raises
+    ------
+    ConfigError
+        It is larger than `TABLE_LIMIT_MB`.
+    """
+    megabytes = 8e-6 * numbers
+    if megabytes > TABLE_LIMIT_MB:
+        raise ConfigError(
+            f"{what} of the model would take {megabytes:,.0f} MB, more than {TABLE_LIMIT_MB} MB: "
+            "check that optics.wavelength_nm, optics.focus_nm, particle.height_nm, "
+            "fit.z_range_nm, fit.roi_nm and camera.pixel_size_nm are in nanometres, or take a "
+            "smaller field or range"
+        )
 
 
 @dataclass(frozen=True)
@@ -71,6 +100,11 @@ class RadialField:
     def reach_nm(self) -> float:
         """Largest distance from the particle that the table covers [nm]."""
         return self.step_nm * float(self.table.shape[3] - 1)
+
+    @property
+    def width(self) -> int:
+        """Numbers in the profile of one order."""
+        return 24 * (int(self.table.shape[3]) - 1)
 
     def lens(self, rho: float) -> Lens:
         """How the kernels make a signal of a profile, with the reference ρ."""
@@ -205,6 +239,11 @@ class LatticeField:
         """Nodes on either side of the particle."""
         return lattice_half(self.reach_nm, self.step_nm)
 
+    @property
+    def width(self) -> int:
+        """Numbers in the profile of one order."""
+        return 2 * len(self.harmonics) * (2 * self.half + 1) ** 2
+
     def lens(self, rho: float) -> Lens:
         """How the kernels make a signal of a profile, with the reference ρ."""
         return Lens(
@@ -221,6 +260,7 @@ class LatticeField:
     def _profiles(self):  # type: ignore[no-untyped-def]
         def at(z_nm: float, orders: int) -> FloatArray:
             side = 2 * self.half + 1
+            check_table("the field around a particle", orders * self.width)
             return self._stack(np.array([z_nm]), orders, 0.0).reshape(-1, side, side)
 
         return lru_cache(_HEIGHTS_KEPT)(at)
@@ -338,6 +378,7 @@ def axial_table(field: Field, z_range_nm: tuple[float, float]) -> AxialTable:
     kappa = float(field.axial.real.min() + field.axial.real.max()) / 2
     step = STEP / float(np.abs(field.axial - kappa).max())
     count = max(math.ceil((high - low) / step), 1) + 1
+    check_table("the table along z", 3.0 * count * field.width)
     heights = field.profiles(low + step * np.arange(count, dtype=np.float64), kappa)
     heights *= (step ** np.arange(3))[:, None, None]
     return AxialTable(heights, low, step, kappa)
