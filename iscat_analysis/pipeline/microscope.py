@@ -418,6 +418,7 @@ def scan_sights(movie: Stack, config: Config, camera: Camera, focus_step_nm: flo
         grid = PixelGrid.region(*region, _pixel_nm(config))
         cut = slice(*region[0]), slice(*region[1])
         masked = np.asarray(saturated)[cut]
+        seen: list[Sight] = []
         for index in taken.astype(int):
             frame, ratio = frames[index][cut], float(ratios[index])
             if n_before:
@@ -432,7 +433,13 @@ def scan_sights(movie: Stack, config: Config, camera: Camera, focus_step_nm: flo
                     model, grid, frame, level, level, extra_variance_e2=read[cut], masked=masked
                 )
             sight = _centred(likelihood, config, frame=first + int(index))
-            sights.append(replace(sight, focus_offset_nm=focus_step_nm * float(index)))
+            seen.append(replace(sight, focus_offset_nm=focus_step_nm * float(index)))
+        weights = [sight.snr**2 for sight in seen]
+        x_nm, y_nm = (
+            float(np.average([getattr(sight, key) for sight in seen], weights=weights))
+            for key in ("x_nm", "y_nm")
+        )
+        sights += [replace(sight, x_nm=x_nm, y_nm=y_nm) for sight in seen]
     return _bright(sights)
 
 

@@ -22,7 +22,11 @@ THRESHOLD = 7.0
 """Excess of the smoothed energy over its noise; the noise of a movie of 10⁸ pixels stays below."""
 
 ALONE_NM = 3500.0
-"""Nothing else may happen nearer than this to a step while its frames are summed."""
+"""Nothing else may happen nearer than this to a step while its frames are summed, and nothing
+brighter than `GLARING` within a distance that grows with the root of its brightness."""
+
+GLARING = 60.0
+"""Signal-to-noise ratio from which a neighbour's rings show beyond `ALONE_NM`."""
 
 LEAST_FRAMES = 8
 """Frames on either side without which a step is left out."""
@@ -32,6 +36,7 @@ CONSTANT_P = 1e-3
 
 _SPOT = 1.0  # standard deviation of the spot over λ/NA
 _SHADOW_NM = 1500.0  # a weaker maximum nearer than this to a stronger one is part of it
+_PEAKED = 0.24  # energy over χ² at the centre of a particle, times the spot's size
 _CORE_NM = 900.0  # radius that dates a step
 
 
@@ -83,7 +88,12 @@ class _Spot:
     frame: int
     row: int
     column: int
-    excess: float
+    snr: float
+
+    @property
+    def reach_nm(self) -> float:
+        """Distance within which it disturbs another."""
+        return ALONE_NM * max(1.0, math.sqrt(self.snr / GLARING))
 
 
 def find_bright_steps(
@@ -155,7 +165,12 @@ def _spots(chunk: Chunk, spot_px: float, shadow_px: float, mapper: Mapper) -> li
 
     energy = np.stack(list(mapper(one, range(count))))
     return [
-        _Spot(chunk.first + int(chunk.edges[k + 1]), i, j, float(energy[k, i, j]))
+        _Spot(
+            chunk.first + int(chunk.edges[k + 1]),
+            i,
+            j,
+            math.sqrt(float(energy[k, i, j]) * spot_px / _PEAKED),
+        )
         for k, i, j in _maxima(energy, shadow_px)
     ]
 
@@ -243,7 +258,7 @@ def _cut(
     low, high = max(chunk.first, spot.frame - window), min(chunk.stop, spot.frame + window)
     margin = max(1, window // (2 * STRIDES)) + 1  # a spot's frame is known to half a block
     for other in spots:
-        if other is spot or _distance(other, spot) * pixel_nm > ALONE_NM:
+        if other is spot or _distance(other, spot) * pixel_nm > other.reach_nm:
             continue
         if other.frame <= spot.frame:
             low = max(low, other.frame + margin)

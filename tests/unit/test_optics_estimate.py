@@ -18,7 +18,7 @@ from iscat_analysis.calibration.optics import (
     with_settings,
 )
 from iscat_analysis.calibration.optics.estimate import _Point, pixel_terms
-from iscat_analysis.calibration.optics.starts import average_sight, search_starts
+from iscat_analysis.calibration.optics.starts import average_sights, search_starts
 from iscat_analysis.config import config_to_toml, parse_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
@@ -104,7 +104,7 @@ def test_score_is_the_slope_of_the_joint_likelihood() -> None:
 def test_the_average_of_shifted_pictures() -> None:
     sights, truth, _ = make_sights({}, 6, seed=7)
     jolted = [replace(s, x_nm=s.x_nm + 90.0, y_nm=s.y_nm - 60.0) for s in sights]
-    average, placed = average_sight(jolted)
+    (average,), placed = average_sights(jolted)
     assert average.grid.shape == GRID.shape
     found = np.array([(s.x_nm, s.y_nm) for s in placed])
     true = np.array([(s.x_nm, s.y_nm) for s in truth])
@@ -115,10 +115,10 @@ def test_the_average_of_shifted_pictures() -> None:
 def test_every_focus_is_tried() -> None:
     """A start 600 nm from the truth is not needed: the coarse search finds its neighbourhood."""
     sights, _, build = make_sights({"focus_nm": 310.0, "reference_phase_deg": 40.0}, 6, seed=8)
-    average, _ = average_sight(sights)
+    averages, _ = average_sights(sights)
     now = settings_of(configuration())
     candidates = [{**now, "focus_nm": f} for f in np.arange(-1000.0, 1000.0, 80.0)]
-    best = search_starts(average, build, candidates, most=2)[0]
+    best = search_starts(averages, build, candidates, most=2)[0]
     assert abs(best.values["focus_nm"] - 310.0) <= 80.0
 
 

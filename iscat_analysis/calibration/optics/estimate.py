@@ -44,6 +44,7 @@ _LARGEST_STEP = {
 }
 _TERM_STEP_NM = 25.0
 _PLACE_STEP_NM = 60.0
+_ROAM_NM = 300.0  # along x and y, from the centre of a picture
 _DAMPING = (1e-3, 1e8)  # first, and where the search gives up
 _LOWEST_NA = 0.3
 _NA_ROOM = 2e-3  # below the index of the oil
@@ -224,7 +225,8 @@ def maximise(
     """
     names = tuple(names)
     values = dict(start)
-    private = np.array([sight.private for sight in sights])
+    walls = _walls(sights)
+    private = np.clip([sight.private for sight in sights], *walls)
     at = _Point.evaluate(sights, build, values, names, private, mapper)
     damping, used, converged = _DAMPING[0], 1, False
     while used < passes and damping < _DAMPING[1]:
@@ -233,10 +235,11 @@ def maximise(
             break
         shared, own = at.step(names, damping)
         trial_values = _limited(values, names, shared, limits or {})
-        trial = _Point.evaluate(sights, build, trial_values, names, private + own, mapper)
+        moved = np.clip(private + own, *walls)
+        trial = _Point.evaluate(sights, build, trial_values, names, moved, mapper)
         used += 1
         if trial.value > at.value:
-            values, private, at = trial_values, private + own, trial
+            values, private, at = trial_values, moved, trial
             damping = max(damping / 8, 1e-9)
         else:
             damping = max(8 * damping, 1e-3)
@@ -250,6 +253,15 @@ def maximise(
         converged=converged,
         passes=used,
     )
+
+
+def _walls(sights: Sequence[Sight]) -> FloatArray:
+    """Bounds of what is a sight's own, shape (2, n, 4): a particle stays in its picture."""
+    centres = np.array([(s.grid.x_nm.mean(), s.grid.y_nm.mean()) for s in sights])
+    walls = np.full((2, len(sights), PRIVATE), np.inf)
+    walls[0] = -np.inf
+    walls[0, :, :2], walls[1, :, :2] = centres - _ROAM_NM, centres + _ROAM_NM
+    return walls
 
 
 def _limited(

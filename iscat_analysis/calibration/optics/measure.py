@@ -35,7 +35,7 @@ from iscat_analysis.calibration.optics.starts import (
     FOCUS_RANGE_NM,
     FOCUS_STEP_NM,
     Start,
-    average_sight,
+    average_sights,
     search_starts,
     with_masses,
 )
@@ -57,6 +57,7 @@ CONTAMINATED_P = 1e-4
 """A single picture with a smaller p-value, where most are fine, shows more than one particle."""
 
 _STARTS = 2  # microscopes that are refined on the average picture, per state
+_PLACE = ("x_nm", "y_nm")
 _ROUGH = 1.0  # gain in log-likelihood that ends a search on the average picture
 _ROUGH_PASSES = 25
 _MASKS_NA = (0.35, 0.65)
@@ -254,8 +255,7 @@ class _Search:
     mapper: Mapper
 
     def run(self, sights: Sequence[Sight]) -> Measured:
-        average, placed = average_sight(sights)
-        best, held_out = self._best_state(average, placed)
+        best, held_out = self._best_state(*average_sights(sights))
         best, held = self._identified(best)
         before = len(best.sights) + len(held_out)
         best, held_out = self._uncontaminated(best, held_out)
@@ -300,7 +300,7 @@ class _Search:
         return tuple(names)
 
     def _best_state(
-        self, average: Sight, placed: Sequence[Sight]
+        self, averages: Sequence[Sight], placed: Sequence[Sight]
     ) -> tuple[Estimate, tuple[Sight, ...]]:
         """Try every state on the average picture, the best ones on the pictures to be fitted.
 
@@ -308,14 +308,17 @@ class _Search:
         """
 
         def begin(state: list[dict[str, Any]]) -> tuple[Start, ...]:
-            starts = search_starts(average, self.build, state, most=_STARTS)
+            starts = search_starts(averages, self.build, state, most=_STARTS)
             return starts if "phase" in self.free else tuple(map(self._phased, starts))
 
         def refine(start: Start) -> Estimate:
-            there = replace(average, x_nm=start.x_nm, y_nm=start.y_nm, mass_kda=start.mass_kda)
+            there = [
+                replace(a, x_nm=start.x_nm, y_nm=start.y_nm, mass_kda=start.mass_kda)
+                for a in averages
+            ]
             names = self._names(start.values, PRIMARY + SECONDARY)
             return maximise(
-                [there], self.build, start.values, names,
+                there, self.build, start.values, names,
                 limits=self.limits, tolerance=_ROUGH, passes=_ROUGH_PASSES,
             )  # fmt: skip
 
@@ -331,9 +334,9 @@ class _Search:
             same = any(_same_state(rough, other) for other in tried)
             if far or same:
                 continue
-            there = rough.sights[0]
+            x_nm, y_nm = (np.median([getattr(a, k) for a in rough.sights]) for k in _PLACE)
             sights = with_masses(
-                [replace(s, x_nm=s.x_nm + there.x_nm, y_nm=s.y_nm + there.y_nm) for s in placed],
+                [replace(s, x_nm=s.x_nm + float(x_nm), y_nm=s.y_nm + float(y_nm)) for s in placed],
                 self.build,
                 rough.values,
             )

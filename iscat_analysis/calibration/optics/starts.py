@@ -27,6 +27,7 @@ FOCUS_RANGE_NM = 1000.0
 FOCUS_STEP_NM = 80.0
 """Step of the search over focus; a quarter of the depth of field at NA 1.2."""
 
+_FOCI = 7  # of a scan, whose averages are searched
 _ROUNDS = 3  # of registration
 _SHIFT_PX = 4.0  # a picture's first centre is off by no more
 
@@ -52,8 +53,8 @@ class Start:
     explained: float
 
 
-def average_sight(sights: Sequence[Sight]) -> tuple[Sight, tuple[Sight, ...]]:
-    """Average all pictures, registered on each other, with the sign of each.
+def average_sights(sights: Sequence[Sight]) -> tuple[tuple[Sight, ...], tuple[Sight, ...]]:
+    """Average the pictures of each focus, registered on each other, with the sign of each.
 
     Parameters
     ----------
@@ -62,12 +63,26 @@ def average_sight(sights: Sequence[Sight]) -> tuple[Sight, tuple[Sight, ...]]:
 
     Returns
     -------
-    average : Sight
-        On a grid centred at 0, with the counts of a movie that would show the average contrast with
-        its noise; of the sign and size of the brightest.
+    averages : tuple of Sight
+        One for each of at most `_FOCI` foci, on a grid centred at 0, with the counts of a movie
+        that would show the average contrast with its noise; of the sign and size of the brightest.
     sights : tuple of Sight
         With the places at which the average's centre lies in them.
     """
+    placed = list(sights)
+    averages = {}
+    for offset in sorted({sight.focus_offset_nm for sight in sights}):
+        members = [i for i, sight in enumerate(sights) if sight.focus_offset_nm == offset]
+        averages[offset], group = _average([sights[i] for i in members])
+        for i, sight in zip(members, group, strict=True):
+            placed[i] = sight
+    offsets = list(averages)
+    chosen = np.unique(np.linspace(0, len(offsets) - 1, min(_FOCI, len(offsets))).round())
+    return tuple(averages[offsets[int(i)]] for i in chosen), tuple(placed)
+
+
+def _average(sights: Sequence[Sight]) -> tuple[Sight, list[Sight]]:
+    """Average pictures of one focus; their places are those of the average's centre."""
     contrasts, variances = zip(*(contrast_of(sight) for sight in sights), strict=True)
     pixel = sights[0].grid.pixel_nm
     shifts = np.array([
@@ -78,8 +93,8 @@ def average_sight(sights: Sequence[Sight]) -> tuple[Sight, tuple[Sight, ...]]:
         for sight in sights
     ])  # fmt: skip
     template = ndimage.shift(contrasts[0], -shifts[0], order=3, mode="nearest")
-    variance = np.ones_like(template)
-    for _ in range(_ROUNDS):
+    variance = np.full(template.shape, float(np.median(variances[0])))
+    for _ in range(_ROUNDS if len(sights) > 1 else 0):
         total, weight = np.zeros_like(template), np.zeros_like(template)
         for index, (contrast, noise) in enumerate(zip(contrasts, variances, strict=True)):
             shifts[index] = _register(contrast, template, shifts[index])
@@ -89,29 +104,23 @@ def average_sight(sights: Sequence[Sight]) -> tuple[Sight, tuple[Sight, ...]]:
             total += scale * moved / noise
             weight += scale**2 / noise
         template, variance = total / weight, 1 / weight
-    grid = PixelGrid.centred(template.shape[0], pixel)
     data = np.zeros((4, *template.shape))
     counts = 2 / variance
     data[0], data[2], data[3] = counts * (1 + template), 1.0, 1.0
     data[1] = counts + data[0]
-    average = replace(
-        sights[0],
-        grid=grid,
-        kind=CONDITIONAL,
-        data=data,
-        x_nm=0.0,
-        y_nm=0.0,
-        mass_kda=0.0,
-        level=0.0,
-    )
-    placed = tuple(
+    grid = PixelGrid.centred(template.shape[0], pixel)
+    average = Sight(
+        grid, CONDITIONAL, data, 0.0, 0.0, sights[0].z_nm,
+        focus_offset_nm=sights[0].focus_offset_nm,
+    )  # fmt: skip
+    placed = [
         replace(
             sight,
             x_nm=float(np.mean(sight.grid.x_nm) + dx * pixel),
             y_nm=float(np.mean(sight.grid.y_nm) + dy * pixel),
         )
         for sight, (dy, dx) in zip(sights, shifts, strict=True)
-    )
+    ]
     return average, placed
 
 
@@ -195,18 +204,18 @@ def with_masses(
 
 
 def search_starts(
-    average: Sight,
+    averages: Sequence[Sight],
     build: Build,
     candidates: Sequence[Mapping[str, Any]],
     *,
     most: int,
 ) -> tuple[Start, ...]:
-    """Rank microscopes by how much of the average picture they explain.
+    """Rank microscopes by how much of the average pictures they explain.
 
     Parameters
     ----------
-    average : Sight
-        From `average_sight`.
+    averages : sequence of Sight
+        From `average_sights`.
     build : callable
         Makes the microscope.
     candidates : sequence of mapping
@@ -219,37 +228,37 @@ def search_starts(
     tuple of Start
         The best first; of neighbouring foci only the better one.
     """
-    contrast, variance = contrast_of(average)
-    noise = float(np.median(variance))
-    spectrum = fft.rfft2(contrast / noise)
+    pixel, shape = averages[0].grid.pixel_nm, averages[0].grid.shape
+    spectra = []
+    for average in averages:
+        contrast, variance = contrast_of(average)
+        spectra.append((fft.rfft2(contrast), float(np.median(variance))))
     reach = math.ceil(_SHIFT_PX / 2)
     here = np.arange(-reach, reach + 1)
     found = []
     for values in candidates:
-        pictures = []
-        for phase in (0.0, 90.0):
-            model = build({**values, "reference_phase_deg": phase})
-            picture = model.gradient(average.grid, 0.0, 0.0, average.z_nm, 0.0)[1][3]
-            pictures.append(picture - picture.mean())
-        basis = np.array(pictures)
-        gram = np.einsum("iyx,jyx->ij", basis, basis) / noise
-        overlaps = np.array([
-            fft.irfft2(spectrum * np.conj(fft.rfft2(p)), s=contrast.shape)[np.ix_(here, here)]
-            for p in basis
-        ])  # fmt: skip
+        gram, overlaps = np.zeros((2, 2)), np.zeros((2, here.size, here.size))
+        for average, (spectrum, noise) in zip(averages, spectra, strict=True):
+            focus = values["focus_nm"] + average.focus_offset_nm
+            pictures = []
+            for phase in (0.0, 90.0):
+                model = build({**values, "focus_nm": focus, "reference_phase_deg": phase})
+                picture = model.gradient(average.grid, 0.0, 0.0, average.z_nm, 0.0)[1][3]
+                pictures.append(picture - picture.mean())
+            gram += np.einsum("iyx,jyx->ij", pictures, pictures) / noise
+            for k, picture in enumerate(pictures):
+                match = fft.irfft2(spectrum * np.conj(fft.rfft2(picture)), s=shape)
+                overlaps[k] += match[np.ix_(here, here)] / noise
         solved = np.einsum("ij,jyx->iyx", np.linalg.pinv(gram), overlaps)
         explained = np.einsum("iyx,iyx->yx", solved, overlaps)
         row, column = np.unravel_index(int(np.argmax(explained)), explained.shape)
         cosine, sine = solved[:, row, column]
-        phase = math.degrees(math.atan2(sine, cosine))
-        mass = math.hypot(cosine, sine)
-        pixel = average.grid.pixel_nm
         found.append(
             Start(
-                {**values, "reference_phase_deg": phase},
+                {**values, "reference_phase_deg": math.degrees(math.atan2(sine, cosine))},
                 x_nm=float(here[column]) * pixel,
                 y_nm=float(here[row]) * pixel,
-                mass_kda=mass,
+                mass_kda=math.hypot(cosine, sine),
                 explained=float(explained[row, column]),
             )
         )
