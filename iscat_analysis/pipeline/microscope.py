@@ -56,6 +56,18 @@ MOST_SIGHTS = 60
 FAINTEST = 8.0
 """Signal-to-noise ratio below which a picture says too little of the microscope."""
 
+RINGS_NM = 9000.0
+"""Farther than this from a particle its rings are left out."""
+
+APART_NM = 2000.0
+"""Particles that all bound at once are used if no other is nearer; the rings are accounted for."""
+
+OTHERS_NM = 1700.0
+"""Side of the region on which a neighbour is fitted."""
+
+SAME_NM = 800.0
+"""Nearer than this, and at the same time, two steps are one."""
+
 _SHIFT_NM = 450.0  # how far a particle may lie from the centre of its picture
 _MODELS_KEPT = 24
 
@@ -110,11 +122,12 @@ def calibrate_movie(
     with ThreadPoolExecutor(config.compute.workers) as pool:
         progress("particles", 0, 1)
         if focus_step_nm is not None:
+            others: list[Sight] = []
             sights = scan_sights(movie, config, camera, focus_step_nm)
         elif has_landings(config):
-            sights = landing_sights(movie, config, camera, pool)
+            sights, others = landing_sights(movie, config, camera, pool)
         else:
-            sights = bound_sights(movie, config, camera)
+            sights, others = bound_sights(movie, config, camera)
         progress("particles", 1, 1)
         source = {
             "movie": movie.path.name,
@@ -124,7 +137,7 @@ def calibrate_movie(
             "version": version("iscat-analysis"),
         }  # fmt: skip
         return calibrate_sights(
-            sights, config, groups, source, given_focus=given_focus, mapper=pool.map
+            sights, others, config, groups, source, given_focus=given_focus, mapper=pool.map
         )
 
 
@@ -152,6 +165,7 @@ def refuse_uncalibratable(config: Config) -> None:
 
 def calibrate_sights(
     sights: Sequence[Sight],
+    others: Sequence[Sight],
     config: Config,
     groups: Sequence[str],
     source: Mapping[str, str],
@@ -165,6 +179,8 @@ def calibrate_sights(
     ----------
     sights : sequence of Sight
         The pictures.
+    others : sequence of Sight
+        Every particle that `Sight.neighbours` counts.
     config : Config
         Resolved.
     groups : sequence of str
@@ -204,6 +220,8 @@ def calibrate_sights(
         limits=optics_limits(optics.n_immersion, optics.n_glass),
         side=int(math.copysign(1, optics.focus_nm)) if given_focus and optics.focus_nm else 0,
         landing=1,
+        others=others,
+        build_wide=microscopes(config, RINGS_NM + sights[0].grid.diagonal_nm),
         mapper=mapper,
     )
     estimate = measured.estimate
@@ -256,7 +274,7 @@ def goodness(sight: Sight, model: ForwardModel) -> tuple[float, float]:
 
 def landing_sights(
     movie: Stack, config: Config, camera: Camera, pool: ThreadPoolExecutor
-) -> list[Sight]:
+) -> tuple[list[Sight], list[Sight]]:
     """Find bright steps of a landing movie, chunk by chunk until there are enough.
 
     Parameters
@@ -272,17 +290,20 @@ def landing_sights(
 
     Returns
     -------
-    list of Sight
+    sights : list of Sight
         At most `MOST_SIGHTS`, the brightest first.
+    others : list of Sight
+        Every bright step, on small regions.
     """
     first, last = config.fit.frames or (0, movie.shape[0])
     reader = Reader(movie, camera, first, min(last, movie.shape[0]), counts_budget(config))
     _, window = choose_windows(reader, config, pool.map)
     stride = max(1, window // STRIDES)
     found: list[BrightStep] = []
+    rest: list[BrightStep] = []
     for _, span in plan_chunks(reader, config, window, stride):
         chunk = reader.chunk(span, stride, pool)
-        found += find_bright_steps(
+        alone, every = find_bright_steps(
             chunk,
             window,
             pixel_nm=_pixel_nm(config),
@@ -291,12 +312,40 @@ def landing_sights(
             most=MOST_SIGHTS,
             mapper=pool.map,
         )
+        found += alone
+        rest += every
         bright = [step for step in found if step.snr > FAINTEST]
         if len(bright) >= MOST_SIGHTS:
             break
     bright.sort(key=lambda step: -step.snr)
     unique = _without_repeats(bright)
-    return [_sight_of(step, config) for step in unique[:MOST_SIGHTS]]
+    others = _without_repeats(rest)
+    sights = [
+        [
+            replace(_sight_of(step, config), neighbours=_neighbours(step, others, config))
+            for step in steps
+        ]
+        for steps in (unique[:MOST_SIGHTS], others)
+    ]
+    return sights[0], sights[1]
+
+
+def _neighbours(
+    step: BrightStep, others: Sequence[BrightStep], config: Config
+) -> tuple[tuple[int, float], ...]:
+    """List the steps whose rings change while a step's frames are summed, and by what share."""
+    found = []
+    for number, other in enumerate(others):
+        apart = math.hypot(step.x_px - other.x_px, step.y_px - other.y_px) * _pixel_nm(config)
+        if apart > RINGS_NM or (abs(step.frame - other.frame) < 5 and apart < SAME_NM):
+            continue
+        shares = [
+            (stop - min(max(other.frame, start), stop)) / max(stop - start, 1)
+            for start, stop in (step.frames_before, step.frames_after)
+        ]
+        if shares[1] > shares[0]:
+            found.append((number, shares[1] - shares[0]))
+    return tuple(found)
 
 
 def _without_repeats(steps: Iterable[BrightStep]) -> list[BrightStep]:
@@ -312,7 +361,7 @@ def _without_repeats(steps: Iterable[BrightStep]) -> list[BrightStep]:
     return kept
 
 
-def bound_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
+def bound_sights(movie: Stack, config: Config, camera: Camera) -> tuple[list[Sight], list[Sight]]:
     """Find bright particles that bound between two ranges of frames.
 
     Parameters
@@ -326,8 +375,10 @@ def bound_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
 
     Returns
     -------
-    list of Sight
+    sights : list of Sight
         At most `MOST_SIGHTS`, the brightest first.
+    others : list of Sight
+        Every bright particle, on small regions.
     """
     before, after = frame_ranges(movie, config)
     windows = _windows(movie, config, camera, before, after)
@@ -337,13 +388,10 @@ def bound_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
     variance = windows.after_e + windows.read_variance_after_e2 + ratio**2 * noise_before
     used = ~windows.masked & (windows.before_e > 0) & (windows.after_e > 0)
     energy = energy_of(windows.after_e - ratio * windows.before_e, variance, used, _spot_px(config))
-    places = find_bright_places(
-        energy, pixel_nm=_pixel_nm(config), alone_nm=ALONE_NM, roi_px=_roi_px(config)
-    )
     model = build_microscope(config, 1000.0, settings_of(config))
-    sights = []
-    for row, column in places[:MOST_SIGHTS]:
-        region = _region(row, column, _roi_px(config))
+
+    def cut_out(row: int, column: int, side: int) -> Sight:
+        region = _region(row, column, side)
         grid = PixelGrid.region(*region, _pixel_nm(config))
         cut = slice(*region[0]), slice(*region[1])
         if windows.n_before:
@@ -359,8 +407,25 @@ def bound_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
                 model, grid, windows.after_e[cut], level, level,
                 extra_variance_e2=windows.read_variance_after_e2[cut], masked=windows.masked[cut],
             )  # fmt: skip
-        sights.append(_centred(likelihood, config, frame=after[0]))
-    return _bright(sights)
+        return _centred(likelihood, config, frame=after[0])
+
+    pixel = _pixel_nm(config)
+    sights, others = (
+        [
+            cut_out(row, column, side)
+            for row, column in find_bright_places(
+                energy, pixel_nm=pixel, alone_nm=alone_nm, roi_px=side
+            )
+        ]
+        for alone_nm, side in ((APART_NM, _roi_px(config)), (0.0, round(OTHERS_NM / pixel)))
+    )
+
+    def with_neighbours(sight: Sight) -> Sight:
+        apart = [math.hypot(sight.x_nm - o.x_nm, sight.y_nm - o.y_nm) for o in others]
+        near = [(k, 1.0) for k, d in enumerate(apart) if SAME_NM < d < RINGS_NM]
+        return replace(sight, neighbours=tuple(near))
+
+    return _bright(map(with_neighbours, sights)), [with_neighbours(o) for o in others]
 
 
 def scan_sights(movie: Stack, config: Config, camera: Camera, focus_step_nm: float) -> list[Sight]:

@@ -22,11 +22,7 @@ THRESHOLD = 7.0
 """Excess of the smoothed energy over its noise; the noise of a movie of 10⁸ pixels stays below."""
 
 ALONE_NM = 3500.0
-"""Nothing else may happen nearer than this to a step while its frames are summed, and nothing
-brighter than `GLARING` within a distance that grows with the root of its brightness."""
-
-GLARING = 60.0
-"""Signal-to-noise ratio from which a neighbour's rings show beyond `ALONE_NM`."""
+"""Nothing else may happen nearer than this to a step while its frames are summed."""
 
 LEAST_FRAMES = 8
 """Frames on either side without which a step is left out."""
@@ -36,7 +32,7 @@ CONSTANT_P = 1e-3
 
 _SPOT = 1.0  # standard deviation of the spot over λ/NA
 _SHADOW_NM = 1500.0  # a weaker maximum nearer than this to a stronger one is part of it
-_PEAKED = 0.24  # energy over χ² at the centre of a particle, times the spot's size
+_OTHERS_NM = 1700.0  # side of the region around a neighbour
 _CORE_NM = 900.0  # radius that dates a step
 
 
@@ -56,8 +52,10 @@ class BrightStep:
         Its region of the field, half-open.
     before_e, after_e : ndarray, shape (ny, nx)
         Summed photoelectrons [e].
+    frames_before, frames_after : (int, int)
+        Frames in each sum, half-open.
     n_before, n_after : int
-        Frames in each sum.
+        The good ones among them.
     power_ratio : float
         Power after over power before.
     usable : ndarray of bool, shape (ny, nx)
@@ -74,6 +72,8 @@ class BrightStep:
     columns: tuple[int, int]
     before_e: FloatArray
     after_e: FloatArray
+    frames_before: tuple[int, int]
+    frames_after: tuple[int, int]
     n_before: int
     n_after: int
     power_ratio: float
@@ -88,12 +88,6 @@ class _Spot:
     frame: int
     row: int
     column: int
-    snr: float
-
-    @property
-    def reach_nm(self) -> float:
-        """Distance within which it disturbs another."""
-        return ALONE_NM * max(1.0, math.sqrt(self.snr / GLARING))
 
 
 def find_bright_steps(
@@ -105,8 +99,8 @@ def find_bright_steps(
     roi_px: int,
     most: int,
     mapper: Mapper = map,
-) -> tuple[BrightStep, ...]:
-    """Bright steps that stand alone, brightest first.
+) -> tuple[tuple[BrightStep, ...], tuple[BrightStep, ...]]:
+    """Bright steps that stand alone, and all of them, brightest first.
 
     Parameters
     ----------
@@ -127,18 +121,22 @@ def find_bright_steps(
 
     Returns
     -------
-    tuple of BrightStep
-        Each with nothing else of its brightness within `ALONE_NM` in the frames summed.
+    alone : tuple of BrightStep
+        Each with nothing else within `ALONE_NM` in the frames summed.
+    others : tuple of BrightStep
+        Every step with nothing else at its own place, in the middle of its region: what the rings
+        in the pictures of the first come from.
     """
     spots = _spots(chunk, _SPOT * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, mapper)
-    found = []
-    for spot in spots:
-        step = _cut(chunk, spot, spots, window, pixel_nm, roi_px)
-        if step is not None:
-            found.append(step)
-        if len(found) == most:
-            break
-    return tuple(sorted(found, key=lambda step: -step.snr))
+    cut = list(
+        mapper(
+            lambda s: _cut(chunk, s, spots, window, pixel_nm, roi_px, ALONE_NM), spots[: 4 * most]
+        )
+    )
+    alone = sorted((step for step in cut if step), key=lambda step: -step.snr)[:most]
+    small = max(5, round(_OTHERS_NM / pixel_nm))
+    rest = mapper(lambda s: _cut(chunk, s, spots, window, pixel_nm, small, _SHADOW_NM), spots)
+    return tuple(alone), tuple(step for step in rest if step)
 
 
 def _spots(chunk: Chunk, spot_px: float, shadow_px: float, mapper: Mapper) -> list[_Spot]:
@@ -165,13 +163,7 @@ def _spots(chunk: Chunk, spot_px: float, shadow_px: float, mapper: Mapper) -> li
 
     energy = np.stack(list(mapper(one, range(count))))
     return [
-        _Spot(
-            chunk.first + int(chunk.edges[k + 1]),
-            i,
-            j,
-            math.sqrt(float(energy[k, i, j]) * spot_px / _PEAKED),
-        )
-        for k, i, j in _maxima(energy, shadow_px)
+        _Spot(chunk.first + int(chunk.edges[k + 1]), i, j) for k, i, j in _maxima(energy, shadow_px)
     ]
 
 
@@ -228,7 +220,7 @@ def find_bright_places(
         for i, j in found
         if room <= i < energy.shape[0] - room
         and room <= j < energy.shape[1] - room
-        and sum(math.hypot(i - k, j - m) * pixel_nm < alone_nm for k, m in found) == 1
+        and sum(math.hypot(i - k, j - m) * pixel_nm < alone_nm for k, m in found) <= 1
     ]
 
 
@@ -253,12 +245,13 @@ def _cut(
     window: int,
     pixel_nm: float,
     roi_px: int,
+    alone_nm: float,
 ) -> BrightStep | None:
     """Date a step and sum the frames around it in which nothing else happens; None if too few."""
     low, high = max(chunk.first, spot.frame - window), min(chunk.stop, spot.frame + window)
     margin = max(1, window // (2 * STRIDES)) + 1  # a spot's frame is known to half a block
     for other in spots:
-        if other is spot or _distance(other, spot) * pixel_nm > other.reach_nm:
+        if other is spot or _distance(other, spot) * pixel_nm > alone_nm:
             continue
         if other.frame <= spot.frame:
             low = max(low, other.frame + margin)
@@ -285,7 +278,8 @@ def _cut(
             return None
         step = BrightStep(
             frame=frame, x_px=column, y_px=row, snr=0.0, rows=rows, columns=columns,
-            before_e=before, after_e=after, n_before=n_before, n_after=n_after,
+            before_e=before, after_e=after, frames_before=(low, frame - (gap or 0)),
+            frames_after=(frame + (gap or 0), high), n_before=n_before, n_after=n_after,
             power_ratio=power_after / power_before, usable=patch.usable,
             read_variance_e2=np.full(before.shape, np.square(patch.read_noise_e)),
         )  # fmt: skip

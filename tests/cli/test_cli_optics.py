@@ -73,6 +73,17 @@ def test_a_landing_movie_tells_its_optics(movie: Path, tmp_path: Path, capsys: C
     assert taken.na == 1.42
 
 
+def test_a_movie_with_background_frames(movie: Path, tmp_path: Path, capsys: Captured) -> None:
+    """All particles at once, each among the rings of the others."""
+    given = ["calibrate", "optics", str(movie), *FREE, "--out", str(tmp_path / "o"), "--json"]
+    given += ["--config", str(movie.with_name("setup.toml"))]
+    given += ["--set", "background.frames=[0,38]", "--set", "fit.frames=[120,160]"]
+    assert main(given) == 0
+    found = {r["parameter"]: r for r in json.loads(capsys.readouterr().out)["parameters"]}
+    for name, true in TRUTH.items():
+        assert abs(found[name]["value"] - true) < SIGMAS * found[name]["sigma"]
+
+
 def test_a_scan_of_the_focus(tmp_path: Path, capsys: Captured) -> None:
     """One immobile gold particle and an even field: focus, and an aberration."""
     gold = {"kind": "gold", "diameter_nm": 20.0, "height_nm": 10.0}

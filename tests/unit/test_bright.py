@@ -31,7 +31,7 @@ def _steps(events: list[tuple[int, float, float, float]], seed: int) -> tuple[Br
     for frame, y, x, contrast in events:
         expected[frame:] *= 1 + _ring(y, x, contrast)
     counts = random.poisson(expected).astype(np.uint16)
-    return find_bright_steps(
+    alone, _ = find_bright_steps(
         _chunk(counts),
         WINDOW,
         pixel_nm=PIXEL_NM,
@@ -39,6 +39,7 @@ def _steps(events: list[tuple[int, float, float, float]], seed: int) -> tuple[Br
         roi_px=20,
         most=20,
     )
+    return alone
 
 
 def _chunk(counts: np.ndarray) -> Chunk:  # type: ignore[type-arg]

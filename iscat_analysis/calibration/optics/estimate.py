@@ -54,6 +54,11 @@ _MASK_NA = 0.02  # smallest mask, and the narrowest ring around it
 class Microscope(Protocol):
     """What the estimator asks of a forward model."""
 
+    def image(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
+    ) -> FloatArray:
+        """Signal of one particle."""
+
     def gradient(
         self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
     ) -> tuple[FloatArray, FloatArray]:
@@ -104,6 +109,13 @@ class Sight:
         First frame of the new state.
     snr : float
         Signal-to-noise ratio with which it was found.
+    neighbours : tuple of (int, float)
+        Other particles whose rings reach into the picture: their number, and the share of their
+        contrast that is new after the step.
+    rings : ndarray, shape (ny, nx), or float
+        Factor of the expected light that was put into `data` for them.
+    baseline : float
+        What they add to the log-likelihood where there is no particle.
     """
 
     grid: PixelGrid
@@ -117,11 +129,33 @@ class Sight:
     focus_offset_nm: float = 0.0
     frame: int = 0
     snr: float = 0.0
+    neighbours: tuple[tuple[int, float], ...] = ()
+    rings: FloatArray | float = 1.0
+    baseline: float = 0.0
 
     @property
     def private(self) -> FloatArray:
         """Start of the sight's own unknowns, shape (4,)."""
         return np.array([self.x_nm, self.y_nm, self.mass_kda, self.level])
+
+    def among(self, contrast: FloatArray) -> Sight:
+        """Return the sight with the contrast of its neighbours in its expectation."""
+        rings = 1 + contrast
+        data = self.data.copy()
+        # a factor of the odds, or of the expected counts with and without the particle
+        columns = [2] if self.kind == CONDITIONAL else [1, 2]
+        data[columns] *= rings / self.rings
+        bare = data.copy()
+        bare[columns] /= rings
+        if self.kind == CONDITIONAL:
+            terms = data[0] * np.log(rings) - data[1] * (np.log1p(data[2]) - np.log1p(bare[2]))
+            baseline = float(np.sum(data[3] * terms))
+        else:
+            now, then = data[1] + data[3], bare[1] + bare[3]
+            used = (data[2] > 0) & (then > 0)
+            ratio = np.where(used, now / np.where(used, then, 1.0), 1.0)
+            baseline = float(np.sum(np.where(used, data[0] * np.log(ratio) - now + then, 0.0)))
+        return replace(self, data=data, rings=rings, baseline=baseline)
 
     def moved(self, private: FloatArray) -> Sight:
         """Return the same pictures with another start."""
@@ -417,7 +451,7 @@ def _scores(
     rows[-1] = of_level.ravel()
     weighted = rows * weight.ravel()
     scored = rows * residual.ravel()
-    return value, scored.sum(axis=1), weighted @ rows.T, scored @ scored.T
+    return value + sight.baseline, scored.sum(axis=1), weighted @ rows.T, scored @ scored.T
 
 
 def pixel_terms(

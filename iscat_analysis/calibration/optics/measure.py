@@ -60,6 +60,7 @@ _STARTS = 2  # microscopes that are refined on the average picture, per state
 _PLACE = ("x_nm", "y_nm")
 _ROUGH = 1.0  # gain in log-likelihood that ends a search on the average picture
 _ROUGH_PASSES = 25
+_OTHERS_PASSES = 8
 _MASKS_NA = (0.35, 0.65)
 _MASK_TRANSMITS = 0.3  # where no attenuation is configured
 _CONTAMINATED_SHARE = 0.25  # more than this is the model's fault
@@ -187,6 +188,8 @@ def measure_microscope(
     limits: Mapping[str, tuple[float, float]],
     side: int = 0,
     landing: int = 0,
+    others: Sequence[Sight] = (),
+    build_wide: Build | None = None,
     mapper: Mapper = map,
 ) -> Measured:
     """Measure the microscope from pictures of particles.
@@ -210,6 +213,10 @@ def measure_microscope(
     landing : int
         1 where more particles land than leave, so that most masses are positive; 0 where that is
         not known, and the reference phase is taken within 90° of the configured one.
+    others : sequence of Sight
+        Every particle that `Sight.neighbours` counts, these sights among them.
+    build_wide : callable, optional
+        Makes the microscope as far as rings matter; needed where there are neighbours.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -218,9 +225,11 @@ def measure_microscope(
     Measured
         Parameters, errors and verdict.
     """
-    return _Search(configured, build, judge_one, tuple(free), limits, side, landing, mapper).run(
-        sorted(sights, key=lambda sight: -sight.snr)
-    )
+    search = _Search(
+        configured, build, judge_one, tuple(free), limits, side, landing, mapper,
+        tuple(others), build_wide,
+    )  # fmt: skip
+    return search.run(sorted(sights, key=lambda sight: -sight.snr))
 
 
 def _fitted(sights: Sequence[Sight]) -> list[Sight]:
@@ -252,10 +261,13 @@ class _Search:
     limits: Mapping[str, tuple[float, float]]
     side: int
     landing: int
-    mapper: Mapper
+    mapper: Mapper = map
+    others: tuple[Sight, ...] = ()
+    build_wide: Build | None = None
 
     def run(self, sights: Sequence[Sight]) -> Measured:
         best, held_out = self._best_state(*average_sights(sights))
+        best, held_out = self._cleared(best, held_out)
         best, held = self._identified(best)
         before = len(best.sights) + len(held_out)
         best, held_out = self._uncontaminated(best, held_out)
@@ -263,6 +275,7 @@ class _Search:
         best, dropped = self._worthwhile(best, held_out)
         best, undecided = self._analyzer(best)
         best, twin = self._twin(best)
+        best, held_out = self._cleared(best, held_out)
         best = self._signed(best)
         held_out = self._own(held_out, best.values)
         judgement = judge(held_out, best.values, self.judge_one, self.mapper)
@@ -284,6 +297,32 @@ class _Search:
         return maximise(
             sights, self.build, start, names, limits=self.limits, passes=passes, mapper=self.mapper
         )
+
+    def _cleared(
+        self, best: Estimate, held_out: Sequence[Sight]
+    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        """Put the rings of all neighbours into what is expected of every picture."""
+        if not self.others or self.build_wide is None:
+            return best, tuple(held_out)
+        wide = self.build_wide(best.values)
+        others = with_masses(self.others, self.build, best.values)
+        others = self._fit(others, best.values, (), _OTHERS_PASSES).sights
+
+        def clear(sight: Sight) -> Sight:
+            contrast = np.zeros(sight.grid.shape)
+            for number, share in sight.neighbours:
+                other = others[number]
+                place = (other.x_nm, other.y_nm, other.z_nm, other.mass_kda)
+                contrast += share * wide.image(sight.grid, *place)
+            return sight.among(contrast)
+
+        others = self._fit(
+            tuple(self.mapper(clear, others)), best.values, (), _OTHERS_PASSES
+        ).sights
+        fitted = tuple(self.mapper(clear, best.sights))
+        judged = tuple(self.mapper(clear, held_out))
+        judged = self._own(judged, best.values) if judged else ()
+        return self._fit(fitted, best.values, best.names), judged
 
     def _own(self, sights: Sequence[Sight], settings: Settings) -> tuple[Sight, ...]:
         """Fit what is a sight's own."""
@@ -457,6 +496,7 @@ class _Search:
                 mirrored[name] = -best.values[name]
         turned = [replace(s, mass_kda=-s.mass_kda) for s in best.sights]
         other = self._fit(turned, mirrored, best.names, _TRIAL_PASSES)
+        other, _ = self._cleared(other, ())  # each among the rings that it makes itself
         gap = best.log_likelihood - other.log_likelihood
         apart = abs(other.values["focus_nm"] - best.values["focus_nm"])
         if abs(gap) >= TWIN_GAP or apart < 1.0:
