@@ -23,7 +23,7 @@ from iscat_analysis.records import Analysis, EventView, FloatArray, PosteriorRes
 from iscat_analysis.report.numbers import LABELS, UNITS, number
 from iscat_analysis.report.style import BLUE, INK, new_figure
 
-EVENT_FIGURES = 50
+EVENT_FIGURES = 12
 """Events whose images are drawn into the folder, at most."""
 
 CORNER_FIGURES = 20

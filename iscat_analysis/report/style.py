@@ -92,6 +92,9 @@ def publish(figures: Iterable[tuple[str, Figure]], folder: Path | None = None) -
     inline = {}
     with mpl.rc_context(STYLE):
         for name, figure in figures:
+            if (engine := figure.get_layout_engine()) is not None:
+                engine.execute(figure)
+                figure.set_layout_engine("none")  # laid out once, not again for each file
             if folder is not None:
                 path = folder / f"{name}.png"
                 figure.savefig(path, dpi=DPI, pil_kwargs={"compress_level": 3})
