@@ -106,7 +106,7 @@ def fit(
     output folder.
     """
     messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages, debug=debug, options={"inject": "--inject"}):
         from iscat_analysis.config import load_config
 
         changes = _changes(settings, mode, frames, background, posterior, workers)
