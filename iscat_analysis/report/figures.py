@@ -19,7 +19,7 @@ from iscat_analysis.records import (
     Status,
 )
 from iscat_analysis.report.event_figures import HALO, display_range, scale_bar
-from iscat_analysis.report.headline import label_of, main_quantity
+from iscat_analysis.report.headline import as_contrasts, label_of, main_quantity
 from iscat_analysis.report.numbers import UNITS
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, VERMILLION, new_figure
 
@@ -175,11 +175,8 @@ def _main_values(analysis: Analysis, table: pd.DataFrame) -> tuple[FloatArray, F
     """Give the main quantity of every row, its σ, and the label of its axis."""
     main = main_quantity(analysis)
     values = table[main.column].to_numpy(float)
-    if main.column in UNITS:
-        sigma = table[f"sigma_{main.column}"].to_numpy(float)
-    else:  # a model without calibration is proportional to the mass
-        relative = table["sigma_mass_kda"] / table["mass_kda"].abs()
-        sigma = np.abs(values) * relative.to_numpy(float)
+    named = table if main.column in UNITS else as_contrasts(table.assign(contrast=values))
+    sigma = named[f"sigma_{main.column if main.column in UNITS else 'mass_kda'}"].to_numpy(float)
     return values, sigma, f"{main.label} [{main.unit}]" if main.unit else main.label
 
 

@@ -112,6 +112,26 @@ def main_quantity(analysis: Analysis) -> Quantity:
     return Quantity("contrast", "contrast", "")
 
 
+def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
+    """Put contrasts where the masses are: right for a scale that is proportional to the mass.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Columns `EVENT_COLUMNS`; without calibration the model's contrast is proportional to the
+        mass.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A copy in which ``mass_kda`` and its σ and bounds are contrasts.
+    """
+    per_kda = (table["contrast"] / table["mass_kda"]).abs()
+    columns = [f"{kind}_mass_kda" for kind in ("sigma", "crb", "qcrb")]
+    scaled = {name: table[name] * per_kda for name in columns}
+    return table.assign(**scaled, mass_kda=table["contrast"])
+
+
 def label_of(analysis: Analysis, name: str) -> str:
     """Say what a parameter is called in tables and figures.
 

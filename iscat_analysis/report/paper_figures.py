@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from iscat_analysis.records import FloatArray
+from iscat_analysis.report.event_figures import HALO
 from iscat_analysis.report.style import BLUE, GREY, INK, VERMILLION, log_y, new_figure
 
 SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "dark field"}
@@ -293,8 +294,9 @@ def images_figure(images: Mapping[tuple[str, float], FloatArray], field_nm: floa
         bar.outline.set_visible(False)
     grid[-1, 0].plot([-half + 0.3, -half + 1.3], [-half + 0.35] * 2, color="white", lw=2.5)
     grid[-1, 0].text(
-        -half + 0.8, -half + 0.5, "1 µm", color="white", ha="center", va="bottom", fontsize=8
-    )
+        -half + 0.8, -half + 0.5, "1 µm", color="white", ha="center", va="bottom", fontsize=8,
+        path_effects=HALO,
+    )  # fmt: skip
     return figure
 
 
