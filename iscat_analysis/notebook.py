@@ -33,6 +33,7 @@ from iscat_analysis.report.headline import (
 )
 from iscat_analysis.report.numbers import UNITS, count, number
 from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
+from iscat_analysis.report.posterior import posterior_groups
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.study.simulate import write_stack
 
@@ -352,31 +353,13 @@ class Result:
         DataError
             There is no such event, it was not sampled, or its chain did not converge.
         """
-        found = posterior_of(self.analysis, event)
+        posterior_of(self.analysis, event)
         with warnings.catch_warnings():
             # ArviZ announces its next major version on import, once a day.
             warnings.simplefilter("ignore", FutureWarning)
             import arviz
-            import xarray
-        axes = ("chain", "draw")
-        chains, draws, _ = found.samples.shape
-        coordinates = {"chain": range(chains), "draw": range(draws)}
-        variables = {
-            name: (axes, found.samples[..., k], {"units": UNITS[name]})
-            for k, name in enumerate(found.names)
-        }
-        about = {
-            "event": int(event),
-            "sampling_library": "emcee",
-            "input_path": self.analysis.provenance.input_path,
-            "input_sha256": self.analysis.provenance.input_sha256,
-        }
-        return arviz.InferenceData(
-            posterior=xarray.Dataset(variables, coords=coordinates, attrs=about),
-            sample_stats=xarray.Dataset(
-                {"log_likelihood": (axes, found.log_likelihood)}, coords=coordinates, attrs=about
-            ),
-        )
+        groups = posterior_groups(self.analysis, [view_of(self.analysis, event)])
+        return arviz.InferenceData(**{name: group.isel(event=0) for name, group in groups.items()})
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write the report, the tables and the figures into a folder.

@@ -14,8 +14,9 @@ from iscat_analysis.report.event_figures import EVENT_FIGURES
 from iscat_analysis.report.event_figures import event_figures as draw_events
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output
 from iscat_analysis.report.page import render_page, render_report
+from iscat_analysis.report.posterior import write_posterior
 from iscat_analysis.report.style import publish
-from iscat_analysis.report.tables import write_posterior, write_tables
+from iscat_analysis.report.tables import write_tables
 
 __all__ = [
     "EVENT_FIGURES",

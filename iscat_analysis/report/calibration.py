@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.report.numbers import count, decimals_for, fixed, number
@@ -225,6 +226,7 @@ def _mass_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     for k, contrast in enumerate(contrasts):
         axes.axvline(contrast, color=VERMILLION, ls="--", label=None if k else "standards")
     axes.set(xlabel="|contrast|", ylabel="events")
+    axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.legend()
     yield "peaks", figure
 
