@@ -5,18 +5,16 @@ Everything arrives as what ``optics.json`` holds; nothing is computed here.
 
 from __future__ import annotations
 
-import base64
-import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from iscat_analysis.report.numbers import number
 from iscat_analysis.report.page import render_page
-from iscat_analysis.report.style import DPI, STYLE, new_figure
+from iscat_analysis.report.style import BLUE, VERMILLION, new_figure, publish
 
 _LABELS = {
     "focus_nm": ("focus", "nm"),
@@ -58,7 +56,7 @@ def optics_page(title: str, found: Mapping[str, Any], toml: str) -> str:
     str
         HTML.
     """
-    pictures = found["pictures"]
+    drawn = publish(_figures(found))
     judged, before = found["held_out"], found["held_out_as_configured"]
     verdict = (
         "The measured optics describe pictures that were not fitted."
@@ -93,32 +91,41 @@ def optics_page(title: str, found: Mapping[str, Any], toml: str) -> str:
         {
             "id": "pictures",
             "title": "Pictures",
-            "images": [
+            "charts": [
                 {
+                    "id": "average",
                     "title": "Average particle",
                     "caption": "Measured, by the microscope that was found, and their difference "
                     "in standard deviations of the average.",
-                    "src": _source(draw_pictures(pictures)),
+                    "svg": drawn["average"],
+                    "wide": True,
                 },
                 {
+                    "id": "radial",
+                    "title": "Radial profile",
+                    "caption": "Average contrast on rings around the particle, with 95 % "
+                    "intervals, and the microscope that was found.",
+                    "svg": drawn["radial"],
+                },
+                {
+                    "id": "pupil",
                     "title": "Pupil",
                     "caption": "Aberrations without the focus, and the amplitude that the mask "
                     "passes.",
-                    "src": _source(draw_pupil(pictures)),
+                    "svg": drawn["pupil"],
                 },
-            ],
-            "charts": [_radial_chart(pictures), _p_chart(judged)],
-        },
-        {
-            "id": "correlations",
-            "title": "Correlations",
-            "lead": "Of the errors of the measured parameters.",
-            "images": [
                 {
+                    "id": "p-values",
+                    "title": "Pictures that were not fitted",
+                    "caption": "Their p-values; uniform where the microscope describes them.",
+                    "svg": drawn["p-values"],
+                },
+                {
+                    "id": "correlation",
                     "title": "Correlation of the errors",
                     "caption": "1 and −1: only a combination of the two is known.",
-                    "src": _source(draw_correlation(found["names"], found["correlation"])),
-                }
+                    "svg": drawn["correlation"],
+                },
             ],
         },
     ]
@@ -140,107 +147,92 @@ def optics_page(title: str, found: Mapping[str, Any], toml: str) -> str:
     )
 
 
-def draw_pictures(pictures: Mapping[str, Any]) -> Figure:
-    """Draw measured picture, model and residual side by side.
+def _figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
+    """Draw what the page shows."""
+    pictures = found["pictures"]
+    yield "average", _average(pictures)
+    yield "radial", _radial(pictures)
+    yield "pupil", _pupil(pictures)
+    yield "p-values", _p_values(found["held_out"]["p_values"])
+    yield "correlation", _correlation(found["names"], found["correlation"])
 
-    Parameters
-    ----------
-    pictures : mapping
-        ``"measured"``, ``"model"``, ``"residual"`` and ``"pixel_nm"``.
 
-    Returns
-    -------
-    Figure
-        Three images.
-    """
+def _average(pictures: Mapping[str, Any]) -> Figure:
     measured, model, residual = (
         np.asarray(pictures[key], dtype=float) for key in ("measured", "model", "residual")
     )
     half = measured.shape[0] * pictures["pixel_nm"] / 2000
     top = float(np.abs(measured).max())
-    with mpl.rc_context(STYLE):
-        figure = new_figure(9.0, 3.0)
-        axes = figure.subplots(1, 3)
-        for ax, image, title, limit in zip(
-            axes, (measured, model, residual), ("measured", "model", "residual [σ]"),
-            (top, top, max(3.0, float(np.abs(residual).max()))), strict=True,
-        ):  # fmt: skip
-            shown = ax.imshow(
-                image, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=(-half, half, half, -half)
-            )
-            ax.set_title(title)
-            ax.set_xlabel("x [µm]")
-            figure.colorbar(shown, ax=ax, shrink=0.8)
-        axes[0].set_ylabel("y [µm]")
+    figure = new_figure(9.0, 2.9)
+    axes = figure.subplots(1, 3)
+    for ax, image, title, limit in zip(
+        axes, (measured, model, residual), ("measured", "model", "residual [σ]"),
+        (top, top, max(3.0, float(np.abs(residual).max()))), strict=True,
+    ):  # fmt: skip
+        shown = ax.imshow(
+            image, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=(-half, half, half, -half)
+        )
+        ax.set_title(title)
+        ax.set_xlabel("x [µm]")
+        figure.colorbar(shown, ax=ax, shrink=0.8)
+    axes[0].set_ylabel("y [µm]")
     return figure
 
 
-def draw_pupil(pictures: Mapping[str, Any]) -> Figure:
-    """Draw phase and amplitude over the pupil.
+def _radial(pictures: Mapping[str, Any]) -> Figure:
+    figure = new_figure(4.6, 3.0)
+    ax = figure.subplots()
+    radius, mean, se = (np.array(pictures[k]) for k in ("radius_nm", "radial", "radial_se"))
+    ax.plot(radius, pictures["radial_model"], color=BLUE, label="model")
+    ax.errorbar(radius, mean, 1.96 * se, fmt=".", color=VERMILLION, label="measured, 95 %")
+    ax.set_xlabel("distance [nm]")
+    ax.set_ylabel("contrast")
+    ax.legend()
+    return figure
 
-    Parameters
-    ----------
-    pictures : mapping
-        ``"wavefront_nm"``, ``"transmission"`` and ``"na"``.
 
-    Returns
-    -------
-    Figure
-        Two images.
-    """
+def _pupil(pictures: Mapping[str, Any]) -> Figure:
     wavefront, passed = (
         np.asarray(pictures[key], dtype=float) for key in ("wavefront_nm", "transmission")
     )
     na = pictures["na"]
     limit = max(1.0, float(np.nanmax(np.abs(wavefront))))
-    with mpl.rc_context(STYLE):
-        figure = new_figure(6.4, 3.0)
-        axes = figure.subplots(1, 2)
-        extent = (-na, na, na, -na)
-        for ax, image, title, scale in (
-            (axes[0], wavefront, "wavefront [nm]", ("RdBu_r", -limit, limit)),
-            (axes[1], passed, "amplitude passed", ("cividis", 0.0, 1.0)),
-        ):
-            shown = ax.imshow(image, cmap=scale[0], vmin=scale[1], vmax=scale[2], extent=extent)
-            ax.set_title(title)
-            ax.set_xlabel("NA along x")
-            figure.colorbar(shown, ax=ax, shrink=0.8)
-        axes[0].set_ylabel("NA along y")
-    return figure
-
-
-def draw_correlation(names: list[str], correlation: list[list[float]]) -> Figure:
-    """Draw the correlation matrix of the measured parameters.
-
-    Parameters
-    ----------
-    names : list of str
-        The parameters.
-    correlation : list of list of float
-        The matrix.
-
-    Returns
-    -------
-    Figure
-        One image.
-    """
-    with mpl.rc_context(STYLE):
-        figure = new_figure(5.2, 4.4)
-        ax = figure.subplots()
-        matrix = np.asarray(correlation, dtype=float).reshape(len(names), len(names))
-        shown = ax.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1)
-        labels = [_LABELS.get(name, (name, ""))[0].split(",")[0] for name in names]
-        ax.set_xticks(range(len(names)), labels, rotation=60, ha="right")
-        ax.set_yticks(range(len(names)), labels)
+    figure = new_figure(6.2, 2.9)
+    axes = figure.subplots(1, 2)
+    for ax, image, title, scale in (
+        (axes[0], wavefront, "wavefront [nm]", ("RdBu_r", -limit, limit)),
+        (axes[1], passed, "amplitude passed", ("cividis", 0.0, 1.0)),
+    ):
+        shown = ax.imshow(
+            image, cmap=scale[0], vmin=scale[1], vmax=scale[2], extent=(-na, na, na, -na)
+        )
+        ax.set_title(title)
+        ax.set_xlabel("NA along x")
         figure.colorbar(shown, ax=ax, shrink=0.8)
+    axes[0].set_ylabel("NA along y")
     return figure
 
 
-def _source(figure: Figure) -> str:
-    """Give a figure as the address of an image inside the page."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+def _p_values(p_values: list[float]) -> Figure:
+    figure = new_figure(4.6, 3.0)
+    ax = figure.subplots()
+    ax.hist(p_values, bins=10, range=(0.0, 1.0), color=VERMILLION)
+    ax.set_xlabel("p-value")
+    ax.set_ylabel("pictures")
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+    return figure
+
+
+def _correlation(names: list[str], correlation: list[list[float]]) -> Figure:
+    figure = new_figure(4.6, 3.8)
+    ax = figure.subplots()
+    matrix = np.asarray(correlation, dtype=float).reshape(len(names), len(names))
+    shown = ax.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1)
+    labels = [_LABELS.get(name, (name, ""))[0].split(",")[0] for name in names]
+    ax.set_xticks(range(len(names)), labels, rotation=60, ha="right")
+    ax.set_yticks(range(len(names)), labels)
+    figure.colorbar(shown, ax=ax, shrink=0.8)
+    return figure
 
 
 def _table(parameters: list[Mapping[str, Any]]) -> dict[str, Any]:
@@ -260,43 +252,3 @@ def _table(parameters: list[Mapping[str, Any]]) -> dict[str, Any]:
         ],
         "rows": rows,
     }
-
-
-def _radial_chart(pictures: Mapping[str, Any]) -> dict[str, Any]:
-    radius, mean, se = (pictures[key] for key in ("radius_nm", "radial", "radial_se"))
-    return {
-        "id": "radial",
-        "title": "Radial profile",
-        "caption": "Average contrast on rings around the particle, with 95 % intervals.",
-        "spec": {
-            "height": 320,
-            "x": {"label": "distance [nm]", "zero": True},
-            "y": {"label": "contrast"},
-            "series": [
-                {"kind": "line", "name": "model", "color": "crb", "x": radius,
-                 "y": pictures["radial_model"]},
-                {"kind": "interval", "name": "measured, 95 %", "color": "sigma", "along": "y",
-                 "at": radius, "mid": mean,
-                 "lo": [m - 1.96 * s for m, s in zip(mean, se, strict=True)],
-                 "hi": [m + 1.96 * s for m, s in zip(mean, se, strict=True)]},
-            ],
-        },
-    }  # fmt: skip
-
-
-def _p_chart(judged: Mapping[str, Any]) -> dict[str, Any]:
-    counts, edges = np.histogram(judged["p_values"], bins=10, range=(0.0, 1.0))
-    return {
-        "id": "p-values",
-        "title": "Pictures that were not fitted",
-        "caption": "Their p-values; uniform where the microscope describes them.",
-        "spec": {
-            "height": 320,
-            "x": {"label": "p-value", "domain": [0, 1]},
-            "y": {"label": "pictures", "zero": True, "whole": True},
-            "series": [
-                {"kind": "bars", "name": "pictures", "color": "sigma", "edges": edges.tolist(),
-                 "counts": counts.tolist()},
-            ],
-        },
-    }  # fmt: skip
