@@ -106,7 +106,7 @@ def fit(
     output folder.
     """
     messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug, options={"inject": "--inject"}):
+    with failures(messages, debug=debug):
         from iscat_analysis.config import load_config
         from iscat_analysis.errors import ConfigError
 

@@ -128,7 +128,7 @@ class TestOverwrite:
     def test_an_earlier_result_stays_without_permission(self, tmp_path: Path) -> None:
         out = write_report(without_events(make_analysis(1)), tmp_path / "out")
         before = (out / "fits.csv").stat().st_mtime_ns
-        with pytest.raises(DataError, match="--overwrite"):
+        with pytest.raises(DataError, match="pass `overwrite`"):
             write_report(make_analysis(1), out)
         assert (out / "fits.csv").stat().st_mtime_ns == before
 
