@@ -66,7 +66,7 @@ def check_output(
         if not target.exists():
             return
         if not target.is_dir():
-            raise DataError(f"{folder}: is a file, not a folder; choose another --out")
+            raise DataError(f"{folder}: is a file, not a folder; choose another `out`")
         entries = sorted(entry.name for entry in target.iterdir() if entry.name not in _LITTER)
     except OSError as error:
         raise DataError(f"{folder}: cannot be read ({error.strerror})") from None
@@ -74,12 +74,12 @@ def check_output(
     if foreign:
         raise DataError(
             f"{folder}: holds {foreign[0]!r}, which is not part of a result, and is left alone; "
-            "choose another --out"
+            "choose another `out`"
         )
     if entries and not overwrite:
         raise DataError(
-            f"{folder}: holds an earlier result; add --overwrite to replace it, or choose "
-            "another --out"
+            f"{folder}: holds an earlier result; pass `overwrite` to replace it, or choose "
+            "another `out`"
         )
 
 
@@ -116,7 +116,7 @@ def claim_output(
         held = _acquire(lock, folder)
     except OSError as error:
         raise DataError(
-            f"{folder}: cannot be made ({error.strerror}); choose another --out"
+            f"{folder}: cannot be made ({error.strerror}); choose another `out`"
         ) from None
     try:
         if held is not None:
@@ -162,7 +162,7 @@ def atomic_folder(
                 building.mkdir(0o700)
             except OSError as error:
                 raise DataError(
-                    f"{folder}: cannot be made ({error.strerror}); choose another --out"
+                    f"{folder}: cannot be made ({error.strerror}); choose another `out`"
                 ) from None
             yield building
             _like_an_ordinary_folder(building)
@@ -188,7 +188,7 @@ def _resolved(folder: Path) -> Path:
     try:
         return folder.resolve()
     except (OSError, RuntimeError) as error:  # RuntimeError: links in a circle, before 3.13
-        raise DataError(f"{folder}: cannot be found ({error}); choose another --out") from None
+        raise DataError(f"{folder}: cannot be found ({error}); choose another `out`") from None
 
 
 def _short(target: Path) -> str:
@@ -225,7 +225,7 @@ else:
                 who = f" (process {owner})" if owner else ""
                 raise DataError(
                     f"{folder}: another run{who} is about to write there; wait for it, or choose "
-                    "another --out"
+                    "another `out`"
                 ) from None
             except OSError as error:
                 os.close(handle)
@@ -237,7 +237,7 @@ else:
                 os.write(handle, str(os.getpid()).encode())
                 return handle
             os.close(handle)  # another run removed the file between opening and locking it
-        raise DataError(f"{folder}: other runs keep writing there; choose another --out")
+        raise DataError(f"{folder}: other runs keep writing there; choose another `out`")
 
     def _is_still(lock: Path, handle: int) -> bool:
         try:

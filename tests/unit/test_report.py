@@ -128,7 +128,7 @@ class TestOverwrite:
     def test_an_earlier_result_stays_without_permission(self, tmp_path: Path) -> None:
         out = write_report(without_events(make_analysis(1)), tmp_path / "out")
         before = (out / "fits.csv").stat().st_mtime_ns
-        with pytest.raises(DataError, match="--overwrite"):
+        with pytest.raises(DataError, match="pass `overwrite`"):
             write_report(make_analysis(1), out)
         assert (out / "fits.csv").stat().st_mtime_ns == before
 
@@ -240,6 +240,14 @@ def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: boo
     assert ("Median mass" in page) != silent
     assert (Status.POOR_FIT.advice in first) == silent
     assert "×10⁹" not in " ".join(headline(analysis, event_table(analysis)))
+
+
+def test_side_lobes_are_no_events() -> None:
+    """Thirty of forty rows are side lobes with absurd masses: ten events remain, and all count."""
+    analysis = with_flagged(make_analysis(40), 30)
+    table = event_table(analysis).replace({"status": {"poor_fit": "sidelobe"}})
+    assert headline(analysis, table)[0].startswith("10 events, all of them ok. Median mass")
+    assert "×10⁹" not in headline(analysis, table)[0]
 
 
 def test_without_calibration_the_headline_is_a_contrast() -> None:
