@@ -208,7 +208,7 @@ def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: 
         print_result(f"… and {len(rows) - ROWS_SHOWN} more in {folder / 'fits.csv'}")
     counts = Counter(str(row["status"]) for row in rows)
     verdict = ", ".join(f"{n} {status}" for status, n in counts.most_common())
-    found = count(len(rows), "row" if analysis.mode == "track" else "event")
+    found = count(len(rows) - counts["sidelobe"], "row" if analysis.mode == "track" else "event")
     print_result(f"{found}{': ' if verdict else ''}{verdict}; results in {folder}")
 
 

@@ -15,6 +15,7 @@ from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Status
 from iscat_analysis.report.event_figures import event_images
 from iscat_analysis.report.headline import (
     caution,
+    counted,
     headline,
     label_of,
     main_quantity,
@@ -105,6 +106,7 @@ def report_context(
 
 def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
     """Give the large numbers at the top: how many, how much, how well."""
+    table = counted(table)
     flagged = int((table["status"] != Status.OK.value).sum())
     tiles = [
         {

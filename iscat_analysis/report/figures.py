@@ -19,7 +19,7 @@ from iscat_analysis.records import (
     Status,
 )
 from iscat_analysis.report.event_figures import HALO, display_range, scale_bar
-from iscat_analysis.report.headline import as_contrasts, label_of, main_quantity
+from iscat_analysis.report.headline import as_contrasts, counted, label_of, main_quantity
 from iscat_analysis.report.numbers import UNITS
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, VERMILLION, new_figure
 
@@ -56,7 +56,7 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[tuple[str,
     if np.asarray(analysis.ratio_image).size:
         yield "overview", overview(analysis, table)
     main = main_quantity(analysis).column
-    if np.isfinite(table[main].to_numpy(float)).any():
+    if np.isfinite(counted(table)[main].to_numpy(float)).any():
         yield f"{_NAMES.get(main, main)}_histogram", histogram(analysis, table)
         yield "timeline", timeline(analysis, table)
         yield "precision", precision(analysis, table)
@@ -195,6 +195,7 @@ def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
     Figure
         Rows that are ok and those that are flagged, stacked.
     """
+    table = counted(table)
     values, sigma, label = _main_values(analysis, table)
     finite, good = np.isfinite(values), _is_ok(table)
     bins = _bins(float(np.ptp(values[finite])), sigma[good & np.isfinite(sigma)])

@@ -72,6 +72,22 @@ class Precision:
     information: float
 
 
+def counted(table: pd.DataFrame) -> pd.DataFrame:
+    """Leave out the rows that stay in the table but are no events: side lobes of others.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        With a column ``status``.
+
+    Returns
+    -------
+    pandas.DataFrame
+        The rows that count as events.
+    """
+    return table[table["status"] != "sidelobe"]
+
+
 def is_uncalibrated(analysis: Analysis) -> bool:
     """Tell whether masses were fitted on the model's own scale.
 
@@ -164,6 +180,7 @@ def caution(table: pd.DataFrame) -> str | None:
         One sentence with the commonest reason and its remedy; None where `MOST_FLAGGED` or fewer
         are flagged.
     """
+    table = counted(table)
     flagged = table["status"][table["status"] != Status.OK.value]
     if len(flagged) <= MOST_FLAGGED * len(table):
         return None
@@ -259,6 +276,7 @@ def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
     list of str
         A warning first where one is due.
     """
+    table = counted(table)
     if table.empty:
         return [
             "Nothing was found in this movie that stands out from its noise. If particles can be "

@@ -242,6 +242,14 @@ def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: boo
     assert "×10⁹" not in " ".join(headline(analysis, event_table(analysis)))
 
 
+def test_side_lobes_are_no_events() -> None:
+    """Thirty of forty rows are side lobes with absurd masses: ten events remain, and all count."""
+    analysis = with_flagged(make_analysis(40), 30)
+    table = event_table(analysis).replace({"status": {"poor_fit": "sidelobe"}})
+    assert headline(analysis, table)[0].startswith("10 events, all of them ok. Median mass")
+    assert "×10⁹" not in headline(analysis, table)[0]
+
+
 def test_without_calibration_the_headline_is_a_contrast() -> None:
     analysis = make_analysis(40)
     bare = replace(analysis, summary={**analysis.summary, "mass_scale": "absolute model"})
