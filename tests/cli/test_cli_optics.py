@@ -92,13 +92,14 @@ def test_a_scan_of_the_focus(tmp_path: Path, capsys: Captured) -> None:
     frames = []
     for k in range(16):
         optics = {"focus_nm": -380.0 + step * k, "aberrations_nm": {"z11": 12.0}}
+        optics |= {"attenuation": 1.0}
         config = parse_config(_values(optics=optics, particle=gold))
         model = forward_model(config, grid.diagonal_nm)
         mass = model.material.mass_kda
         expected = 2e4 * (1 + model.image(grid, 29.7 * 84.4, 30.2 * 84.4, 10.0, mass))
         frames.append(random.poisson(expected))
     tifffile.imwrite(tmp_path / "scan.tif", np.array(frames).astype(np.uint16))
-    config = parse_config(_values(particle=gold))
+    config = parse_config(_values(optics={"attenuation": 1.0}, particle=gold))
     (tmp_path / "setup.toml").write_text(config_to_toml(config), encoding="utf-8")
     given = ["calibrate", "optics", str(tmp_path / "scan.tif"), "--focus-step", "50", "--json"]
     given += ["--config", str(tmp_path / "setup.toml"), "--free", "focus,phase,zernike"]
