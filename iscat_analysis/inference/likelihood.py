@@ -43,6 +43,8 @@ from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+Derivatives = tuple[FloatArray, FloatArray, FloatArray]
+"""Signal (ny, nx), gradient (4, ny, nx) and second derivatives (4, 4, ny, nx) in (x, y, z, a)."""
 
 LEVEL = 4
 """Index of the level in θ."""
@@ -123,10 +125,11 @@ class Likelihood:
     @property
     def n_pixels(self) -> int:
         """Pixels that are not masked."""
-        return int(np.count_nonzero(self._used))
+        return int(np.count_nonzero(self.used))
 
     @property
-    def _used(self) -> BoolArray:
+    def used(self) -> BoolArray:
+        """Which pixels are not masked, shape (ny, nx)."""
         column = 3 if self.kind == CONDITIONAL else 2
         used: BoolArray = self.data[column] > 0
         return used
@@ -305,13 +308,38 @@ class Likelihood:
         values[inside], amplitudes[inside] = found, refitted
         return values, amplitudes
 
-    def observed_information(self, theta: FloatArray) -> FloatArray:
+    def derivatives(self, theta: FloatArray) -> Derivatives:
+        """Signal and its first and second derivatives.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (5,)
+            Parameters, in the support.
+
+        Returns
+        -------
+        signal, gradient, hessian : ndarray
+            See `Derivatives`.
+
+        Raises
+        ------
+        ConfigError
+            θ lies outside the support.
+        """
+        x, y, z, amplitude, _ = (float(value) for value in self._supported(theta))
+        return self.model.amplitude_hessian(self.grid, x, y, z, amplitude)
+
+    def observed_information(
+        self, theta: FloatArray, derivatives: Derivatives | None = None
+    ) -> FloatArray:
         """Negative Hessian of the log-likelihood.
 
         Parameters
         ----------
         theta : ndarray, shape (5,)
             Parameters.
+        derivatives : Derivatives, optional
+            Of the signal at θ, where they are known already.
 
         Returns
         -------
@@ -323,10 +351,9 @@ class Likelihood:
         ConfigError
             θ lies outside the support.
         """
-        theta = self._supported(theta)
-        s, first, second = self.model.amplitude_hessian(self.grid, *theta[:4])
+        s, first, second = derivatives or self.derivatives(theta)
         level = np.exp(theta[LEVEL])
-        used = self._used
+        used = self.used
         c0, c1, c2, c3 = (np.where(used, c, 0.0) for c in self.data)
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.kind == CONDITIONAL:
@@ -382,7 +409,7 @@ class Likelihood:
             else:
                 rate = level * (c1 + c2 * s) + c3
                 out = (c0 - rate) / np.sqrt(rate)
-        return np.where(self._used, out, np.nan)
+        return np.where(self.used, out, np.nan)
 
     def signal(self, theta: FloatArray) -> FloatArray:
         """Signal of the model at θ, which must lie in the support; shape (ny, nx)."""
@@ -395,7 +422,7 @@ class Likelihood:
         with np.errstate(divide="ignore", invalid="ignore"):
             conditional = self.kind == CONDITIONAL
             out = c0 / ((c1 - c0) * c2) - 1 if conditional else (c0 - c3 - c1) / c2
-        return np.where(self._used, out, np.nan)
+        return np.where(self.used, out, np.nan)
 
     def signal_information(self, signal: FloatArray | None = None) -> FloatArray:
         """Fisher information of each pixel about its own signal.
@@ -418,7 +445,7 @@ class Likelihood:
                 out = c3 * c1 * p * (1 - p) / (1 + s) ** 2
             else:
                 out = c2**2 / np.maximum(c1 + c2 * s + c3, 1.0)
-        return np.where(self._used, out, 0.0)
+        return np.where(self.used, out, 0.0)
 
     def _supported(self, theta: FloatArray) -> FloatArray:
         """Return θ, unless the model is not known there."""
@@ -441,7 +468,7 @@ class Likelihood:
             )
         low, high = np.where(free, lower, start), np.where(free, upper, start)
         low[3:], high[3:] = start[3:], start[3:]
-        corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(5, -1).T
+        corners = np.stack([low, high, [low[0], *high[1:]], [high[0], *low[1:]]])
         if not self.supports(corners).all():
             raise ConfigError(
                 f"lower = {_listed(lower)}, upper = {_listed(upper)}: {self._support()}; narrow "

@@ -36,6 +36,7 @@ from iscat_analysis.records import (
     Status,
     Windows,
     silent,
+    verdict,
 )
 from iscat_analysis.search.templates import find_particles
 
@@ -216,7 +217,7 @@ def _fit_all(
         likelihood = region_likelihood(scene, windows, region, others)
         if likelihood.n_pixels < 0.5 * others.size:
             return None
-        fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm)
+        fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=False)
         return Event(region, fit, likelihood)
 
     return [event for event in pool.map(one, range(len(candidates))) if event is not None]
@@ -275,12 +276,10 @@ def _judged(scene: Scene, windows: Windows, events: Sequence[Event]) -> list[Eve
         dx = (columns + event.region.columns[0]) * scene.pixel_nm - x
         dy = (rows + event.region.rows[0]) * scene.pixel_nm - y
         burnt = bool(np.any(np.hypot(dx, dy) < _SATURATION_NM))
-        flags = [
+        status, flags = verdict([
+            *event.fit.flags,
             *([Status.SATURATED] if burnt else []),
-            *(f for f in event.fit.flags if f != Status.POOR_FIT),
             *([Status.TOO_CLOSE] if crowded else []),
-            *(f for f in event.fit.flags if f == Status.POOR_FIT),
-        ]
-        status = Status(flags[0]) if flags else Status.OK
-        judged.append(replace(event, fit=replace(event.fit, status=status, flags=tuple(flags))))
+        ])  # fmt: skip
+        judged.append(replace(event, fit=replace(event.fit, status=status, flags=flags)))
     return judged

@@ -115,7 +115,7 @@ def _record(scene: Scene, row: Row) -> dict[str, Any]:
     fit, windows = row.event.fit, row.windows
     collected = collected_photons(scene, windows, row.event)
     bounds: EventBounds = event_bounds(
-        row.event.likelihood, fit.theta, fit.free, collected, level=bool(fit.box.free[LEVEL])
+        row.event.likelihood, fit.estimate, fit.free, collected, level=bool(fit.box.free[LEVEL])
     )
     record: dict[str, Any] = {
         "event": row.number,
