@@ -99,7 +99,7 @@ def camera(
                 notify=messages.notify,
             )
         if as_json:
-            print_json({**found.to_dict(), "out": str(folder)})
+            print_json("camera", {**found.to_dict(), "out": str(folder)})
         else:
             _print_camera(found)
         messages.notify(f"wrote {folder}; open {folder / 'camera.html'}")
@@ -163,7 +163,7 @@ def mass(
             notify=messages.notify,
         )
         if as_json:
-            print_json({**found.to_dict(), "out": str(folder)})
+            print_json("calibration", {**found.to_dict(), "out": str(folder)})
         else:
             _print_mass(found)
         messages.notify(f"wrote {folder}; open {folder / 'calibration.html'}")

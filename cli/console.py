@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import signal
@@ -285,33 +284,19 @@ def print_result(result: RenderableType) -> None:
     _write(sys.stdout, "".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))
 
 
-def print_json(value: Mapping[str, Any]) -> None:
-    """Print one JSON object on stdout; what is not a finite number becomes null.
+def print_json(document: str, values: Mapping[str, Any]) -> None:
+    """Print one JSON object on stdout.
 
     Parameters
     ----------
-    value : mapping
+    document : str
+        Name of its schema, as for `iscat_analysis.schema`.
+    values : mapping
         Of plain values, NumPy scalars and arrays, nested at will.
     """
-    _write(sys.stdout, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
+    from iscat_analysis.schemas import to_json
 
-
-def _plain(value: Any) -> Any:
-    import numpy as np
-
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    if value is None or isinstance(value, (str, bool, int, float)):
-        return value
-    return None if value != value else str(value)  # pandas' own missing values
+    _write(sys.stdout, to_json(document, values) + "\n")
 
 
 def _write(stream: TextIO | None, text: str) -> None:

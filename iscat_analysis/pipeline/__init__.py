@@ -175,10 +175,19 @@ def analyse(
         warnings.append(text)
         notify(text)
 
-    implied = movie.notes if config.camera.pixel_size_nm is None else ()
     config, notes = resolve_metadata(config, movie.metadata)
-    for note in (*implied, *notes):
+    for note in (*movie.notes, *notes):
         tell(note)
+    if config.optics.scheme == "darkfield" and config.particle.photons_per_frame is None:
+        photons = config.simulation.photons_per_pixel
+        tell(
+            f"particle.photons_per_frame is not given, so that masses rest on "
+            f"simulation.photons_per_pixel = {photons:g}, which says nothing of this movie; give "
+            "the scattered photons collected per frame from a particle of particle.mass_kda: the "
+            "next release asks for it"
+        )
+        particle = config.particle.model_copy(update={"photons_per_frame": photons})
+        config = config.model_copy(update={"particle": particle})
     shape = (movie.shape[1], movie.shape[2])
     camera = camera_from_config(config.camera, shape, movie.dtype)
     hashing = ThreadPoolExecutor(1)
@@ -219,13 +228,13 @@ def analyse(
         )
     windows = found.windows
     summary = summary_of(scene, found.table, windows, clock.seconds)
-    sampled = config.posterior.enabled and scene.mode != "track"
+    sampled = config.samples_posterior
     provenance = Provenance(
         command=_printable(command) or "iscat_analysis.pipeline.analyse",
         input_path=_printable(str(movie.path)),
         input_sha256=digest.result(),
         versions=_versions(),
-        seed=config.simulation.seed if sampled else None,
+        seed=config.compute.seed if sampled else None,
         started=started,
     )
     summary |= {
@@ -279,12 +288,12 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
         The background leaves no frame to fit.
     """
     before = config.background.frames
-    if config.background.method == "none":
+    if config.background.method == "known":
         before = None
     elif before is None:
         raise ConfigError(
             "which frames come before the particles? give them as --background 0:200 "
-            'or background.frames, or a known level with background.method = "none"'
+            'or background.frames, or a known level with background.method = "known"'
         )
     start = before[1] if before else 0
     after = config.fit.frames or (start, movie.shape[0])
@@ -323,7 +332,7 @@ def _measured_background(
         camera,
         before,
         after,
-        method=config.background.method,
+        median=config.background.method == "median",
         level_e=config.background.level_e,
         power_normalization=config.background.power_normalization,
         check=check,
@@ -365,7 +374,7 @@ def _bound_particles(
     clock.lap("fit")
     rows = [Row(number, event, windows) for number, event in enumerate(events)]
     interrupted = False
-    if scene.config.posterior.enabled:
+    if scene.config.samples_posterior:
         rows, interrupted = _sampled(scene, rows, pool, progress)
         clock.lap("posterior")
     views = tuple(view_of(row) for row in rows)
@@ -376,7 +385,7 @@ def _sampled(
     scene: Scene, rows: list[Row], pool: ThreadPoolExecutor, progress: Progress
 ) -> tuple[list[Row], bool]:
     """Sample the posteriors; an interrupt keeps those that are done."""
-    settings, seed = scene.config.posterior, scene.config.simulation.seed
+    settings, seed = scene.config.posterior, scene.config.compute.seed
     stop = threading.Event()
 
     def one(row: Row) -> PosteriorResult:

@@ -238,7 +238,7 @@ def _distribution(scene: Scene, good: pd.DataFrame) -> dict[str, Any] | None:
     )
     filter_sigma = _median(np.abs(mass[snr > 0]) / snr[snr > 0])
     efficiency = Efficiency(scene.templates.threshold, filter_sigma) if filter_sigma else None
-    found = describe(mass, sigma, efficiency=efficiency, seed=scene.config.simulation.seed)
+    found = describe(mass, sigma, efficiency=efficiency, seed=scene.config.compute.seed)
     return found.to_dict()
 
 
