@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis._kernels.image import Lens, Pixels
 from iscat_analysis._kernels.radial import AxialTable
@@ -492,13 +492,13 @@ class Likelihood:
 def conditional(
     model: ForwardModel,
     grid: PixelGrid,
-    before_e: FloatArray,
-    after_e: FloatArray,
-    power_ratio: FloatArray | float,
+    before_e: ArrayLike,
+    after_e: ArrayLike,
+    power_ratio: ArrayLike,
     *,
-    read_variance_before_e2: FloatArray | float = 0.0,
-    read_variance_after_e2: FloatArray | float = 0.0,
-    masked: BoolArray | None = None,
+    read_variance_before_e2: ArrayLike = 0.0,
+    read_variance_after_e2: ArrayLike = 0.0,
+    masked: ArrayLike | None = None,
 ) -> Likelihood:
     """Binomial likelihood of counts before and after landing.
 
@@ -560,12 +560,12 @@ def conditional(
 def poisson(
     model: ForwardModel,
     grid: PixelGrid,
-    counts_e: FloatArray,
-    background_e: FloatArray | float,
-    scale_e: FloatArray | float,
+    counts_e: ArrayLike,
+    background_e: ArrayLike,
+    scale_e: ArrayLike,
     *,
-    extra_variance_e2: FloatArray | float = 0.0,
-    masked: BoolArray | None = None,
+    extra_variance_e2: ArrayLike = 0.0,
+    masked: ArrayLike | None = None,
 ) -> Likelihood:
     """Poisson likelihood with expectation background + scale·signal.
 

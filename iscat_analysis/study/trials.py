@@ -162,7 +162,7 @@ def run_trials(
             begun = time.thread_time()
             fit = fit_particle(
                 likelihood, start, setting.mode, setting.config.fit.z_range_nm,
-                level=False, correct_bias=correct_bias,
+                level=setting.level, correct_bias=correct_bias,
             )  # fmt: skip
             spent += time.thread_time() - begun
             fits[i] = fit
