@@ -147,7 +147,8 @@ def mass(
     Writes calibration.json, calibration.toml (a section to paste) and calibration.html.
     """
     messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    options = {"standards_kda": "--standards", "landing": "--landing"}
+    with failures(messages, debug=debug, options=options):
         masses, errors = _standards(standards)
 
         from iscat_analysis.pipeline.calibrations import mass_calibration

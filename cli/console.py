@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -32,6 +33,12 @@ SECONDS_TO_FIRST_LINE = 2.0
 SECONDS_BETWEEN_LINES = 10.0
 PLAIN_WIDTH = 200
 
+GRACE_S = 1.5
+"""After a signal to end, the time that is left for tidying up."""
+
+WRITING_GRACE_S = 30.0
+"""The same while results are being written, which a second signal cuts short."""
+
 
 class Messages:
     """Progress, notes and errors of one command, on stderr.
@@ -47,6 +54,7 @@ class Messages:
     def __init__(self, name: str, *, quiet: bool = False) -> None:
         self.name = name
         self.quiet = quiet
+        self.writing = False
         self._terminal = Console(stderr=True, highlight=False, markup=False, emoji=False)
 
     def error(self, text: str) -> None:
@@ -85,6 +93,16 @@ class Messages:
         Progress
             To be handed to the library.
         """
+        with self._shown() as shown:
+
+            def tell(stage: str, done: int, total: int) -> None:
+                self.writing = stage == "report" and done < total
+                shown(stage, done, total)
+
+            yield tell
+
+    @contextmanager
+    def _shown(self) -> Iterator[Progress]:
         if self.quiet:
             yield _ignore
         elif self._terminal.is_terminal:
@@ -182,7 +200,9 @@ def _ignore(stage: str, done: int, total: int) -> None:
 
 
 @contextmanager
-def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
+def failures(
+    messages: Messages, *, debug: bool, options: Mapping[str, str] | None = None
+) -> Iterator[None]:
     """Turn whatever a command raises into one line and an exit status.
 
     Parameters
@@ -191,6 +211,9 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
         Where the line goes.
     debug : bool
         Show the traceback as well.
+    options : mapping of str to str, optional
+        Argument of the library → option of the command: what the library calls ``name = value`` is
+        shown as ``--option value``.
 
     Yields
     ------
@@ -214,7 +237,7 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
         where = f" ({category.__name__}, {Path(filename).name}:{lineno})" if debug else ""
         messages.notify(f"warning: {message}{where}")
 
-    with warnings.catch_warnings(), _termination_interrupts():
+    with warnings.catch_warnings(), _ending_in_time(messages), _termination_interrupts():
         warnings.showwarning = show
         try:
             yield
@@ -228,8 +251,60 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
             if debug:
                 _write(sys.stderr, traceback.format_exc())
             line, status = _verdict(error, debug=debug)
+            for argument, option in (options or {}).items():
+                line = re.sub(rf"\b{argument} = ", f"{option} ", line)
             messages.error(line)
             raise typer.Exit(status) from error
+
+
+@contextmanager
+def _ending_in_time(messages: Messages) -> Iterator[None]:
+    """End the process where the answer to a signal takes too long.
+
+    Python raises `KeyboardInterrupt` between two of its own instructions, so a long call into
+    compiled code delays it, and so do threads that must finish first.  The operating system's
+    handler writes each signal's number into a pipe at once; a thread reads it and keeps the time.
+    """
+    if threading.current_thread() is not threading.main_thread() or os.name == "nt":
+        yield
+        return
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    ended = threading.Event()
+
+    def watch() -> None:
+        with open(reader, "rb", buffering=0) as signals:  # noqa: PTH123  (a descriptor)
+            while (number := signals.read(1)) and number[0] not in _ENDING:
+                pass
+            if not number:
+                return
+            if ended.wait(GRACE_S):
+                return
+            if messages.writing:
+                os.set_blocking(reader, False)
+                due = time.monotonic() + WRITING_GRACE_S
+                while messages.writing and time.monotonic() < due:
+                    if ended.wait(0.1):
+                        return
+                    again = signals.read(1)
+                    if again and again[0] in _ENDING:
+                        break
+        messages.error(f"interrupted by {signal.Signals(number[0]).name}")
+        os._exit(INTERRUPTED)
+
+    earlier = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    threading.Thread(target=watch, daemon=True, name="signals").start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(earlier)
+        ended.set()
+        os.close(writer)
+
+
+_ENDING = {
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+}
 
 
 @contextmanager

@@ -35,6 +35,7 @@ from iscat_analysis.pipeline.landing import analyse_landings, has_landings, inje
 from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
 from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
 from iscat_analysis.pipeline.scene import Scene, field_likelihood, make_scene
+from iscat_analysis.pipeline.systematic import with_systematic
 from iscat_analysis.pipeline.tracking import track_particles
 from iscat_analysis.records import (
     Analysis,
@@ -131,6 +132,7 @@ def fit_stack(
         if not analysis.summary["interrupted"]:
             shutil.rmtree(partial_folder(folder.resolve()), ignore_errors=True)
     if analysis.summary["interrupted"]:
+        progress("report", 1, 1)
         notify(f"interrupted; what was finished is in {folder}")
         raise KeyboardInterrupt
     return analysis
@@ -220,13 +222,16 @@ def analyse(
     else:
         if inject:
             raise ConfigError(
-                "--inject adds particles to a landing movie: it needs an interferometric scheme "
-                "and neither --background nor background.frames"
+                f"inject = {inject}: particles are added to landing movies only, which have an "
+                'interferometric scheme and background.method = "sliding"; leave it out'
             )
         scene, found, image, further = _measured_background(
             movie, config, camera, clock, tell=tell, notify=notify, progress=progress
         )
     windows = found.windows
+    if found.interrupted:  # what was finished is now gathered and kept, which takes a moment
+        progress("report", 0, 1)
+    found = replace(found, table=with_systematic(config, found.table))
     summary = summary_of(scene, found.table, windows, clock.seconds)
     sampled = config.samples_posterior
     provenance = Provenance(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -33,15 +33,21 @@ LEAST_EVENTS = 10
 """Fewer are listed, not described."""
 
 SPECIES_COLUMNS = (
-    "mass_kda", "mass_se", "mass_low", "mass_high", "width_kda", "width_low", "width_high",
+    "mass_kda", "mass_se", "mass_low", "mass_high", "mass_systematic",
+    "width_kda", "width_low", "width_high",
     "fraction", "fraction_low", "fraction_high", "count", "count_low", "count_high",
-    "landing", "leaving", "efficiency", "count_corrected", "corrected_low", "corrected_high",
-    "outlier",
+    "landing", "leaving", "efficiency", "stay_frames",
+    "count_corrected", "corrected_low", "corrected_high", "outlier",
 )  # fmt: skip
-"""Columns of the table of species: intervals are 95 %, `fraction` and `count_corrected` are of the
+"""Columns of the table of species: `mass_se` is the statistical standard error, `mass_systematic`
+the error of the mass scale, 0 where none is known, and the interval of the mass holds both.
+`efficiency` is of particles that stay as long as the window; of those that stay `stay_frames` every
+other one is found (NaN where the window is not known, or where it is too short for that).
+Intervals are 95 %, `fraction` and `count_corrected` are of the
 particles that came, the other counts of those that were seen; `outlier` where these are fewer than
 `LEAST_SPECIES`."""
 
+_TWO_SIDED_95 = 1.959964
 _BROAD = 0.4  # width over mass
 _DIGITS = 6  # of the curves in summary.json
 
@@ -122,6 +128,8 @@ def describe(
     seed: int,
     branch: Branch = "magnitude",
     draws: int = 100,
+    scale_error: Callable[[FloatArray], FloatArray] | None = None,
+    window_frames: int | None = None,
 ) -> Distribution:
     """Describe a set of masses as a mixture of species.
 
@@ -141,6 +149,12 @@ def describe(
         Which events: |mass| of all, or one side.
     draws : int
         Simulated repetitions for the intervals; 0 for none.
+    scale_error : callable, optional
+        Gives the standard deviation of the mass scale at masses [kDa]; it is common to all events
+        and widens the intervals of the species' masses.
+    window_frames : int, optional
+        Frames that the search averages: the efficiency is that of particles that stay as long.  A
+        visitor of fewer frames d changes their mean by d/window_frames of its contrast only.
 
     Returns
     -------
@@ -155,7 +169,8 @@ def describe(
     Notes
     -----
     Intervals are the 2.5 and 97.5 % quantiles of the bootstrap, which draws the number of events
-    from its own Poisson distribution.
+    from its own Poisson distribution.  The error of the mass scale is added in quadrature to the
+    distance of these quantiles from the estimate.
     """
     mass, sigma = (np.asarray(v, dtype=np.float64).reshape(-1) for v in (masses, sigmas))
     if mass.shape != sigma.shape:
@@ -180,7 +195,8 @@ def describe(
     bic = [fit.bic(events.x.size) for fit in fits]
     best = fits[int(np.argmin(bic))].by_mass()
     repeats, support = bootstrap(events, best, draws=draws, least=LEAST_EVENTS, seed=seed)
-    species = _table(events, best, repeats, mass[usable] > 0)
+    scale = np.zeros(best.mean.shape) if scale_error is None else scale_error(best.mean)
+    species = _table(events, best, repeats, mass[usable] > 0, scale, window_frames)
     bandwidth = bandwidth_of(events, len(species))
     return Distribution(
         species=species,
@@ -200,14 +216,19 @@ def describe(
         branch=branch,
         draws=draws,
         seed=seed,
-        notes=(*notes, *_remarks(species)),
+        notes=(*notes, *_remarks(species), *_brief(species, window_frames)),
     )
 
 
 def _table(
-    events: Events, best: Mixture, repeats: Sequence[Repeat], lands: BoolArray
+    events: Events,
+    best: Mixture,
+    repeats: Sequence[Repeat],
+    lands: BoolArray,
+    scale: FloatArray,
+    window_frames: int | None,
 ) -> pd.DataFrame:
-    """Lay out the species, with intervals from the repetitions."""
+    """Lay out the species, with intervals from the repetitions and from the mass scale."""
     share = best.shares(events)
     seen = share.sum(axis=0)
 
@@ -228,8 +249,9 @@ def _table(
         {
             "mass_kda": best.mean,
             "mass_se": means.std(axis=0, ddof=1) if len(repeats) > 1 else math.nan,
-            "mass_low": mass_low,
-            "mass_high": mass_high,
+            "mass_low": mass_low - _widening(best.mean - mass_low, scale),
+            "mass_high": mass_high + _widening(mass_high - best.mean, scale),
+            "mass_systematic": scale,
             "width_kda": np.sqrt(best.variance),
             "width_low": width_low,
             "width_high": width_high,
@@ -242,6 +264,7 @@ def _table(
             "landing": share[lands].sum(axis=0),
             "leaving": share[~lands].sum(axis=0),
             "efficiency": best.chance(events).mean(axis=0),
+            "stay_frames": _stay(events, best, window_frames),
             "count_corrected": best.weight * best.arrived(events),
             "corrected_low": came_low,
             "corrected_high": came_high,
@@ -249,6 +272,20 @@ def _table(
         },
         columns=list(SPECIES_COLUMNS),
     )
+
+
+def _stay(events: Events, best: Mixture, window_frames: int | None) -> FloatArray:
+    """Frames that a particle of each species must stay to be found every other time."""
+    if window_frames is None or events.efficiency is None:
+        return np.full(best.mean.shape, math.nan)
+    frames = np.ceil(window_frames * events.efficiency.threshold_kda / best.mean)
+    return np.where(frames <= window_frames, np.maximum(frames, 1.0), math.nan)
+
+
+def _widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
+    """By how much an end of a 95 % interval moves when the error of the scale is added."""
+    reach = np.maximum(reach, 0.0)
+    return np.asarray(np.hypot(reach, _TWO_SIDED_95 * scale) - reach)
 
 
 def _remarks(species: pd.DataFrame) -> list[str]:
@@ -273,6 +310,21 @@ def _remarks(species: pd.DataFrame) -> list[str]:
         text.format(", ".join(f"{mass:.3g}" for mass in species["mass_kda"][which]))
         for which, text in cases
         if which.any()
+    ]
+
+
+def _brief(species: pd.DataFrame, window_frames: int | None) -> list[str]:
+    """Say for how long a particle must stay for its efficiency to be what the table says."""
+    known = species[np.isfinite(species["stay_frames"].to_numpy(dtype=float)) & ~species["outlier"]]
+    if window_frames is None or known.empty:
+        return []
+    stays = ", ".join(
+        f"{row.mass_kda:.3g} kDa from {row.stay_frames:.0f} frames" for row in known.itertuples()
+    )
+    return [
+        f"efficiencies and corrected counts are of particles that stay {window_frames} frames or "
+        f"longer; briefer visitors are missed more often and appear lighter: every other one is "
+        f"found of {stays}"
     ]
 
 
