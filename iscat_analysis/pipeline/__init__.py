@@ -23,7 +23,7 @@ from iscat_analysis.inference.likelihood import compile_kernels
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.background import measure_windows
-from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts
+from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts, refuse_ratio
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pipeline.diagnosis import (
     camera_warnings,
@@ -192,6 +192,7 @@ def analyse(
         config = config.model_copy(update={"particle": particle})
     shape = (movie.shape[1], movie.shape[2])
     camera = camera_from_config(config.camera, shape, movie.dtype)
+    refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
     hashing = ThreadPoolExecutor(1)
     digest = hashing.submit(movie.sha256)
     hashing.shutdown(wait=False)
