@@ -63,6 +63,10 @@ ComplexArray = NDArray[np.complex128]
 
 _SENSITIVITIES_KEPT = 4  # heights whose derivatives are at hand, some MB each
 
+PEAK_REACH = 4.0
+"""Distance, over λ/NA, up to which the peak contrast that a calibration is about is looked for: out
+of focus it lies on a ring, and a model made for a few pixels must have the scale of any other."""
+
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
 
@@ -499,6 +503,8 @@ def forward_model(
         this focus cannot give.
     """
     optics = config.optics
+    if config.calibration is not None:
+        reach_nm = max(reach_nm, PEAK_REACH * optics.wavelength_nm / optics.na)
     height = config.particle.height_nm
     matter = material(config.particle, optics.wavelength_nm)
     k = 2 * math.pi / optics.wavelength_nm

@@ -19,6 +19,8 @@ CENTRE = (PIXELS - 1) / 2 * 84.4
 LIGHT = 1e4
 FRAMES = 200
 SIGMAS = 5.0
+QUADRATURE = 1e-6
+"""Between models for fields of different size, which have different numbers of nodes."""
 
 OPTICS = ia.Optics(na=1.42, wavelength_nm=525, focus_nm=-500)
 CAMERA = ia.Camera(pixel_size_nm=84.4)
@@ -55,10 +57,20 @@ def test_images_of_arrays_are_those_of_numbers() -> None:
 
 
 def test_images_have_the_contrast_of_the_calibration() -> None:
-    fine = ia.Camera(pixel_size_nm=20.0)
+    fine = ia.Camera(pixel_size_nm=5.0)
     masses = np.array([100.0, 1000.0])
-    images = ia.psf(OPTICS, PROTEIN, fine, pixels=51, calibration=LINE, mass_kda=masses)
-    np.testing.assert_allclose(images.min(axis=(1, 2)), -3.1e-5 * masses, rtol=2e-3)
+    images = ia.psf(OPTICS, PROTEIN, fine, pixels=121, calibration=LINE, mass_kda=masses)
+    peak = np.take_along_axis(
+        images.reshape(2, -1), np.abs(images).reshape(2, -1).argmax(axis=1)[:, None], axis=1
+    )[:, 0]
+    np.testing.assert_allclose(peak, -3.1e-5 * masses, rtol=1e-3)
+
+
+def test_a_calibration_holds_for_regions_of_any_size() -> None:
+    """Out of focus the peak lies on a ring, which few pixels do not hold."""
+    many = ia.psf(OPTICS, PROTEIN, CAMERA, pixels=33, calibration=LINE)
+    few = ia.psf(OPTICS, PROTEIN, CAMERA, pixels=1, calibration=LINE)
+    assert few[0, 0] == pytest.approx(many[16, 16], rel=QUADRATURE)
 
 
 def test_right_and_down_are_positive() -> None:
@@ -230,12 +242,12 @@ def test_a_known_background_makes_the_same_fit_sharper() -> None:
 
 
 def test_a_level_that_is_not_told_is_fitted() -> None:
-    """The light gained 0.3 %: with a free level nothing happens, held at 1 the masses suffer."""
+    """The light gained 0.6 %: with a free level nothing happens, held at 1 the masses suffer."""
     before, after = _counts(12, seed=6)
-    after = np.random.default_rng(7).poisson(1.003 * after.astype(float))
+    after = np.random.default_rng(7).poisson(1.006 * after.astype(float))
     options = {"n_before": FRAMES, "n_after": FRAMES, "calibration": LINE}
     free = ia.fit_rois(before, after, OPTICS, PROTEIN, CAMERA, **options)
-    told = ia.fit_rois(before, after, OPTICS, PROTEIN, CAMERA, **options, power_ratio=1.003)
+    told = ia.fit_rois(before, after, OPTICS, PROTEIN, CAMERA, **options, power_ratio=1.006)
     held = ia.fit_rois(before, after, OPTICS, PROTEIN, CAMERA, **options, power_ratio=1.0)
     pulls = [((t["mass_kda"] - 1000) / t["sigma_mass_kda"]).mean() for t in (free, told, held)]
     assert max(abs(p) for p in pulls[:2]) < SIGMAS / math.sqrt(12)
@@ -343,9 +355,9 @@ def test_bounds_are_those_of_the_command(scheme: str, n_before: int) -> None:
     quantum = ia.qcrb(ia.Optics(**optics), gold, ia.Camera(**camera), **setup)
     both = ia.qcrb(ia.Optics(**optics), gold, ia.Camera(**camera), joint=True, **setup)
     for name in PARAMETERS:
-        assert float(found[name]) == pytest.approx(told["crb_joint"][name], rel=1e-6)
-        assert float(quantum[name]) == pytest.approx(told["qcrb"][name], rel=1e-9)
-        assert float(both[name]) == pytest.approx(told["qcrb_joint"][name], rel=1e-9)
+        assert float(found[name]) == pytest.approx(told["crb_joint"][name], rel=QUADRATURE)
+        assert float(quantum[name]) == pytest.approx(told["qcrb"][name], rel=QUADRATURE)
+        assert float(both[name]) == pytest.approx(told["qcrb_joint"][name], rel=QUADRATURE)
 
 
 def test_bounds_of_arrays_are_those_of_numbers() -> None:
