@@ -223,7 +223,7 @@ def analyse(
     else:
         if inject:
             raise ConfigError(
-                f"inject = {inject}: particles are added to landing movies only, which have an "
+                f"`inject` = {inject}: particles are added to landing movies only, which have an "
                 'interferometric scheme and background.method = "sliding"; leave it out'
             )
         scene, found, image, further = _measured_background(
@@ -298,8 +298,8 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
         before = None
     elif before is None:
         raise ConfigError(
-            "which frames come before the particles? give them as --background 0:200 "
-            'or background.frames, or a known level with background.method = "known"'
+            "which frames come before the particles? give them as "
+            'background.frames = [0, 200], or a known level with background.method = "known"'
         )
     start = before[1] if before else 0
     after = config.fit.frames or (start, movie.shape[0])

@@ -242,7 +242,7 @@ def test_impossible_settings(setting: str, expected: str, refused: Run, movie: P
 
 
 def test_gold_where_its_table_ends(refused: Run, movie: Path) -> None:
-    settings = ["--set", "particle.kind=gold", "--set", "optics.wavelength_nm=5000"]
+    settings = ["--set", "particle.kind=gold", "--set", "optics.wavelength_nm=2500"]
     line = refused(movie, *settings, "--set", "fit.roi_nm=3000", status=USAGE)
     assert "gold" in line
 
