@@ -114,8 +114,7 @@ def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
     flags : tuple of Status
         All of them, worst first, each once.
     """
-    noticed = set(flags) - {Status.OK}
-    ordered = tuple(status for status in SEVERITY if status in noticed)
+    ordered = tuple(sorted(set(flags) - {Status.OK}, key=SEVERITY.index))
     return (ordered[0] if ordered else Status.OK), ordered
 
 
