@@ -147,8 +147,7 @@ def mass(
     Writes calibration.json, calibration.toml (a section to paste) and calibration.html.
     """
     messages = Messages(context.command_path, quiet=quiet)
-    options = {"standards_kda": "--standards", "landing": "--landing"}
-    with failures(messages, debug=debug, options=options):
+    with failures(messages, debug=debug):
         masses, errors = _standards(standards)
 
         from iscat_analysis.pipeline.calibrations import mass_calibration

@@ -121,12 +121,12 @@ def plan(
     pixel_nm = camera.pixel_size_nm
     if pixel_nm is None:
         raise ConfigError(
-            "camera.pixel_size_nm is missing: give it, as in --set camera.pixel_size_nm=84.4"
+            "camera.pixel_size_nm is missing: give it, as in camera.pixel_size_nm = 84.4"
         )
     if isinstance(camera.read_noise_e, str):
         raise ConfigError(
             f"camera.read_noise_e = {camera.read_noise_e!r} is a map: bounds need a number, as in "
-            "--set camera.read_noise_e=1.5"
+            "camera.read_noise_e = 1.5"
         )
     half = at.pixels * pixel_nm / 2
     if max(abs(at.x_nm), abs(at.y_nm)) > half:

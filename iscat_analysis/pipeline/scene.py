@@ -287,6 +287,6 @@ def _is_counted(config: Config) -> bool:
 def _pixel_nm(config: Config) -> float:
     if config.camera.pixel_size_nm is None:
         raise ConfigError(
-            "camera.pixel_size_nm is needed: set it, as in --set camera.pixel_size_nm=84.4"
+            "camera.pixel_size_nm is needed: set it, as in camera.pixel_size_nm = 84.4"
         )
     return config.camera.pixel_size_nm
