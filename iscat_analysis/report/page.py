@@ -15,6 +15,7 @@ from iscat_analysis.report.context import report_context
 from iscat_analysis.report.distribution import distribution_section, species_figure
 from iscat_analysis.report.event_figures import corner_figures
 from iscat_analysis.report.figures import page_figures
+from iscat_analysis.report.headline import caution, is_uncalibrated
 from iscat_analysis.report.style import publish
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.schemas import jsonable
@@ -77,8 +78,10 @@ def render_report(analysis: Analysis, *, folder: Path | None = None) -> str:
         HTML.
     """
     table = event_table(analysis)
-    found = analysis.summary.get("distribution")
+    found = analysis.summary.get("distribution") if caution(table) is None else None
     species = distribution_section(jsonable(found)) if found else None
+    if species is not None and is_uncalibrated(analysis):
+        species["lead"] = f"On the model's own scale, which is not a mass. {species['lead']}"
     drawn = chain(
         page_figures(analysis, table),
         species_figure(jsonable(found)) if found else (),

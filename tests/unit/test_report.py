@@ -25,6 +25,7 @@ from iscat_analysis.report.numbers import number
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.schemas import jsonable
+from iscat_analysis.species import describe
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from report_factory import HOSTILE, make_analysis, without_events
@@ -240,6 +241,19 @@ def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: boo
     assert ("Median mass" in page) != silent
     assert (Status.POOR_FIT.advice in first) == silent
     assert "×10⁹" not in " ".join(headline(analysis, event_table(analysis)))
+
+
+def test_species_are_shown_for_fair_samples_only() -> None:
+    table = make_analysis(40).table
+    found = describe(
+        table["mass_kda"].to_numpy(), table["sigma_mass_kda"].to_numpy(), seed=1
+    ).to_dict()
+    for flagged, scale in ((0, "calibration"), (0, "absolute model"), (20, "calibration")):
+        analysis = with_flagged(make_analysis(40), flagged)
+        summary = {**analysis.summary, "distribution": found, "mass_scale": scale}
+        page = render_report(replace(analysis, summary=summary))
+        assert ('id="species"' in page) == (flagged == 0)
+        assert ("On the model&#39;s own scale" in page) == (scale == "absolute model")
 
 
 def test_side_lobes_are_no_events() -> None:
