@@ -11,6 +11,7 @@ The flow of a measurement, each step a name of this package::
     result.view(0)              # matplotlib Figure: data, model, residual
     result.posterior(0)         # arviz.InferenceData
     result.save("movie.iscat")  # report.html, fits.csv, fits.parquet, …
+    ia.calibrate_optics("movie.tif", config=setup)  # focus, aberrations… from the movie itself
     ia.compute_bounds(setup)    # what no estimate from such frames can beat
 
 `fit_movie` runs load → calibrate → background → detect → fit → posterior → bounds.  The modules of
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from iscat_analysis.movie import open_stack as open_stack
     from iscat_analysis.notebook import Bounds as Bounds
     from iscat_analysis.notebook import Result as Result
+    from iscat_analysis.notebook import calibrate_optics as calibrate_optics
     from iscat_analysis.notebook import compute_bounds as compute_bounds
     from iscat_analysis.notebook import fit_movie as fit_movie
     from iscat_analysis.notebook import simulate_movie as simulate_movie
@@ -57,6 +59,7 @@ _HOME = {
     "fit_movie": "notebook",
     "Result": "notebook",
     "simulate_movie": "notebook",
+    "calibrate_optics": "notebook",
     "compute_bounds": "notebook",
     "Bounds": "notebook",
     "Config": "config",
@@ -87,6 +90,7 @@ __all__ = [
     "Result",
     "Stack",
     "Status",
+    "calibrate_optics",
     "compute_bounds",
     "config_to_toml",
     "configure",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import html
 import textwrap
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,9 +18,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from iscat_analysis.bounds import bounds_report, parse_scan, scan
+from iscat_analysis.calibration.optics import OpticsCalibration
 from iscat_analysis.config import Config, configure
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.pipeline import analyse
+from iscat_analysis.pipeline.calibrations import optics_calibration
+from iscat_analysis.pipeline.microscope import calibrate_movie
 from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Progress, silent
 from iscat_analysis.report import check_output, write_report
 from iscat_analysis.report.headline import (
@@ -125,6 +128,63 @@ def fit_movie(
     if folder is not None:
         result.save(folder, overwrite=overwrite)
     return result
+
+
+def calibrate_optics(
+    movie: str | Path,
+    *,
+    config: str | Path | Mapping[str, Any] | Config | None = None,
+    settings: Mapping[str, Any] | Iterable[str] | None = None,
+    free: str | Sequence[str] | None = None,
+    focus_step_nm: float | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> OpticsCalibration:
+    """Learn the optics from a movie of particles; in memory, unless `out` names a folder.
+
+    Parameters
+    ----------
+    movie : str or Path
+        A landing movie, one with background frames, or a scan of the focus.
+    config : str, Path, mapping or Config, optional
+        As for `configure`: the microscope as far as it is known.
+    settings : mapping of str to Any, or iterable of str, optional
+        As for `configure`; they win over `config`.
+    free : str or sequence of str, optional
+        What may change, some of ``focus, na, phase, mask, zernike, polarization``; default all.
+    focus_step_nm : float, optional
+        The movie is a scan of immobile particles: rise of the focus from frame to frame [nm].
+    out : str or Path, optional
+        Folder for optics.toml, optics.json and optics.html.
+    overwrite : bool
+        Replace an earlier result in `out`.
+    progress : Progress
+        Called with the stage and the steps done and in all.
+
+    Returns
+    -------
+    OpticsCalibration
+        Its `config` holds the measured optics, unless they are refused.
+
+    Raises
+    ------
+    DataError
+        The movie shows too few bright particles, or `out` may not be written.
+    ConfigError
+        A setting is unknown or impossible, or cannot be calibrated.
+    """
+    resolved, path = configure(config, settings=settings), Path(movie)
+    folder = _path(out)
+    if folder is not None:
+        return optics_calibration(
+            path, resolved, folder, free=free, focus_step_nm=focus_step_nm, overwrite=overwrite,
+            progress=progress,
+        )  # fmt: skip
+    with open_stack(path) as stack:
+        return calibrate_movie(
+            stack, resolved, free=free, focus_step_nm=focus_step_nm, progress=progress
+        )
 
 
 def simulate_movie(

@@ -153,10 +153,10 @@ class Likelihood:
         inside = self.supports(points)
         out = np.full(len(points), -np.inf)
         if inside.all():
-            value_batch(*self._arguments, points, out)
+            value_batch(self._table(points[:, 2]), *self._arguments, points, out)
         elif inside.any():
             known = np.empty(int(inside.sum()))
-            value_batch(*self._arguments, points[inside], known)
+            value_batch(self._table(points[inside, 2]), *self._arguments, points[inside], known)
             out[inside] = known
         out[np.isnan(out)] = -np.inf  # an amplitude so large that the light overflows
         return out
@@ -217,7 +217,7 @@ class Likelihood:
             return -np.inf, np.full(5, np.nan), np.full((5, 5), np.nan)
         score, fisher = np.empty(5), np.empty((5, 5))
         profile = self.model.profile(point[2])
-        value = score_pass(profile, *self._arguments[1:], point, score, fisher)
+        value = score_pass(profile, *self._arguments, point, score, fisher)
         return value, score, fisher
 
     def maximize(
@@ -265,8 +265,19 @@ class Likelihood:
         score, fisher = np.empty(5), np.empty((5, 5))
         wavelength = self.model.optics.wavelength_nm
         max_step = np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, np.inf, 1.0])
+        table = self.model.axial_table if free[2] else self.model.height_table(theta[2])
         value, used, outcome = maximize(
-            *self._arguments, free, lower, upper, max_step, tolerance, passes, theta, score, fisher
+            table,
+            *self._arguments,
+            free,
+            lower,
+            upper,
+            max_step,
+            tolerance,
+            passes,
+            theta,
+            score,
+            fisher,
         )
         return Optimum(theta, value, used, outcome == CONVERGED, fisher)
 
@@ -300,7 +311,10 @@ class Likelihood:
         inside = self.supports(points)
         known = heights[inside]
         found, refitted = np.empty(known.size), np.empty(known.size)
-        scan_heights(*self._arguments, known, amplitude_range or (0.0, 0.0), point, found, refitted)
+        scan_heights(
+            self.model.axial_table, *self._arguments, known, amplitude_range or (0.0, 0.0), point,
+            found, refitted,
+        )  # fmt: skip
         values, amplitudes = np.full(heights.size, -np.inf), np.full(heights.size, np.nan)
         values[inside], amplitudes[inside] = found, refitted
         return values, amplitudes
@@ -455,11 +469,16 @@ class Likelihood:
             f"{self.model.reach_nm:.0f} nm from the particle to the farthest pixel"
         )
 
+    def _table(self, heights_nm: FloatArray) -> AxialTable:
+        """Profiles along z, or at the one height that is asked for."""
+        first = float(heights_nm[0])
+        single = bool(np.all(heights_nm == first))
+        return self.model.height_table(first) if single else self.model.axial_table
+
     @property
-    def _arguments(self) -> tuple[AxialTable, Lens, Pixels, int, FloatArray]:
-        """What every scoring kernel takes first."""
-        model = self.model
-        return model.axial_table, model.lens, model.pixels(self.grid), self.kind, self.data
+    def _arguments(self) -> tuple[Lens, Pixels, int, FloatArray]:
+        """What every scoring kernel takes after the profiles."""
+        return self.model.lens, self.model.pixels(self.grid), self.kind, self.data
 
 
 def conditional(

@@ -61,7 +61,7 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_SENSITIVITIES_KEPT = 4  # heights whose derivatives are at hand, some MB each
+_TABLES_KEPT = 4  # heights whose derivatives or tables are at hand, some MB each
 
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
@@ -161,6 +161,25 @@ class ForwardModel:
     def axial_table(self) -> AxialTable:
         """Profiles at the heights of `z_range_nm`, for the kernels that interpolate along z."""
         return axial_table(self.wave, self.z_range_nm)
+
+    def height_table(self, z_nm: float) -> AxialTable:
+        """Profiles at one height, in the form of `axial_table`; the last few are kept.
+
+        Parameters
+        ----------
+        z_nm : float
+            Height [nm].
+
+        Returns
+        -------
+        AxialTable
+            For kernels that stay at this height.
+        """
+        return self._height_tables(z_nm)
+
+    @cached_property
+    def _height_tables(self) -> Callable[[float], AxialTable]:
+        return lru_cache(_TABLES_KEPT)(lambda z_nm: axial_table(self.wave, (z_nm, z_nm)))
 
     def image(
         self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
@@ -341,7 +360,7 @@ class ForwardModel:
                 z_nm, names, rho=self.rho, reach_nm=self.reach_nm,
             )  # fmt: skip
 
-        return lru_cache(_SENSITIVITIES_KEPT)(at)
+        return lru_cache(_TABLES_KEPT)(at)
 
     def field(
         self, dx_nm: FloatArray, dy_nm: FloatArray, z_nm: float, mass_kda: float

@@ -113,8 +113,10 @@ def fit_field(
         events = _without_doubles(events, scene)
         events = _fit_all(scene, windows, [e.candidate for e in events], events, pool)
         windows = _refined(scene, windows, events)
-    events = [e for e in events if e.snr > scene.templates.threshold and _wanted(scene, e)]
-    events = _judged(scene, windows, events)
+    kept = [e for e in events if e.snr > scene.templates.threshold and _wanted(scene, e)]
+    if 0 < len(kept) < len(events):  # what is dropped must leave its neighbours' background too
+        kept = _fit_all(scene, windows, [e.candidate for e in kept], kept, pool)
+    events = _judged(scene, windows, kept)
     progress("detect", MAX_ROUNDS, MAX_ROUNDS)
     return tuple(sorted(events, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
 
