@@ -178,9 +178,14 @@ def _is_flagged(row: Mapping[str, Any]) -> bool:
 def _advise(messages: Messages, flagged: Sequence[Mapping[str, Any]]) -> None:
     from iscat_analysis.records import Status
 
-    for status, count in Counter(str(row["status"]) for row in flagged).most_common():
-        if status != Status.OK:
-            messages.notify(f"{count} {status}: {Status(status).advice}")
+    remarks = Counter(
+        remark
+        for row in flagged
+        for remark in {str(row["status"]), *str(row["flags"] or "").split(";")}
+    )
+    for status in Status:
+        if status != Status.OK and remarks[status.value]:
+            messages.notify(f"{remarks[status.value]} {status}: {status.advice}")
 
 
 def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: Path) -> None:

@@ -76,6 +76,25 @@ def known_keys(location: list[str]) -> list[str]:
     return list(model.model_fields)
 
 
+def section_name(model: type) -> tuple[str, ...]:
+    """Name the section that a class describes.
+
+    Parameters
+    ----------
+    model : type
+        Of a section.
+
+    Returns
+    -------
+    tuple of str
+        Its name in a configuration; empty where it has none.
+    """
+    for name, field in Config.model_fields.items():
+        if model in (field.annotation, *get_args(field.annotation)):
+            return (name,)
+    return ()
+
+
 def model_of(annotation: Any) -> type[Section]:
     """Give the section of an annotation that may be None.
 

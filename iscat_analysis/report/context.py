@@ -17,6 +17,7 @@ from iscat_analysis.report.headline import (
     caution,
     counted,
     headline,
+    is_uncalibrated,
     label_of,
     main_quantity,
     precision_of,
@@ -24,13 +25,17 @@ from iscat_analysis.report.headline import (
     quantiles,
     sizes,
 )
-from iscat_analysis.report.numbers import UNITS, count, decimals_for, fixed, number, percent
+from iscat_analysis.report.numbers import LABELS, UNITS, count, decimals_for, fixed, number, percent
 
 _MODES = {
     "mass": "position and mass, height fixed",
     "localize": "position in three dimensions, mass fixed",
     "joint": "position in three dimensions and mass",
     "track": "position and mass in every frame, linked into tracks",
+}
+_SIGNS = {
+    "mass_kda": "Negative masses are particles that leave.",
+    "contrast": "Dark particles that land, and bright ones that leave, have negative contrast.",
 }
 _SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "Dark field"}
 
@@ -77,6 +82,7 @@ def report_context(
         "figures": figures,
         "histogram": next((name for name in figures if name.endswith("_histogram")), None),
         "main_label": main_quantity(analysis).label.capitalize(),
+        "signs": _SIGNS.get(main_quantity(analysis).column),
         "events": event_rows(analysis, table),
         "images": {str(row): list(packed) for row, packed in images.items()},
         "embedding_note": f"To keep this page small it holds the images of the first {len(images)} "
@@ -131,18 +137,24 @@ def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
     )
     name = "mass_kda" if "mass_kda" in FREE_PARAMETERS[analysis.mode] else "z_nm"
     if (p := precision_of(table, name)).events:
-        label, unit = label_of(analysis, name), UNITS[name]
+        label, unit = LABELS[name], UNITS[name]
+        said = (
+            f"σ {number(p.sigma)}, CRB {number(p.crb)} {unit}",
+            f", QCRB {number(p.qcrb)} {unit}",
+        )
+        if is_uncalibrated(analysis):
+            label, said = "contrast", ("median of the events' own ratios", "")
         tiles += [
             {
                 "label": f"Spread of {label} over its CRB",
                 "value": number(p.over_crb),
                 "unit": "×",
-                "note": f"σ {number(p.sigma)}, CRB {number(p.crb)} {unit}",
+                "note": said[0],
             },
             {
                 "label": f"Information on {label} used",
                 "value": percent(p.information),
-                "note": f"(QCRB / CRB)², QCRB {number(p.qcrb)} {unit}",
+                "note": f"(QCRB / CRB)²{said[1]}",
             },
         ]
     return tiles

@@ -26,7 +26,7 @@ from report_factory import summary_of
 from iscat_analysis.config import Mode as ConfigMode
 from iscat_analysis.config import load_config
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.records import EVENT_COLUMNS
+from iscat_analysis.records import EVENT_COLUMNS, Status
 from iscat_cli import main, main_fit
 from iscat_cli.app import COMMANDS
 from iscat_cli.options import Mode
@@ -135,7 +135,17 @@ def test_the_table_is_short_and_plain(library, capsys) -> None:
         assert cell in first
     assert "at_bound" in second
     assert last == "2 events: 1 ok, 1 at_bound; results in movie.iscat"
-    assert "1 at_bound: A parameter lies on its bound" in captured.err
+    assert f"1 at_bound: {Status.AT_BOUND.advice}" in captured.err
+
+
+def test_every_remark_is_explained(library, capsys) -> None:
+    """A status hides no other: what is said beside it is counted and explained too."""
+    both = _row(0, "poor_fit", "poor_fit;saturated")
+    library(_returning(_analysis(both, _row(1, "saturated", "saturated"))))
+    assert main_fit(["movie.tif"]) == 0
+    told = capsys.readouterr().err
+    assert f"1 poor_fit: {Status.POOR_FIT.advice}" in told
+    assert f"2 saturated: {Status.SATURATED.advice}" in told
 
 
 def test_without_calibration_contrasts_are_printed(library, capsys) -> None:
