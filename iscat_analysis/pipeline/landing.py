@@ -26,7 +26,6 @@ from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
-from iscat_analysis.movie.metadata import diagnose_gain
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.pipeline.chunks import (
     FRAME_COLUMN,
@@ -35,8 +34,8 @@ from iscat_analysis.pipeline.chunks import (
     Frames,
     Merged,
     Reader,
-    choose_windows,
     counts_budget,
+    judge_noise,
     plan_chunks,
 )
 from iscat_analysis.pipeline.diagnosis import DRIFT_PX
@@ -56,8 +55,6 @@ POSTERIORS = 20
 
 JUMP = 0.1
 """Relative change of the light from one frame to the next that is reported."""
-
-_GAIN_FRAMES = 64
 
 Tell = Callable[[str], None]
 
@@ -173,7 +170,10 @@ def analyse_landings(
         )
     reader = Reader(movie, camera, first, last, counts_budget(config))
     with ThreadPoolExecutor(config.compute.workers) as pool:
-        curve, window = choose_windows(reader, config, pool.map)
+        noise = judge_noise(reader, config, pool.map)
+    curve, window = noise.curve, noise.window
+    if noise.gain_message:
+        tell(noise.gain_message)
     stride = max(1, window // STRIDES)
     count = max(math.ceil((last - first) / stride) - 1, 1)
     posterior = _posterior_wanted(config)
@@ -192,7 +192,7 @@ def analyse_landings(
                 if done is None:
                     chunk = reader.chunk(span, stride, pool)
                     budget = POSTERIORS - merged.sampled if posterior else 0
-                    done = _analyse_chunk(scene, chunk, core, window, pool, budget)
+                    done = _analyse_chunk(scene, chunk, core, window, pool, budget, noise.gain_message)
                     store.save(number, done)
                 merged.add(done)
                 progress("landing", core[1] - first, last - first)
@@ -212,9 +212,6 @@ def analyse_landings(
             "background.power_normalization = false has no effect on a landing movie: each frame "
             "is weighed by its own light"
         )
-    message = merged.gain_message
-    if message:
-        tell(message)
     found = table["mass_kda"] < 0
     summary = {
         "window_frames": window,
@@ -383,10 +380,11 @@ def _analyse_chunk(
     window: int,
     pool: ThreadPoolExecutor,
     posteriors: int,
+    gain_message: str,
 ) -> Done:
     wanted = scene.config.background.drift_correction
     trajectory = follow(chunk, pool.map) if wanted else None
-    fitter = ChunkFitter(scene, chunk, window, pool, trajectory)
+    fitter = ChunkFitter(scene, chunk, window, pool, trajectory, gain_message=gain_message)
     seam = max(2, window // STRIDES)
     steps = fitter.run((core[0] - seam, core[1] + seam))
     rows = list(pool.map(_row, range(len(steps)), steps))
@@ -416,10 +414,6 @@ def _analyse_chunk(
     table[FRAME_COLUMN] = [s.step.at.half_width for s in steps]
     inside = slice(core[0] - chunk.first, core[1] - chunk.first)
     light = np.where(chunk.good, chunk.power, np.nan) * float(chunk.mean_e.mean())
-    message = ""
-    used = chunk.counts[chunk.good][:_GAIN_FRAMES] if core[0] == chunk.first else chunk.counts[:0]
-    if len(used) >= 2:
-        message = diagnose_gain(used, chunk.camera, masked=~chunk.usable).message or ""
     return Done(
         core=core,
         table=table,
@@ -430,7 +424,6 @@ def _analyse_chunk(
         saturated=chunk.saturated,
         strongest=fitter.strongest,
         ends_e=_ends(chunk, inside),
-        gain_message=message,
         sampled=sampled,
         stopped=stopped,
         trajectory=trajectory,

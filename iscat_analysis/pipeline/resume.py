@@ -88,7 +88,6 @@ class Store:
                     saturated=data["saturated"],
                     strongest=data["strongest"],
                     ends_e=data["ends_e"],
-                    gain_message=str(data["gain_message"]),
                     trajectory=_trajectory(data["trajectory"]),
                 )
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
@@ -119,7 +118,6 @@ class Store:
                     saturated=done.saturated,
                     strongest=done.strongest,
                     ends_e=done.ends_e,
-                    gain_message=np.array(done.gain_message),
                     trajectory=_columns(done.trajectory),
                 )
             building.replace(path)

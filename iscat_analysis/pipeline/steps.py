@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from iscat_analysis.errors import DataError
 from iscat_analysis.inference.fit import POOR_FIT_P, fit_particle, search_box, start_theta
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pipeline.bias import unbiased
@@ -39,6 +40,7 @@ from iscat_analysis.records import (
     Windows,
 )
 from iscat_analysis.search.sliding import (
+    NORMAL_QUARTILE,
     STRIDES,
     Chunk,
     Filter,
@@ -52,6 +54,13 @@ from iscat_analysis.search.sliding import (
 
 ROUNDS = 6
 """Searches at most; each takes what was found so far off the contrast."""
+
+FLOOD = 1000
+"""Candidates in a chunk beyond which the noise is looked at before they are fitted."""
+
+FLOOD_SPREAD = 1.2
+"""Spread of the signal-to-noise ratio over the field, 1 where the noise is as expected, from which
+so many candidates are noise."""
 
 _SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
 _SIDELOBE = 0.5  # of a stronger peak, below which a peak in its region waits for the next round
@@ -104,6 +113,8 @@ class ChunkFitter:
         Runs the fits; the result does not depend on its size.
     trajectory : Trajectory, optional
         Of the fixed pattern, whose motion is then divided out.
+    gain_message : str
+        What is known of a wrong gain, for the line that says why a search was given up.
 
     Attributes
     ----------
@@ -121,7 +132,10 @@ class ChunkFitter:
         window: int,
         pool: ThreadPoolExecutor,
         trajectory: Trajectory | None = None,
+        *,
+        gain_message: str = "",
     ) -> None:
+        self._gain_message = gain_message
         pattern = MovingPattern(chunk, trajectory, pool.map) if trajectory else None
         chunk = pattern.chunk if pattern else chunk
         self._scene = scene
@@ -230,6 +244,8 @@ class ChunkFitter:
             frames = np.maximum(effective[where], 1e-9)
             self.strongest = np.stack([np.abs(best), best / np.sqrt(frames * matched.norm)])
         peaks = find_steps(chunk, matched, snr, effective, scene.templates.threshold)
+        if not steps and len(peaks) > FLOOD:
+            self._refuse_flood(snr, len(peaks))
         fresh: list[Peak] = []
         taller: list[Peak] = []
         for peak in peaks:
@@ -239,6 +255,21 @@ class ChunkFitter:
             if not waits and not any(self._is_residue(step, peak) for step in steps):
                 fresh.append(peak)
         return [self._begin(peak) for peak in fresh]
+
+    def _refuse_flood(self, snr: MapArray, candidates: int) -> None:
+        """Give up where noise itself passes the threshold; many true steps are no reason to."""
+        spread = float(np.median(np.abs(snr[:, ::4, ::4]))) / NORMAL_QUARTILE
+        if spread < FLOOD_SPREAD:
+            return
+        chunk = self._chunk
+        cause = self._gain_message or (
+            "the light flickers or the fixed pattern moves: look at the laser, set "
+            "background.drift_correction = true, or shorten background.window_frames"
+        )
+        raise DataError(
+            f"{candidates} places in frames {chunk.first}:{chunk.stop} pass the detection threshold "
+            f"because the noise there is {spread**2:.2g} times what was expected; {cause}"
+        )
 
     def _shadows(self, one: Peak, peak: Peak) -> bool:
         """Whether a peak may be nothing but the side lobe of a stronger one."""

@@ -12,6 +12,7 @@ from iscat_analysis.search.sliding.frames import Chunk, Patch, make_chunk, measu
 from iscat_analysis.search.sliding.noise import (
     LONGEST_WINDOW,
     MOVIE_SHARE,
+    NORMAL_QUARTILE,
     SHORTEST_MOVIE,
     SHORTEST_WINDOW,
     SHOT_LIMITED,
@@ -34,6 +35,7 @@ __all__ = [
     "CREDIBLE",
     "LONGEST_WINDOW",
     "MOVIE_SHARE",
+    "NORMAL_QUARTILE",
     "SHORTEST_MOVIE",
     "SHORTEST_WINDOW",
     "SHOT_LIMITED",

@@ -28,7 +28,8 @@ SHOT_LIMITED = 1.2
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
 _ROWS = 16  # on which the noise is measured
-_NORMAL_QUARTILE = 0.6744897501960817
+NORMAL_QUARTILE = 0.6744897501960817
+"""Median magnitude of a standard normal number."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,7 @@ def measure_noise(
         contrast = after / (power * before) - 1
         variance = (before + n * read[lit]) / before**2 + (after + n * read[lit]) / after**2
         deviation = float(np.median(np.abs(contrast) / np.sqrt(variance)))
-        return (deviation / _NORMAL_QUARTILE) ** 2
+        return (deviation / NORMAL_QUARTILE) ** 2
 
     lengths = sorted({*_LENGTHS[:-1], max(longest, 1)})
     lengths = [n for n in lengths if n <= longest and 2 * n <= len(strip)]
