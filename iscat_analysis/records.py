@@ -66,6 +66,7 @@ class Status(StrEnum):
     POOR_FIT = "poor_fit"
     TOO_CLOSE = "too_close"
     SATURATED = "saturated"
+    SIDELOBE = "sidelobe"
 
     @property
     def advice(self) -> str:
@@ -82,6 +83,8 @@ _ADVICE = {
     Status.POOR_FIT: "The model does not describe the data: check focus, NA, gain and neighbours.",
     Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
     "treat the mass as shared between them.",
+    Status.SIDELOBE: "Not larger than what the model leaves over of the brighter particle beside it: not "
+    "counted; calibrate the optics (focus, NA, aberrations) to tell whether it is a particle.",
     Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
 }
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter
 from scipy.special import jv
 
 FloatArray = NDArray[np.float64]
@@ -187,9 +188,8 @@ class InstrumentMovie:
         frames, rows, columns = shape
         y, x = np.arange(rows) * pixel_nm, np.arange(columns) * pixel_nm
         pictures = Pictures(instrument)
-        light = level_e * (
-            1 + 0.03 * np.sin(2 * np.pi * x / 3100.0) + 0.02 * np.cos(2 * np.pi * y / 2300.0)[:, None]
-        )
+        rough = gaussian_filter(rng.standard_normal((rows, columns)), 3.0, mode="wrap")
+        light = level_e * (1 + 0.05 * rough / rough.std())
         order = np.argsort(landings.frame)
         counts = np.empty(shape, dtype=np.uint16)
         expected = light.copy()

@@ -57,6 +57,8 @@ class Step:
         Latest estimate.
     snr : float
         √(2 Δℓ) of it against no particle, with the neighbours in place.
+    excess : float
+        χ² that its best fit left above the expected; 0 where that may be noise.
     """
 
     sign: int
@@ -67,6 +69,7 @@ class Step:
     slopes: FloatArray = field(default_factory=lambda: np.empty((5, 0, 0)))
     theta: FloatArray | None = None
     snr: float = math.inf
+    excess: float = 0.0
 
 
 class Neighbours:

@@ -18,6 +18,7 @@ import numpy as np
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.fit import POOR_FIT_P, fit_particle, search_box, start_theta
+from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pipeline.bias import unbiased
 from iscat_analysis.pipeline.field import Event
@@ -54,6 +55,17 @@ from iscat_analysis.search.sliding import (
 
 ROUNDS = 6
 """Searches at most; each takes what was found so far off the contrast."""
+
+EXCEEDS = 1.5
+"""Times the next largest peak on its ring around a brighter particle that a particle must have."""
+
+EXPLAINS = 0.5
+"""Share of a brighter particle's χ² in excess that a particle in its region must explain."""
+
+EXCESS_SIGMAS = 3.0
+_LISTED = 0.7  # of what a particle would need, below which a peak is not even listed
+RING_PX = 2.0
+PATCH_PX = 5.0
 
 FLOOD = 1000
 """Candidates in a chunk beyond which the noise is looked at before they are fitted."""
@@ -149,6 +161,7 @@ class ChunkFitter:
         self._tasks = TaskBuilder(scene, chunk, window, self._neighbours, pattern)
         self._stride = int(chunk.edges[1] - chunk.edges[0])
         self._maps: tuple[MapArray, FloatArray] | None = None
+        self._doubtful: list[Peak] = []
         self._near: list[list[Step]] = []  # steps that each of the maps knows of
         self.strongest = np.zeros((2, *chunk.shape))
         self.rounds = 0
@@ -196,13 +209,15 @@ class ChunkFitter:
             steps = credible
         if not steps:
             return []
-        seen, _ = self._neighbours.of(steps)
+        lobes = [self._begin(peak) for peak in self._doubtful]
+        everything = steps + lobes
+        seen = [[k for k in near if k < len(steps)] for near in self._neighbours.of(everything)[0]]
         # steps of the other polarity are fitted too: their rings have the one that is reported
         sign = reported_steps(self._scene)
         own = [
-            i for i, s in enumerate(steps) if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
+            i for i, s in enumerate(everything) if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
         ]
-        found = self._pool.map(lambda i: self._finish(i, steps, seen), own)
+        found = self._pool.map(lambda i: self._finish(i, everything, seen, lobe=i >= len(steps)), own)
         fitted = [f for f in found if f is not None]
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
 
@@ -247,14 +262,59 @@ class ChunkFitter:
         if not steps and len(peaks) > FLOOD:
             self._refuse_flood(snr, len(peaks))
         fresh: list[Peak] = []
+        doubtful: list[Peak] = []
         taller: list[Peak] = []
         for peak in peaks:
             # one that waits casts its shadow too, or its rings would be taken for particles
             waits = any(self._shadows(p, peak) for p in taller)
             taller.append(peak)
-            if not waits and not any(self._is_residue(step, peak) for step in steps):
+            if waits or any(self._is_residue(step, peak) for step in steps):
+                continue
+            size = max((self._misfit(step, peak, steps, snr) for step in steps), default=0.0)
+            if abs(peak.snr) > size:
                 fresh.append(peak)
+            elif abs(peak.snr) > _LISTED * size:
+                doubtful.append(peak)
+        self._doubtful = doubtful
         return [self._begin(peak) for peak in fresh]
+
+    def _misfit(
+        self, step: Step, peak: Peak, steps: Sequence[Step], snr: MapArray
+    ) -> float:
+        """Signal-to-noise ratio that a peak beside a step must exceed not to be what its fit left.
+
+        A second particle fills a part of the ring around the step on which it lies, and explains
+        most of the χ² in excess there; a misfit has other peaks on that ring, as large.
+        """
+        if not self._meet(step, peak):
+            return 0.0
+        x0, y0 = step.start.x_px, step.start.y_px
+        distance = math.hypot(peak.x_px - x0, peak.y_px - y0)
+        if distance > LARGEST_IMAGE * self._roi_px:
+            return 0.0
+        # a window that holds the step only in part sees that part of the misfit
+        part = max(1 - abs(step.at.frame - peak.frame) / self._window, 0.0)
+        whole = part * math.sqrt(EXPLAINS * step.excess) if distance < self._roi_px / 2 else 0.0
+        far = distance + 2 * RING_PX
+        (top, bottom), (left, right) = (
+            (max(math.floor(c - far), 0), min(math.ceil(c + far) + 1, n))
+            for c, n in zip((y0, x0), self._chunk.shape, strict=True)
+        )
+        y, x = np.mgrid[top:bottom, left:right]
+        away = np.hypot(y - y0, x - x0)
+        ring = np.abs(away - max(distance, RING_PX)) < RING_PX
+        y, x, away = y[ring], x[ring], away[ring]
+        own = np.hypot(y - peak.y_px, x - peak.x_px) > PATCH_PX
+        for other in steps:  # what is nearer to another step is what that one's fit left over
+            if other is not step and self._meet(other, peak):
+                own &= np.hypot(y - other.start.y_px, x - other.start.x_px) > away
+        j = round((peak.frame - self._chunk.first) / self._stride) - 1
+        largest = float(np.abs(snr[j, y[own], x[own]]).max(initial=0.0))
+        return max(whole, EXCEEDS * largest)
+
+    def _meet(self, step: Step, peak: Peak) -> bool:
+        """Whether a step is seen at the boundary of a peak."""
+        return abs(step.at.frame - peak.frame) <= (self._strides + 1) * self._stride
 
     def _refuse_flood(self, snr: MapArray, candidates: int) -> None:
         """Give up where noise itself passes the threshold; many true steps are no reason to."""
@@ -278,7 +338,7 @@ class ChunkFitter:
         if apart > reach + self._stride:
             return False
         dx, dy = abs(one.x_px - peak.x_px), abs(one.y_px - peak.y_px)
-        if apart < reach and math.hypot(dx, dy) < self._roi_px / 6:
+        if apart < reach and math.hypot(dx, dy) < self._roi_px / 3:
             return True
         far = max(dx, dy) >= self._roi_px
         if far and max(dx, dy) >= LARGEST_IMAGE * self._roi_px:
@@ -287,7 +347,7 @@ class ChunkFitter:
 
     def _is_residue(self, step: Step, peak: Peak) -> bool:
         """Whether a peak may be what a fitted step left over: the model is never quite right."""
-        if abs(step.at.frame - peak.frame) > (self._strides + 1) * self._stride:
+        if not self._meet(step, peak):
             return False
         start = step.start
         distance = math.hypot(start.x_px - peak.x_px, start.y_px - peak.y_px)
@@ -343,7 +403,10 @@ class ChunkFitter:
             )
             snr = math.sqrt(2 * max(best.log_likelihood, 0.0))
             return self._neighbours.drawn(
-                replace(step, at=task.at, start=moved, theta=best.theta, snr=snr)
+                replace(
+                    step, at=task.at, start=moved, theta=best.theta, snr=snr,
+                    excess=_excess(likelihood, best.theta),
+                )  # fmt: skip
             )
 
         improved = list(steps)
@@ -357,7 +420,7 @@ class ChunkFitter:
         return "mass" if "mass_kda" in FREE_PARAMETERS[self._scene.mode] else "localize"
 
     def _finish(
-        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]]
+        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]], *, lobe: bool
     ) -> FittedStep | None:
         """Fit a step for good and judge it."""
         scene, step = self._scene, steps[index]
@@ -372,7 +435,7 @@ class ChunkFitter:
         fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=True)
         if fit.mass_kda <= 0 and "mass_kda" in fit.free:
             return None
-        fit = _judged(scene, unbiased(likelihood, fit), task)
+        fit = _judged(scene, unbiased(likelihood, fit), task, lobe=lobe)
         pixel = scene.pixel_nm
         fit = replace(fit, x_nm=fit.x_nm - x_px * pixel, y_nm=fit.y_nm - y_px * pixel)
         local = Region(
@@ -399,19 +462,27 @@ class ChunkFitter:
         return kept
 
 
-def _judged(scene: Scene, fit: FitResult, task: Task) -> FitResult:
+def _judged(scene: Scene, fit: FitResult, task: Task, *, lobe: bool) -> FitResult:
     """Add the verdicts that need the neighbourhood."""
     rows, columns = np.nonzero(task.windows.saturated)
     dx = (columns + task.region.columns[0]) * scene.pixel_nm - fit.x_nm
     dy = (rows + task.region.rows[0]) * scene.pixel_nm - fit.y_nm
     poor = Status.POOR_FIT in fit.flags or task.at.p_constant < POOR_FIT_P
     flags = [
+        *([Status.SIDELOBE] if lobe else []),
         *([Status.SATURATED] if np.any(np.hypot(dx, dy) < _SATURATION_NM) else []),
         *(f for f in fit.flags if f != Status.POOR_FIT),
         *([Status.TOO_CLOSE] if task.crowded else []),
         *([Status.POOR_FIT] if poor else []),
     ]
     return replace(fit, status=Status(flags[0]) if flags else Status.OK, flags=tuple(flags))
+
+
+def _excess(likelihood: Likelihood, theta: FloatArray) -> float:
+    """χ² above its expectation, 0 unless it stands out of its scatter."""
+    n = likelihood.n_pixels
+    excess = float(np.nansum(likelihood.residuals(theta) ** 2)) - n
+    return excess if excess > EXCESS_SIGMAS * math.sqrt(2 * n) else 0.0
 
 
 def _ids(steps: Sequence[Step]) -> set[int]:
