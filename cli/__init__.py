@@ -6,8 +6,10 @@ so that ``--help`` and shell completion stay quick; and `app` itself only once C
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
+import sys
 from collections.abc import Sequence
 
 __all__ = ["main", "main_fit"]
@@ -65,5 +67,15 @@ def _start(program: str, arguments: Sequence[str] | None) -> int:
         if arguments is None:  # the process ends; looking through what is left takes half a second
             gc.freeze()
     except KeyboardInterrupt:  # before a command began or after it ended
-        return INTERRUPTED
+        status = INTERRUPTED
+    if status == INTERRUPTED and arguments is None:
+        _end()
     return status
+
+
+def _end() -> None:
+    """End the process without waiting for threads that are still at work."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            stream.flush()
+    os._exit(INTERRUPTED)

@@ -86,7 +86,7 @@ def benchmark(
             )
         write_benchmark(study, out, overwrite=overwrite)
         if as_json:
-            print_json(study)
+            print_json("benchmark", study)
         else:
             print_result(benchmark_table(study))
             print_result(f"report: {out / 'benchmark.html'}")

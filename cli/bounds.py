@@ -168,7 +168,7 @@ def bounds(
             write_bounds(report, out, overwrite=overwrite, **along)
             messages.notify(f"wrote {out}")
         if as_json:
-            print_json(report)
+            print_json("bounds", report)
             return
         _print(report)
 
@@ -277,7 +277,7 @@ def _paper(messages: Messages, out: Path, *, overwrite: bool, as_json: bool) -> 
     )
     messages.notify(f"wrote {out}; open {out / 'comparison.html'}")
     if as_json:
-        print_json({"table_1": found.table.to_dict("records")})
+        print_json("comparison", {"table_1": found.table.to_dict("records")})
         return
     table = _table("quantum bound of one photon")
     names = ("printed", "authors", "dong2021", "exact", "reciprocal")

@@ -99,7 +99,7 @@ def camera(
                 notify=messages.notify,
             )
         if as_json:
-            print_json({**found.to_dict(), "out": str(folder)})
+            print_json("camera", {**found.to_dict(), "out": str(folder)})
         else:
             _print_camera(found)
         messages.notify(f"wrote {folder}; open {folder / 'camera.html'}")
@@ -147,7 +147,8 @@ def mass(
     Writes calibration.json, calibration.toml (a section to paste) and calibration.html.
     """
     messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    options = {"standards_kda": "--standards", "landing": "--landing"}
+    with failures(messages, debug=debug, options=options):
         masses, errors = _standards(standards)
 
         from iscat_analysis.pipeline.calibrations import mass_calibration
@@ -163,7 +164,7 @@ def mass(
             notify=messages.notify,
         )
         if as_json:
-            print_json({**found.to_dict(), "out": str(folder)})
+            print_json("calibration", {**found.to_dict(), "out": str(folder)})
         else:
             _print_mass(found)
         messages.notify(f"wrote {folder}; open {folder / 'calibration.html'}")

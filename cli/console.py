@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -33,6 +33,12 @@ SECONDS_TO_FIRST_LINE = 2.0
 SECONDS_BETWEEN_LINES = 10.0
 PLAIN_WIDTH = 200
 
+GRACE_S = 1.5
+"""After a signal to end, the time that is left for tidying up."""
+
+WRITING_GRACE_S = 30.0
+"""The same while results are being written, which a second signal cuts short."""
+
 
 class Messages:
     """Progress, notes and errors of one command, on stderr.
@@ -48,6 +54,7 @@ class Messages:
     def __init__(self, name: str, *, quiet: bool = False) -> None:
         self.name = name
         self.quiet = quiet
+        self.writing = False
         self._terminal = Console(stderr=True, highlight=False, markup=False, emoji=False)
 
     def error(self, text: str) -> None:
@@ -86,6 +93,16 @@ class Messages:
         Progress
             To be handed to the library.
         """
+        with self._shown() as shown:
+
+            def tell(stage: str, done: int, total: int) -> None:
+                self.writing = stage == "report" and done < total
+                shown(stage, done, total)
+
+            yield tell
+
+    @contextmanager
+    def _shown(self) -> Iterator[Progress]:
         if self.quiet:
             yield _ignore
         elif self._terminal.is_terminal:
@@ -183,7 +200,9 @@ def _ignore(stage: str, done: int, total: int) -> None:
 
 
 @contextmanager
-def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
+def failures(
+    messages: Messages, *, debug: bool, options: Mapping[str, str] | None = None
+) -> Iterator[None]:
     """Turn whatever a command raises into one line and an exit status.
 
     Parameters
@@ -192,6 +211,9 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
         Where the line goes.
     debug : bool
         Show the traceback as well.
+    options : mapping of str to str, optional
+        Argument of the library → option of the command: what the library calls ``name = value`` is
+        shown as ``--option value``.
 
     Yields
     ------
@@ -215,7 +237,7 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
         where = f" ({category.__name__}, {Path(filename).name}:{lineno})" if debug else ""
         messages.notify(f"warning: {message}{where}")
 
-    with warnings.catch_warnings(), _termination_interrupts():
+    with warnings.catch_warnings(), _ending_in_time(messages), _termination_interrupts():
         warnings.showwarning = show
         try:
             yield
@@ -229,8 +251,60 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
             if debug:
                 _write(sys.stderr, traceback.format_exc())
             line, status = _verdict(error, debug=debug)
+            for argument, option in (options or {}).items():
+                line = re.sub(rf"\b{argument} = ", f"{option} ", line)
             messages.error(line)
             raise typer.Exit(status) from error
+
+
+@contextmanager
+def _ending_in_time(messages: Messages) -> Iterator[None]:
+    """End the process where the answer to a signal takes too long.
+
+    Python raises `KeyboardInterrupt` between two of its own instructions, so a long call into
+    compiled code delays it, and so do threads that must finish first.  The operating system's
+    handler writes each signal's number into a pipe at once; a thread reads it and keeps the time.
+    """
+    if threading.current_thread() is not threading.main_thread() or os.name == "nt":
+        yield
+        return
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    ended = threading.Event()
+
+    def watch() -> None:
+        with open(reader, "rb", buffering=0) as signals:  # noqa: PTH123  (a descriptor)
+            while (number := signals.read(1)) and number[0] not in _ENDING:
+                pass
+            if not number:
+                return
+            if ended.wait(GRACE_S):
+                return
+            if messages.writing:
+                os.set_blocking(reader, False)
+                due = time.monotonic() + WRITING_GRACE_S
+                while messages.writing and time.monotonic() < due:
+                    if ended.wait(0.1):
+                        return
+                    again = signals.read(1)
+                    if again and again[0] in _ENDING:
+                        break
+        messages.error(f"interrupted by {signal.Signals(number[0]).name}")
+        os._exit(INTERRUPTED)
+
+    earlier = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    threading.Thread(target=watch, daemon=True, name="signals").start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(earlier)
+        ended.set()
+        os.close(writer)
+
+
+_ENDING = {
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+}
 
 
 @contextmanager
@@ -285,33 +359,19 @@ def print_result(result: RenderableType) -> None:
     _write(sys.stdout, "".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))
 
 
-def print_json(value: Mapping[str, Any]) -> None:
-    """Print one JSON object on stdout; what is not a finite number becomes null.
+def print_json(document: str, values: Mapping[str, Any]) -> None:
+    """Print one JSON object on stdout.
 
     Parameters
     ----------
-    value : mapping
+    document : str
+        Name of its schema, as for `iscat_analysis.schema`.
+    values : mapping
         Of plain values, NumPy scalars and arrays, nested at will.
     """
-    _write(sys.stdout, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
+    from iscat_analysis.schemas import to_json
 
-
-def _plain(value: Any) -> Any:
-    import numpy as np
-
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    if value is None or isinstance(value, (str, bool, int, float)):
-        return value
-    return None if value != value else str(value)  # pandas' own missing values
+    _write(sys.stdout, to_json(document, values) + "\n")
 
 
 def _write(stream: TextIO | None, text: str) -> None:

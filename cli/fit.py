@@ -106,7 +106,7 @@ def fit(
     output folder.
     """
     messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages, debug=debug, options={"inject": "--inject"}):
         from iscat_analysis.config import load_config
 
         changes = _changes(settings, mode, frames, background, posterior, workers)
@@ -128,7 +128,7 @@ def fit(
             )
         rows: list[dict[str, Any]] = analysis.table.to_dict("records")
         if as_json:
-            print_json({**analysis.summary, "events": rows, "out": str(folder)})
+            print_json("fit", {**analysis.summary, "events": rows, "out": str(folder)})
         else:
             _print_table(analysis, rows, folder)
         flagged = [row for row in rows if _is_flagged(row)]

@@ -57,6 +57,9 @@ def simulate(
             truth = write_stack(resolved, out, seed=seed, overwrite=overwrite, progress=progress)
         table = out.with_suffix(".truth.csv")
         if as_json:
-            print_json({"stack": str(out), "truth": str(table), "events": truth.to_dict("records")})
+            print_json(
+                "simulate",
+                {"stack": str(out), "truth": str(table), "events": truth.to_dict("records")},
+            )
         else:
             print_result(f"{len(truth)} particles in {out}, their truth in {table}")

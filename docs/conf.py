@@ -127,11 +127,11 @@ def _write_schemas() -> None:
     pages = []
     for name in schema_names():
         text = schema(name)
-        pages.append(f"## {text['title']}\n\n{text['description']}\n")
+        pages.append(f"## {name}\n\n{text['description']}\n")
         pages.append("| key | type | meaning |\n|---|---|---|")
         for key, about in text["properties"].items():
-            kind = about.get("type", "one of a list" if "enum" in about else "any")
-            kind = " or ".join(kind) if isinstance(kind, list) else kind
+            kinds = [one.get("type", "object") for one in about.get("anyOf", [about])]
+            kind = "one of a list" if "enum" in about else " or ".join(kinds)
             missing = "" if key in text.get("required", ()) else "; may be absent"
             pages.append(f"| `{key}` | {kind}{missing} | {about.get('description', '')} |")
         pages.append("")

@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from iscat_analysis.config import Config as Config
     from iscat_analysis.config import config_to_toml as config_to_toml
+    from iscat_analysis.config import configure as configure
     from iscat_analysis.config import load_config as load_config
     from iscat_analysis.errors import ConfigError as ConfigError
     from iscat_analysis.errors import DataError as DataError
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
     from iscat_analysis.notebook import Bounds as Bounds
     from iscat_analysis.notebook import Result as Result
     from iscat_analysis.notebook import compute_bounds as compute_bounds
-    from iscat_analysis.notebook import configure as configure
     from iscat_analysis.notebook import fit_movie as fit_movie
     from iscat_analysis.notebook import simulate_movie as simulate_movie
     from iscat_analysis.pipeline import fit_stack as fit_stack
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from iscat_analysis.schemas import schema as schema
 
 _HOME = {
-    "configure": "notebook",
+    "configure": "config",
     "fit_movie": "notebook",
     "Result": "notebook",
     "simulate_movie": "notebook",

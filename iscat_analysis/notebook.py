@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import html
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,9 +17,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from iscat_analysis.bounds import bounds_report, parse_scan, scan
-from iscat_analysis.config import Config, load_config, parse_config
-from iscat_analysis.errors import ConfigError
-from iscat_analysis.movie import open_stack
+from iscat_analysis.config import Config, configure
+from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Progress, silent
 from iscat_analysis.report import check_output, write_report
@@ -36,53 +35,12 @@ ROWS_SHOWN = 20
 _COLUMNS = ("event", "frame", "x_px", "y_px", "z_nm", "mass_kda")
 
 
-def configure(
-    source: str | Path | Config | None = None,
-    *,
-    settings: Mapping[str, Any] | None = None,
-) -> Config:
-    """Make a configuration from a file, from another one, or from the defaults.
-
-    Parameters
-    ----------
-    source : str, Path or Config, optional
-        A TOML file, or a configuration to change; without it, the defaults.
-    settings : mapping of str to Any, optional
-        ``{"section.key": value}``, as in ``{"optics.na": 1.3, "fit.frames": (200, 400)}``; these
-        win over the source, and None removes a key.
-
-    Returns
-    -------
-    Config
-        Validated and immutable; `iscat_analysis.config` documents every key and its unit.
-
-    Raises
-    ------
-    ConfigError
-        The file cannot be read, a key is unknown (the nearest known one is named), or a value is
-        impossible.
-    """
-    base = source if isinstance(source, Config) else load_config(_path(source))
-    if not settings:
-        return base
-    values = base.model_dump(exclude_none=True)
-    for name, value in settings.items():
-        section, dot, key = name.partition(".")
-        if not (dot and section and key):
-            raise ConfigError(f'settings: write "{name}" as "section.key", as in "optics.na"')
-        table = values.setdefault(section, {})
-        if value is None:
-            table.pop(key, None)
-        else:
-            table[key] = value
-    return parse_config(values, where="settings")
-
-
 def fit_movie(
-    movie: str | Path,
+    movie: str | Path | ArrayLike,
     *,
-    config: str | Path | Config | None = None,
-    settings: Mapping[str, Any] | None = None,
+    name: str | None = None,
+    config: str | Path | Mapping[str, Any] | Config | None = None,
+    settings: Mapping[str, Any] | Iterable[str] | None = None,
     mode: str | None = None,
     background: tuple[int, int] | None = None,
     frames: tuple[int, int] | None = None,
@@ -97,11 +55,13 @@ def fit_movie(
 
     Parameters
     ----------
-    movie : str or Path
-        A TIFF file, frames (t, y, x) in counts.
-    config : str, Path or Config, optional
+    movie : str, Path or array_like of shape (t, y, x)
+        A file, or the camera's counts as an array of NumPy, Dask, Zarr or h5py; see `open_stack`.
+    name : str, optional
+        What messages and reports call an array; default ``"array"``.
+    config : str, Path, mapping or Config, optional
         As for `configure`.
-    settings : mapping of str to Any, optional
+    settings : mapping of str to Any, or iterable of str, optional
         As for `configure`; they win over `config`, and the arguments below win over both.
     mode : str, optional
         ``"mass"`` (x, y, mass), ``"localize"`` (x, y, z), ``"joint"`` (x, y, z, mass) or
@@ -135,23 +95,21 @@ def fit_movie(
     ConfigError
         A setting is unknown or impossible, or does not suit the movie.
     """
-    given: dict[str, Any] = {
-        "fit.mode": mode,
-        "background.frames": background,
-        "fit.frames": frames,
-        "camera.pixel_size_nm": pixel_size_nm,
-        "posterior.enabled": posterior,
-        "compute.workers": workers,
+    given = {
+        "mode": mode,
+        "background": background,
+        "frames": frames,
+        "pixel_size_nm": pixel_size_nm,
+        "posterior": posterior,
+        "workers": workers,
     }
-    named = {key: value for key, value in given.items() if value is not None}
-    resolved = configure(config, settings={**(settings or {}), **named})
-    path, folder = Path(movie), _path(out)
+    resolved = _with_arguments(configure(config, settings=settings), given)
+    folder = _path(out)
     if folder is not None:
         check_output(folder, overwrite)
-    with open_stack(path) as stack:
-        analysis = analyse(
-            stack, resolved, progress=progress, command=f"iscat_analysis.fit_movie({str(path)!r})"
-        )
+    with open_stack(movie, name=name) as stack:
+        command = f"iscat_analysis.fit_movie({str(stack.path)!r})"
+        analysis = analyse(stack, resolved, progress=progress, command=command)
     result = Result(analysis)
     if folder is not None:
         result.save(folder, overwrite=overwrite)
@@ -159,11 +117,11 @@ def fit_movie(
 
 
 def simulate_movie(
-    config: str | Path | Config,
+    config: str | Path | Mapping[str, Any] | Config,
     path: str | Path,
     *,
     seed: int | None = None,
-    settings: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | Iterable[str] | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> pd.DataFrame:
@@ -171,13 +129,13 @@ def simulate_movie(
 
     Parameters
     ----------
-    config : str, Path or Config
+    config : str, Path, mapping or Config
         As for `configure`; its ``[simulation]`` says what is in the movie.
     path : str or Path
         The TIFF file; ``<stem>.truth.csv`` lands beside it.
     seed : int, optional
         In place of ``simulation.seed``; the same seed gives the same bytes.
-    settings : mapping of str to Any, optional
+    settings : mapping of str to Any, or iterable of str, optional
         As for `configure`.
     overwrite : bool
         Replace an existing file.
@@ -201,18 +159,18 @@ def simulate_movie(
 
 
 def compute_bounds(
-    config: str | Path | Config | None = None,
+    config: str | Path | Mapping[str, Any] | Config | None = None,
     *,
-    settings: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | Iterable[str] | None = None,
     mode: str | None = None,
 ) -> Bounds:
     """Compute what no estimate from a planned experiment can beat.
 
     Parameters
     ----------
-    config : str, Path or Config, optional
+    config : str, Path, mapping or Config, optional
         As for `configure`; its ``[bounds]`` describes the experiment.
-    settings : mapping of str to Any, optional
+    settings : mapping of str to Any, or iterable of str, optional
         As for `configure`.
     mode : str, optional
         Which parameters are free in the joint bound; as for `fit_movie`.
@@ -227,9 +185,26 @@ def compute_bounds(
     ConfigError
         A setting is unknown or impossible, or the pixel size is missing.
     """
-    chosen = {"fit.mode": mode} if mode is not None else {}
-    resolved = configure(config, settings={**(settings or {}), **chosen})
+    resolved = _with_arguments(configure(config, settings=settings), {"mode": mode})
     return Bounds(resolved, bounds_report(resolved))
+
+
+_KEYS = {
+    "mode": "fit.mode",
+    "background": "background.frames",
+    "frames": "fit.frames",
+    "pixel_size_nm": "camera.pixel_size_nm",
+    "posterior": "posterior.enabled",
+    "workers": "compute.workers",
+}
+"""Argument → key of the configuration."""
+
+
+def _with_arguments(config: Config, given: Mapping[str, Any]) -> Config:
+    """Change the keys that arguments stand for; messages name the arguments."""
+    changes = {_KEYS[name]: value for name, value in given.items() if value is not None}
+    called = {key: name for name, key in _KEYS.items()}
+    return configure(config, settings=changes, called=called)
 
 
 def _path(source: str | Path | None) -> Path | None:

@@ -139,7 +139,7 @@ def make_analysis(
         ratio_image=image,
         power=1 + 0.004 * rng.standard_normal(400).cumsum() / 8,
         power_frames=np.arange(400),
-        summary={"events": n, "efficiency": np.nan, "timings_s": {"fit": np.float64(1.25)}},
+        summary=summary_of(frame, mode, scheme),
         provenance=Provenance(
             command=f"iscat-fit {HOSTILE} --mode {mode} # </script><!--<script>",
             input_path=HOSTILE,
@@ -150,6 +150,34 @@ def make_analysis(
         ),
         warnings=("The TIFF says pixel_size_nm = 84.0, the configuration 84.4: using 84.4.",),
     )
+
+
+def summary_of(table: pd.DataFrame, mode: str, scheme: str) -> dict[str, object]:
+    """Say of an invented analysis what a summary must say."""
+    medians = ("sigma", "crb", "qcrb", "sigma_over_crb", "information_fraction")
+    return {
+        "events": len(table),
+        "mode": mode,
+        "scheme": scheme,
+        "emission": "reciprocal",
+        "convention": "exact",
+        "mass_scale": "model",
+        "status": table["status"].value_counts().to_dict(),
+        "frames_before": (0, 200),
+        "frames_after": (200, 400),
+        "power_ratio": np.nan,
+        "power_spread": np.float64(0.004),
+        "masked_pixels": np.int64(0),
+        "detection_threshold_snr": 5.0,
+        "medians": {},
+        "precision": {"x_nm": {f"{name}_median": 1.5 for name in medians}},
+        "seconds": {"fit": np.float64(1.25)},
+        "input": {"path": HOSTILE, "sha256": "0" * 64},
+        "seed": 1,
+        "versions": {"iscat-analysis": "0.1.0", "python": "3.11.7", "numpy": "2.1.0"},
+        "warnings": [],
+        "efficiency": np.nan,
+    }
 
 
 def without_events(analysis: Analysis) -> Analysis:

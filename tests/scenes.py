@@ -37,6 +37,9 @@ def make_config(*, calibrated: bool = True, **sections: Mapping[str, Any]) -> Co
         del values["calibration"]
     for name, changes in sections.items():
         values.setdefault(name, {}).update(changes)
+    if values["optics"].get("scheme") == "darkfield":
+        photons = values["simulation"].get("photons_per_pixel", 1e4)
+        values["particle"].setdefault("photons_per_frame", photons)
     return parse_config(values)
 
 

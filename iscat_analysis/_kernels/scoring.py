@@ -373,6 +373,8 @@ def maximize(
         for i in range(5):
             trial[i] = min(max(theta[i] + shrink * step[i], lower[i]), upper[i])
             gain += 0.5 * score[i] * (trial[i] - theta[i])
+        if not np.isfinite(gain):  # an overflow: a place that is no number must not be looked up
+            return value, passes, STALLED
         if damping == 0.0 and gain < tolerance:
             theta[:] = trial
             return value + gain, passes, CONVERGED

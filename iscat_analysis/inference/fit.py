@@ -165,7 +165,7 @@ def fit_particle(
         free=names,
         sigma=sigma,
         covariance=covariance,
-        contrast=likelihood.model.peak_contrast(float(best.theta[2]), mass),
+        contrast=likelihood.model.amplitude_contrast(float(best.theta[2]), float(best.theta[3])),
         log_likelihood=best.log_likelihood,
         iterations=best.passes,
         chi2_reduced=chi2_reduced,

@@ -168,14 +168,8 @@ class _View:
 
 
 def _look(likelihood: Likelihood, theta: FloatArray) -> _View:
-    model = likelihood.model
-    signal, gradient = model.gradient(
-        likelihood.grid,
-        float(theta[0]),
-        float(theta[1]),
-        float(theta[2]),
-        float(model.scale.mass(theta[3])),
-    )
+    place = (float(value) for value in theta[:4])
+    signal, gradient = likelihood.model.amplitude_gradient(likelihood.grid, *place)
     conditional = likelihood.kind == CONDITIONAL
     used = likelihood.data[3 if conditional else 2] > 0
     c0, c1, c2, c3 = (c[used] for c in likelihood.data)

@@ -13,6 +13,10 @@ What to use when
 
 Parameters are always θ = (x [nm], y [nm], z [nm], a, g): a the model's amplitude (the mass in kDa
 unless a calibration is given), g the logarithm of a common level, normally fixed at 0.
+
+The model is known for heights in its `z_range_nm` and where no pixel is farther from the particle
+than its `reach_nm`.  Outside this support, and where a parameter is not a finite number, a
+log-likelihood is −∞ and what has no limit there is refused.
 """
 
 from __future__ import annotations
@@ -33,6 +37,8 @@ from iscat_analysis._kernels.scoring import (
     score_pass,
     value_batch,
 )
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import mask_of, pixels_of, vector_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 
 FloatArray = NDArray[np.float64]
@@ -40,6 +46,11 @@ BoolArray = NDArray[np.bool_]
 
 LEVEL = 4
 """Index of the level in θ."""
+
+LARGEST_LEVEL = 50.0
+"""Logarithm of the level beyond which no light is meant, and counts would overflow."""
+
+_SLACK_NM = 1e-6  # rounding of coordinates near the edge of the support
 
 
 @dataclass(frozen=True)
@@ -81,12 +92,33 @@ class Likelihood:
         CONDITIONAL or POISSON.
     data : ndarray, shape (4, ny, nx)
         Per-pixel constants; see `iscat_analysis._kernels.scoring`.  A masked pixel holds zeros.
+
+    Raises
+    ------
+    DataError
+        The constants are not finite numbers, one set for each pixel of the grid.
     """
 
     model: ForwardModel
     grid: PixelGrid
     kind: int
     data: FloatArray
+
+    def __post_init__(self) -> None:
+        if self.kind not in (CONDITIONAL, POISSON):
+            raise ConfigError(
+                f"kind = {self.kind!r}: use `conditional` or `poisson` of this module"
+            )
+        ready = isinstance(self.data, np.ndarray) and self.data.dtype == np.float64
+        if not ready or self.data.shape != (4, *self.grid.shape):
+            raise DataError(
+                f"data: has shape {np.shape(self.data)}, the grid needs {(4, *self.grid.shape)} of "
+                "64-bit floats; build it with `conditional` or `poisson`"
+            )
+        if not self.data.flags.c_contiguous:
+            object.__setattr__(self, "data", np.ascontiguousarray(self.data))
+        if not np.all(np.isfinite(self.data)):
+            raise DataError("data: holds values that are not finite; mask those pixels")
 
     @property
     def n_pixels(self) -> int:
@@ -110,11 +142,53 @@ class Likelihood:
         Returns
         -------
         ndarray, shape (n,)
-            Relative to no particle.
+            Relative to no particle; −∞ outside the support.
+
+        Raises
+        ------
+        DataError
+            The array has another shape or does not hold real numbers.
         """
-        out = np.empty(len(thetas))
-        value_batch(*self._arguments, np.ascontiguousarray(thetas), out)
+        points = vector_of("thetas", thetas, (-1, 5))
+        inside = self.supports(points)
+        out = np.full(len(points), -np.inf)
+        if inside.all():
+            value_batch(*self._arguments, points, out)
+        elif inside.any():
+            known = np.empty(int(inside.sum()))
+            value_batch(*self._arguments, points[inside], known)
+            out[inside] = known
+        out[np.isnan(out)] = -np.inf  # an amplitude so large that the light overflows
         return out
+
+    def supports(self, thetas: FloatArray) -> BoolArray:
+        """Tell where the model is known.
+
+        Parameters
+        ----------
+        thetas : ndarray, shape (n, 5)
+            Parameters.
+
+        Returns
+        -------
+        ndarray of bool, shape (n,)
+            False for heights outside the model's `z_range_nm`, for places with a pixel of the grid
+            beyond its `reach_nm`, and for values that are not finite.
+        """
+        x, y, z, amplitude, level = thetas.T
+        low, high = self.model.z_range_nm
+        half = self.grid.pixel_nm / 2
+        columns, rows = self.grid.x_nm, self.grid.y_nm
+        far_x = np.maximum(np.abs(x - columns[0]), np.abs(x - columns[-1])) + half
+        far_y = np.maximum(np.abs(y - rows[0]), np.abs(y - rows[-1])) + half
+        inside: BoolArray = (
+            (np.hypot(far_x, far_y) <= self.model.reach_nm)
+            & (z >= low - _SLACK_NM)
+            & (z <= high + _SLACK_NM)
+            & np.isfinite(amplitude)
+            & (np.abs(level) <= LARGEST_LEVEL)
+        )
+        return inside
 
     def score_fisher(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Log-likelihood, its gradient and the expected information.
@@ -127,17 +201,23 @@ class Likelihood:
         Returns
         -------
         value : float
-            Log-likelihood.
+            Log-likelihood; −∞ outside the support.
         score : ndarray, shape (5,)
-            Gradient.
+            Gradient; NaN outside the support.
         fisher : ndarray, shape (5, 5)
-            Fisher information (physics.md, section 4).
+            Fisher information (physics.md, section 4); NaN outside the support.
+
+        Raises
+        ------
+        DataError
+            θ has another shape or does not hold real numbers.
         """
+        point = vector_of("theta", theta, (5,))
+        if not self.supports(point[None])[0]:
+            return -np.inf, np.full(5, np.nan), np.full((5, 5), np.nan)
         score, fisher = np.empty(5), np.empty((5, 5))
-        value = score_pass(
-            self.model.profile(theta[2]), *self._arguments[1:],
-            np.ascontiguousarray(theta, dtype=float), score, fisher,
-        )  # fmt: skip
+        profile = self.model.profile(point[2])
+        value = score_pass(profile, *self._arguments[1:], point, score, fisher)
         return value, score, fisher
 
     def maximize(
@@ -168,8 +248,20 @@ class Likelihood:
         -------
         Optimum
             The estimate.
+
+        Raises
+        ------
+        DataError
+            An array has another shape or does not hold real numbers.
+        ConfigError
+            The start lies outside the box, or the box or the start outside the support.
         """
-        theta = np.array(start, dtype=float)
+        theta = vector_of("start", start, (5,)).copy()
+        lower, upper = vector_of("lower", lower, (5,)), vector_of("upper", upper, (5,))
+        free = np.ascontiguousarray(free, dtype=np.bool_)
+        if free.shape != (5,):
+            raise DataError(f"free: has shape {free.shape} where (5,) is needed")
+        self._require_box(theta, free, lower, upper)
         score, fisher = np.empty(5), np.empty((5, 5))
         wavelength = self.model.optics.wavelength_nm
         max_step = np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, np.inf, 1.0])
@@ -195,14 +287,22 @@ class Likelihood:
         Returns
         -------
         values, amplitudes : ndarray, shape (n,)
-            Log-likelihood and amplitude at each height.
+            Log-likelihood and amplitude at each height; −∞ and NaN outside the support.
+
+        Raises
+        ------
+        DataError
+            An array has another shape or does not hold real numbers.
         """
-        values, amplitudes = np.empty(heights.size), np.empty(heights.size)
-        scan_heights(
-            *self._arguments, np.ascontiguousarray(heights, dtype=float),
-            amplitude_range or (0.0, 0.0), np.ascontiguousarray(theta, dtype=float),
-            values, amplitudes,
-        )  # fmt: skip
+        heights, point = vector_of("heights", heights, (-1,)), vector_of("theta", theta, (5,))
+        points = np.tile(point, (heights.size, 1))
+        points[:, 2] = heights
+        inside = self.supports(points)
+        known = heights[inside]
+        found, refitted = np.empty(known.size), np.empty(known.size)
+        scan_heights(*self._arguments, known, amplitude_range or (0.0, 0.0), point, found, refitted)
+        values, amplitudes = np.full(heights.size, -np.inf), np.full(heights.size, np.nan)
+        values[inside], amplitudes[inside] = found, refitted
         return values, amplitudes
 
     def observed_information(self, theta: FloatArray) -> FloatArray:
@@ -217,7 +317,13 @@ class Likelihood:
         -------
         ndarray, shape (5, 5)
             Observed information.
+
+        Raises
+        ------
+        ConfigError
+            θ lies outside the support.
         """
+        theta = self._supported(theta)
         s, first, second = self.model.amplitude_hessian(self.grid, *theta[:4])
         level = np.exp(theta[LEVEL])
         used = self._used
@@ -259,6 +365,11 @@ class Likelihood:
         -------
         ndarray, shape (ny, nx)
             Pearson residuals, NaN where masked.
+
+        Raises
+        ------
+        ConfigError
+            θ lies outside the support.
         """
         s = self.signal(theta)
         level = np.exp(theta[LEVEL])
@@ -274,8 +385,9 @@ class Likelihood:
         return np.where(self._used, out, np.nan)
 
     def signal(self, theta: FloatArray) -> FloatArray:
-        """Signal of the model at θ, shape (ny, nx)."""
-        return _signal(self.model, self.grid, theta)
+        """Signal of the model at θ, which must lie in the support; shape (ny, nx)."""
+        x, y, z, amplitude, _ = (float(value) for value in self._supported(theta))
+        return self.model.amplitude_image(self.grid, x, y, z, amplitude)
 
     def measured_signal(self) -> FloatArray:
         """Signal that the counts show, shape (ny, nx); NaN where masked."""
@@ -307,6 +419,41 @@ class Likelihood:
             else:
                 out = c2**2 / np.maximum(c1 + c2 * s + c3, 1.0)
         return np.where(self._used, out, 0.0)
+
+    def _supported(self, theta: FloatArray) -> FloatArray:
+        """Return θ, unless the model is not known there."""
+        point = vector_of("theta", theta, (5,))
+        if not self.supports(point[None])[0]:
+            raise ConfigError(
+                f"theta = {_listed(point)}: {self._support()}; move the particle or give "
+                "forward_model a larger reach_nm or z_max_nm"
+            )
+        return point
+
+    def _require_box(
+        self, start: FloatArray, free: BoolArray, lower: FloatArray, upper: FloatArray
+    ) -> None:
+        """Refuse a box that a fit could leave the support in."""
+        if np.any(free & ~((lower <= start) & (start <= upper))):
+            raise ConfigError(
+                f"start = {_listed(start)} lies outside the box from {_listed(lower)} to "
+                f"{_listed(upper)}: clip it, or widen the box"
+            )
+        low, high = np.where(free, lower, start), np.where(free, upper, start)
+        low[3:], high[3:] = start[3:], start[3:]
+        corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(5, -1).T
+        if not self.supports(corners).all():
+            raise ConfigError(
+                f"lower = {_listed(lower)}, upper = {_listed(upper)}: {self._support()}; narrow "
+                "the box or give forward_model a larger reach_nm or z_max_nm"
+            )
+
+    def _support(self) -> str:
+        low, high = self.model.z_range_nm
+        return (
+            f"the model is known for z_nm from {low:g} to {high:g} and up to "
+            f"{self.model.reach_nm:.0f} nm from the particle to the farthest pixel"
+        )
 
     @property
     def _arguments(self) -> tuple[AxialTable, Lens, Pixels, int, FloatArray]:
@@ -348,16 +495,36 @@ def conditional(
     -------
     Likelihood
         Of kind CONDITIONAL.
+
+    Raises
+    ------
+    DataError
+        An array does not fit the grid, or an unmasked pixel holds no finite number.
     """
+    masked = mask_of("masked", masked, grid.shape)
+    before = pixels_of("before_e", before_e, grid.shape, masked)
+    after = pixels_of("after_e", after_e, grid.shape, masked)
+    ratio = pixels_of("power_ratio", power_ratio, grid.shape, masked, scalar=True)
+    read_before, read_after = (
+        pixels_of(name, value, grid.shape, masked, scalar=True, least=0.0)
+        for name, value in (
+            ("read_variance_before_e2", read_variance_before_e2),
+            ("read_variance_after_e2", read_variance_after_e2),
+        )
+    )
+    if not np.any(ratio > 0):
+        raise DataError(
+            f"power_ratio = {float(ratio.flat[0]):g}: give the light after over that before, a "
+            "positive number"
+        )
+    usable = (before > 0) & (after > 0) & (ratio > 0) & ~masked
+    ratio = np.where(usable, ratio, 1.0)
     data = np.zeros((4, *grid.shape))
-    total = before_e + after_e
-    p = np.broadcast_to(np.asarray(power_ratio / (1 + power_ratio)), grid.shape)
+    total = before + after
+    p = ratio / (1 + ratio)
     shot = total * p * (1 - p)
-    read = (1 - p) ** 2 * read_variance_after_e2 + p**2 * read_variance_before_e2
-    usable = (before_e > 0) & (after_e > 0)
-    if masked is not None:
-        usable &= ~masked
-    data[0], data[1], data[2] = after_e, total, power_ratio
+    read = (1 - p) ** 2 * read_after + p**2 * read_before
+    data[0], data[1], data[2] = after, total, ratio
     data[3] = shot / np.where(usable, shot + read, 1.0)
     data[:, ~usable] = 0.0
     return Likelihood(model, grid, CONDITIONAL, data)
@@ -397,12 +564,29 @@ def poisson(
     -------
     Likelihood
         Of kind POISSON.
+
+    Raises
+    ------
+    DataError
+        An array does not fit the grid, or an unmasked pixel holds no finite number.
     """
-    data = np.zeros((4, *grid.shape))
-    data[0] = np.maximum(counts_e + extra_variance_e2, 0.0)
-    data[1], data[2], data[3] = background_e, scale_e, extra_variance_e2
-    if masked is not None:
-        data[:, masked] = 0.0
+    masked = mask_of("masked", masked, grid.shape)
+    counts = pixels_of("counts_e", counts_e, grid.shape, masked)
+    background, scale, extra = (
+        pixels_of(name, value, grid.shape, masked, scalar=True)
+        for name, value in (
+            ("background_e", background_e),
+            ("scale_e", scale_e),
+            ("extra_variance_e2", extra_variance_e2),
+        )
+    )
+    if not np.any(scale > 0):
+        raise DataError(
+            f"scale_e = {float(scale.flat[0]):g}: give the photoelectrons for unit signal, a "
+            "positive number"
+        )
+    data = np.stack([np.maximum(counts + extra, 0.0), background, scale, extra])
+    data[:, masked | (scale <= 0)] = 0.0
     return Likelihood(model, grid, POISSON, data)
 
 
@@ -438,7 +622,7 @@ def asimov_conditional(
     Likelihood
         Of kind CONDITIONAL, with the read-noise weight taken at the truth.
     """
-    signal = _signal(model, grid, theta)
+    signal = model.amplitude_image(grid, *(float(value) for value in theta[:4]))
     before = np.broadcast_to(n_before * np.asarray(background_e, dtype=float), grid.shape)
     after = n_after * np.asarray(background_e) * (1 + signal)
     exact = conditional(model, grid, before, after, n_after / n_before)
@@ -476,7 +660,7 @@ def asimov_poisson(
     Likelihood
         Of kind POISSON.
     """
-    signal = _signal(model, grid, theta)
+    signal = model.amplitude_image(grid, *(float(value) for value in theta[:4]))
     counts = background_e + scale_e * signal
     return poisson(model, grid, counts, background_e, scale_e, extra_variance_e2=extra_variance_e2)
 
@@ -494,7 +678,8 @@ def compile_kernels(model: ForwardModel) -> None:
     counts = np.full(grid.shape, 100.0)
     likelihood = poisson(model, grid, counts, counts, counts)
     free = np.array([True, True, True, True, False])
-    likelihood.maximize(theta, free, theta - 1, theta + 1, passes=2)
+    margin = np.array([1.0, 1.0, 0.0, 1.0, 0.0])
+    likelihood.maximize(theta, free, theta - margin, theta + margin, passes=2)
     likelihood.values(theta[None])
     likelihood.score_fisher(theta)
     likelihood.observed_information(theta)
@@ -503,6 +688,5 @@ def compile_kernels(model: ForwardModel) -> None:
     model.gradient(grid, *theta[:4])
 
 
-def _signal(model: ForwardModel, grid: PixelGrid, theta: FloatArray) -> FloatArray:
-    x, y, z, amplitude = (float(value) for value in theta[:4])
-    return model.image(grid, x, y, z, float(model.scale.mass(np.asarray(amplitude))))
+def _listed(theta: FloatArray) -> str:
+    return "(" + ", ".join(f"{value:g}" for value in theta) + ")"

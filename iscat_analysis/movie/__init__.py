@@ -1,4 +1,4 @@
-"""Movie files become a `Stack`: frames (t, y, x), read lazily, whole or not at all.
+"""Movie files and arrays become a `Stack`: frames (t, y, x), read lazily, whole or not at all.
 
 Each format is one module that offers `Frames`; `_READERS` names its signature.  What a file says
 of itself is checked against what it holds before any pixel is read: a movie that is cut short, or
@@ -7,16 +7,18 @@ whose description announces more than it holds, is refused and never analysed in
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from iscat_analysis.errors import DataError
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.hdf5 import SIGNATURE
 from iscat_analysis.movie.refeyn import open_refeyn
-from iscat_analysis.movie.stack import Frames, Stack
+from iscat_analysis.movie.stack import ArrayFrames, ArrayLike, Frames, Stack
 from iscat_analysis.movie.tiff import open_tiff
+from iscat_analysis.records import StackMetadata
 
-__all__ = ["Frames", "Stack", "open_stack"]
+__all__ = ["ArrayLike", "Frames", "Stack", "open_stack"]
 
 _READERS: Mapping[bytes, Callable[[Path], Frames]] = {
     b"II\x2a\x00": open_tiff,
@@ -39,17 +41,33 @@ _FOREIGN: Mapping[bytes, str] = {
 _SIGNATURE_BYTES = 8
 
 
-def open_stack(path: Path) -> Stack:
+def open_stack(
+    movie: str | Path | ArrayLike,
+    *,
+    name: str | None = None,
+    pixel_size_nm: float | None = None,
+    exposure_ms: float | None = None,
+    frame_rate_hz: float | None = None,
+) -> Stack:
     """Open a movie without reading its pixels.
 
     TIFF, BigTIFF, OME-TIFF, ImageJ and Micro-Manager stacks are read; strips or tiles;
     uncompressed, LZW, Deflate, Zstandard, PackBits or LZMA.  So are Refeyn's ``.mp`` movies, of
-    OneMP and TwoMP, compressed or not.
+    OneMP and TwoMP, compressed or not, and arrays: of NumPy, memory-mapped or not, of Dask, Zarr or
+    h5py, or whatever has a shape and a dtype and can be sliced.
 
     Parameters
     ----------
-    path : Path
-        The file.
+    movie : str, Path or array_like of shape (t, y, x)
+        The file, or the camera's counts; of an array a few frames are read at a time.
+    name : str, optional
+        What messages and reports call an array; default ``"array"``.  A file has its own name.
+    pixel_size_nm : float, optional
+        Of an array, in the sample plane [nm].
+    exposure_ms : float, optional
+        Of an array [ms].
+    frame_rate_hz : float, optional
+        Of an array [Hz].
 
     Returns
     -------
@@ -60,9 +78,37 @@ def open_stack(path: Path) -> Stack:
     ------
     DataError
         The file is missing, is not a movie, is cut short, contradicts its own description, or has
-        more than one axis besides y and x.
+        more than one axis besides y and x; or the array is not one of counts (t, y, x).
+    ConfigError
+        A file was given what only arrays need, or a number is not positive.
     """
-    path = Path(path)
+    said = {
+        "pixel_size_nm": pixel_size_nm,
+        "exposure_ms": exposure_ms,
+        "frame_rate_hz": frame_rate_hz,
+    }
+    if isinstance(movie, (str, Path)):
+        given = [key for key, value in {"name": name, **said}.items() if value is not None]
+        if given:
+            raise ConfigError(
+                f"{given[0]}: describes an array, but {movie} is a file, which has a name and "
+                "metadata of its own; leave it out, and correct the file in the configuration, "
+                "as in camera.pixel_size_nm"
+            )
+        return _open_file(Path(movie))
+    if not isinstance(movie, ArrayLike):
+        raise DataError(
+            f"a {type(movie).__name__} is no movie; give the path of a file, or an array (t, y, x)"
+        )
+    for key, value in said.items():
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ConfigError(f"{key} = {value:g} must be positive")
+    source = "arguments" if any(value is not None for value in said.values()) else "none"
+    name = name or "array"
+    return Stack(Path(name), ArrayFrames(movie, name, StackMetadata(**said, source=source)))
+
+
+def _open_file(path: Path) -> Stack:
     try:
         with path.open("rb") as file:
             signature = file.read(_SIGNATURE_BYTES)

@@ -51,7 +51,7 @@ def measure_windows(
     before: tuple[int, int] | None,
     after: tuple[int, int],
     *,
-    method: str = "mean",
+    median: bool = False,
     level_e: float | None = None,
     power_normalization: bool = True,
     check: Check = _unchecked,
@@ -69,10 +69,10 @@ def measure_windows(
         Half-open range of pre-binding frames; None where the background is known.
     after : (int, int)
         Half-open range of frames with the particles.
-    method : str
-        ``"mean"`` or ``"median"`` of the frames before, or ``"none"``.
+    median : bool
+        Take the median of the frames before, scaled to their sum, in place of their sum.
     level_e : float, optional
-        Known background per pixel and frame, for ``"none"`` [e].
+        Known background per pixel and frame [e], where `before` is None.
     power_normalization : bool
         Estimate ρ from the data; otherwise it is the ratio of the frame counts.
     check : callable
@@ -103,7 +103,7 @@ def measure_windows(
     else:
         n_before = start = before[1] - before[0]
         first = _sum_frames(stack, camera, before, check, progress, 0, total)
-        if method == "median":
+        if median:
             totals = first.frame_totals_e
             level = totals / totals.mean() if power_normalization and totals.min() > 0 else None
             first = replace(first, total_e=n_before * _median(stack, camera, before, level))

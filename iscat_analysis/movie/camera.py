@@ -29,6 +29,8 @@ _UNREADABLE = (
 CEILING_REPEATS = 4
 """Counts that must share the largest one before it is taken for a converter's full scale."""
 
+_RATIO_TOLERANCE = 0.1  # of a mean of 1; a power that was not divided out is within it
+_RATIO_MOST_E = 10.0  # photoelectrons in a pixel, of which no interferometric image is made
 _NEGATIVE_SIGMAS = 6.0  # 1e-9 of pixels in the dark
 _NEGATIVE_FRACTION = 0.01  # more pixels below the offset than a sensor has dead ones
 
@@ -237,7 +239,8 @@ def check_counts(
     DataError
         A frame holds NaN or infinity, is zero throughout or saturated throughout, or lies further
         below the offset than six standard deviations of the read noise: in one pixel if the count
-        itself is negative, otherwise in more than 1 % of the pixels.
+        itself is negative, otherwise in more than 1 % of the pixels; or the frame is a ratio of
+        frames.
     """
     if camera is None:
         integer = np.issubdtype(counts.dtype, np.integer)
@@ -254,6 +257,11 @@ def check_counts(
             raise DataError(
                 f"{where} is NaN or infinite {_first(bad)}; "
                 "leave the frame out or export the movie again"
+            )
+        if is_ratio(frame, camera):
+            raise DataError(
+                f"{where} is ratiometric (floats around 1): its shot noise cannot be known any "
+                "more; give the camera's raw counts, which are divided here"
             )
         if low == high == 0:
             raise DataError(
@@ -286,6 +294,29 @@ def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatAr
     sigma = np.sqrt(np.square(np.divide(camera.read_noise_e, camera.gain_e_per_adu)) + rounding)
     floor: float | FloatArray = camera.offset_adu - _NEGATIVE_SIGMAS * sigma
     return floor
+
+
+def is_ratio(frame: NDArray[Any], camera: Camera) -> bool:
+    """Whether a frame was divided by another: floats whose mean is 1, and a fraction around it.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (y, x)
+        As stored [counts].
+    camera : Camera
+        A gain that makes more than a few photoelectrons of a count of 1 says that the movie was
+        only scaled.
+
+    Returns
+    -------
+    bool
+        True for what cannot be raw counts.
+    """
+    if not np.issubdtype(frame.dtype, np.floating):
+        return False
+    mean = float(frame.mean(dtype=np.float64))
+    near = abs(mean - 1) < _RATIO_TOLERANCE and float(frame.std(dtype=np.float64)) < 1 / 2
+    return near and mean * float(np.mean(camera.gain_e_per_adu)) < _RATIO_MOST_E
 
 
 def converter_ceiling(counts: NDArray[Any]) -> float:

@@ -1,50 +1,144 @@
-"""Descriptions other than OME-XML: ImageJ, tifffile's own ('shaped'), Micro-Manager, plain TIFF."""
+"""What TIFF files say of themselves: which axis is time, the pixel size, and the timing.
+
+ImageJ, tifffile's own descriptions ('shaped'), Micro-Manager and plain TIFF; OME-XML is in `ome`.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from iscat_analysis.movie.axes import time_axis
-from iscat_analysis.movie.hints import LENGTH_NM, TIME_S, Hints, inverse, positive
+from iscat_analysis.errors import DataError
+from iscat_analysis.records import StackMetadata
 
+TIME_FROM_HEIGHTS = (
+    "the images lie along Z (height) in the file, which names no axis of time; "
+    "they are taken as frames, one after the other in time"
+)
+"""What a user should know of a movie whose file calls its frames heights."""
+
+LENGTH_NM = {
+    "pm": 1e-3, "å": 0.1, "angstrom": 0.1, "nm": 1.0, "nanometer": 1.0, "nanometers": 1.0,
+    "µm": 1e3, "μm": 1e3, "um": 1e3, "\\u00b5m": 1e3, "micron": 1e3, "microns": 1e3,
+    "micrometer": 1e3, "micrometers": 1e3, "mm": 1e6, "cm": 1e7, "inch": 2.54e7, "in": 2.54e7,
+    "m": 1e9,
+}  # fmt: skip
+"""Nanometres in one unit of length, by its lower-case name (both Unicode micro signs)."""
+
+TIME_S = {
+    "ns": 1e-9, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "ms": 1e-3, "msec": 1e-3, "s": 1.0, "sec": 1.0,
+    "min": 60.0, "h": 3600.0,
+}  # fmt: skip
+"""Seconds in one unit of time, by its lower-case name."""
+
+_TIME_LIKE = "TZQI"
+_MOST_CHANNELS = 7  # of an ImageJ composite
+_AXES = {"T": "time", "Z": "height", "C": "channel", "S": "sample", "P": "position"}
 _IMAGEJ_AXES = {"channels": "C", "slices": "Z", "frames": "T"}
+_MICRO_MANAGER_AXES = {"Frames": "T", "Slices": "Z", "Channels": "C", "Positions": "P"}
 _SHAPED = re.compile(r'^\{\s*"shape"\s*:')
 _MOST_DIGITS = 20  # any count of more digits is beyond every file, and stays so when cut
-_INCH, _CENTIMETRE = 2, 3
-_RESOLUTION_UNIT_NM = {_INCH: LENGTH_NM["inch"], _CENTIMETRE: LENGTH_NM["cm"]}
+_RESOLUTION_UNIT_NM = {2: LENGTH_NM["inch"], 3: LENGTH_NM["cm"]}
 _PLAUSIBLE_PIXEL_NM = (5.0, 5000.0)  # outside: a printer's 72 or 300 dpi, not a microscope
+_SQUARE_TOLERANCE = 1e-3  # relative; writers round resolutions to six digits or fewer
+
+Resolution = tuple[float, float, int]
+"""Pixels per unit along x and y, and TIFF's number of the unit."""
+
+
+@dataclass(frozen=True)
+class Hints:
+    """Pixel size along x and y [nm], exposure [ms] and frame rate [Hz] from one kind of metadata.
+
+    None where it is silent; `source` is as in `StackMetadata`.
+    """
+
+    source: str
+    pixel_x_nm: float | None = None
+    pixel_y_nm: float | None = None
+    exposure_ms: float | None = None
+    frame_rate_hz: float | None = None
 
 
 @dataclass(frozen=True)
 class Described:
-    """How many frames a description announces.
+    """What a description announces.
 
-    Attributes
-    ----------
-    frames : int
-        From the image that carries the description onwards.
-    one_directory : bool
-        Whether the convention allows a single directory, the other frames' pixels following it.
+    `frames` counts from the image that carries the description; `axis` is theirs; `one_image` says
+    that one image may stand for all, the other frames' pixels following it.
     """
 
     frames: int
-    one_directory: bool
+    axis: str | None
+    one_image: bool
 
 
-def described_frames(text: str, rows: int, columns: int, path: Path) -> Described | None:
+def time_axis(sizes: Mapping[str, int], path: Path) -> str | None:
+    """Name the axis along which the frames lie: the one that is longer than 1 beside y and x.
+
+    T, Q and I are time.  So is Z where T is not named, as many camera programs write, and C beyond
+    the seven channels of an ImageJ composite: tifffile calls the frames of ImageJ and OME stacks
+    channels when it is not told otherwise.
+
+    Parameters
+    ----------
+    sizes : mapping of str to int
+        Length of each axis that the file names besides y and x.
+    path : Path
+        What messages call the file.
+
+    Returns
+    -------
+    str or None
+        None where every axis has length 1.
+
+    Raises
+    ------
+    DataError
+        There are two such axes, or the only one cannot be time.
+    """
+    long = {axis: size for axis, size in sizes.items() if size > 1}
+
+    def shown(axes: Mapping[str, int]) -> str:
+        names = {axis: f"{axis} ({_AXES[axis]})" if axis in _AXES else axis for axis in axes}
+        return " and ".join(f"{names[axis]} of length {size}" for axis, size in axes.items())
+
+    if len(long) > 1:
+        raise DataError(
+            f"{path}: needs one axis besides y and x but has {shown(long)}; "
+            "export one of them at a time, each to its own file"
+        )
+    if not long:
+        return None
+    (axis,) = long
+    if axis == "Z" and "T" in sizes:
+        raise DataError(
+            f"{path}: has {shown(long)} and {shown({'T': sizes['T']})}: a stack of heights, not a "
+            "movie; if its images are frames, name their axis T and export the file again "
+            "(in Fiji: Image > Properties)"
+        )
+    if axis not in _TIME_LIKE and not (axis == "C" and long[axis] > _MOST_CHANNELS):
+        raise DataError(
+            f"{path}: its only axis besides y and x is {shown(long)}, which is not time; "
+            "declare it as frames (in Fiji: Image > Properties), or export one channel or position"
+        )
+    return axis
+
+
+def described_frames(text: str, shape: tuple[int, ...], path: Path) -> Described | None:
     """Read how many frames an ImageJ or tifffile description announces.
 
     Parameters
     ----------
     text : str
         The description.
-    rows, columns : int
-        Size of the image that carries it [px].
+    shape : (int, int)
+        Rows and columns of the image that carries it [px].
     path : Path
         What messages call the file.
 
@@ -60,14 +154,24 @@ def described_frames(text: str, rows: int, columns: int, path: Path) -> Describe
     """
     if text.startswith("ImageJ="):
         fields = _imagej_fields(text)
-        time_axis({axis: _count(fields, key) for key, axis in _IMAGEJ_AXES.items()}, path)
-        return Described(_count(fields, "images"), one_directory=True)
-    if _SHAPED.match(text):
-        return _shaped(text, rows, columns, path)
-    return None
+        sizes = {axis: _count(fields[key]) for key, axis in _IMAGEJ_AXES.items() if key in fields}
+        return Described(_count(fields.get("images", "1")), time_axis(sizes, path), one_image=True)
+    described = _json_object(text) if _SHAPED.match(text) else {}
+    lengths, axes = described.get("shape"), described.get("axes")
+    if not isinstance(lengths, list) or not all(type(n) is int and n > 0 for n in lengths):
+        return None
+    if isinstance(axes, str) and len(axes) == len(lengths):
+        sizes = {axis: n for axis, n in zip(axes, lengths, strict=True) if axis not in "YX"}
+    else:
+        # Without names, the first axis is time; a second one is refused under its number.
+        leading = lengths[:-2] if lengths[-2:] == [*shape] else lengths[:-3]
+        long = [n for n in leading if n > 1]
+        sizes = {"T" if k == 0 else f"number {k + 1}": n for k, n in enumerate(long)}
+    axis = time_axis(sizes, path)
+    return Described(sizes[axis] if axis else 1, axis, bool(described.get("truncated")))
 
 
-def imagej_hints(text: str, resolution: tuple[float, float, int] | None) -> Hints:
+def imagej_hints(text: str, resolution: Resolution | None) -> Hints:
     """Read ImageJ's pixel size and frame interval.
 
     Parameters
@@ -80,7 +184,7 @@ def imagej_hints(text: str, resolution: tuple[float, float, int] | None) -> Hint
     Returns
     -------
     Hints
-        None where ImageJ was not calibrated.
+        Silent where ImageJ was not calibrated.
     """
     fields = _imagej_fields(text)
     x_nm = y_nm = None
@@ -97,29 +201,31 @@ def imagej_hints(text: str, resolution: tuple[float, float, int] | None) -> Hint
 
 
 def micro_manager_axes(summary: Mapping[str, Any]) -> dict[str, int]:
-    """Planned lengths of Micro-Manager's axes, from its summary.
+    """Planned lengths of Micro-Manager's axes, as far as the summary of an acquisition names them.
 
     Parameters
     ----------
     summary : mapping
-        Of the acquisition; may be empty.
+        May be empty.
 
     Returns
     -------
     dict of str to int
-        Length of each axis; 1 where the summary is silent.
+        Length of each axis.
     """
-    names = {"Frames": "T", "Slices": "Z", "Channels": "C", "Positions": "P"}
-    return {axis: int(_mm_number(summary.get(name)) or 1) for name, axis in names.items()}
+    lengths = {axis: _mm_number(summary.get(key)) for key, axis in _MICRO_MANAGER_AXES.items()}
+    return {axis: int(length) for axis, length in lengths.items() if length is not None}
 
 
-def micro_manager_hints(first: str, last: str, n_frames: int, summary: Mapping[str, Any]) -> Hints:
+def micro_manager_hints(
+    first: object, last: object, n_frames: int, summary: Mapping[str, Any]
+) -> Hints:
     """Read Micro-Manager's metadata.
 
     Parameters
     ----------
-    first, last : str
-        JSON of the first and of the last frame.
+    first, last : object
+        Mappings that belong to the first and to the last frame; anything else is ignored.
     n_frames : int
         In the movie.
     summary : mapping
@@ -131,7 +237,7 @@ def micro_manager_hints(first: str, last: str, n_frames: int, summary: Mapping[s
         A pixel size of 0 is Micro-Manager's word for unknown, and an interval of 0, or one
         shorter than the exposure, for "as fast as possible": then the time stamps decide.
     """
-    begin, end = _json_object(first), _json_object(last)
+    begin, end = (found if isinstance(found, dict) else {} for found in (first, last))
 
     def find(name: str) -> float | None:
         return _mm_number(begin.get(name)) or _mm_number(summary.get(name))
@@ -141,15 +247,17 @@ def micro_manager_hints(first: str, last: str, n_frames: int, summary: Mapping[s
     interval = find("Interval_ms")
     if interval is not None and exposure is not None and interval < exposure:
         interval = None
-    if interval is None:
-        stamps = [_mm_stamp(frame.get("ElapsedTime-ms")) for frame in (begin, end)]
-        if stamps[0] is not None and stamps[1] is not None and n_frames > 1:
-            interval = positive((stamps[1] - stamps[0]) / (n_frames - 1))
+    if interval is None and n_frames > 1:
+        start, stop = (_mm_value(frame.get("ElapsedTime-ms")) for frame in (begin, end))
+        started = 0.0 if start in (0, 0.0) else positive(start)
+        stopped = positive(stop)
+        if started is not None and stopped is not None:
+            interval = positive((stopped - started) / (n_frames - 1))
     rate = None if interval is None else positive(1e3 / interval)
     return Hints("micromanager", pixel, pixel, exposure_ms=exposure, frame_rate_hz=rate)
 
 
-def plain_hints(resolution: tuple[float, float, int] | None) -> Hints:
+def plain_hints(resolution: Resolution | None) -> Hints:
     """Read the TIFF resolution tags, where they could mean a microscope's pixels.
 
     Parameters
@@ -169,6 +277,86 @@ def plain_hints(resolution: tuple[float, float, int] | None) -> Hints:
     return Hints("tiff", x_nm, y_nm) if _plausible(x_nm, y_nm) else Hints("tiff")
 
 
+def positive(value: object, factor: float = 1.0) -> float | None:
+    """Read a number that must be finite and above zero to mean anything.
+
+    Parameters
+    ----------
+    value : object
+        A number, or text that holds one.
+    factor : float
+        Converts the unit.
+
+    Returns
+    -------
+    float or None
+        The product; None where there is no such number.
+    """
+    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+        return None
+    try:
+        number = float(value) * factor
+    except (ValueError, OverflowError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def inverse(value: float | None) -> float | None:
+    """Turn an interval into a rate, or back.
+
+    Parameters
+    ----------
+    value : float or None
+        Positive.
+
+    Returns
+    -------
+    float or None
+        Its inverse; None stays None.
+    """
+    return None if value is None else positive(1 / value)
+
+
+def merge(hints: Sequence[Hints], path: Path) -> StackMetadata:
+    """Take each value from the first kind of metadata that gives it.
+
+    Parameters
+    ----------
+    hints : sequence of Hints
+        Most trusted first.
+    path : Path
+        What messages call the file.
+
+    Returns
+    -------
+    StackMetadata
+        `source` joins the kinds that contributed with ``"+"``.
+
+    Raises
+    ------
+    DataError
+        The pixels are not square.
+    """
+    found: dict[str, float] = {}
+    sources = []
+    for hint in hints:
+        x, y = hint.pixel_x_nm, hint.pixel_y_nm
+        given = {
+            "pixel_size_nm": x,
+            "exposure_ms": hint.exposure_ms,
+            "frame_rate_hz": hint.frame_rate_hz,
+        }
+        fresh = {key: n for key, n in given.items() if n is not None and key not in found}
+        if "pixel_size_nm" in fresh and x and y and abs(y / x - 1) > _SQUARE_TOLERANCE:
+            raise DataError(
+                f"{path}: its pixels measure {x:g} nm in x and {y:g} nm in y, but they must be "
+                "square; correct the metadata, or resample the movie"
+            )
+        found |= fresh
+        sources += [hint.source] if fresh else []
+    return StackMetadata(**found, source="+".join(sources) or "none")
+
+
 def _plausible(*sizes_nm: float | None) -> bool:
     low, high = _PLAUSIBLE_PIXEL_NM
     return all(size is not None and low <= size <= high for size in sizes_nm)
@@ -179,27 +367,8 @@ def _imagej_fields(text: str) -> dict[str, str]:
     return {key.strip(): value.strip() for key, equals, value in pairs if equals}
 
 
-def _count(fields: Mapping[str, str], key: str) -> int:
-    value = fields.get(key, "1")
-    if not (value.isascii() and value.isdigit()):
-        return 1
-    return max(1, int(value[:_MOST_DIGITS]))
-
-
-def _shaped(text: str, rows: int, columns: int, path: Path) -> Described | None:
-    fields = _json_object(text)
-    shape, axes = fields.get("shape"), fields.get("axes")
-    if not isinstance(shape, list) or not all(type(n) is int and n > 0 for n in shape):
-        return None
-    if isinstance(axes, str) and len(axes) == len(shape):
-        sizes = {axis: n for axis, n in zip(axes, shape, strict=True) if axis not in "YX"}
-        axis = time_axis(sizes, path)
-        return Described(sizes[axis] if axis else 1, bool(fields.get("truncated")))
-    leading = shape[:-2] if shape[-2:] == [rows, columns] else shape[:-3]
-    long = [n for n in leading if n > 1]
-    # Without names, the first axis is time; a second one is refused under its number.
-    axis = time_axis({("T" if k == 0 else f"number {k + 1}"): n for k, n in enumerate(long)}, path)
-    return Described(long[0] if axis else 1, bool(fields.get("truncated")))
+def _count(value: str) -> int:
+    return max(1, int(value[:_MOST_DIGITS])) if value.isascii() and value.isdigit() else 1
 
 
 def _json_object(text: str) -> dict[str, Any]:
@@ -210,15 +379,10 @@ def _json_object(text: str) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
+def _mm_value(value: object) -> object:
+    """Unwrap a value that Micro-Manager 2 wraps as a property of a device."""
+    return value.get("PropVal") if isinstance(value, dict) else value
+
+
 def _mm_number(value: object) -> float | None:
-    """Read a positive number, bare or wrapped as Micro-Manager 2 wraps device properties."""
-    return positive(value.get("PropVal") if isinstance(value, dict) else value)
-
-
-def _mm_stamp(value: object) -> float | None:
-    """Read a time stamp, which unlike every other number may be 0."""
-    if isinstance(value, dict):
-        value = value.get("PropVal")
-    if isinstance(value, (int, float)) and value == 0:
-        return 0.0
-    return positive(value)
+    return positive(_mm_value(value))

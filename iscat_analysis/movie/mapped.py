@@ -1,11 +1,18 @@
-"""A file in memory-mapped pages, and the look that must come before they are touched."""
+"""A file in memory-mapped pages, and what the libraries that read files raise on damaged ones."""
 
 from __future__ import annotations
 
 import mmap
+import struct
 from pathlib import Path
 
 from iscat_analysis.errors import DataError
+
+WHAT_LIBRARIES_RAISE = (
+    ValueError, RuntimeError, TypeError, LookupError, OSError, ArithmeticError, MemoryError,
+    AttributeError, AssertionError, SystemError, struct.error,
+)  # fmt: skip
+"""What a damaged file makes tifffile, h5py and imagecodecs raise."""
 
 _MAPPED_ALONG = 2**16
 
@@ -28,7 +35,7 @@ def map_file(path: Path) -> mmap.mmap:
 
 
 def refuse_changed(path: Path, data: mmap.mmap) -> None:
-    """Touching mapped bytes beyond a file's end kills the process, so look first.
+    """Refuse a file that has shrunk: touching mapped bytes beyond its end kills the process.
 
     Parameters
     ----------

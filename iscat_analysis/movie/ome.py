@@ -15,8 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.axes import time_axis
-from iscat_analysis.movie.hints import LENGTH_NM, TIME_S, Hints, inverse, positive
+from iscat_analysis.movie.descriptions import (
+    LENGTH_NM,
+    TIME_S,
+    Hints,
+    inverse,
+    positive,
+    time_axis,
+)
 
 _OME_ROOT = re.compile(r"<(?:\w+:)?OME[\s>]")
 _AXES = ("T", "Z", "C")

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.descriptions import Hints, merge, positive
 from iscat_analysis.movie.hdf5 import Hdf5Reader, StoredArray
-from iscat_analysis.movie.hints import Hints, merge, positive
 from iscat_analysis.movie.mapped import refuse_changed
 from iscat_analysis.records import StackMetadata
 
@@ -390,7 +390,7 @@ def _hints(reader: Hdf5Reader, dialect: _Dialect) -> tuple[Hints, tuple[str, ...
         return Hints("refeyn", exposure_ms=exposure, frame_rate_hz=rate), ()
     pixel = unbinned * pixel_binning
     note = (
-        f"the pixel size is taken to be {pixel:g} nm, as for every {instrument}: {unbinned:g} nm "
-        f"times the pixel binning of {pixel_binning:g}; the file does not store it"
+        f"the file does not store its pixel size; that of every {instrument} is {unbinned:g} nm "
+        f"times the pixel binning of {pixel_binning:g}: {pixel:g} nm"
     )
     return Hints("refeyn", pixel, pixel, exposure, rate), (note,)

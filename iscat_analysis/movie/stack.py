@@ -1,4 +1,4 @@
-"""`Stack`, the movie that every later stage reads, and `Frames`, what each file format provides."""
+"""`Stack`, the movie that every later stage reads, and `Frames`, what each format provides."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ _MB = 1_000_000
 
 
 class Frames(Protocol):
-    """The pixels of one open file, whatever its format."""
+    """The pixels of one open file or array, whatever its format."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -34,7 +34,7 @@ class Frames(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how the metadata came about."""
+        """What a user should know of what the file implies but does not state."""
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Frames ``[start, stop)``, already known to exist, as a new array (t, y, x)."""
@@ -43,13 +43,86 @@ class Frames(Protocol):
         """Release the file."""
 
 
+@runtime_checkable
+class ArrayLike(Protocol):
+    """An array in memory, mapped, or behind slices: of NumPy, Dask, Zarr or h5py."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Frames, rows, columns."""
+
+    @property
+    def dtype(self) -> Any:
+        """Type of the counts."""
+
+    def __getitem__(self, key: Any, /) -> Any:
+        """Frames ``array[start:stop]``, which `numpy.asarray` understands."""
+
+
+class ArrayFrames:
+    """The frames of an array; `iscat_analysis.movie.open_stack` makes it.
+
+    Parameters
+    ----------
+    array : array_like, shape (t, y, x)
+        Counts; read a few frames at a time.
+    name : str
+        What messages call it.
+    metadata : StackMetadata
+        What the caller says of it.
+
+    Raises
+    ------
+    DataError
+        It has not three axes, holds no integers or floats, or fewer than two frames.
+    """
+
+    notes = ()
+
+    def __init__(self, array: ArrayLike, name: str, metadata: StackMetadata) -> None:
+        shape = tuple(int(n) for n in array.shape)
+        stored = np.dtype(array.dtype)
+        if len(shape) != 3 or 0 in shape or stored.kind not in "uif":
+            raise DataError(
+                f"{name}: needs to be frames (t, y, x) of integers or floats but is {stored} of "
+                f"shape {shape}; pass the camera's counts, one frame after the other"
+            )
+        if shape[0] < 2:
+            raise DataError(
+                f"{name}: holds a single frame; a movie needs frames before and after a particle "
+                "binds"
+            )
+        self._array = array
+        self.shape = (shape[0], shape[1], shape[2])
+        self.dtype = stored.newbyteorder("=")
+        self.metadata = metadata
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames.
+
+        Parameters
+        ----------
+        start, stop : int
+            Half-open range inside the movie.
+
+        Returns
+        -------
+        ndarray, shape (stop − start, y, x)
+            A new array in native byte order [counts].
+        """
+        return np.array(self._array[start:stop], dtype=self.dtype, order="C")
+
+    def close(self) -> None:
+        """Leave the array as it is; it belongs to the caller."""
+
+
 class Stack:
-    """A movie on disk; `iscat_analysis.movie.open_stack` makes it.
+    """A movie in a file or an array; `iscat_analysis.movie.open_stack` makes it.
 
     Parameters
     ----------
     path : Path
-        The file.
+        The file, or the name of the array.
     frames : Frames
         Its pixels.
     """
@@ -77,7 +150,7 @@ class Stack:
 
     @property
     def path(self) -> Path:
-        """The file."""
+        """The file, or the name of the array."""
         return self._path
 
     @property
@@ -102,7 +175,7 @@ class Stack:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """One sentence for each metadata value that the file implies but does not state."""
+        """One sentence for each thing that the file implies but does not state."""
         return self._frames.notes
 
     def close(self) -> None:
@@ -174,18 +247,24 @@ class Stack:
             yield first, self.read(first, min(first + step, end))
 
     def sha256(self) -> str:
-        """Hash the bytes of the file, without holding them in memory.
+        """Hash the movie, without holding it in memory.
 
         Returns
         -------
         str
-            SHA-256 as 64 hexadecimal digits.
+            SHA-256 as 64 hexadecimal digits: of the bytes of a file; of an array's type, shape and
+            counts in the order of the axes.
 
         Raises
         ------
         DataError
             The file can no longer be read.
         """
+        if isinstance(self._frames, ArrayFrames):
+            digest = hashlib.sha256(f"{self.dtype.str} {self.shape}".encode())
+            for _, block in self.chunks():
+                digest.update(block.data)
+            return digest.hexdigest()
         try:
             with self._path.open("rb") as file:
                 return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,42 +1,80 @@
 """TIFF movies: which images are the frames, and their pixels.
 
-The directories are counted against every description in the file.  Never the other way round: a
-movie that was written frame by frame carries a description of one frame in each directory, and a
-reader that believes the first of them returns one frame of thousands.
+tifffile reads the images.  It repairs what it can, by leaving out what it cannot read; whatever it
+left out is a reason here to refuse the file.  The images are counted against every description: a
+movie that was written frame by frame describes one frame in each image, and a reader that believes
+the first of these descriptions returns one frame of thousands.
 """
 
 from __future__ import annotations
 
+import itertools
+import logging
+import math
 import mmap
-from collections.abc import Callable, Sequence
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.axes import time_axis
 from iscat_analysis.movie.descriptions import (
+    TIME_FROM_HEIGHTS,
     described_frames,
     imagej_hints,
+    merge,
     micro_manager_axes,
     micro_manager_hints,
     plain_hints,
+    time_axis,
 )
-from iscat_analysis.movie.directory import Directory, DirectoryReader, Layout
-from iscat_analysis.movie.hints import Hints, merge
-from iscat_analysis.movie.mapped import map_file, refuse_changed, release
+from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, map_file, refuse_changed, release
 from iscat_analysis.movie.ome import is_ome, read_ome
 from iscat_analysis.records import StackMetadata
+
+_DESCRIPTION, _MICRO_MANAGER = 270, 51123
+_STRIP_OFFSETS, _TILE_OFFSETS, _STRIP_SIZES, _TILE_SIZES = 273, 324, 279, 325
+_ESSENTIAL = {
+    256, 257, 258, 259, 266, _DESCRIPTION, _STRIP_OFFSETS, 277, 278, _STRIP_SIZES, 317, 322, 323,
+    _TILE_OFFSETS, _TILE_SIZES, 339, 32997,
+}  # fmt: skip
+"""Tags without which an image would be taken for another: size, type, encoding, place, text."""
 
 _LOSSLESS = {1, 5, 8, 32773, 32946, 34925, 50000}
 """No compression, LZW, Deflate, PackBits, old Deflate, LZMA, Zstandard."""
 
+_LARGEST_FRAME_BYTES = 2**31  # 32 768 × 32 768 pixels of 16 bits, beyond any camera
 _BOMB_RATIO = 2000  # Deflate reaches 1032, on constant images only
 _FRAME_BOMB_RATIO = 100  # of one frame, which is held in memory whole
 _BOMB_BYTES = 64_000_000  # smaller than this, anything is harmless whatever its ratio
+_OVERLAP = 2  # values of tags over the size of the file; each lies in it once
+_OVERLAP_BYTES = 1_000_000
+
+_PLAIN = dict.fromkeys(("is_lsm", "is_ndpi", "is_ome", "is_scanimage", "is_stk"), False)
+"""Dialects whose images tifffile would guess rather than read."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Image:
+    """One image of the file: how it is stored, and where its strips or tiles lie."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any] | None
+    encoding: int  # equal where one decoder serves both
+    reduced: bool
+    texts: tuple[str, ...]
+    offsets: tuple[int, ...]
+    sizes: tuple[int, ...]
+    start: int | None  # first byte of the pixels where they lie in one piece as they are
+
+    def __str__(self) -> str:
+        return f"{' x '.join(map(str, self.shape))} pixels of {self.dtype}"
 
 
 class TiffFrames:
@@ -48,67 +86,43 @@ class TiffFrames:
         The whole file.
     path : Path
         What messages call it.
-    layout : Layout
-        Common to all frames.
-    byte_order : str
-        ``"<"`` or ``">"``.
-    frames : sequence of Directory
-        One per frame, or a single one that the other frames' pixels follow.
+    dtype : dtype
+        Of the pixels, in the byte order of the file.
+    images : sequence
+        One image per frame, or a single one that the other frames' pixels follow.
     n_frames : int
         In the movie.
     metadata : StackMetadata
         What the file says of itself.
+    notes : tuple of str
+        What a user should know of it.
+    decode : callable
+        tifffile's decoder of the strips or tiles of these images.
     """
 
     def __init__(
         self,
         data: mmap.mmap,
         path: Path,
-        layout: Layout,
         *,
-        byte_order: Literal["<", ">"],
-        frames: Sequence[Directory],
+        dtype: np.dtype[Any],
+        images: Sequence[_Image],
         n_frames: int,
         metadata: StackMetadata,
+        notes: tuple[str, ...],
+        decode: Callable[..., Any],
     ) -> None:
-        dtype = layout.dtype
-        if dtype is None:
-            raise DataError(
-                f"{path}: its pixels are {layout.bits}-bit numbers of sample format "
-                f"{layout.sample_format}; export it as 8-, 16- or 32-bit integers or as floats"
-            )
         self._data = data
         self._path = path
-        self._layout = layout
-        self._dtype = dtype
-        self._stored_dtype = dtype.newbyteorder(byte_order)
-        self._frames = frames
-        self._shape = (n_frames, layout.rows, layout.columns)
-        self._metadata = metadata
+        self._stored_dtype = dtype
+        self._images = images
+        self._decode = decode
+        rows, columns = images[0].shape
+        self.dtype: np.dtype[Any] = dtype.newbyteorder("=")
+        self.shape = (n_frames, rows, columns)
+        self.metadata = metadata
+        self.notes = notes
         self._starts = self._find_starts(n_frames)
-        self._decode: Callable[..., Any] | None = None
-        if self._starts is None:
-            self._decode = _decoder(path, frames[0].index)
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Frames, rows, columns."""
-        return self._shape
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the stored numbers, in native byte order."""
-        return self._dtype
-
-    @property
-    def metadata(self) -> StackMetadata:
-        """What the file says of itself."""
-        return self._metadata
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Nothing: what TIFF metadata say is taken as they say it."""
-        return ()
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
@@ -129,48 +143,30 @@ class TiffFrames:
             The file has changed since it was opened, or its pixels cannot be decoded.
         """
         refuse_changed(self._path, self._data)
-        block = np.empty((stop - start, *self._shape[1:]), dtype=self._dtype)
-        if start == stop:
-            return block
+        block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
         if self._starts is None:
-            for number, frame in enumerate(self._frames[start:stop]):
-                self._decode_into(block[number], frame, start + number)
+            for number in range(start, stop):
+                self._decode_into(block[number - start], self._images[number], number)
             return block
-        starts = self._starts[start:stop]
-        steps = np.diff(starts)
-        if len(steps) and steps[0] > 0 and np.all(steps == steps[0]):
-            block[:] = self._mapped(int(starts[0]), (int(steps[0]),), (stop - start,))
-            release(self._data, int(starts[0]), int(starts[-1]))
-        else:
-            for number, first in enumerate(starts):
-                block[number] = self._mapped(int(first), (), ())
+        for number, first in enumerate(self._starts[start:stop]):
+            block[number] = np.ndarray(
+                self.shape[1:], self._stored_dtype, buffer=self._data, offset=int(first)
+            )
+        if start < stop:
+            release(self._data, int(self._starts[start]), int(self._starts[stop - 1]))
         return block
 
     def close(self) -> None:
         """Release the file."""
         self._data.close()
 
-    def _mapped(
-        self, first: int, frame_strides: tuple[int, ...], frames: tuple[int, ...]
-    ) -> NDArray[Any]:
-        """View the mapped bytes as frames; never handed out, so that the file can be closed."""
-        _, y, x = self._shape
-        size = self._dtype.itemsize
-        return np.ndarray(
-            (*frames, y, x),
-            self._stored_dtype,
-            buffer=self._data,
-            offset=first,
-            strides=(*frame_strides, x * size, size),
-        )
-
     def _find_starts(self, n_frames: int) -> NDArray[np.int64] | None:
         """First byte of every frame, where all of them lie in the file as they are."""
-        starts = [start for frame in self._frames if (start := frame.start) is not None]
-        size = self._layout.frame_bytes
-        if len(starts) < len(self._frames):
+        starts = [image.start for image in self._images if image.start is not None]
+        if len(starts) < len(self._images):
             return None
-        followers = n_frames - len(starts)  # frames without a directory of their own
+        size = math.prod(self.shape[1:]) * self.dtype.itemsize
+        followers = n_frames - len(starts)  # frames without an image of their own
         end = max(starts) + size * (1 + followers)
         if end > len(self._data):
             raise DataError(
@@ -181,19 +177,15 @@ class TiffFrames:
             return starts[0] + size * np.arange(n_frames, dtype=np.int64)
         return np.array(starts, dtype=np.int64)
 
-    def _decode_into(self, image: NDArray[Any], frame: Directory, number: int) -> None:
-        rows, columns = image.shape
-        decode = self._decode
-        if decode is None:
-            raise DataError(f"{self._path}: frame {number} has no decoder")
-        pairs = zip(frame.offsets.tolist(), frame.byte_counts.tolist(), strict=True)
-        for segment, (offset, count) in enumerate(pairs):
+    def _decode_into(self, frame: NDArray[Any], image: _Image, number: int) -> None:
+        rows, columns = frame.shape
+        for segment, (offset, size) in enumerate(zip(image.offsets, image.sizes, strict=True)):
             try:
-                pixels, place, _ = decode(self._data[offset : offset + count], segment)
+                pixels, place, _ = self._decode(self._data[offset : offset + size], segment)
                 top, left = place[2], place[3]
                 tile = pixels[0, : rows - top, : columns - left, 0]
-                image[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
-            except (ValueError, TypeError, IndexError, RuntimeError, MemoryError) as error:
+                frame[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
+            except WHAT_LIBRARIES_RAISE as error:
                 raise DataError(
                     f"{self._path}: the pixels of frame {number} cannot be decompressed "
                     f"({error or type(error).__name__}); copy the file again or export it again"
@@ -220,153 +212,269 @@ def open_tiff(path: Path) -> TiffFrames:
     """
     data = map_file(path)
     try:
-        return _open_mapped(data, path)
-    except BaseException:
+        with _unheard(), tifffile.TiffFile(path, **_PLAIN) as file:
+            return _open(file, data, path)
+    except DataError:
         data.close()
         raise
+    except WHAT_LIBRARIES_RAISE as error:
+        size = len(data)
+        data.close()
+        raise DataError(
+            f"{path}: is truncated or damaged ({_first_line(error)}; it is {size} bytes long); "
+            "copy it again or export it again"
+        ) from None
 
 
-def _open_mapped(data: mmap.mmap, path: Path) -> TiffFrames:
-    reader = DirectoryReader(data, path)
-    directories = reader.directories()
-    _check_kind(directories[0].layout, path)
-    texts = [reader.text(extent) for extent in directories[0].descriptions]
-    hints: list[Hints] = []
-
+def _open(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> TiffFrames:
+    images = list(_images(file, data, path))
+    texts = images[0].texts
     ome_text = next((text for text in texts if is_ome(text)), None)
+    notes: tuple[str, ...] = ()
     if ome_text is not None:
-        ome = read_ome(ome_text, len(directories), path)
-        frames = [directories[index] for index in ome.order]
-        n_frames = len(frames)
-        hints.append(ome.hints)
+        ome = read_ome(ome_text, len(images), path)
+        order = ome.order.tolist()
+        n_frames, hints = len(order), [ome.hints]
     else:
-        frames = _without_thumbnails(directories)
-        n_frames = _count_frames(reader, frames, path)
-    layout = _common_layout(frames, path)
+        # Thumbnails are left out, unless everything is declared to be one.
+        order = [k for k, image in enumerate(images) if not image.reduced]
+        order = order or list(range(len(images)))
+        n_frames, heights = _count_frames([images[k] for k in order], path)
+        hints = []
+        notes = (TIME_FROM_HEIGHTS,) if heights else ()
+    frames = [images[k] for k in order]
+    first = file.pages[order[0]]
+    dtype = _dtype(first, path).newbyteorder(file.byteorder)
+    _refuse_differences(frames, path)
     if n_frames < 2:
         raise DataError(
             f"{path}: holds a single frame; a movie needs frames before and after a particle binds"
         )
+    size = math.prod(frames[0].shape) * dtype.itemsize
+    for number, image in enumerate(frames):
+        if image.start is None:
+            _refuse_growth(size, sum(image.sizes), _FRAME_BOMB_RATIO, f"image {number}", path)
+    if frames[0].start is None:
+        _refuse_growth(n_frames * size, len(data), _BOMB_RATIO, "it", path)
 
-    total = n_frames * layout.frame_bytes
-    if frames[0].start is None and total > max(_BOMB_BYTES, _BOMB_RATIO * len(data)):
-        raise DataError(
-            f"{path}: would grow from {len(data)} to {total} bytes, which no recording does; "
-            "the file is damaged, export it again"
-        )
-
-    hints += _micro_manager(reader, frames, path, check_axes=ome_text is None)
-    resolution = directories[0].resolution
+    stamps = [file.pages[k].tags.valueof(_MICRO_MANAGER) for k in (order[0], order[-1])]
+    if stamps[0] is not None or _MICRO_MANAGER in first.tags:
+        summary = _micro_manager_summary(path)
+        if ome_text is None:
+            time_axis(micro_manager_axes(summary), path)
+        hints.append(micro_manager_hints(stamps[0], stamps[1], len(frames), summary))
+    resolution = _resolution(file.pages[0])
     hints += [imagej_hints(text, resolution) for text in texts if text.startswith("ImageJ=")]
     hints.append(plain_hints(resolution))
     return TiffFrames(
         data,
         path,
-        layout,
-        byte_order=reader.byte_order,
-        frames=frames,
+        dtype=dtype,
+        images=frames,
         n_frames=n_frames,
         metadata=merge(hints, path),
+        notes=notes,
+        decode=first.decode,
     )
 
 
-def _check_kind(layout: Layout, path: Path) -> None:
-    if layout.samples > 1:
-        raise DataError(
-            f"{path}: holds colour images ({layout.samples} samples per pixel); "
-            "export the camera's grey values"
+def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[_Image]:
+    """Read the images one by one, and refuse the file where tifffile would repair it."""
+    seen: set[int] = set()
+    following = values = 0
+    for number in itertools.count():
+        try:
+            page = file.pages[number]
+        except IndexError:
+            break
+        if page.offset in seen:
+            raise _damaged(path, f"its list of frames runs in a circle after {number}")
+        seen.add(page.offset)
+        tags, following = _declared_tags(file.tiff, data, page.offset)
+        if len(tags) != len(page.tags) and set(tags) & _ESSENTIAL - set(page.tags.keys()):
+            raise _damaged(path, f"the header of image {number} is truncated or cannot be read")
+        # Images that share one long value would cost its length each time.
+        values += sum(tag.count for tag in page.tags)
+        if values > _OVERLAP * len(data) + _OVERLAP_BYTES:
+            raise _damaged(path, "the headers of its images overlap")
+        _refuse_unread_pixels(page, len(data), path)
+        yield _Image(
+            page.shape,
+            page.dtype,
+            page.hash,
+            page.is_reduced,
+            tuple(_text(tag.value) for tag in page.tags.getall(_DESCRIPTION, ())),
+            page.dataoffsets,
+            page.databytecounts,
+            page.dataoffsets[0] if page.is_final else None,
         )
-    if layout.depth > 1:
+    if not seen and not any(data[4:8] if not file.tiff.is_bigtiff else data[8:16]):
         raise DataError(
-            f"{path}: holds volumes ({layout.depth} planes per image); export one plane per frame"
+            f"{path}: holds no image; it was not finished when it was written, export it again"
         )
-    if layout.compression not in _LOSSLESS:
-        name = tifffile.COMPRESSION(layout.compression).name if _known(layout) else "unknown"
+    if not seen or following:
         raise DataError(
-            f"{path}: its compression ({name}, number {layout.compression}) is not supported; "
-            "save it uncompressed or with Deflate"
+            f"{path}: is truncated (its list of frames breaks off after {len(seen)} of them); "
+            "copy it again or export it again"
         )
 
 
-def _known(layout: Layout) -> bool:
-    return layout.compression in tifffile.COMPRESSION.__members__.values()
+def _declared_tags(
+    tiff: tifffile.TiffFormat, data: mmap.mmap, offset: int
+) -> tuple[list[int], int]:
+    """Codes of the tags that an image lists, and where the next image is; 0 after the last."""
+    (count,) = struct.unpack_from(tiff.tagnoformat, data, offset)
+    first = offset + tiff.tagnosize
+    end = first + count * tiff.tagsize
+    codes = np.ndarray(count, f"{tiff.byteorder}u2", data, first, (tiff.tagsize,)).tolist()
+    return codes, int(struct.unpack_from(tiff.offsetformat, data, end)[0])
 
 
-def _without_thumbnails(directories: list[Directory]) -> list[Directory]:
-    full = [directory for directory in directories if not directory.reduced]
-    return full or directories
+def _refuse_unread_pixels(page: tifffile.TiffPage, file_size: int, path: Path) -> None:
+    """Every strip or tile must be listed and lie in the file, with as many bytes as it needs."""
+    number, rows, columns = page.index, page.imagelength, page.imagewidth
+    frame_bytes = rows * columns * (page.dtype.itemsize if page.dtype else 8) * page.samplesperpixel
+    if not 0 < frame_bytes <= _LARGEST_FRAME_BYTES:
+        raise _damaged(path, f"image {number} declares {rows} x {columns} pixels")
+    needed = math.prod(page.chunked)
+    tag = page.tags.get(_TILE_OFFSETS) or page.tags.get(_STRIP_OFFSETS)
+    listed = tag.count if tag is not None else 0
+    if page.compression != 1 and not {_STRIP_SIZES, _TILE_SIZES} & set(page.tags.keys()):
+        raise _damaged(path, f"image {number} does not say how long its pixel data are")
+    if not listed == len(page.dataoffsets) == len(page.databytecounts) == needed:
+        raise _damaged(path, f"image {number} lists {listed} strips or tiles but needs {needed}")
+    if min(page.dataoffsets) <= 0 or min(page.databytecounts) <= 0:
+        raise DataError(
+            f"{path}: image {number} has no pixel data for part of its area; "
+            "the recording or the copy was interrupted, export it again"
+        )
+    end = max(map(sum, zip(page.dataoffsets, page.databytecounts, strict=True)))
+    if end > file_size:
+        raise DataError(
+            f"{path}: is truncated (the pixels of image {number} should reach byte {end} of "
+            f"{file_size}); copy it again or export it again"
+        )
+    if page.compression == 1:
+        stored = sum(page.databytecounts)
+        tile_rows, tile_columns = page.chunks[-2:] if page.samplesperpixel == 1 else (1, 1)
+        if page.is_tiled and page.samplesperpixel == 1:
+            rows, columns = needed * tile_rows, tile_columns
+        if stored < rows * -(-columns * page.bitspersample // 8):
+            raise _damaged(path, f"image {number} needs more than the {stored} bytes it stores")
 
 
-def _common_layout(frames: Sequence[Directory], path: Path) -> Layout:
-    layout = frames[0].layout
-    for number, frame in enumerate(frames):
-        if frame.layout != layout:
-            what = (
-                f"{frame.layout} but the first is {layout}"
-                if str(frame.layout) != str(layout)
-                else "stored in another way than the first"
-            )
-            raise DataError(
-                f"{path}: its frames differ: image {number} is {what}; "
-                "export the frames of one movie to a file of their own"
-            )
-        stored = int(frame.byte_counts.sum())
-        if layout.frame_bytes > max(_BOMB_BYTES, _FRAME_BOMB_RATIO * stored):
-            raise DataError(
-                f"{path}: image {number} would grow from {stored} to {layout.frame_bytes} bytes, "
-                "which no recording does; the file is damaged, export it again"
-            )
-    return layout
+def _text(value: str | bytes) -> str:
+    """Text of a description, which tifffile gives as bytes where it is not UTF-8."""
+    text = value if isinstance(value, str) else value.decode("latin-1")
+    return text.partition("\0")[0].strip()
 
 
-def _count_frames(reader: DirectoryReader, frames: list[Directory], path: Path) -> int:
-    """Set what the file holds against every description in it; the larger number must be true."""
+def _count_frames(images: Sequence[_Image], path: Path) -> tuple[int, bool]:
+    """Set what the file holds against every description in it; the larger number must be true.
+
+    Returns the number of frames, and whether they lie along an axis of heights.
+    """
     announced = 0
-    truncated = False
-    for frame in frames:
-        for extent in frame.descriptions:
-            found = described_frames(
-                reader.text(extent), frame.layout.rows, frame.layout.columns, path
-            )
+    one_image = heights = False
+    for image in images:
+        for text in image.texts:
+            found = described_frames(text, image.shape, path)
             if found is not None:
                 announced += found.frames
-                truncated |= found.one_directory
+                one_image |= found.one_image
+                heights |= found.axis == "Z"
                 break
-    if announced <= len(frames):
-        return len(frames)
-    if len(frames) == 1 and truncated and frames[0].start is not None:
-        return announced
+    if announced <= len(images):
+        return len(images), heights
+    if len(images) == 1 and one_image and images[0].start is not None:
+        return announced, heights
     raise DataError(
-        f"{path}: describes {announced} frames but holds {len(frames)}; "
+        f"{path}: describes {announced} frames but holds {len(images)}; "
         "the recording or the copy was interrupted: export it again"
     )
 
 
-def _micro_manager(
-    reader: DirectoryReader, frames: list[Directory], path: Path, *, check_axes: bool
-) -> list[Hints]:
-    first, last = frames[0].micro_manager, frames[-1].micro_manager
-    if first is None:
-        return []
+def _dtype(page: tifffile.TiffPage, path: Path) -> np.dtype[Any]:
+    """Type of the pixels of the first frame, if the movie is of a kind that can be analysed."""
+    if page.samplesperpixel > 1:
+        raise DataError(
+            f"{path}: holds colour images ({page.samplesperpixel} samples per pixel); "
+            "export the camera's grey values"
+        )
+    if page.imagedepth > 1:
+        raise DataError(
+            f"{path}: holds volumes ({page.imagedepth} planes per image); "
+            "export one plane per frame"
+        )
+    if page.compression not in _LOSSLESS:
+        name = getattr(page.compression, "name", "unknown")
+        raise DataError(
+            f"{path}: its compression ({name}, number {int(page.compression)}) is not supported; "
+            "save it uncompressed or with Deflate"
+        )
+    if page.dtype is None or page.dtype.kind not in "uif":
+        raise DataError(
+            f"{path}: its pixels are {page.bitspersample}-bit numbers of sample format "
+            f"{int(page.sampleformat)}; export it as 8-, 16- or 32-bit integers or as floats"
+        )
+    dtype: np.dtype[Any] = page.dtype
+    return dtype
+
+
+def _refuse_differences(frames: Sequence[_Image], path: Path) -> None:
+    first = frames[0]
+    for number, image in enumerate(frames):
+        if image.encoding != first.encoding:
+            differs = str(image) != str(first)
+            what = f"{image} but the first is {first}" if differs else "stored in another way"
+            raise DataError(
+                f"{path}: its frames differ: image {number} is {what}; "
+                "export the frames of one movie to a file of their own"
+            )
+
+
+def _refuse_growth(size: int, stored: int, ratio: int, what: str, path: Path) -> None:
+    if size > max(_BOMB_BYTES, ratio * stored):
+        raise DataError(
+            f"{path}: {what} would grow from {stored} to {size} bytes, which no recording does; "
+            "the file is damaged, export it again"
+        )
+
+
+def _micro_manager_summary(path: Path) -> dict[str, Any]:
+    """Summary of the acquisition; empty where the file is of an older version or was edited."""
     try:
         with path.open("rb") as file:
             found = tifffile.read_micromanager_metadata(file, {"Summary"}).get("Summary")
-    except (ValueError, OSError, RecursionError):  # older or edited: the frames still tell
-        found = None
-    summary = found if isinstance(found, dict) else {}
-    if check_axes:
-        time_axis(micro_manager_axes(summary), path)
-    texts = [reader.text(extent) if extent else "" for extent in (first, last)]
-    return [micro_manager_hints(texts[0], texts[1], len(frames), summary)]
+    except WHAT_LIBRARIES_RAISE:
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
-def _decoder(path: Path, index: int) -> Callable[..., Any]:
-    """Borrow tifffile's decoder of one image; all frames share its layout."""
+def _resolution(page: tifffile.TiffPage) -> tuple[float, float, int] | None:
+    """Pixels per unit along x and y, and the unit."""
+    pair = [page.tags.valueof(code) for code in (282, 283)]
+    if any(not isinstance(value, tuple) or len(value) != 2 or 0 in value for value in pair):
+        return None
+    (x, x_per), (y, y_per) = pair
+    unit: int = page.tags.valueof(296, 2)
+    return x / x_per, y / y_per, unit
+
+
+@contextmanager
+def _unheard() -> Iterator[None]:
+    """Keep what tifffile logs from stderr where the program has set up no logging of its own."""
+    logger, handler = logging.getLogger("tifffile"), logging.NullHandler()
+    logger.addHandler(handler)
     try:
-        with tifffile.TiffFile(path) as file:
-            decode: Callable[..., Any] = file.pages[index].decode
-    except (ValueError, TypeError, IndexError, KeyError, OSError) as error:
-        raise DataError(
-            f"{path}: its first frame cannot be decoded ({error}); export it again"
-        ) from None
-    return decode
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+def _first_line(error: BaseException) -> str:
+    return next(iter(str(error).splitlines()), "") or type(error).__name__
+
+
+def _damaged(path: Path, how: str) -> DataError:
+    return DataError(f"{path}: is damaged ({how}); export it again")

@@ -36,6 +36,9 @@ NEAR_CRITICAL = 0.98
 
 _HEIGHTS_KEPT = 8  # profiles at hand; where z is fixed, every image asks for the same one
 
+TABLE_LIMIT_MB = 400
+"""No table of the model is larger: a length in the wrong unit would fill the memory."""
+
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
 
@@ -153,6 +156,7 @@ class ForwardModel:
         step = STEP / float(np.abs(self.axial - kappa).max())
         count = max(math.ceil((high - low) / step), 1) + 1
         points = self.table.shape[3]
+        check_table("the table along z", 72.0 * count * (points - 1))
         nodes, out = np.empty((12, 3 * points)), np.empty((12, points - 1, 6))
         heights = np.empty((count, 3, 4, 6 * (points - 1)))
         for i in range(count):
@@ -180,8 +184,31 @@ class ForwardModel:
         ndarray, shape (ny, nx)
             Contrast C, or |E_sca|² in dark field.
         """
+        return self.amplitude_image(grid, x_nm, y_nm, z_nm, self.scale.amplitude(mass_kda))
+
+    def amplitude_image(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
+    ) -> FloatArray:
+        """Signal of one particle whose amplitude is known instead of its mass.
+
+        Below the offset of a calibration two amplitudes have one mass, so that what was fitted as
+        an amplitude must be drawn from it.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        ndarray, shape (ny, nx)
+            As `image` gives it.
+        """
         out = np.empty(grid.shape)
-        amplitude = self.scale.amplitude(mass_kda)
         signal_image(self.profile(z_nm, 1), *self._geometry(grid, x_nm, y_nm, amplitude), out)
         return out
 
@@ -207,9 +234,33 @@ class ForwardModel:
             Derivatives with respect to x, y, z [1/nm] and mass [1/kDa].
         """
         amplitude = self.scale.amplitude(mass_kda)
+        signal, gradient = self.amplitude_gradient(grid, x_nm, y_nm, z_nm, amplitude)
+        gradient[3] /= self.scale.slope(amplitude)
+        return signal, gradient
+
+    def amplitude_gradient(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Signal and its derivatives in (x, y, z, a), a the amplitude.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        signal : ndarray, shape (ny, nx)
+            As `image` gives it.
+        gradient : ndarray, shape (4, ny, nx)
+            Derivatives with respect to x, y, z [1/nm] and the amplitude.
+        """
         rows = np.empty((grid.shape[0], 5, grid.shape[1]))
         signal_gradient(self.profile(z_nm, 2), *self._geometry(grid, x_nm, y_nm, amplitude), rows)
-        rows[:, 4] /= self.scale.slope(amplitude)
         out = np.moveaxis(rows, 1, 0)
         return out[0], out[1:]
 
@@ -285,7 +336,24 @@ class ForwardModel:
         float
             Peak contrast, or the peak of |E_sca|² in dark field.
         """
-        linear, quadratic, _ = self._peak(z_nm, self.scale.amplitude(mass_kda))
+        return self.amplitude_contrast(z_nm, self.scale.amplitude(mass_kda))
+
+    def amplitude_contrast(self, z_nm: float, amplitude: float) -> float:
+        """Peak contrast of an amplitude; see `peak_contrast` and `amplitude_image`.
+
+        Parameters
+        ----------
+        z_nm : float
+            Height [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        float
+            Peak contrast, or the peak of |E_sca|² in dark field.
+        """
+        linear, quadratic, _ = self._peak(z_nm, amplitude)
         return linear + quadratic
 
     def collected_area_nm2(self, z_nm: float, mass_kda: float) -> float:
@@ -435,11 +503,13 @@ def forward_model(
     alpha = math.asin(optics.na / ni)
     near = NEAR_CRITICAL * ns < optics.na and ns < ni
     critical = math.asin(ns / ni) if near else None
+    step = STEP / (k * optics.na)
+    intervals = math.ceil(reach_nm / step) + 1
+    turns = k * (optics.na * reach_nm + ns * z_max_nm + ni * abs(oil_nm) * (1 - math.cos(alpha)))
+    check_table("the radial table", 6 * (30 + 0.45 * turns) * (intervals + 1))
     if paper:
         theta, weight = rectangle(alpha, nodes or DONG2021_FIELD_NODES)
     else:
-        rise = 1 - math.cos(alpha)
-        turns = k * (optics.na * reach_nm + ns * z_max_nm + ni * abs(oil_nm) * rise)
         beyond = max(0.0, (alpha - critical) / alpha) if critical else 0.0
         theta, weight = gauss_legendre(
             alpha,
@@ -489,8 +559,6 @@ def forward_model(
     common = pupil.weight * pupil.apodization * np.exp(1j * pupil.oil * fixed_oil_nm)
     common = common * front * strength / (reference or 1.0)
     source = np.stack([common * (pupil.t_s + pupil.t_p_cos), common * (pupil.t_s - pupil.t_p_cos)])
-    step = STEP / (k * optics.na)
-    intervals = math.ceil(reach_nm / step) + 1
     same = (
         like is not None
         and like.step_nm == step
@@ -517,6 +585,31 @@ def forward_model(
     if config.calibration is None:
         return model
     return replace(model, scale=_mass_scale(model, config.calibration))
+
+
+def check_table(what: str, numbers: float) -> None:
+    """Refuse a table that would not fit into the memory, before it is allocated.
+
+    Parameters
+    ----------
+    what : str
+        What the message calls it.
+    numbers : float
+        How many 8-byte numbers it holds.
+
+    Raises
+    ------
+    ConfigError
+        It is larger than `TABLE_LIMIT_MB`.
+    """
+    megabytes = 8e-6 * numbers
+    if megabytes > TABLE_LIMIT_MB:
+        raise ConfigError(
+            f"{what} of the model would take {megabytes:,.0f} MB, more than {TABLE_LIMIT_MB} MB: "
+            "check that optics.wavelength_nm, optics.focus_nm, particle.height_nm, "
+            "fit.z_range_nm, fit.roi_nm and camera.pixel_size_nm are in nanometres, or take a "
+            "smaller field or range"
+        )
 
 
 def _mass_scale(model: ForwardModel, line: Calibration) -> MassScale:

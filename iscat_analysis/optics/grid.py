@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.errors import DataError
+
 FloatArray = NDArray[np.float64]
 
 
@@ -21,11 +23,27 @@ class PixelGrid:
         Centres [nm].
     pixel_nm : float
         Side of a pixel [nm].
+
+    Raises
+    ------
+    DataError
+        The centres are not finite numbers that ascend, or the side is not positive.
     """
 
     x_nm: FloatArray
     y_nm: FloatArray
     pixel_nm: float
+
+    def __post_init__(self) -> None:
+        for name in ("x_nm", "y_nm"):
+            axis = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            if axis.ndim != 1 or not axis.size or not np.all(np.isfinite(axis)):
+                raise DataError(f"{name}: give the centres as one row of finite numbers")
+            if np.any(np.diff(axis) <= 0):
+                raise DataError(f"{name}: the centres must ascend; sort them, without doubles")
+            object.__setattr__(self, name, axis)
+        if not (math.isfinite(self.pixel_nm) and self.pixel_nm > 0):
+            raise DataError(f"pixel_nm = {self.pixel_nm}: give the side of a pixel, above 0 nm")
 
     @classmethod
     def region(cls, rows: tuple[int, int], columns: tuple[int, int], pixel_nm: float) -> PixelGrid:

@@ -35,6 +35,7 @@ from iscat_analysis.pipeline.landing import analyse_landings, has_landings, inje
 from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
 from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
 from iscat_analysis.pipeline.scene import Scene, field_likelihood, make_scene
+from iscat_analysis.pipeline.systematic import with_systematic
 from iscat_analysis.pipeline.tracking import track_particles
 from iscat_analysis.records import (
     Analysis,
@@ -131,6 +132,7 @@ def fit_stack(
         if not analysis.summary["interrupted"]:
             shutil.rmtree(partial_folder(folder.resolve()), ignore_errors=True)
     if analysis.summary["interrupted"]:
+        progress("report", 1, 1)
         notify(f"interrupted; what was finished is in {folder}")
         raise KeyboardInterrupt
     return analysis
@@ -175,10 +177,19 @@ def analyse(
         warnings.append(text)
         notify(text)
 
-    implied = movie.notes if config.camera.pixel_size_nm is None else ()
     config, notes = resolve_metadata(config, movie.metadata)
-    for note in (*implied, *notes):
+    for note in (*movie.notes, *notes):
         tell(note)
+    if config.optics.scheme == "darkfield" and config.particle.photons_per_frame is None:
+        photons = config.simulation.photons_per_pixel
+        tell(
+            f"particle.photons_per_frame is not given, so that masses rest on "
+            f"simulation.photons_per_pixel = {photons:g}, which says nothing of this movie; give "
+            "the scattered photons collected per frame from a particle of particle.mass_kda: the "
+            "next release asks for it"
+        )
+        particle = config.particle.model_copy(update={"photons_per_frame": photons})
+        config = config.model_copy(update={"particle": particle})
     shape = (movie.shape[1], movie.shape[2])
     camera = camera_from_config(config.camera, shape, movie.dtype)
     hashing = ThreadPoolExecutor(1)
@@ -211,21 +222,24 @@ def analyse(
     else:
         if inject:
             raise ConfigError(
-                "--inject adds particles to a landing movie: it needs an interferometric scheme "
-                "and neither --background nor background.frames"
+                f"inject = {inject}: particles are added to landing movies only, which have an "
+                'interferometric scheme and background.method = "sliding"; leave it out'
             )
         scene, found, image, further = _measured_background(
             movie, config, camera, clock, tell=tell, notify=notify, progress=progress
         )
     windows = found.windows
+    if found.interrupted:  # what was finished is now gathered and kept, which takes a moment
+        progress("report", 0, 1)
+    found = replace(found, table=with_systematic(config, found.table))
     summary = summary_of(scene, found.table, windows, clock.seconds)
-    sampled = config.posterior.enabled and scene.mode != "track"
+    sampled = config.samples_posterior
     provenance = Provenance(
         command=_printable(command) or "iscat_analysis.pipeline.analyse",
         input_path=_printable(str(movie.path)),
         input_sha256=digest.result(),
         versions=_versions(),
-        seed=config.simulation.seed if sampled else None,
+        seed=config.compute.seed if sampled else None,
         started=started,
     )
     summary |= {
@@ -279,12 +293,12 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
         The background leaves no frame to fit.
     """
     before = config.background.frames
-    if config.background.method == "none":
+    if config.background.method == "known":
         before = None
     elif before is None:
         raise ConfigError(
             "which frames come before the particles? give them as --background 0:200 "
-            'or background.frames, or a known level with background.method = "none"'
+            'or background.frames, or a known level with background.method = "known"'
         )
     start = before[1] if before else 0
     after = config.fit.frames or (start, movie.shape[0])
@@ -323,7 +337,7 @@ def _measured_background(
         camera,
         before,
         after,
-        method=config.background.method,
+        median=config.background.method == "median",
         level_e=config.background.level_e,
         power_normalization=config.background.power_normalization,
         check=check,
@@ -365,7 +379,7 @@ def _bound_particles(
     clock.lap("fit")
     rows = [Row(number, event, windows) for number, event in enumerate(events)]
     interrupted = False
-    if scene.config.posterior.enabled:
+    if scene.config.samples_posterior:
         rows, interrupted = _sampled(scene, rows, pool, progress)
         clock.lap("posterior")
     views = tuple(view_of(row) for row in rows)
@@ -376,7 +390,7 @@ def _sampled(
     scene: Scene, rows: list[Row], pool: ThreadPoolExecutor, progress: Progress
 ) -> tuple[list[Row], bool]:
     """Sample the posteriors; an interrupt keeps those that are done."""
-    settings, seed = scene.config.posterior, scene.config.simulation.seed
+    settings, seed = scene.config.posterior, scene.config.compute.seed
     stop = threading.Event()
 
     def one(row: Row) -> PosteriorResult:

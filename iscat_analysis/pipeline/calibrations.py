@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,8 +17,9 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.records import Progress, Status, silent
-from iscat_analysis.report import atomic_folder, check_output, jsonable
+from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.calibration import camera_page, mass_page
+from iscat_analysis.schemas import jsonable, to_json
 
 CAMERA_FILES = frozenset(
     {
@@ -98,7 +98,7 @@ def camera_calibration(
     contents |= found.to_dict()
     toml = found.to_toml(names)
     with atomic_folder(out, overwrite, known=CAMERA_FILES) as folder:
-        _write_json(contents, folder / "camera.json")
+        (folder / "camera.json").write_text(to_json("camera", contents) + "\n", encoding="utf-8")
         (folder / "camera.toml").write_text(toml, encoding="utf-8")
         for key, values in found.maps.items():
             tifffile.imwrite(folder / names[key], values.astype(np.float32))
@@ -179,7 +179,8 @@ def mass_calibration(
     }
     toml = found.to_toml()
     with atomic_folder(out, overwrite, known=MASS_FILES) as folder:
-        _write_json(contents, folder / "calibration.json")
+        text = to_json("calibration", contents)
+        (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
         (folder / "calibration.toml").write_text(toml, encoding="utf-8")
         page = mass_page(events.name, jsonable(contents), toml)
         (folder / "calibration.html").write_text(page, encoding="utf-8")
@@ -237,8 +238,3 @@ def _landing(contrast: np.ndarray[Any, Any], mass: np.ndarray[Any, Any]) -> Land
     product = contrast * mass
     product = product[np.isfinite(product)]
     return "bright" if product.size and float(np.median(product)) > 0 else "dark"
-
-
-def _write_json(contents: Any, path: Path) -> None:
-    text = json.dumps(jsonable(contents), indent=2, ensure_ascii=False, allow_nan=False)
-    path.write_text(text + "\n", encoding="utf-8")

@@ -111,8 +111,7 @@ def has_landings(config: Config) -> bool:
         Whether `analyse_landings` is the way to analyse it.
     """
     return (
-        config.background.frames is None
-        and config.background.method == "mean"
+        config.background.method == "sliding"
         and config.optics.scheme != "darkfield"
         and config.fit.mode != "track"
         and config.fit.likelihood != "poisson"
@@ -176,7 +175,7 @@ def analyse_landings(
         tell(noise.gain_message)
     stride = max(1, window // STRIDES)
     count = max(math.ceil((last - first) / stride) - 1, 1)
-    posterior = _posterior_wanted(config)
+    posterior = config.samples_posterior
     sampling = config.posterior.model_copy(update={"enabled": posterior})
     config = config.model_copy(update={"posterior": sampling})
     scene = make_landing_scene(config, reader.shape, searches=count)
@@ -280,7 +279,7 @@ def inject_and_recover(
     frames = config.fit.frames or (0, movie.shape[0])
     window = int(result.summary["window_frames"])
     fixed = config.background.model_copy(update={"window_frames": window})
-    seed = config.simulation.seed
+    seed = config.compute.seed
     particles = draw_particles(
         result.scene, (movie.shape[1], movie.shape[2]), frames, window, count, result.table, seed
     )
@@ -397,7 +396,7 @@ def _analyse_chunk(
             chain = sample_posterior(
                 row.event.likelihood, row.event.fit,
                 walkers=settings.walkers, steps=settings.steps,
-                seed=scene.config.simulation.seed + steps[i].step.at.frame,
+                seed=scene.config.compute.seed + steps[i].step.at.frame,
             )  # fmt: skip
         except KeyboardInterrupt:  # the fits are done, and kept
             stopped = True
@@ -446,11 +445,6 @@ def _row(number: int, step: FittedStep) -> Row:
 def _view(row: Row, step: FittedStep) -> EventView:
     view = view_of(row)
     return replace(view, row_px=step.region.rows[0], column_px=step.region.columns[0])
-
-
-def _posterior_wanted(config: Config) -> bool:
-    """Whether the configuration itself asks: sampling hundreds of events takes hours."""
-    return config.posterior.enabled and "enabled" in config.posterior.model_fields_set
 
 
 def frame_warnings(

@@ -238,8 +238,24 @@ def _distribution(scene: Scene, good: pd.DataFrame) -> dict[str, Any] | None:
     )
     filter_sigma = _median(np.abs(mass[snr > 0]) / snr[snr > 0])
     efficiency = Efficiency(scene.templates.threshold, filter_sigma) if filter_sigma else None
-    found = describe(mass, sigma, efficiency=efficiency, seed=scene.config.simulation.seed)
+    found = describe(
+        mass,
+        sigma,
+        efficiency=efficiency,
+        seed=scene.config.compute.seed,
+        scale_error=_scale_error(good),
+    )
     return found.to_dict()
+
+
+def _scale_error(good: pd.DataFrame) -> Callable[[FloatArray], FloatArray] | None:
+    """Read the error that all events share, as a function of mass, off the events themselves."""
+    if "systematic_mass_kda" not in good or good.empty:
+        return None
+    size = good["mass_kda"].abs().to_numpy(dtype=float)
+    error = good["systematic_mass_kda"].to_numpy(dtype=float)
+    order = np.argsort(size)
+    return lambda masses: np.interp(masses, size[order], error[order])
 
 
 def _median(values: pd.Series[float] | FloatArray) -> float | None:

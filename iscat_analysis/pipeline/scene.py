@@ -20,6 +20,10 @@ SPREAD_NM = 10_000.0
 """Farther than this from a particle its rings are left out; they are 1e-4 of its peak."""
 
 
+_VARIANCE_OF_BACKGROUND = {"fixed": 1.0, "sliding": 1.0, "median": math.pi / 2, "known": 0.0}
+"""Variance of a measured background over that of the mean of its frames."""
+
+
 @dataclass(frozen=True)
 class Region:
     """Half-open ranges of full-frame pixels."""
@@ -108,10 +112,10 @@ def make_scene(config: Config, field_px: tuple[int, int], *, searches: int = 1) 
             f"{field_px[0]} x {field_px[1]}: lower fit.roi_nm or check camera.pixel_size_nm"
         )
     darkfield = config.optics.scheme == "darkfield"
-    if config.fit.likelihood == "conditional" and (darkfield or config.background.method != "mean"):
+    if config.fit.likelihood == "conditional" and (darkfield or not _is_counted(config)):
         raise ConfigError(
             'fit.likelihood = "conditional" needs an interferometric scheme and '
-            'background.method = "mean": use "auto"'
+            'background.method = "fixed" or "sliding": use "auto"'
         )
     reach = math.sqrt(2) * (roi_px * pixel / 2 + window_nm(pixel) + pixel)
     model = forward_model(config, reach)
@@ -188,7 +192,7 @@ def region_likelihood(
             read_variance_after_e2=windows.read_variance_after_e2[cut],
             masked=masked,
         )  # fmt: skip
-    measured = {"mean": 1.0, "median": math.pi / 2, "none": 0.0}[config.background.method]
+    measured = _VARIANCE_OF_BACKGROUND[config.background.method or "fixed"]
     read = windows.read_variance_before_e2[cut]
     steady = smooth_background(before, read, masked) if measured else before
     # The expected variance is that of the smooth background; the excess is that over the own one.
@@ -220,9 +224,14 @@ def photons_scale(scene: Scene, windows: Windows) -> float:
     float
         Photoelectrons per pixel for unit |E_sca|², summed over the frames after.
     """
-    per_frame = scene.model.photons_per_intensity(
-        scene.config.simulation.photons_per_pixel, scene.pixel_nm
-    )
+    photons = scene.config.particle.photons_per_frame
+    if photons is None:
+        raise ConfigError(
+            "particle.photons_per_frame is needed in dark field, where it is the scale of masses: "
+            "give the scattered photons that are collected per frame from a particle of "
+            "particle.mass_kda"
+        )
+    per_frame = scene.model.photons_per_intensity(photons, scene.pixel_nm)
     return per_frame * windows.power_ratio * max(windows.n_before, 1)
 
 
@@ -266,8 +275,13 @@ def reported_steps(scene: Scene) -> int:
 def _uses_conditional(config: Config) -> bool:
     """Whether the fits condition on the sum of counts before and after."""
     if config.fit.likelihood == "auto":
-        return config.optics.scheme != "darkfield" and config.background.method == "mean"
+        return config.optics.scheme != "darkfield" and _is_counted(config)
     return config.fit.likelihood == "conditional"
+
+
+def _is_counted(config: Config) -> bool:
+    """Whether the background is a sum of counts, which is what the conditional law is about."""
+    return config.background.method in ("fixed", "sliding")
 
 
 def _pixel_nm(config: Config) -> float:

@@ -13,14 +13,13 @@ from iscat_analysis.records import Analysis
 from iscat_analysis.report.figures import EVENT_FIGURES, write_figures
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output
 from iscat_analysis.report.page import render_page, render_report
-from iscat_analysis.report.tables import jsonable, write_posterior, write_tables
+from iscat_analysis.report.tables import write_posterior, write_tables
 
 __all__ = [
     "EVENT_FIGURES",
     "OUTPUT_NAMES",
     "atomic_folder",
     "check_output",
-    "jsonable",
     "render_page",
     "render_report",
     "write_report",

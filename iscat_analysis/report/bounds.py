@@ -5,7 +5,6 @@ Everything arrives as tables; nothing is computed here.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from iscat_analysis.records import PARAMETERS
 from iscat_analysis.report.numbers import LABELS, UNITS
 from iscat_analysis.report.output import atomic_folder
 from iscat_analysis.report.style import BLUE, INK, STYLE, VERMILLION, log_y, new_figure, save_figure
-from iscat_analysis.report.tables import jsonable
+from iscat_analysis.schemas import to_json
 
 BOUNDS_FILES = frozenset({"bounds.json", "scan.csv", "scan.png", "scan.svg"})
 """What `write_bounds` may leave in its folder."""
@@ -63,8 +62,7 @@ def write_bounds(
         The folder may not or cannot be written.
     """
     with atomic_folder(folder, overwrite, known=BOUNDS_FILES) as building:
-        text = json.dumps(jsonable(report), indent=2, ensure_ascii=False, allow_nan=False)
-        (building / "bounds.json").write_text(text + "\n", encoding="utf-8")
+        (building / "bounds.json").write_text(to_json("bounds", report) + "\n", encoding="utf-8")
         if table is not None:
             table.to_csv(
                 building / "scan.csv", index=False, float_format="%.9g", lineterminator="\n"

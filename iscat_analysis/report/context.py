@@ -32,7 +32,8 @@ from iscat_analysis.report.precision import (
     precision_row,
     quantiles,
 )
-from iscat_analysis.report.tables import event_table, jsonable
+from iscat_analysis.report.tables import event_table
+from iscat_analysis.schemas import jsonable
 
 POWER_POINTS = 1500
 """Points of the power curve; longer ones keep the extremes of each stretch."""

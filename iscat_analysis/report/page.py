@@ -13,7 +13,7 @@ from markupsafe import Markup
 from iscat_analysis.records import Analysis
 from iscat_analysis.report.context import report_context
 from iscat_analysis.report.distribution import distribution_section
-from iscat_analysis.report.tables import jsonable
+from iscat_analysis.schemas import jsonable
 
 _UNSAFE_IN_SCRIPT = {
     "<": "\\u003c",

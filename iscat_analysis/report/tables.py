@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import io
 import json
-import math
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
@@ -17,6 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.records import EVENT_COLUMNS, Analysis, EventView
+from iscat_analysis.schemas import to_json
 
 CSV_DIGITS = 9
 """Significant digits in ``fits.csv``: 0.1 pm in a field of 100 µm, with no digits of pure noise."""
@@ -85,39 +85,9 @@ def write_tables(analysis: Analysis, folder: Path) -> None:
     )
     with (folder / "fits.parquet").open("wb") as file:  # pyarrow opens no path that is not text
         table.to_parquet(file, index=False)
-    summary = json.dumps(jsonable(analysis.summary), indent=2, ensure_ascii=False, allow_nan=False)
+    summary = to_json("summary", analysis.summary)
     (folder / "summary.json").write_text(summary + "\n", encoding="utf-8")
     (folder / "config.toml").write_text(analysis.config_toml, encoding="utf-8")
-
-
-def jsonable(value: Any) -> Any:
-    """Turn a value into what strict JSON can hold.
-
-    Parameters
-    ----------
-    value : Any
-        Numbers, arrays, mappings, sequences, paths, enumerations, at any depth.
-
-    Returns
-    -------
-    Any
-        The same with NaN and ±∞ as None, arrays as lists and everything unknown as text.
-    """
-    if value is None or isinstance(value, (bool, np.bool_)):
-        return None if value is None else bool(value)
-    if isinstance(value, Enum):
-        return jsonable(value.value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {_text(key) or str(key): jsonable(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return jsonable(value.tolist())
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [jsonable(item) for item in value]
-    return str(value)
 
 
 def write_posterior(analysis: Analysis, path: Path) -> bool:

@@ -1,24 +1,49 @@
-"""JSON schemas (draft 2020-12) of what the commands print and write, one file each."""
+"""The JSON documents that the commands print and write, as pydantic models.
+
+Each document is dumped through its model (`to_json`), and `schema` gives the JSON schema that
+pydantic derives from it, so that the two cannot disagree.  A model states what readers may rely on:
+every document may carry further keys, and readers should ignore those they do not know.  NaN and
+infinity become null.
+"""
 
 from __future__ import annotations
 
 import json
-from importlib.resources import files
+import math
+from collections.abc import Mapping
+from enum import Enum
 from typing import Any
 
+import numpy as np
+from pydantic import BaseModel
+
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.schemas.bounds import Bounds, Comparison
+from iscat_analysis.schemas.calibration import Calibration, Camera
+from iscat_analysis.schemas.fit import Fit, Simulate, Summary
+from iscat_analysis.schemas.study import Benchmark
+
+_DOCUMENTS: Mapping[str, type[BaseModel]] = {
+    "benchmark": Benchmark,
+    "bounds": Bounds,
+    "calibration": Calibration,
+    "camera": Camera,
+    "comparison": Comparison,
+    "fit": Fit,
+    "simulate": Simulate,
+    "summary": Summary,
+}
 
 
 def schema_names() -> tuple[str, ...]:
-    """List the schemas there are.
+    """List the documents that have a schema.
 
     Returns
     -------
     tuple of str
         Sorted.
     """
-    found = (entry.name for entry in files(__name__).iterdir())
-    return tuple(sorted(name.removesuffix(".json") for name in found if name.endswith(".json")))
+    return tuple(_DOCUMENTS)
 
 
 def schema(name: str) -> dict[str, Any]:
@@ -34,16 +59,65 @@ def schema(name: str) -> dict[str, Any]:
     Returns
     -------
     dict
-        A JSON schema, draft 2020-12, with a description and a unit for every number.
+        A JSON schema, draft 2020-12, derived from the model that is dumped.
 
     Raises
     ------
     ConfigError
         There is no such schema; the known ones are named.
     """
-    names = schema_names()
-    if name not in names:
-        raise ConfigError(f"schema {name!r} is not known; there are {', '.join(names)}")
-    text = files(__name__).joinpath(f"{name}.json").read_text(encoding="utf-8")
-    found: dict[str, Any] = json.loads(text)
-    return found
+    if name not in _DOCUMENTS:
+        raise ConfigError(f"schema {name!r} is not known; there are {', '.join(_DOCUMENTS)}")
+    return _DOCUMENTS[name].model_json_schema(mode="serialization")
+
+
+def to_json(name: str, values: Mapping[str, Any]) -> str:
+    """Write a document as JSON, through its model.
+
+    Parameters
+    ----------
+    name : str
+        As for `schema`.
+    values : mapping
+        Its content; NumPy scalars and arrays are allowed at any depth.
+
+    Returns
+    -------
+    str
+        Strict JSON, indented, without a newline at the end.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        The content is not what the schema promises.
+    """
+    document = _DOCUMENTS[name].model_validate(jsonable(values))
+    plain = document.model_dump(mode="json", exclude_unset=True, by_alias=True)
+    return json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def jsonable(value: Any) -> Any:
+    """Turn a value into what strict JSON can hold.
+
+    Parameters
+    ----------
+    value : Any
+        Numbers, arrays, mappings, sequences, paths, enumerations, at any depth.
+
+    Returns
+    -------
+    Any
+        The same with NaN, ±∞ and pandas' missing values as None, arrays as lists, and everything
+        unknown as text.
+    """
+    if value is None or isinstance(value, (str, bool, int)):
+        return value.value if isinstance(value, Enum) else value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(jsonable(key)): jsonable(item) for key, item in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        return jsonable(value.tolist())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [jsonable(item) for item in value]
+    return None if value != value else str(value)

@@ -19,7 +19,7 @@ from scipy.ndimage import maximum_filter
 
 from iscat_analysis.config import Detection
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid
+from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
 
 HEIGHTS_PER_FRINGE = 8
@@ -99,6 +99,7 @@ def make_templates(
     else:
         low, high = z_range_nm
         count = math.ceil((high - low) / model.fringe_nm * HEIGHTS_PER_FRINGE) + 1
+        check_table("the family of templates", float(count) * (2 * half + 1) ** 2)
         heights = np.linspace(low, high, count)
     bare = replace(model, scale=MassScale())
     weak = _weak_amplitude(bare)

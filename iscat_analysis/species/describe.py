@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -33,15 +33,19 @@ LEAST_EVENTS = 10
 """Fewer are listed, not described."""
 
 SPECIES_COLUMNS = (
-    "mass_kda", "mass_se", "mass_low", "mass_high", "width_kda", "width_low", "width_high",
+    "mass_kda", "mass_se", "mass_low", "mass_high", "mass_systematic",
+    "width_kda", "width_low", "width_high",
     "fraction", "fraction_low", "fraction_high", "count", "count_low", "count_high",
     "landing", "leaving", "efficiency", "count_corrected", "corrected_low", "corrected_high",
     "outlier",
 )  # fmt: skip
-"""Columns of the table of species: intervals are 95 %, `fraction` and `count_corrected` are of the
+"""Columns of the table of species: `mass_se` is the statistical standard error, `mass_systematic`
+the error of the mass scale, 0 where none is known, and the interval of the mass holds both.
+Intervals are 95 %, `fraction` and `count_corrected` are of the
 particles that came, the other counts of those that were seen; `outlier` where these are fewer than
 `LEAST_SPECIES`."""
 
+_TWO_SIDED_95 = 1.959964
 _BROAD = 0.4  # width over mass
 _DIGITS = 6  # of the curves in summary.json
 
@@ -122,6 +126,7 @@ def describe(
     seed: int,
     branch: Branch = "magnitude",
     draws: int = 100,
+    scale_error: Callable[[FloatArray], FloatArray] | None = None,
 ) -> Distribution:
     """Describe a set of masses as a mixture of species.
 
@@ -141,6 +146,9 @@ def describe(
         Which events: |mass| of all, or one side.
     draws : int
         Simulated repetitions for the intervals; 0 for none.
+    scale_error : callable, optional
+        Gives the standard deviation of the mass scale at masses [kDa]; it is common to all events
+        and widens the intervals of the species' masses.
 
     Returns
     -------
@@ -155,7 +163,8 @@ def describe(
     Notes
     -----
     Intervals are the 2.5 and 97.5 % quantiles of the bootstrap, which draws the number of events
-    from its own Poisson distribution.
+    from its own Poisson distribution.  The error of the mass scale is added in quadrature to the
+    distance of these quantiles from the estimate.
     """
     mass, sigma = (np.asarray(v, dtype=np.float64).reshape(-1) for v in (masses, sigmas))
     if mass.shape != sigma.shape:
@@ -180,7 +189,8 @@ def describe(
     bic = [fit.bic(events.x.size) for fit in fits]
     best = fits[int(np.argmin(bic))].by_mass()
     repeats, support = bootstrap(events, best, draws=draws, least=LEAST_EVENTS, seed=seed)
-    species = _table(events, best, repeats, mass[usable] > 0)
+    scale = np.zeros(best.mean.shape) if scale_error is None else scale_error(best.mean)
+    species = _table(events, best, repeats, mass[usable] > 0, scale)
     bandwidth = bandwidth_of(events, len(species))
     return Distribution(
         species=species,
@@ -205,9 +215,13 @@ def describe(
 
 
 def _table(
-    events: Events, best: Mixture, repeats: Sequence[Repeat], lands: BoolArray
+    events: Events,
+    best: Mixture,
+    repeats: Sequence[Repeat],
+    lands: BoolArray,
+    scale: FloatArray,
 ) -> pd.DataFrame:
-    """Lay out the species, with intervals from the repetitions."""
+    """Lay out the species, with intervals from the repetitions and from the mass scale."""
     share = best.shares(events)
     seen = share.sum(axis=0)
 
@@ -228,8 +242,9 @@ def _table(
         {
             "mass_kda": best.mean,
             "mass_se": means.std(axis=0, ddof=1) if len(repeats) > 1 else math.nan,
-            "mass_low": mass_low,
-            "mass_high": mass_high,
+            "mass_low": mass_low - _widening(best.mean - mass_low, scale),
+            "mass_high": mass_high + _widening(mass_high - best.mean, scale),
+            "mass_systematic": scale,
             "width_kda": np.sqrt(best.variance),
             "width_low": width_low,
             "width_high": width_high,
@@ -249,6 +264,12 @@ def _table(
         },
         columns=list(SPECIES_COLUMNS),
     )
+
+
+def _widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
+    """By how much an end of a 95 % interval moves when the error of the scale is added."""
+    reach = np.maximum(reach, 0.0)
+    return np.asarray(np.hypot(reach, _TWO_SIDED_95 * scale) - reach)
 
 
 def _remarks(species: pd.DataFrame) -> list[str]:

@@ -271,7 +271,7 @@ def make_setting(
         experiment = _experiment(config, scene, height, collected)
     config = _changed(
         experiment.config,
-        {"simulation": {"photons_per_pixel": experiment.config.bounds.photons_per_pixel}},
+        {"particle": {"photons_per_frame": experiment.config.bounds.photons_per_pixel}},
     )
     centre = (side - 1) / 2 * scene.pixel_nm
     at = config.bounds
@@ -290,10 +290,10 @@ def _background(config: Config) -> dict[str, Any]:
     """Tell the fits what ``[bounds]`` says of the background: measured beforehand, or known."""
     at = config.bounds
     if at.n_before:
-        return {"method": "mean"}
+        return {"method": "fixed"}
     dark = config.optics.scheme == "darkfield"
     level = (config.background.level_e or 0.0) if dark else at.photons_per_pixel
-    return {"method": "none", "frames": None, "level_e": level}
+    return {"method": "known", "frames": None, "level_e": level}
 
 
 def _check_place(config: Config, half_nm: float) -> None:

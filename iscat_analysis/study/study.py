@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import platform
 import threading
@@ -16,8 +15,9 @@ import numpy as np
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.records import PARAMETERS, FloatArray, Progress, Status, silent
-from iscat_analysis.report import atomic_folder, check_output, jsonable
+from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.benchmark import BENCHMARK_NAMES, draw_benchmark, render_benchmark
+from iscat_analysis.schemas import to_json
 from iscat_analysis.study.baselines import Baselines
 from iscat_analysis.study.calibration import RANKS, Calibration, calibrate_posterior
 from iscat_analysis.study.scores import (
@@ -195,8 +195,7 @@ def write_benchmark(study: Mapping[str, Any], folder: Path, *, overwrite: bool =
         The folder exists and may not be replaced, or cannot be written.
     """
     with atomic_folder(folder, overwrite, known=BENCHMARK_NAMES) as building:
-        plain = jsonable(study)
-        text = json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
+        text = to_json("benchmark", study)
         (building / "benchmark.json").write_text(text + "\n", encoding="utf-8")
         (building / "config.toml").write_text(study["config"], encoding="utf-8")
         (building / "benchmark.html").write_text(render_benchmark(study), encoding="utf-8")

@@ -134,9 +134,7 @@ def test_the_median_forgets_a_visitor() -> None:
     stack, _ = _movie(4, power_noise=0.0)
     stack.counts[5:11, 20:24, 20:24] *= 3
     camera = Camera(offset_adu=7.0)
-    windows = measure_windows(
-        stack, camera, BEFORE, AFTER, method="median", power_normalization=False
-    )
+    windows = measure_windows(stack, camera, BEFORE, AFTER, median=True, power_normalization=False)
     expected = 30 * (np.median(stack.counts[:30], axis=0) - 7.0)
     np.testing.assert_allclose(windows.before_e, expected)
     mean = measure_windows(stack, camera, BEFORE, AFTER)
@@ -147,7 +145,7 @@ def test_the_median_forgets_a_visitor() -> None:
 def test_the_median_scatters_as_a_median_of_shot_noise(power_noise: float) -> None:
     """Whatever the laser does: variance π/2 times that of the mean, and no bias."""
     stack, power = _movie(5, power_noise=power_noise)
-    windows = measure_windows(stack, Camera(), BEFORE, AFTER, method="median")
+    windows = measure_windows(stack, Camera(), BEFORE, AFTER, median=True)
     light = 2e3 * np.random.default_rng(2).uniform(0.7, 1.3, SHAPE) * power[:30].sum()
     pulls = (windows.before_e - light) / np.sqrt(light * np.pi / 2)
     # The median of 30 is not yet that of infinitely many: 2 % less.
@@ -157,16 +155,14 @@ def test_the_median_scatters_as_a_median_of_shot_noise(power_noise: float) -> No
 
 def test_a_known_background_needs_no_frames() -> None:
     stack, _ = _movie(5, power_noise=0.02)
-    windows = measure_windows(stack, Camera(), None, AFTER, method="none", level_e=2e3)
+    windows = measure_windows(stack, Camera(), None, AFTER, level_e=2e3)
     assert windows.n_before == 0
     assert windows.frames_before == (0, 0)
     np.testing.assert_array_equal(windows.before_e, 2e3)
     total = windows.after_e.sum()
     expected = total / (2e3 * np.prod(SHAPE))
     assert windows.power_ratio == pytest.approx(expected, rel=0.02)
-    fixed = measure_windows(
-        stack, Camera(), None, AFTER, method="none", level_e=2e3, power_normalization=False
-    )
+    fixed = measure_windows(stack, Camera(), None, AFTER, level_e=2e3, power_normalization=False)
     assert fixed.power_ratio == 20
     assert windows.power.size == 20
 

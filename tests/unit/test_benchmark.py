@@ -146,7 +146,7 @@ def test_the_height_is_moved_off_the_ends_only_where_it_is_free_and_not_given() 
 
 @pytest.mark.parametrize("scheme", ["iscat", "darkfield"])
 @pytest.mark.parametrize("n_before", [0, 20])
-@pytest.mark.parametrize("method", ["mean", "none"])
+@pytest.mark.parametrize("method", ["fixed", "known"])
 def test_fits_know_as_much_of_the_background_as_the_bounds(
     scheme: str, n_before: int, method: str
 ) -> None:

@@ -199,6 +199,17 @@ def test_frames_without_information_are_refused() -> None:
         check_counts(counts, 0, "m.tif", camera=camera)
 
 
+def test_ratios_are_refused_and_scaled_counts_are_not() -> None:
+    """A ratio of frames, and the same floats where a gain says what a count of 1 stands for."""
+    rng = np.random.default_rng(7)
+    ratio = (rng.poisson(1e4, (4, 20, 20)) / rng.poisson(1e4, (4, 20, 20))).astype("f4")
+    with pytest.raises(DataError, match=r"frame 5 is ratiometric.*raw counts"):
+        check_counts(ratio, 5, "m.tif")
+    check_counts(ratio, 5, "m.tif", camera=Camera(gain_e_per_adu=1e4))
+    check_counts(good("f4") / 10, 5, "m.tif")  # floats around 100
+    check_counts(rng.poisson(1.0, (4, 20, 20)), 5, "m.tif")  # dark field, in whole numbers
+
+
 def test_read_noise_around_the_offset_passes() -> None:
     noise = np.random.default_rng(3).normal(100, 2, (4, 20, 20))
     check_counts(np.rint(noise).astype("u2"), 0, "m", camera=Camera(1.0, 100.0, 2.0))

@@ -79,6 +79,22 @@ IMPOSSIBLE = [
     (["optics.focus_nm=nan"], "optics.focus_nm"),
     (["optics.focus_nm=inf"], "optics.focus_nm"),
     (["optics.scheme=iskat"], "optics.scheme"),
+    (["optics.wavelength_nm=0.525"], "if 0.525 is in micrometres, write 525"),
+    (["optics.wavelength_nm=5.25e-7"], "if 5.25e-07 is in metres, write 525"),
+    (["optics.wavelength_nm=5.25"], "5.25 nm is not between 200 and 3000 nm"),
+    (["optics.focus_nm=3e6"], "not between 0 and 100000 nm"),
+    (["optics.na=1,42"], "optics.na: write 1.42, with a decimal point"),
+    (["fit.roi_nm=2.7"], "if 2.7 is in micrometres, write 2700"),
+    (["fit.roi_nm=100"], "smaller than 131.25 nm, a pixel or a quarter of the wavelength"),
+    (["fit.roi_nm=1e9"], "fit.roi_nm"),
+    (["fit.z_range_nm=[0, 1e9]"], "fit.z_range_nm"),
+    (["particle.diameter_nm=3e7"], "particle.diameter_nm"),
+    (["posterior.walkers=1000000"], "posterior.walkers"),
+    (["posterior.enabled=perhaps"], "posterior.enabled"),
+    (["simulation.shape=[1000000, 1000000]"], "simulation.shape"),
+    (["background.method=sliding", "background.frames=[0, 9]"], "leave frames out"),
+    (["background.method=tracks"], "is not available yet"),
+    (["background.frames=200"], "[start, stop)"),
     (["camera.pixel_size_nm=0"], "camera.pixel_size_nm"),
     (["camera.pixel_size_nm=84400"], "84400 nm is not between 1 and 2000 nm"),
     (["camera.pixel_size_nm=0.0844"], "0.0844 nm is not between 1 and 2000 nm"),
@@ -89,7 +105,7 @@ IMPOSSIBLE = [
     (["particle.height_nm=-1"], "particle.height_nm"),
     (["background.frames=[200, 100]"], "start < stop"),
     (["background.frames=[0]"], "background.frames"),
-    (["background.method=none"], "needs level_e"),
+    (["background.method=known"], "needs level_e"),
     (["fit.frames=[-1, 5]"], "start < stop"),
     (["fit.mode=masses"], "fit.mode"),
     (["fit.z_range_nm=[100, 100]"], "is empty"),
@@ -212,7 +228,7 @@ def configurations(draw: st.DrawFn) -> Config:
     text = st.text(st.characters(blacklist_categories=("Cs", "Cc")), min_size=1, max_size=12)
     values = {
         "optics": {
-            "focus_nm": draw(finite),
+            "focus_nm": draw(st.floats(-1e5, 1e5)),
             "polarization_deg": draw(finite),
             "scheme": draw(st.sampled_from(["iscat", "cobri", "darkfield"])),
         },
@@ -227,7 +243,7 @@ def configurations(draw: st.DrawFn) -> Config:
         },
         "background": {"frames": draw(st.none() | st.just(frames))},
         "fit": {"mode": draw(st.sampled_from(get_args(Mode))), "frames": frames},
-        "posterior": {"enabled": draw(st.booleans())},
+        "posterior": {"enabled": draw(st.booleans() | st.just("auto"))},
         "calibration": draw(
             st.none()
             | st.fixed_dictionaries(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
@@ -16,8 +18,11 @@ from iscat_analysis.calibration.mass import (
     mass_from_contrast,
     york_line,
 )
+from iscat_analysis.config import configure, parse_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.event_tables import read_events, stored_calibration
+from iscat_analysis.pipeline.systematic import systematic, with_systematic
+from iscat_analysis.species import describe
 
 STANDARDS = (66.0, 146.0, 480.0)
 GRADIENT, OFFSET = -3.1e-5, 2e-4
@@ -208,7 +213,7 @@ def test_a_wrong_sign_is_one_clear_line() -> None:
 
 @pytest.mark.parametrize("standards", [(66.0,), (66.0, -146.0), (66.0, math.nan), (66.0, 66.0)])
 def test_impossible_standards_are_refused(standards: tuple[float, ...]) -> None:
-    with pytest.raises(ConfigError, match="--standards"):
+    with pytest.raises(ConfigError, match="standards_kda = "):
         calibrate_mass(events(np.random.default_rng(7)), standards)
 
 
@@ -225,7 +230,7 @@ def test_two_standards_cannot_test_the_line() -> None:
 
 def test_scatter_beyond_the_errors_widens_the_line() -> None:
     rng = np.random.default_rng(9)
-    contrast = events(rng, (66.0, 152.0, 480.0))
+    contrast = events(rng, (66.0, 149.0, 480.0))
     tight = [0.01, 0.01, 0.01]
     found = calibrate_mass(contrast, STANDARDS, standards_se_kda=tight)
     assert found.chi2 > 4
@@ -251,3 +256,67 @@ def test_refeyns_masses_are_reproduced_exactly(data_dir: Path) -> None:
     assert found.gradient_per_kda == pytest.approx(stored.gradient_per_kda, rel=0.03)
     assert np.allclose(found.standards["contrast"], stored.standard_contrasts, rtol=0.06)
     assert abs(found.standards["residual_percent"]).max() < 1  # %
+
+
+@pytest.mark.parametrize(
+    ("standards", "fit", "misfit"),
+    [
+        ((66, 146, 480, 900), "66, 146, 480 kDa would fit", "900 kDa does not"),
+        ((66, 146, 300), "66, 146 kDa would fit", "300 kDa does not"),
+    ],
+)
+def test_a_standard_that_is_not_there_is_named(
+    standards: tuple[float, ...], fit: str, misfit: str
+) -> None:
+    for seed in range(5):
+        with pytest.raises(DataError) as caught:
+            calibrate_mass(events(np.random.default_rng(seed)), standards)
+        message = str(caught.value)
+        assert "|contrast| peaks at 0.0018" in message
+        assert fit in message
+        assert misfit in message
+
+
+def test_a_match_is_refused_by_its_chi_square() -> None:
+    """The same distance from the line is too much for errors of 1 %, but not for errors of 5 %."""
+    contrast = events(np.random.default_rng(10))
+    with pytest.raises(DataError, match=r"χ² = .* for 1 degrees of freedom"):
+        calibrate_mass(contrast, (66, 146, 420), standards_se_kda=(0.66, 1.46, 4.2))
+    assert calibrate_mass(contrast, (66, 146, 420), standards_se_kda=(3.3, 7.3, 21.0)).dof == 1
+
+
+def test_the_error_of_the_line_is_keys_that_are_read_back() -> None:
+    found = calibrate_mass(events(np.random.default_rng(11)), STANDARDS)
+    config = parse_config(tomllib.loads(found.to_toml()))
+    line = config.calibration
+    assert line is not None
+    assert line.gradient_se_per_kda == pytest.approx(math.sqrt(found.covariance[0, 0]), rel=1e-3)
+    table = pd.DataFrame({"mass_kda": [66.0, -146.0, 300.0, 900.0], "flags": ""})
+    shared = systematic(config, table)["mass_kda"]
+    contrast = found.gradient_per_kda * 300 + found.offset
+    assert shared[2] == pytest.approx(found.sigma_kda(contrast), rel=2e-3)
+    # Repetitions of the whole line scatter as it says, between the standards and beyond.
+    rng = np.random.default_rng(12)
+    lines = rng.multivariate_normal([found.gradient_per_kda, found.offset], found.covariance, 4000)
+    for mass, sigma in zip(table["mass_kda"].abs(), shared, strict=True):
+        size = found.gradient_per_kda * mass + found.offset
+        masses = (size - lines[:, 1]) / lines[:, 0]
+        assert masses.std() == pytest.approx(sigma, rel=0.06)  # 4 standard errors of 4000, and more
+    changed = with_systematic(config, table)
+    assert list(changed.columns) == ["mass_kda", "flags", "systematic_mass_kda"]
+    assert with_systematic(configure(), table) is table
+
+
+def test_the_error_of_the_scale_widens_the_intervals_of_species() -> None:
+    rng = np.random.default_rng(13)
+    mass, sigma = 480 + 20 * rng.standard_normal(200), np.full(200, 20.0)
+    plain = describe(mass, sigma, seed=1, max_species=1, draws=40).species.iloc[0]
+    wider = describe(
+        mass, sigma, seed=1, max_species=1, draws=40, scale_error=lambda m: 0.015 * m
+    ).species.iloc[0]
+    assert plain["mass_systematic"] == 0
+    assert wider["mass_systematic"] == pytest.approx(0.015 * plain["mass_kda"])
+    assert wider["mass_se"] == plain["mass_se"]
+    half = (wider["mass_high"] - wider["mass_low"]) / 2
+    statistical = (plain["mass_high"] - plain["mass_low"]) / 2
+    assert half == pytest.approx(math.hypot(statistical, 1.96 * 0.015 * 480), rel=0.05)

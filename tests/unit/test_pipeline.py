@@ -268,7 +268,7 @@ def test_dark_field_refuses_what_needs_a_reference(tmp_path: Path) -> None:
     "background",
     [
         {"method": "median"},
-        {"method": "none", "level_e": 4e4},
+        {"method": "known", "level_e": 4e4},
         {"power_normalization": False},
     ],
 )

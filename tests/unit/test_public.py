@@ -124,6 +124,16 @@ def test_two_arguments_are_enough_where_the_movie_tells_the_rest(movie) -> None:
     assert found.mode == "mass"
 
 
+def test_an_array_is_fitted_as_the_file_that_holds_it(movie, config, result) -> None:
+    with ia.open_stack(movie) as stack:
+        counts = stack.read(0, stack.shape[0])
+    found = ia.fit_movie(counts, name="from memory", config=config, posterior=False)
+    for name in ("x_px", "y_px", "mass_kda", "sigma_mass_kda"):
+        np.testing.assert_array_equal(found.table[name], result.table[name])
+    assert found.summary["input"]["path"] == "from memory"
+    assert len(found.summary["input"]["sha256"]) == 64
+
+
 def test_named_arguments_win(movie, config) -> None:
     found = ia.fit_movie(
         movie, config=config, mode="joint", frames=(60, 100), workers=1, posterior=False,

@@ -22,7 +22,8 @@ from iscat_analysis.report.numbers import number
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder
 from iscat_analysis.report.pack import CREDIBLE_LEVELS, credible_shades, quantise
 from iscat_analysis.report.precision import precision_of
-from iscat_analysis.report.tables import event_table, jsonable
+from iscat_analysis.report.tables import event_table
+from iscat_analysis.schemas import jsonable
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from report_factory import HOSTILE, make_analysis, without_events
@@ -202,7 +203,6 @@ def test_everything_missing_still_makes_a_folder(tmp_path: Path) -> None:
                     residual=v.residual * np.nan)
             for v in analysis.views
         ),
-        summary={},
     )  # fmt: skip
     assert (write_report(bare, tmp_path / "out") / "report.html").exists()
 

@@ -18,7 +18,12 @@ from __future__ import annotations
 from iscat_analysis.calibration.mass.calibrate import LEAST_EVENTS, STANDARD_ERROR, calibrate_mass
 from iscat_analysis.calibration.mass.line import Line, york_line
 from iscat_analysis.calibration.mass.peaks import Peak, find_contrast_peaks
-from iscat_analysis.calibration.mass.result import Landing, MassCalibration, mass_from_contrast
+from iscat_analysis.calibration.mass.result import (
+    Landing,
+    MassCalibration,
+    line_sigma_kda,
+    mass_from_contrast,
+)
 
 __all__ = [
     "LEAST_EVENTS",
@@ -29,6 +34,7 @@ __all__ = [
     "Peak",
     "calibrate_mass",
     "find_contrast_peaks",
+    "line_sigma_kda",
     "mass_from_contrast",
     "york_line",
 ]

@@ -77,7 +77,7 @@ def calibrate_mass(
         raise DataError(
             f"{name}: only {lands.sum()} of {signed.size} events are {landing}, which landing "
             f"should be: the contrast has the wrong sign; if your particles land {other}, say "
-            f"--landing {other}"
+            f"landing = {other}"
         )
     size, size_errors = np.abs(signed[lands]), errors[lands]
     if size.size < LEAST_EVENTS:
@@ -87,6 +87,7 @@ def calibrate_mass(
     # The kernel's width follows the spread of the whole histogram, which is too wide where few
     # events lie in narrow peaks far apart: finer ones are for those.  Standards chosen at random
     # hardly pass more often for it, since a line through more peaks must meet the same limits.
+    refusals: list[tuple[int, DataError]] = []
     for detail in _DETAILS:
         peaks = find_contrast_peaks(size, size_errors, detail=detail)
         try:
@@ -99,9 +100,10 @@ def calibrate_mass(
             )
             check_match(line, chosen, peaks, masses, name)
             break
-        except DataError:
-            if detail == _DETAILS[-1]:
-                raise
+        except DataError as refusal:
+            refusals.append((len(peaks), refusal))
+    else:  # the clearest view is the one that shows most peaks
+        raise max(refusals, key=lambda each: each[0])[1]
     widen = max(1.0, line.chi2 / line.dof) if line.dof else 1.0
     notes = []
     if widen > 1:
@@ -133,13 +135,14 @@ def _standards(
     shown = ",".join(f"{m:g}" for m in values)
     if values.size < 2 or not np.isfinite(values).all() or (values <= 0).any():
         raise ConfigError(
-            f"--standards {shown}: needs two or more positive masses in kDa, as in 66,146,480"
+            f"standards_kda = {shown}: a line needs two or more positive masses in kDa, as in "
+            "66,146,480"
         )
     if np.unique(values).size < values.size:
-        raise ConfigError(f"--standards {shown}: names a mass twice")
+        raise ConfigError(f"standards_kda = {shown}: names a mass twice")
     se = STANDARD_ERROR * values if errors is None else np.asarray(errors, dtype=np.float64)
     if se.shape != values.shape or not np.isfinite(se).all() or (se < 0).any():
-        raise ConfigError(f"--standards {shown}: needs one error, not negative, for each mass")
+        raise ConfigError(f"standards_kda = {shown}: needs one error, not negative, for each mass")
     order = np.argsort(values)
     return values[order], se[order]
 

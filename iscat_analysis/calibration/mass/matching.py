@@ -7,14 +7,21 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
+from scipy.special import chdtrc
 
 from iscat_analysis.calibration.mass.line import Line
 from iscat_analysis.calibration.mass.peaks import Peak
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import FloatArray
 
-_MISMATCH = 0.07  # of a standard's mass, beyond which the line does not go through the peaks
-_OFFSET_SHARE = 0.35  # of the lightest peak's contrast that the offset may be
+LEAST_PROBABILITY = 1e-4
+"""A line whose χ² is less probable than this does not go through its standards."""
+
+OFFSET_SHARE = 0.35
+"""Of the lightest peak's contrast, the share that the contrast of zero mass may be."""
+
+_FITS = 0.05  # relative distance within which a standard is said to fit, when others do not
+_MOST_STANDARDS = 8  # of more, no subsets are tried for a message
 
 
 def match(peaks: Sequence[Peak], masses: FloatArray, name: str) -> list[Peak]:
@@ -41,28 +48,16 @@ def match(peaks: Sequence[Peak], masses: FloatArray, name: str) -> list[Peak]:
     """
     if len(peaks) < masses.size:
         raise DataError(
-            f"{name}: {_found(peaks)}, fewer than the {masses.size} standards "
-            f"{_shown(masses)}; leave out those that are not in the sample"
+            f"{name}: {_found(peaks)}, fewer than the {masses.size} standards {_shown(masses)}; "
+            f"{_advice(peaks, masses)}"
         )
-    most = max(peak.count for peak in peaks)
-    best, least = list(peaks[: masses.size]), math.inf
-    for chosen in combinations(peaks, int(masses.size)):
-        contrast = np.array([peak.contrast for peak in chosen])
-        slope, offset = np.polyfit(masses, contrast, 1, w=1 / contrast)
-        if slope <= 0:
-            continue
-        off = (contrast - offset) / slope / masses - 1
-        cost = float(np.sum((off / 0.02) ** 2)) + (offset / (0.15 * contrast[0])) ** 2
-        cost -= 2 * sum(math.log(peak.count / most) for peak in chosen)
-        if cost < least:
-            best, least = list(chosen), cost
-    return best
+    return _nearest(peaks, masses)[0]
 
 
 def check_match(
     line: Line, chosen: Sequence[Peak], peaks: Sequence[Peak], masses: FloatArray, name: str
 ) -> None:
-    """Refuse a line that misses its standards, or does not begin near zero.
+    """Refuse a line that misses its standards by its χ², or does not begin near zero.
 
     Parameters
     ----------
@@ -86,18 +81,62 @@ def check_match(
     slope, offset = abs(line.slope), math.copysign(1.0, line.slope) * line.intercept
     off = (contrast - offset) / slope / masses - 1
     worst = int(np.argmax(np.abs(off)))
-    remedy = "correct --standards, or leave out what is not in the sample"
-    if abs(off[worst]) > _MISMATCH:
+    start = f"{name}: the standards {_shown(masses)} do not match the peaks ({_found(peaks)}): "
+    if line.dof and float(chdtrc(line.dof, line.chi2)) < LEAST_PROBABILITY:
         raise DataError(
-            f"{name}: the standards {_shown(masses)} do not match the peaks ({_found(peaks)}): "
-            f"the nearest line misses {masses[worst]:g} kDa by {100 * abs(off[worst]):.0f} %; "
-            f"{remedy}"
+            f"{start}the nearest line misses {masses[worst]:g} kDa by "
+            f"{100 * abs(off[worst]):.1f} %, with χ² = {line.chi2:.3g} for {line.dof} degrees of "
+            f"freedom; {_advice(peaks, masses)}"
         )
-    if abs(offset) > _OFFSET_SHARE * contrast[0]:
+    if abs(offset) > OFFSET_SHARE * contrast[0]:
         raise DataError(
-            f"{name}: the standards {_shown(masses)} do not match the peaks ({_found(peaks)}): "
-            f"zero mass would have the contrast {offset:.2g}; {remedy}"
+            f"{start}zero mass would have the contrast {offset:.2g}, more than {OFFSET_SHARE:g} of "
+            f"that of the lightest standard; {_advice(peaks, masses)}"
         )
+
+
+def _nearest(peaks: Sequence[Peak], masses: FloatArray) -> tuple[list[Peak], float]:
+    """Choose peaks for the standards, and say how far off they are altogether."""
+    most = max(peak.count for peak in peaks)
+    best, least = list(peaks[: masses.size]), math.inf
+    for chosen in combinations(peaks, int(masses.size)):
+        contrast = np.array([peak.contrast for peak in chosen])
+        slope, offset = np.polyfit(masses, contrast, 1, w=1 / contrast)
+        if slope <= 0:
+            continue
+        off = (contrast - offset) / slope / masses - 1
+        cost = float(np.sum((off / 0.02) ** 2)) + (offset / (0.15 * contrast[0])) ** 2
+        cost -= 2 * sum(math.log(peak.count / most) for peak in chosen)
+        if cost < least:
+            best, least = list(chosen), cost
+    return best, least
+
+
+def _advice(peaks: Sequence[Peak], masses: FloatArray) -> str:
+    """Name the standards that fit the peaks and those that do not."""
+    known = _fitting(peaks, masses) if masses.size <= _MOST_STANDARDS else None
+    if known is None:
+        return "name the standards that are in the sample"
+    others = masses[~np.isin(masses, known)]
+    verb = "does not" if others.size == 1 else "do not"
+    return f"{_shown(known)} would fit, {_shown(others)} {verb}: leave out what is not there"
+
+
+def _fitting(peaks: Sequence[Peak], masses: FloatArray) -> FloatArray | None:
+    """Find the largest part of the standards, two at least, that lies on a line through peaks."""
+    for size in range(min(int(masses.size) - 1, len(peaks)), 1, -1):
+        fits: list[tuple[float, FloatArray]] = []
+        for part in combinations(masses.tolist(), size):
+            some = np.array(part)
+            chosen, cost = _nearest(peaks, some)
+            contrast = np.array([peak.contrast for peak in chosen])
+            slope, offset = np.polyfit(some, contrast, 1, w=1 / contrast)
+            off = np.abs((contrast - offset) / slope / some - 1).max() if slope > 0 else math.inf
+            if off < _FITS and abs(offset) < OFFSET_SHARE * contrast[0]:
+                fits.append((cost, some))
+        if fits:
+            return min(fits, key=lambda fit: fit[0])[1]
+    return None
 
 
 def _found(peaks: Sequence[Peak]) -> str:

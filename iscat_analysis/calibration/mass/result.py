@@ -52,6 +52,40 @@ def mass_from_contrast(
     return masses
 
 
+def line_sigma_kda(
+    mass_kda: ArrayLike,
+    gradient_per_kda: float,
+    covariance: FloatArray,
+    sigma_contrast: ArrayLike = 0.0,
+) -> FloatArray:
+    """Propagate the errors of the line, and of a contrast, into a mass.
+
+    Parameters
+    ----------
+    mass_kda : array_like
+        Masses by the line, of either sign [kDa].
+    gradient_per_kda : float
+        Contrast per kDa.
+    covariance : ndarray, shape (2, 2)
+        Of gradient and offset.
+    sigma_contrast : array_like
+        Standard deviations of the contrasts; 0 leaves those of the line alone.
+
+    Returns
+    -------
+    ndarray
+        Standard deviations [kDa], by linear propagation.
+    """
+    mass = np.abs(np.asarray(mass_kda, dtype=np.float64))
+    variance = (
+        np.square(np.asarray(sigma_contrast, dtype=np.float64))
+        + mass**2 * covariance[0, 0]
+        + 2 * mass * covariance[0, 1]
+        + covariance[1, 1]
+    )
+    return np.asarray(np.sqrt(variance) / abs(gradient_per_kda))
+
+
 @dataclass(frozen=True, eq=False)
 class MassCalibration:
     """The line between contrast and mass; `calibrate_mass` makes it.
@@ -123,14 +157,9 @@ class MassCalibration:
         ndarray
             Standard deviations [kDa].
         """
-        mass = np.abs(self.mass_kda(contrast))
-        variance = (
-            np.square(np.asarray(sigma_contrast, dtype=np.float64))
-            + mass**2 * self.covariance[0, 0]
-            + 2 * mass * self.covariance[0, 1]
-            + self.covariance[1, 1]
+        return line_sigma_kda(
+            self.mass_kda(contrast), self.gradient_per_kda, self.covariance, sigma_contrast
         )
-        return np.asarray(np.sqrt(variance) / abs(self.gradient_per_kda))
 
     def prediction_interval(
         self, contrast: ArrayLike, sigma_contrast: ArrayLike = 0.0, *, level: float = 0.95
@@ -165,6 +194,9 @@ class MassCalibration:
     def to_toml(self) -> str:
         """Write the section ``[calibration]`` to paste into a configuration.
 
+        The standard errors of the line and their correlation are part of it, so that analyses can
+        say what the calibration contributes to the error of each mass.
+
         Returns
         -------
         str
@@ -173,8 +205,11 @@ class MassCalibration:
         s_se, o_se = (math.sqrt(self.covariance[k, k]) for k in (0, 1))
         return (
             "[calibration]\n"
-            f"gradient_per_kda = {self.gradient_per_kda:.6g}  # ± {s_se:.2g}\n"
-            f"offset = {self.offset:.6g}  # ± {o_se:.2g}\n"
+            f"gradient_per_kda = {self.gradient_per_kda:.6g}\n"
+            f"offset = {self.offset:.6g}\n"
+            f"gradient_se_per_kda = {s_se:.4g}  # {100 * abs(s_se / self.gradient_per_kda):.2g} %\n"
+            f"offset_se = {o_se:.4g}\n"
+            f"correlation = {self.covariance[0, 1] / (s_se * o_se):.5f}\n"
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -1,31 +1,41 @@
-"""The configuration: one frozen, validated model for each section of the TOML file.
+"""The sections and keys of a configuration: what each means and which values it may have.
 
 Lengths are nm, masses kDa, counts photoelectrons; ranges are half-open ``[start, stop)`` frames;
-complex numbers are ``[re, im]``.  Every field carries the text `iscat config` prints beside it.
+complex numbers are ``[re, im]``.  The description of each field is what `iscat config` prints
+beside it.
 """
 
 from __future__ import annotations
 
-import difflib
-import math
-import tomllib
-from collections.abc import Iterable, Mapping
-from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
-    ValidationError,
     model_validator,
 )
 
-from iscat_analysis.errors import ConfigError
-
 Mode = Literal["mass", "localize", "joint", "track"]
-Scheme = Literal["iscat", "cobri", "darkfield"]
+
+
+def _lower(value: Any) -> Any:
+    return value.lower() if isinstance(value, str) else value
+
+
+Scheme = Annotated[Literal["iscat", "cobri", "darkfield"], BeforeValidator(_lower)]
+Method = Literal["fixed", "sliding", "tracks", "median", "known"]
+
+
+def _two(frames: Any) -> Any:
+    if isinstance(frames, (list, tuple)) and len(frames) == 2:
+        return frames
+    raise ValueError(
+        "[start, stop) takes two numbers, the first frame and the one after the last, as in "
+        "[0, 200]"
+    )
 
 
 def _ordered(frames: tuple[int, int]) -> tuple[int, int]:
@@ -34,8 +44,38 @@ def _ordered(frames: tuple[int, int]) -> tuple[int, int]:
     return frames
 
 
+WAVELENGTH_NM = (200.0, 3000.0)
+"""Vacuum wavelengths that a light microscope uses [nm]."""
+
+LARGEST_NM = 1e5
+"""No height, focus or fitted square is larger [nm]."""
+
 PIXEL_NM = (1.0, 2000.0)
 """Pixel sizes in the sample plane that a microscope can have [nm]; outside, the unit is wrong."""
+
+_UNITS_NM = {"micrometres": 1e3, "millimetres": 1e6, "metres": 1e9, "ångström": 0.1}
+
+
+def unit_guess(value: float, low_nm: float, high_nm: float) -> str:
+    """Say which unit an impossible length was probably written in.
+
+    Parameters
+    ----------
+    value : float
+        As it was given.
+    low_nm, high_nm : float
+        Smallest and largest length that is possible [nm].
+
+    Returns
+    -------
+    str
+        A clause that names the unit and the length in nanometres; empty where no unit fits.
+    """
+    for unit, nanometres in _UNITS_NM.items():
+        converted = value * nanometres
+        if low_nm <= abs(converted) <= high_nm:
+            return f"; if {value:g} is in {unit}, write {converted:g}"
+    return ""
 
 
 def plausible_pixel(size_nm: float) -> float:
@@ -60,12 +100,24 @@ def plausible_pixel(size_nm: float) -> float:
     if not low <= size_nm <= high:
         raise ValueError(
             f"a pixel of {size_nm:g} nm is not between {low:g} and {high:g} nm: give its size in "
-            "the sample plane (not on the sensor), in nanometres"
+            f"the sample plane (not on the sensor), in nanometres{unit_guess(size_nm, low, high)}"
         )
     return size_nm
 
 
-Frames = Annotated[tuple[int, int], AfterValidator(_ordered)]
+def _length(low_nm: float, high_nm: float) -> AfterValidator:
+    """Accept lengths whose magnitude lies in a range, and guess the unit of the others."""
+
+    def check(value: float) -> float:
+        if low_nm <= abs(value) <= high_nm:
+            return value
+        guess = unit_guess(value, max(low_nm, 1e-3 * high_nm), high_nm)
+        raise ValueError(f"{value:g} nm is not between {low_nm:g} and {high_nm:g} nm{guess}")
+
+    return AfterValidator(check)
+
+
+Frames = Annotated[tuple[int, int], BeforeValidator(_two), AfterValidator(_ordered)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -80,7 +132,12 @@ class Section(BaseModel):
 class Optics(Section):
     """The microscope (physics.md, section 1)."""
 
-    wavelength_nm: Positive = Field(525.0, description="vacuum wavelength")
+    file: str | None = Field(
+        None, description="of `iscat calibrate optics`; its values win over this section's"
+    )
+    wavelength_nm: Annotated[Positive, _length(*WAVELENGTH_NM)] = Field(
+        525.0, description="vacuum wavelength"
+    )
     na: Positive = Field(1.42, description="numerical aperture")
     n_immersion: Positive = Field(1.515, description="refractive index of the immersion oil")
     n_glass: Positive = Field(1.515, description="refractive index of the coverslip")
@@ -92,7 +149,7 @@ class Optics(Section):
     polarization_deg: Finite = Field(
         0.0, description="of the illumination, from the image's x axis towards y"
     )
-    focus_nm: Finite = Field(
+    focus_nm: Annotated[Finite, _length(0.0, LARGEST_NM)] = Field(
         -300.0,
         description="focus height z_f; sets the oil thickness for a particle at particle.height_nm",
     )
@@ -104,6 +161,12 @@ class Optics(Section):
     )
     emission: Literal["dong2021", "reciprocal"] = Field(
         "dong2021", description='"dong2021" | "reciprocal" (energy-conserving)'
+    )
+    psf: Literal["model", "measured"] = Field(
+        "model", description='"model" | "measured" (from the movie itself; mode mass only)'
+    )
+    calibrate: Literal["auto", "always", "never"] = Field(
+        "auto", description='"auto" | "always" | "never": learn the optics from the movie'
     )
 
     @model_validator(mode="after")
@@ -164,8 +227,17 @@ class Particle(Section):
     mass_kda: Positive | None = Field(
         None, description="start value, and the truth of a simulation"
     )
-    diameter_nm: Positive | None = Field(None, description="in place of mass_kda")
-    height_nm: NonNegative = Field(5.0, description="z where it is fixed; start value elsewhere")
+    diameter_nm: Annotated[Positive, _length(0.1, 1e4)] | None = Field(
+        None, description="in place of mass_kda"
+    )
+    height_nm: Annotated[NonNegative, _length(0.0, LARGEST_NM)] = Field(
+        5.0, description="z where it is fixed; start value elsewhere"
+    )
+    photons_per_frame: Positive | None = Field(
+        None,
+        description="dark field: scattered photons collected per frame from a particle of this "
+        "mass, which is the scale of masses there",
+    )
 
     @model_validator(mode="after")
     def _one_of(self) -> Particle:
@@ -184,6 +256,11 @@ class Particle(Section):
 class BackgroundConfig(Section):
     """The image without particles."""
 
+    method: Method | None = Field(
+        None,
+        description='"fixed": the mean of frames | "median": their median | "sliding": landing '
+        'movies | "tracks": moving particles | "known": level_e',
+    )
     frames: Frames | None = Field(
         None, description="pre-binding frames [start, stop); absent in landing movies"
     )
@@ -191,11 +268,8 @@ class BackgroundConfig(Section):
         None,
         description="landing movies: frames before and after each step; absent: from the noise",
     )
-    method: Literal["mean", "median", "none"] = Field(
-        "mean", description='"mean" | "median" | "none" (then level_e gives the known level)'
-    )
     level_e: Positive | None = Field(
-        None, description="known level per pixel and frame, for method none"
+        None, description="known level per pixel and frame, for method known"
     )
     power_normalization: bool = Field(
         True, description="divide out the laser power, estimated with the particles excluded"
@@ -205,9 +279,19 @@ class BackgroundConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _known(self) -> BackgroundConfig:
-        if self.method == "none" and self.level_e is None:
-            raise ValueError('method = "none" needs level_e, the known background level')
+    def _consistent(self) -> BackgroundConfig:
+        if self.method == "known" and self.level_e is None:
+            raise ValueError('method = "known" needs level_e, the known background level')
+        if self.method == "sliding" and self.frames is not None:
+            raise ValueError(
+                'method = "sliding" takes every frame against its neighbours: leave frames out, '
+                'or set method = "fixed"'
+            )
+        if self.method == "tracks":
+            raise ValueError(
+                'method = "tracks", the background of moving particles, is not available yet: use '
+                '"fixed" with frames that hold no particles'
+            )
         return self
 
 
@@ -230,13 +314,16 @@ class Fit(Section):
     frames: Frames | None = Field(
         None, description="[start, stop); absent: all after the background"
     )
-    roi_nm: Positive = Field(2700.0, description="side of the square that is fitted")
+    roi_nm: Annotated[Positive, _length(50.0, LARGEST_NM)] = Field(
+        2700.0, description="side of the square that is fitted"
+    )
     likelihood: Literal["auto", "poisson", "conditional"] = Field(
         "auto", description='"auto" | "poisson" | "conditional"'
     )
-    z_range_nm: tuple[NonNegative, NonNegative] = Field(
-        (0.0, 1000.0), description="bounds of z where it is free"
-    )
+    z_range_nm: tuple[
+        Annotated[NonNegative, _length(0.0, LARGEST_NM)],
+        Annotated[NonNegative, _length(0.0, LARGEST_NM)],
+    ] = Field((0.0, 1000.0), description="bounds of z where it is free")
 
     @model_validator(mode="after")
     def _range(self) -> Fit:
@@ -248,9 +335,15 @@ class Fit(Section):
 class PosteriorConfig(Section):
     """Sampling of the posterior with emcee."""
 
-    enabled: bool = Field(True, description="sample it; --posterior and --no-posterior override")
-    walkers: Annotated[int, Field(ge=10, multiple_of=2)] = Field(32, description="even number")
-    steps: Annotated[int, Field(ge=100)] = Field(2000, description="per walker, burn-in included")
+    enabled: Literal["auto"] | bool = Field(
+        "auto", description='true | false | "auto": where events are few, not in landing movies'
+    )
+    walkers: Annotated[int, Field(ge=10, le=10_000, multiple_of=2)] = Field(
+        32, description="even number"
+    )
+    steps: Annotated[int, Field(ge=100, le=1_000_000)] = Field(
+        2000, description="per walker, burn-in included"
+    )
 
 
 class Calibration(Section):
@@ -261,6 +354,13 @@ class Calibration(Section):
 
     gradient_per_kda: Finite = Field(description="signed peak contrast per kDa")
     offset: Finite = Field(0.0, description="peak contrast at zero mass (odd-symmetric)")
+    gradient_se_per_kda: NonNegative = Field(
+        0.0, description="standard error of gradient_per_kda; 0: not known"
+    )
+    offset_se: NonNegative = Field(0.0, description="standard error of offset")
+    correlation: Annotated[float, Field(ge=-1, le=1)] = Field(
+        0.0, description="of the errors of gradient_per_kda and offset"
+    )
 
     @model_validator(mode="after")
     def _usable(self) -> Calibration:
@@ -293,8 +393,8 @@ class SimulatedEvent(Section):
 class Simulation(Section):
     """A synthetic movie with known truth."""
 
-    shape: tuple[Annotated[int, Field(ge=8)], Annotated[int, Field(ge=8)]] = Field(
-        (128, 128), description="rows, columns"
+    shape: tuple[Annotated[int, Field(ge=8, le=16_384)], Annotated[int, Field(ge=8, le=16_384)]] = (
+        Field((128, 128), description="rows, columns")
     )
     frames: Annotated[int, Field(ge=2)] = Field(400, description="frames in the movie")
     photons_per_pixel: Positive = Field(
@@ -310,8 +410,8 @@ class Simulation(Section):
     )
     seed: Annotated[int, Field(ge=0)] = Field(1, description="same seed, same bytes")
     events: tuple[SimulatedEvent, ...] = Field((), description="each particle, placed by hand")
-    count: Annotated[int, Field(ge=1)] | None = Field(
-        None, description="landings at random places and times, in place of events"
+    count: Annotated[int, Field(ge=0, le=1_000_000)] | None = Field(
+        None, description="landings at random places and times, in place of events; 0: a blank"
     )
     leavings: Annotated[int, Field(ge=0)] = Field(
         0, description="how many of the count leave before the movie ends"
@@ -359,16 +459,24 @@ class BoundsConfig(Section):
 
 
 class Compute(Section):
-    """Resources."""
+    """Resources, and the seed of what the analysis draws."""
 
-    workers: Annotated[int, Field(ge=1)] = Field(2, description="threads")
+    workers: Annotated[int, Field(ge=1, le=1024)] = Field(2, description="threads")
     memory_limit_mb: Annotated[int, Field(ge=64)] = Field(
         1000, description="for the pixel data held at once"
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(
+        1,
+        description="of what the analysis draws: posteriors, injected particles, resampled species",
     )
 
 
 class Config(Section):
-    """A whole configuration; `load_config` reads one."""
+    """A whole configuration; `iscat_analysis.config.configure` makes one.
+
+    The method of the background is explicit in it: where `background.method` is not given, it is
+    ``"fixed"`` if background frames are given, in dark field and in mode track, else ``"sliding"``.
+    """
 
     optics: Optics = Field(default_factory=Optics)
     camera: CameraConfig = Field(default_factory=CameraConfig)
@@ -382,201 +490,48 @@ class Config(Section):
     bounds: BoundsConfig = Field(default_factory=BoundsConfig)
     compute: Compute = Field(default_factory=Compute)
 
+    @model_validator(mode="after")
+    def _explicit_method(self) -> Config:
+        known = self.background.frames is not None or self.optics.scheme == "darkfield"
+        if self.background.method is None:
+            method = "fixed" if known or self.fit.mode == "track" else "sliding"
+            # The model is frozen for its users; here it is still being made.
+            self.__dict__["background"] = self.background.model_copy(update={"method": method})
+        elif self.background.method == "sliding" and self.optics.scheme == "darkfield":
+            raise ValueError(
+                'background.method = "sliding" needs an interferometric scheme: dark field needs '
+                "background.frames"
+            )
+        elif self.background.method == "sliding" and self.fit.mode == "track":
+            raise ValueError(
+                'background.method = "sliding" has no tracks: give background.frames for '
+                'fit.mode = "track"'
+            )
+        return self
 
-def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
-    """Read a configuration file and apply overrides.
+    @model_validator(mode="after")
+    def _lengths_agree(self) -> Config:
+        wavelength, roi = self.optics.wavelength_nm, self.fit.roi_nm
+        pixel = self.camera.pixel_size_nm
+        if pixel is not None and pixel > 4 * wavelength:
+            raise ValueError(
+                f"camera.pixel_size_nm = {pixel:g} is more than four wavelengths "
+                f"(optics.wavelength_nm = {wavelength:g}): no image is left in such pixels"
+            )
+        smallest = max(wavelength / 4, pixel or 0.0)
+        if roi < smallest:
+            guess = unit_guess(roi, smallest, LARGEST_NM)
+            raise ValueError(
+                f"fit.roi_nm = {roi:g} is smaller than {smallest:g} nm, a pixel or a quarter of "
+                f"the wavelength: no particle fits into such a square{guess}"
+            )
+        return self
 
-    Parameters
-    ----------
-    path : Path, optional
-        TOML file; without it, the defaults.
-    overrides : iterable of str
-        ``"section.key=value"``, the value as TOML would write it (quotes may be left out).
-
-    Returns
-    -------
-    Config
-        Validated.  Relative paths in it are relative to the file's folder.
-
-    Raises
-    ------
-    ConfigError
-        The file cannot be read, a key is unknown or a value is impossible.
-    """
-    values: dict[str, Any] = {}
-    if path is not None:
-        try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-        except UnicodeDecodeError:
-            raise ConfigError(f"{path}: is not a text file in UTF-8") from None
-        except tomllib.TOMLDecodeError as error:
-            raise ConfigError(f"{path}: is not valid TOML: {error}") from None
-        _anchor_paths(values, path.parent)
-    for override in overrides:
-        _apply_override(values, override)
-    return parse_config(values, where=str(path) if path else "configuration")
-
-
-def parse_config(values: Mapping[str, Any], *, where: str = "configuration") -> Config:
-    """Validate a nested mapping, as `tomllib` returns it.
-
-    Parameters
-    ----------
-    values : mapping
-        Sections of keys.
-    where : str
-        What error messages call the source.
-
-    Returns
-    -------
-    Config
-        Validated.
-
-    Raises
-    ------
-    ConfigError
-        One line that names each offending key.
-    """
-    try:
-        return Config.model_validate(values)
-    except ValidationError as error:
-        complaints = "; ".join(dict.fromkeys(_complaint(item) for item in error.errors()))
-        raise ConfigError(f"{where}: {complaints}") from None
-
-
-def config_to_toml(config: Config, *, comments: bool = True) -> str:
-    """Write a configuration as TOML that `load_config` reads back to an equal object.
-
-    Parameters
-    ----------
-    config : Config
-        What to write.
-    comments : bool
-        Put each key's description beside it and show unset keys commented out.
-
-    Returns
-    -------
-    str
-        TOML text.
-    """
-    blocks = []
-    for name, field in type(config).model_fields.items():
-        model: Section | type[Section]
-        section = getattr(config, name)
-        model = section if section is not None else _model_of(field.annotation)
-        if section is None and not comments:
-            continue
-        lines = [f"[{name}]" if section is not None else f"# [{name}]"]
-        tables: list[str] = []
-        fields = (model if isinstance(model, type) else type(model)).model_fields
-        for key, info in fields.items():
-            value = getattr(section, key) if section is not None else None
-            if key == "events":
-                tables = [_event_toml(event) for event in value or ()]
-                continue
-            if value is None and not comments:
-                continue
-            line = f"# {key} =" if value is None else f"{key} = {_toml_value(value)}"
-            lines.append(f"{line:<36} # {info.description}" if comments else line)
-        blocks.append("\n".join([*lines, *tables]))
-    return "\n\n".join(blocks) + "\n"
-
-
-def _model_of(annotation: Any) -> type[Section]:
-    model: type[Section] = next(a for a in get_args(annotation) if a is not type(None))
-    return model
-
-
-def _event_toml(event: SimulatedEvent) -> str:
-    lines = [f"{k} = {_toml_value(v)}" for k, v in event.model_dump().items() if v is not None]
-    return "\n".join(["[[simulation.events]]", *lines])
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
-    if isinstance(value, tuple):
-        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
-    return repr(value)
-
-
-_PATH_KEYS = {
-    "camera": ("gain_e_per_adu", "offset_adu", "read_noise_e"),
-    "simulation": ("background",),
-}
-
-
-def _anchor_paths(values: dict[str, Any], folder: Path) -> None:
-    """Make the relative paths of a file relative to the folder it lies in."""
-    for section, keys in _PATH_KEYS.items():
-        table = values.get(section)
-        if not isinstance(table, dict):
-            continue
-        for key in keys:
-            value = table.get(key)
-            if isinstance(value, str) and value not in ("flat", "speckle"):
-                table[key] = str(folder / value)
-
-
-def _apply_override(values: dict[str, Any], override: str) -> None:
-    name, equals, text = override.partition("=")
-    section, dot, key = name.strip().partition(".")
-    if not (equals and dot and section and key):
-        raise ConfigError(f"--set {override}: write it as section.key=value, as in optics.na=1.42")
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = text.strip()
-    table = values.setdefault(section, {})
-    if not isinstance(table, dict):
-        raise ConfigError(f"--set {override}: {section} is not a section")
-    table[key] = value
-    exclusive = {
-        "mass_kda": "diameter_nm",
-        "diameter_nm": "mass_kda",
-        "index": "permittivity",
-        "permittivity": "index",
-    }
-    if section == "particle" and key in exclusive:
-        table.pop(exclusive[key], None)
-
-
-def _complaint(item: Mapping[str, Any]) -> str:
-    location = [str(part) for part in item["loc"] if not _is_union_branch(part)]
-    key = ".".join(location)
-    if item["type"] == "extra_forbidden":
-        known = _known_keys(location[:-1])
-        near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
-        hint = f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known)}"
-        kind = "section" if len(location) == 1 else "key"
-        return f"unknown {kind} {key}{hint}"
-    message = item["msg"].removeprefix("Value error, ")
-    if item["type"] == "missing":
-        return f"{key}: is required"
-    given = item["input"]
-    shown = f" (got {given!r})" if isinstance(given, (str, int, float, list)) else ""
-    if isinstance(given, float) and math.isnan(given):
-        shown = " (got nan)"
-    return f"{key}: {message[:1].lower()}{message[1:]}{shown}"
-
-
-def _is_union_branch(part: Any) -> bool:
-    return isinstance(part, str) and (part in {"str", "float", "int"} or "constrained" in part)
-
-
-def _known_keys(location: list[str]) -> list[str]:
-    model: type[Section] = Config
-    for part in location:
-        if part.isdigit():
-            continue
-        if part == "events":
-            model = SimulatedEvent
-            continue
-        annotation = model.model_fields[part].annotation
-        model = annotation if isinstance(annotation, type) else _model_of(annotation)
-    return list(model.model_fields)
+    @property
+    def samples_posterior(self) -> bool:
+        """Whether posteriors are sampled: as asked, else where events are few."""
+        if self.fit.mode == "track":
+            return False
+        if self.posterior.enabled == "auto":
+            return self.background.method != "sliding"
+        return self.posterior.enabled

@@ -1,0 +1,61 @@
+"""The configuration: what the keys are, how files are read, and how single keys are changed.
+
+`schema` lists the sections and keys.  `configure` is the one way to a `Config`: files, mappings,
+keyword arguments and ``--set`` all go through it, so that the same keys give the same
+configuration and a later value wins over an earlier one in the same way.  `files` reads and writes
+TOML, and `renamed` keeps old names working for one release.
+"""
+
+from __future__ import annotations
+
+from iscat_analysis.config.files import OpticsFile, config_to_toml, read_optics_file
+from iscat_analysis.config.overrides import configure, load_config, parse_config
+from iscat_analysis.config.schema import (
+    PIXEL_NM,
+    BackgroundConfig,
+    BoundsConfig,
+    Calibration,
+    CameraConfig,
+    Compute,
+    Config,
+    Detection,
+    Fit,
+    Method,
+    Mode,
+    Optics,
+    Particle,
+    PosteriorConfig,
+    Scheme,
+    Section,
+    SimulatedEvent,
+    Simulation,
+    plausible_pixel,
+)
+
+__all__ = [
+    "PIXEL_NM",
+    "BackgroundConfig",
+    "BoundsConfig",
+    "Calibration",
+    "CameraConfig",
+    "Compute",
+    "Config",
+    "Detection",
+    "Fit",
+    "Method",
+    "Mode",
+    "Optics",
+    "OpticsFile",
+    "Particle",
+    "PosteriorConfig",
+    "Scheme",
+    "Section",
+    "SimulatedEvent",
+    "Simulation",
+    "config_to_toml",
+    "configure",
+    "load_config",
+    "parse_config",
+    "plausible_pixel",
+    "read_optics_file",
+]

@@ -1,0 +1,100 @@
+"""What is wrong with a configuration, in words: the key, the value, and what to write instead."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, get_args
+
+from iscat_analysis.config.schema import Config, Section, SimulatedEvent
+
+_DECIMAL_COMMA = re.compile(r"\s*([-+]?\d+),(\d+)\s*")
+
+
+def complaint(item: Mapping[str, Any], called: Mapping[str, str]) -> str:
+    """Put one of pydantic's errors into words.
+
+    Parameters
+    ----------
+    item : mapping
+        One of `pydantic.ValidationError.errors()`.
+    called : mapping of str to str
+        What to call a key, where it has another name for the user.
+
+    Returns
+    -------
+    str
+        Half a sentence that names the key.
+    """
+    location = [str(part) for part in item["loc"] if not _is_union_branch(part)]
+    key = called.get(".".join(location), ".".join(location))
+    if item["type"] == "extra_forbidden":
+        known = known_keys(location[:-1])
+        near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
+        hint = f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known)}"
+        kind = "section" if len(location) == 1 else "key"
+        return f"unknown {kind} {key}{hint}"
+    message = str(item["msg"]).removeprefix("Value error, ")
+    if not key:
+        return message
+    if item["type"] == "missing":
+        return f"{key}: is required"
+    given = item["input"]
+    comma = _DECIMAL_COMMA.fullmatch(given) if isinstance(given, str) else None
+    if comma:
+        return f"{key}: write {comma[1]}.{comma[2]}, with a decimal point (got {given!r})"
+    shown = f" (got {given!r})" if isinstance(given, (str, int, float, list)) else ""
+    if isinstance(given, float) and math.isfinite(given) and f"{given:g} " in message:
+        shown = ""
+    return f"{key}: {message[:1].lower()}{message[1:]}{shown}"
+
+
+def known_keys(location: list[str]) -> list[str]:
+    """List the keys of a section.
+
+    Parameters
+    ----------
+    location : list of str
+        Where it lies in the configuration; empty for the sections themselves.
+
+    Returns
+    -------
+    list of str
+        Their names.
+    """
+    model: type[Section] = Config
+    for part in location:
+        if part.isdigit():
+            continue
+        if part == "events":
+            model = SimulatedEvent
+            continue
+        annotation = model.model_fields[part].annotation
+        model = annotation if isinstance(annotation, type) else model_of(annotation)
+    return list(model.model_fields)
+
+
+def model_of(annotation: Any) -> type[Section]:
+    """Give the section of an annotation that may be None.
+
+    Parameters
+    ----------
+    annotation : Any
+        As in ``Calibration | None``.
+
+    Returns
+    -------
+    type
+        The class of the section.
+    """
+    model: type[Section] = next(a for a in get_args(annotation) if a is not type(None))
+    return model
+
+
+def _is_union_branch(part: Any) -> bool:
+    return isinstance(part, str) and (
+        part in {"str", "float", "int", "bool"}
+        or any(mark in part for mark in ("constrained", "literal", "function"))
+    )

@@ -1,0 +1,186 @@
+"""Reading and writing TOML."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from iscat_analysis.config.complaints import model_of
+from iscat_analysis.config.schema import Config, Section, SimulatedEvent
+from iscat_analysis.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class OpticsFile:
+    """What ``iscat calibrate optics`` measured of a microscope.
+
+    Attributes
+    ----------
+    optics : dict
+        Keys of the section ``[optics]`` and their values.
+    uncertainty : dict
+        The table ``[uncertainty]``: standard errors, by key.
+    covariance : dict
+        The table ``[covariance]``: of the parameters that were fitted together.
+    """
+
+    optics: dict[str, Any]
+    uncertainty: dict[str, Any]
+    covariance: dict[str, Any]
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a configuration file without validating it.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    dict
+        Sections of keys; relative paths in it are relative to the file's folder.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be read, or is not TOML.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        values = tomllib.loads(text)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: is not a text file in UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: is not valid TOML: {_explain(text, str(error))}") from None
+    _anchor_paths(values, path.parent)
+    return values
+
+
+def read_optics_file(path: Path) -> OpticsFile:
+    """Read the optics that were measured from a movie.
+
+    Parameters
+    ----------
+    path : Path
+        TOML with a table ``[optics]``, and the tables ``[uncertainty]`` and ``[covariance]`` where
+        they are known.
+
+    Returns
+    -------
+    OpticsFile
+        The values are validated where they are used.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be read, or has no table ``[optics]``.
+    """
+    values = read_toml(path)
+    tables = {name: values.pop(name, {}) for name in ("optics", "uncertainty", "covariance")}
+    if not tables["optics"] or not all(isinstance(table, dict) for table in tables.values()):
+        raise ConfigError(
+            f"{path}: has no table [optics], which optics.file needs; "
+            "`iscat calibrate optics` writes one"
+        )
+    if "file" in tables["optics"]:
+        raise ConfigError(f"{path}: names another optics file: give that one as optics.file")
+    return OpticsFile(**tables)
+
+
+def _explain(text: str, message: str) -> str:
+    """Say what is meant where the parser of TOML says what it expected."""
+    place = re.search(r"\(at line (\d+)", message)
+    lines = text.splitlines()
+    number = int(place[1]) if place else 0
+    line = lines[number - 1].strip() if 0 < number <= len(lines) else ""
+    comma = re.match(r"(\w+)\s*=\s*([-+]?\d+),(\d+)\s*(#.*)?$", line)
+    if comma:
+        return (
+            f"line {number}: numbers have a decimal point: write {comma[1]} = {comma[2]}.{comma[3]}"
+        )
+    if "twice" in message:
+        return f"line {number}: the section {line} is there twice: put its keys under one heading"
+    if "overwrite" in message:
+        key = line.partition("=")[0].strip() if place else lines[-1].partition("=")[0].strip()
+        return f"the key {key} is given twice in its section: leave one out"
+    return message
+
+
+def config_to_toml(config: Config, *, comments: bool = True) -> str:
+    """Write a configuration as TOML that `load_config` reads back to an equal object.
+
+    Parameters
+    ----------
+    config : Config
+        What to write.
+    comments : bool
+        Put each key's description beside it and show unset keys commented out.
+
+    Returns
+    -------
+    str
+        TOML text.
+    """
+    blocks = []
+    for name, field in type(config).model_fields.items():
+        model: Section | type[Section]
+        section = getattr(config, name)
+        model = section if section is not None else model_of(field.annotation)
+        if section is None and not comments:
+            continue
+        lines = [f"[{name}]" if section is not None else f"# [{name}]"]
+        tables: list[str] = []
+        fields = (model if isinstance(model, type) else type(model)).model_fields
+        for key, info in fields.items():
+            value = getattr(section, key) if section is not None else None
+            if key == "events":
+                tables = [_event_toml(event) for event in value or ()]
+                continue
+            if value is None and not comments:
+                continue
+            line = f"# {key} =" if value is None else f"{key} = {_toml_value(value)}"
+            lines.append(f"{line:<36} # {info.description}" if comments else line)
+        blocks.append("\n".join([*lines, *tables]))
+    return "\n\n".join(blocks) + "\n"
+
+
+def _event_toml(event: SimulatedEvent) -> str:
+    lines = [f"{k} = {_toml_value(v)}" for k, v in event.model_dump().items() if v is not None]
+    return "\n".join(["[[simulation.events]]", *lines])
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return f'"{escaped}"'
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
+    return repr(value)
+
+
+_PATH_KEYS = {
+    "optics": ("file",),
+    "camera": ("gain_e_per_adu", "offset_adu", "read_noise_e"),
+    "simulation": ("background",),
+}
+
+
+def _anchor_paths(values: dict[str, Any], folder: Path) -> None:
+    """Make the relative paths of a file relative to the folder it lies in."""
+    for section, keys in _PATH_KEYS.items():
+        table = values.get(section)
+        if not isinstance(table, dict):
+            continue
+        for key in keys:
+            value = table.get(key)
+            if isinstance(value, str) and value not in ("flat", "speckle"):
+                table[key] = str(folder / value)

@@ -1,0 +1,254 @@
+"""The one way to a configuration.
+
+A configuration starts from a file, a mapping, another configuration or the defaults, and keys are
+then changed one after another.  Whether a change comes from ``--set``, from an option, from
+``settings=`` or from a keyword argument makes no difference to what it does.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from iscat_analysis.config.complaints import complaint
+from iscat_analysis.config.files import read_optics_file, read_toml
+from iscat_analysis.config.renamed import rename
+from iscat_analysis.config.schema import Config
+from iscat_analysis.errors import ConfigError
+
+_RIVALS = {
+    ("particle", "mass_kda"): ("diameter_nm",),
+    ("particle", "diameter_nm"): ("mass_kda",),
+    ("particle", "index"): ("permittivity",),
+    ("particle", "permittivity"): ("index",),
+    ("simulation", "count"): ("events",),
+    ("simulation", "events"): ("count", "leavings"),
+}
+"""Keys that say the same in two ways: the one that is given later removes the other."""
+
+
+def configure(
+    source: str | Path | Mapping[str, Any] | Config | None = None,
+    *,
+    settings: Mapping[str, Any] | Iterable[str] | None = None,
+    called: Mapping[str, str] | None = None,
+) -> Config:
+    """Make a configuration from a file, a mapping, another configuration, or the defaults.
+
+    Parameters
+    ----------
+    source : str, Path, mapping or Config, optional
+        A TOML file, sections of keys as in ``{"optics": {"na": 1.3}}`` or
+        ``{"optics.na": 1.3}``, or a configuration to change; without it, the defaults.
+    settings : mapping of str to Any, or iterable of str, optional
+        Changes, which win over the source, in their order: ``{"optics.na": 1.3, "fit.frames":
+        (200, 400)}``, or text as in ``["optics.na=1.3"]``.  None as a value unsets a key.  Where
+        two keys exclude each other, as ``particle.mass_kda`` and ``particle.diameter_nm`` do, the
+        later one replaces the earlier.
+    called : mapping of str to str, optional
+        What messages call a key that reached this function under another name, as in
+        ``{"fit.mode": "mode"}``.
+
+    Returns
+    -------
+    Config
+        Validated and immutable; `iscat_analysis.config` documents every key and its unit.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, a key is unknown (the nearest known one is named), or a value is
+        impossible.
+    """
+    if isinstance(source, Config):
+        if not settings:
+            return source
+        values, where = source.model_dump(exclude_none=True), "settings"
+    elif source is None:
+        values, where = {}, "configuration"
+    elif isinstance(source, Mapping):
+        values, where = _nested(source), "configuration"
+    elif isinstance(source, (str, Path)):
+        values, where = read_toml(Path(source)), str(source)
+    else:
+        raise ConfigError(
+            f"a configuration is made from a file, a mapping or a Config, not from a "
+            f"{type(source).__name__}: give the path of a TOML file, or sections of keys as in "
+            '{"optics": {"na": 1.42}}'
+        )
+    changes = _changes(settings)
+    for section, key, value in changes:
+        _change(values, section, key, value)
+    if any(change[:2] in _METHOD_FOLLOWS for change in changes):
+        _choose_method_again(values, changes)
+    return _validated(values, changes, where, called or {})
+
+
+def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -> Config:
+    """Read a configuration file and change keys of it.
+
+    Parameters
+    ----------
+    path : str or Path, optional
+        TOML file; without it, the defaults.
+    overrides : iterable of str
+        ``"section.key=value"``, the value as TOML would write it (quotes may be left out).
+
+    Returns
+    -------
+    Config
+        Validated.  Relative paths in it are relative to the file's folder.
+
+    Raises
+    ------
+    ConfigError
+        As `configure` raises it.
+    """
+    return configure(path, settings=list(overrides))
+
+
+def parse_config(values: Mapping[str, Any], *, where: str = "configuration") -> Config:
+    """Validate a nested mapping, as `tomllib` returns it.
+
+    Parameters
+    ----------
+    values : mapping
+        Sections of keys.
+    where : str
+        What messages call it.
+
+    Returns
+    -------
+    Config
+        Validated.
+
+    Raises
+    ------
+    ConfigError
+        One line that names each offending key.
+    """
+    return _validated(_nested(values), [], where, {})
+
+
+Change = tuple[str, str, Any]
+
+
+def _validated(
+    values: dict[str, Any], changes: Iterable[Change], where: str, called: Mapping[str, str]
+) -> Config:
+    rename(values)
+    _merge_optics_file(values, changes)
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        found = (complaint(item, called) for item in error.errors())
+        raise ConfigError(f"{where}: {'; '.join(dict.fromkeys(found))}") from None
+
+
+def _changes(settings: Mapping[str, Any] | Iterable[str] | None) -> list[Change]:
+    if settings is None:
+        return []
+    if isinstance(settings, str):
+        settings = [settings]
+    if not isinstance(settings, Mapping):
+        return [_parsed(text) for text in settings]
+    found = []
+    for name, value in settings.items():
+        section, dot, key = str(name).partition(".")
+        if dot and section and key:
+            found.append((section, key, value))
+        elif not dot and isinstance(value, Mapping):
+            found += [(section, str(each), item) for each, item in value.items()]
+        else:
+            raise ConfigError(f'settings: write "{name}" as "section.key", as in "optics.na"')
+    return found
+
+
+def _parsed(text: str) -> Change:
+    """Read ``section.key=value`` as ``--set`` has it."""
+    name, equals, written = text.partition("=")
+    section, dot, key = name.strip().partition(".")
+    if not (equals and dot and section and key):
+        raise ConfigError(f"--set {text}: write it as section.key=value, as in optics.na=1.42")
+    try:
+        value = tomllib.loads(f"value = {written}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = written.strip()
+    return section, key, value
+
+
+def _nested(source: Mapping[str, Any]) -> dict[str, Any]:
+    """Copy a mapping; ``{"optics.na": 1.3}`` becomes ``{"optics": {"na": 1.3}}``."""
+    values: dict[str, Any] = {}
+    for name, value in source.items():
+        section, dot, key = str(name).partition(".")
+        if dot:
+            _change(values, section, key, value, exclude=False)
+        elif isinstance(value, Mapping) and isinstance(values.get(section), dict):
+            values[section].update(deepcopy(dict(value)))
+        else:
+            values[section] = deepcopy(dict(value)) if isinstance(value, Mapping) else value
+    return values
+
+
+def _change(
+    values: dict[str, Any], section: str, key: str, value: Any, *, exclude: bool = True
+) -> None:
+    table = values.setdefault(section, {})
+    if not isinstance(table, dict):
+        raise ConfigError(f"{section}.{key}: {section} is not a section but {table!r}")
+    if value is None:
+        table.pop(key, None)
+        return
+    table[key] = value
+    for rival in _RIVALS.get((section, key), ()) if exclude else ():
+        table.pop(rival, None)
+
+
+_METHOD_FOLLOWS = {
+    ("background", "frames"),
+    ("background", "method"),
+    ("optics", "scheme"),
+    ("fit", "mode"),
+}
+
+
+def _choose_method_again(values: dict[str, Any], changes: Iterable[Change]) -> None:
+    """Let a change decide anew between a fixed and a sliding background.
+
+    A configuration that is changed names its method, which followed from the frames, the scheme and
+    the mode that it had.  A method that is among the changes is taken as it is, and removes frames
+    of the source that contradict it.
+    """
+    background = values.get("background")
+    if not isinstance(background, dict):
+        return
+    named = {key: value for section, key, value in changes if section == "background"}
+    if named.get("method") is not None:
+        if named["method"] == "sliding" and "frames" not in named:
+            background.pop("frames", None)
+    elif background.get("method") == "sliding" or (
+        background.get("method") == "fixed" and background.get("frames") is None
+    ):
+        del background["method"]
+
+
+def _merge_optics_file(values: dict[str, Any], changes: Iterable[Change]) -> None:
+    """Put the values of ``optics.file`` over those of the section."""
+    optics = values.get("optics")
+    path = optics.get("file") if isinstance(optics, dict) else None
+    if not isinstance(optics, dict) or not isinstance(path, str):
+        return
+    measured = read_optics_file(Path(path)).optics
+    for section, key, value in changes:
+        if section == "optics" and key in measured and measured[key] != value:
+            raise ConfigError(
+                f"optics.{key} = {value} contradicts {path}, which says {measured[key]}: change it "
+                "in that file, or leave optics.file out"
+            )
+    optics.update(measured)

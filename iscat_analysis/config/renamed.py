@@ -1,0 +1,48 @@
+"""Old names of keys and values, which work for one release with a notice that names the new one."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+OLD_VALUES: dict[tuple[str, str], dict[str, str]] = {
+    ("background", "method"): {"mean": "fixed", "none": "known"}
+}
+"""Section and key → old value → new value."""
+
+OLD_KEYS: dict[tuple[str, str], tuple[str, str]] = {}
+"""Old section and key → new section and key; the meaning and the unit are the same."""
+
+
+def rename(values: dict[str, Any]) -> None:
+    """Replace old names in place, and say so in a `FutureWarning`.
+
+    Parameters
+    ----------
+    values : dict
+        Sections of keys, not validated yet.
+    """
+    for (section, key), (new_section, new_key) in OLD_KEYS.items():
+        table = values.get(section)
+        if isinstance(table, dict) and key in table:
+            values.setdefault(new_section, {}).setdefault(new_key, table.pop(key))
+            _notice(f"{section}.{key}", f"{new_section}.{new_key}")
+    for (section, key), names in OLD_VALUES.items():
+        table = values.get(section)
+        old = table.get(key) if isinstance(table, dict) else None
+        if isinstance(table, dict) and isinstance(old, str) and old in names:
+            if old == "mean" and table.get("frames") is None:
+                # Without frames the mean meant that the windows slide, where the scheme allows it.
+                del table[key]
+                _notice('background.method = "mean" without background.frames', '"sliding"')
+                continue
+            table[key] = names[old]
+            _notice(f'{section}.{key} = "{old}"', f'"{names[old]}"')
+
+
+def _notice(old: str, new: str) -> None:
+    warnings.warn(
+        f"{old} is now called {new}; the old name works until the next release",
+        FutureWarning,
+        stacklevel=4,
+    )

@@ -1,0 +1,66 @@
+"""What the models of the documents are made of."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Number = float | None
+Count = Annotated[int, Field(ge=0)]
+Natural = Annotated[int, Field(ge=1)]
+Positive = Annotated[float, Field(gt=0)] | None
+NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)] | None
+Interval = tuple[Number, Number]
+Row4 = tuple[Number, Number, Number, Number]
+Matrix4 = tuple[Row4, Row4, Row4, Row4]
+Mode = Literal["mass", "localize", "joint", "track"]
+Scheme = Literal["iscat", "cobri", "darkfield"]
+Emission = Literal["dong2021", "reciprocal"]
+Convention = Literal["exact", "dong2021"]
+Parameter = Literal["x_nm", "y_nm", "z_nm", "mass_kda"]
+
+
+def key(description: str) -> Any:
+    """Describe a key that is always there.
+
+    Parameters
+    ----------
+    description : str
+        What the key holds, with its unit.
+
+    Returns
+    -------
+    Any
+        The field.
+    """
+    return Field(description=description)
+
+
+def maybe(description: str) -> Any:
+    """Describe a key that is left out where there is nothing to say.
+
+    Parameters
+    ----------
+    description : str
+        What the key holds, with its unit.
+
+    Returns
+    -------
+    Any
+        The field.
+    """
+    return Field(default=None, description=description)
+
+
+class Document(BaseModel):
+    """A document, or a part of one, that may hold further keys."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class Closed(BaseModel):
+    """A part that holds the keys named here and no other."""
+
+    model_config = ConfigDict(extra="forbid")

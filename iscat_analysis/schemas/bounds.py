@@ -1,0 +1,175 @@
+"""Documents of ``iscat bounds``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field
+
+from iscat_analysis.schemas.base import (
+    Closed,
+    Convention,
+    Document,
+    Emission,
+    Matrix4,
+    Mode,
+    Number,
+    Parameter,
+    Positive,
+    Scheme,
+    key,
+    maybe,
+)
+
+
+class Experiment(Document):
+    """The experiment whose bounds are computed."""
+
+    scheme: Scheme
+    mode: Mode
+    free: list[Parameter]
+    x_nm: float
+    y_nm: float
+    z_nm: float
+    mass_kda: float
+    focus_nm: float
+    attenuation: float
+    na: float
+    pixel_size_nm: float
+    photons_per_pixel: float
+    pixels: int
+    n_before: int
+    n_after: int
+
+
+class Scattered(Document):
+    """Scattered photons in all frames after."""
+
+    camera: float = key("On the field of pixels")
+    collected: float = key("Through the pupil")
+
+
+class PerPhoton(Closed):
+    """Standard deviations for one photon."""
+
+    x_nm: Positive = key("[nm]")
+    y_nm: Positive = key("[nm]")
+    z_nm: Positive = key("[nm]")
+    mass_rel: Positive = key("Relative to the mass")
+    z_nm_phase_free: Positive = maybe("The phase between particle and reference unknown [nm]")
+
+
+class Planned(Closed):
+    """Standard deviations for the planned frames."""
+
+    x_nm: Positive = key("[nm]")
+    y_nm: Positive = key("[nm]")
+    z_nm: Positive = key("[nm]")
+    mass_kda: Positive = key("[kDa]")
+    z_nm_phase_free: Positive = maybe("The phase between particle and reference unknown [nm]")
+
+
+class BoundsPerPhoton(Document):
+    """Bounds for one scattered photon: on the camera for a CRB, collected for a QCRB."""
+
+    crb_single: PerPhoton = key("Everything else known")
+    crb_joint: PerPhoton = key("Over the mode's free parameters; null where not identifiable")
+    qcrb: PerPhoton = key("Quantum, everything else known")
+    qcrb_joint: PerPhoton = key("Quantum, over all four parameters")
+    qcrb_dong2021: PerPhoton = key("Quantum, with the mode weight of Dong et al. (2021)")
+
+
+class BoundsPlanned(Document):
+    """Bounds for the planned frames."""
+
+    crb_single: Planned = key("Everything else known")
+    crb_joint: Planned = key("Over the mode's free parameters; null where not identifiable")
+    qcrb: Planned = key("Quantum, everything else known")
+    qcrb_joint: Planned = key("Quantum, over all four parameters")
+    qcrb_dong2021: Planned = key("Quantum, with the mode weight of Dong et al. (2021)")
+
+
+class Crosstalk(Document):
+    """The direction among the free parameters that is hidden worst."""
+
+    inflation: Number
+    direction: dict[str, Number]
+
+
+class Scan(Document):
+    """Bounds along an axis."""
+
+    name: str
+    label: str
+    here: Number
+    columns: dict[str, list[Number | str]]
+
+
+class Optimum(Document):
+    """The best value of a setting."""
+
+    model_config = ConfigDict(extra="allow", validate_by_name=True)
+
+    of: str
+    wanted: str = Field(alias="for")
+    value: Number
+    bound: Number
+    configured: Number
+    bound_configured: Number
+    note: str
+
+
+class Target(Document):
+    """What reaches a wanted precision."""
+
+    parameter: Parameter
+    value: float
+    effort: list[dict[str, Any]]
+    budget: list[dict[str, Any]]
+    note: str
+
+
+class Bounds(Document):
+    """What iscat bounds prints: classical and quantum Cramér–Rao bounds of one particle."""
+
+    at: Experiment = key("The experiment")
+    n_scattered: Scattered = key("Scattered photons in all frames after")
+    per_photon: BoundsPerPhoton = key("For one scattered photon [nm; mass_rel is relative]")
+    actual: BoundsPlanned = key("For the planned frames [nm, kDa]")
+    fisher: Matrix4 = key(
+        "Fisher information of all frames, order x, y, z, mass [1/nm², 1/(nm kDa), 1/kDa²]",
+    )
+    qfi: Matrix4 = key("Quantum Fisher information of the light")
+    qfi_imaginary: Matrix4 = key(
+        "Its imaginary part; where not zero, no single measurement is best for both parameters",
+    )
+    information_fraction: dict[Parameter, Number] = key("Share of the light's information")
+    incompatible: dict[str, float] = key(
+        "Pairs that no single measurement estimates best, and how strongly, from 0 to 1"
+    )
+    unidentifiable: list[str] = key("Directions that the image does not show")
+    crosstalk: Crosstalk = key("The direction worst hidden among the free parameters")
+    convention: Convention = key("Formulas")
+    emission: Emission = key("Emission model")
+    warnings: list[str] = key("What the user should know, one line each")
+    scan: Scan = maybe("With --scan")
+    optimum: Optimum = maybe("With --optimize")
+    target: Target = maybe("With --target")
+
+
+class Table1Row(Closed):
+    """One row of Table 1."""
+
+    quantity: Literal["x", "y", "z_iscat", "z_cobri", "mass"] = key("Parameter, and scheme")
+    unit: Literal["nm", "relative"] = key("Unit of the row")
+    printed: Positive = key("As published")
+    authors: Positive = key("The authors' formulas by their rectangle rule")
+    dong2021: Positive = key("The same formulas integrated exactly")
+    exact: Positive = key("Exact")
+    reciprocal: Positive = key("Exact, with an emission that conserves energy")
+
+
+class Comparison(Document):
+    """What iscat bounds --preset dong2021 prints: Table 1 of Dong et al. (2021), five ways."""
+
+    table_1: Annotated[list[Table1Row], Field(min_length=5, max_length=5)] = key("Per photon")

@@ -1,0 +1,122 @@
+"""Documents of ``iscat calibrate``."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from iscat_analysis.schemas.base import (
+    Closed,
+    Count,
+    Document,
+    NotNegative,
+    Number,
+    key,
+    maybe,
+)
+
+
+class Estimate(Closed):
+    """A measured number."""
+
+    value: float = key("The estimate")
+    se: NotNegative = key("Its standard error")
+    ci95: tuple[float, float] = key("Its 95 % interval")
+
+
+class PhotonTransfer(Closed):
+    """Variance against mean, in groups of pixels."""
+
+    mean_adu: list[float] = key("Mean [counts]")
+    variance_adu2: list[float] = key("Variance between frames [counts²]")
+    variance_se: list[NotNegative] = key("Its standard error [counts²]")
+    fit_adu2: list[Number] = key("The fitted line [counts²]")
+    pixels: list[Count] = key("How many pixels")
+
+
+class Averaging(Closed):
+    """Noise against averaging."""
+
+    n_frames: list[Count] = key("Frames averaged before and after")
+    contrast_noise: list[NotNegative] = key("Standard deviation of the contrast of a pixel")
+    contrast_noise_se: list[Number] = key("Its standard error")
+    shot_noise: list[Number] = key("What the photoelectrons alone would give")
+    excess: list[Number] = key("Variance over that of the photoelectrons")
+    excess_se: list[Number] = key("Its standard error")
+    comparisons: list[Count] = key("How many pairs of averages")
+
+
+class Camera(Document):
+    """What iscat calibrate camera prints and writes as camera.json."""
+
+    recordings: list[str] = maybe("In the file: the stacks")
+    dark: str | None = maybe("In the file: the dark")
+    gain_e_per_adu: Estimate | None = key("Photoelectrons per count [e]")
+    offset_adu: Estimate = key("Counts in the dark [counts]")
+    offset_from: Literal["dark", "given", "flicker", "line"] = key("Where the offset is from")
+    read_noise_adu: Estimate | None = key("Read noise, standard deviation [counts]")
+    read_noise_e: Estimate | None = key("Read noise, standard deviation [e]")
+    read_noise_below_e: NotNegative | None = key(
+        "Upper limit, 95 %, of a read noise too small to measure [e]"
+    )
+    shot_limited_frames: Count | None = key("Frames that may be averaged before other noise shows")
+    verdict: str = key("The same as a sentence")
+    frames: Count = key("Frames that were used")
+    masked_pixels: dict[str, Count] = key("Pixels left out, by reason")
+    photon_transfer: PhotonTransfer = key("Variance against mean")
+    noise: Averaging = key("Noise against averaging")
+    notes: list[str] = key("What the user should know, one line each")
+    out: str = maybe("The folder that was written; not in the file")
+
+
+class Peak(Closed):
+    """A peak of the contrasts."""
+
+    contrast: NotNegative = key("Size of the peak's contrast")
+    contrast_se: NotNegative = key("Its standard error")
+    width: NotNegative = key("Standard deviation of the peak beyond the events' own")
+    count: NotNegative = key("Events in it")
+
+
+class Standard(Closed):
+    """A standard and what the line makes of its peak."""
+
+    mass_kda: float = key("Known mass [kDa]")
+    mass_se: NotNegative = key("Its standard error [kDa]")
+    contrast: float = key("Signed contrast of its peak")
+    contrast_se: NotNegative = key("Its standard error")
+    width: NotNegative = key("Standard deviation of the peak beyond the events' own")
+    count: NotNegative = key("Events in it")
+    found_kda: float = key("Its mass by the line [kDa]")
+    residual_percent: float = key("found_kda beside mass_kda [%]")
+    low_kda: Number = key("Lower end of the prediction interval [kDa]")
+    high_kda: Number = key("Upper end [kDa]")
+
+
+class Histogram(Closed):
+    """A histogram."""
+
+    edges: list[NotNegative] = key("Edges of the bins")
+    counts: list[Count] = key("Events in each")
+
+
+class Calibration(Document):
+    """What iscat calibrate mass prints and writes as calibration.json.
+
+    The line between contrast and mass: contrast = gradient · mass + sign · offset.
+    """
+
+    source: str = maybe("In the file: the table of events")
+    gradient_per_kda: float = key("Signed peak contrast per kDa")
+    gradient_se: NotNegative = key("Its standard error")
+    offset: float = key("Contrast at zero mass")
+    offset_se: NotNegative = key("Its standard error")
+    covariance: tuple[tuple[float, float], tuple[float, float]] = key("Of gradient and offset")
+    chi2: NotNegative = key("χ² of the standards about the line")
+    dof: Count = key("Its degrees of freedom")
+    landing: Literal["dark", "bright"] = key("What landing does to its place")
+    events: Count = key("Landing events that were used")
+    standards: list[Standard] = key("The standards, lightest first")
+    peaks: list[Peak] = key("Every peak that was found")
+    notes: list[str] = key("What the user should know, one line each")
+    histogram: Histogram = maybe("In the file: sizes of the contrasts")
+    out: str = maybe("The folder that was written; not in the file")

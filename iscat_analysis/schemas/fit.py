@@ -1,0 +1,253 @@
+"""Documents of ``iscat fit`` and ``iscat simulate``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from iscat_analysis.records import Status
+from iscat_analysis.schemas.base import (
+    Closed,
+    Convention,
+    Count,
+    Document,
+    Emission,
+    Mode,
+    Natural,
+    NotNegative,
+    Number,
+    Parameter,
+    Positive,
+    Scheme,
+    Share,
+    key,
+    maybe,
+)
+
+_SIGMA = "Standard deviation from the observed information [{}]; null where it is not free"
+_CRB = "Joint Cramér–Rao bound at the estimate [{}]; null where the parameter is not free"
+_QCRB = "Quantum Cramér–Rao bound for the collected photons [{}]"
+_SYSTEMATIC = "Error common to the movie, from the calibration [{}]"
+_REPEAT = "Spread between disjoint parts of the event's frames [{}]"
+
+
+class Event(Closed):
+    """One row of fits.csv."""
+
+    event: Count = key("Number of the event")
+    frame: Count = key("First frame of the new state")
+    n_before: Count = key("Frames summed before")
+    n_after: Count = key("Frames summed after")
+    x_px: Number = key("Column, 0-based; an integer is a pixel's centre [px]")
+    y_px: Number = key("Row, downwards, 0-based; an integer is a pixel's centre [px]")
+    x_nm: Number = key("x_px times the pixel size [nm]")
+    y_nm: Number = key("y_px times the pixel size [nm]")
+    z_nm: Number = key("Height above the coverslip [nm]")
+    mass_kda: Number = key(
+        "Mass [kDa]; negative for a particle that leaves; on the model's scale where the summary's "
+        "mass_calibrated is false"
+    )
+    contrast: Number = key("Signed peak contrast of the fitted model; null in dark field")
+    sigma_x_nm: Positive = key(_SIGMA.format("nm"))
+    sigma_y_nm: Positive = key(_SIGMA.format("nm"))
+    sigma_z_nm: Positive = key(_SIGMA.format("nm"))
+    sigma_mass_kda: Positive = key(_SIGMA.format("kDa"))
+    crb_x_nm: Positive = key(_CRB.format("nm"))
+    crb_y_nm: Positive = key(_CRB.format("nm"))
+    crb_z_nm: Positive = key(_CRB.format("nm"))
+    crb_mass_kda: Positive = key(_CRB.format("kDa"))
+    qcrb_x_nm: Positive = key(_QCRB.format("nm"))
+    qcrb_y_nm: Positive = key(_QCRB.format("nm"))
+    qcrb_z_nm: Positive = key(_QCRB.format("nm"))
+    qcrb_mass_kda: Positive = key(_QCRB.format("kDa"))
+    n_scattered: Number = key("Scattered photons collected in the frames after")
+    snr: Number = key("Matched-filter signal over its noise")
+    chi2_reduced: Number = key("Reduced χ² of the fitted pixels")
+    p_value: Share = key("Probability of a worse fit if the model holds")
+    status: Status = key("The verdict")
+    flags: str | None = key("Every condition that was noticed, joined by semicolons")
+    frame_ci95: NotNegative | None = maybe(
+        "Half-width of the 95 % interval of frame [frames]; landing movies only"
+    )
+    systematic_x_nm: Number = maybe(_SYSTEMATIC.format("nm"))
+    systematic_y_nm: Number = maybe(_SYSTEMATIC.format("nm"))
+    systematic_z_nm: Number = maybe(_SYSTEMATIC.format("nm"))
+    systematic_mass_kda: Number = maybe(_SYSTEMATIC.format("kDa"))
+    repeat_x_nm: Number = maybe(_REPEAT.format("nm"))
+    repeat_y_nm: Number = maybe(_REPEAT.format("nm"))
+    repeat_z_nm: Number = maybe(_REPEAT.format("nm"))
+    repeat_mass_kda: Number = maybe(_REPEAT.format("kDa"))
+    track: Count | None = maybe("Number of the track that the row belongs to")
+
+
+class Medians(Document):
+    """Medians of one free parameter over the events that are ok."""
+
+    sigma_median: Number = key("Achieved standard deviation [nm or kDa]")
+    crb_median: Number = key("Cramér–Rao bound [nm or kDa]")
+    qcrb_median: Number = key("Quantum Cramér–Rao bound [nm or kDa]")
+    sigma_over_crb_median: Number = key("1 where the fit uses all that the frames hold")
+    information_fraction_median: Number = key("(QCRB/CRB)², the share of the light's information")
+
+
+class Input(Document):
+    """The movie that was read."""
+
+    path: str = key("Path as it was given")
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] = key("SHA-256 of its bytes")
+
+
+class Versions(BaseModel):
+    """Versions of this program, of Python and of the numerical libraries."""
+
+    model_config = ConfigDict(extra="allow", validate_by_name=True)
+    __pydantic_extra__: dict[str, str]
+
+    program: str = Field(alias="iscat-analysis", description="This program")
+    python: str = key("Python")
+    numpy: str = key("NumPy")
+
+
+class Noise(Document):
+    """Noise against averaging, and the drift of the fixed pattern."""
+
+    noise_frames: list[Count] = key("Frames averaged")
+    noise_variance_over_shot: list[Number] = key("Variance over that of the photoelectrons")
+    shot_noise_limited_frames: int | None = key("Frames that may be averaged before other noise")
+
+
+class Background(Noise):
+    """A movie with background frames: its noise, and its drift to the frames after."""
+
+    drift_px: tuple[float, float] | None = key(
+        "Drift of the fixed pattern along y and x [px]; null where there is none to follow"
+    )
+    drift_error_px: tuple[float, float] | None = key("Its standard errors [px]")
+
+
+class Landing(Document):
+    """A landing movie: its windows, what was searched, and its drift."""
+
+    window_frames: Natural = maybe("Frames in each window")
+    landings: Count = maybe("Events that land")
+    leavings: Count = maybe("Events that leave")
+    noise_frames: list[Count] = maybe("Frames averaged")
+    noise_variance_over_shot: list[Number] = maybe("Variance over that of the photoelectrons")
+    shot_noise_limited_frames: int | None = maybe("Frames that may be averaged before other noise")
+    stride_frames: Natural = maybe("From one searched boundary to the next")
+    boundaries_searched: Count = maybe("Boundaries that share the expected false alarms")
+    frames_left_out: Count = maybe("Frames that the camera dropped or repeated")
+    drift_px: list[float] | None = maybe("Drift over the movie along y and x [px]")
+    drift_corrected: bool = maybe("Whether the motion of the fixed pattern was divided out")
+    drift_frames: list[float] | None = maybe("Mean frames of the blocks in which it was followed")
+    drift_x_px: list[float] | None = maybe("Motion along x in each block [px]")
+    drift_y_px: list[float] | None = maybe("Motion along y in each block [px]")
+    drift_error_px: Number = maybe("Standard error from one block to the next [px]")
+    chunks: Count = maybe("Parts the movie was analysed in")
+
+
+class Injection(Closed):
+    """Known particles added to the movie: how many were found again, and how well."""
+
+    added: Count = key("Steps added: each particle lands, and leaves unless the movie ends first")
+    recovered: Count = key("Steps found again")
+    recall: Share = key("Their share")
+    isolated: Count = key("Steps with no other one near in place and time")
+    recall_isolated: Share = key("Share of these that was found")
+    bias_rel: float = maybe(
+        "Mean relative error of the mass; from here on: of two or more isolated"
+    )
+    bias_rel_se: NotNegative = maybe("Its standard error")
+    spread_over_crb: NotNegative = maybe("Standard deviation of mass errors in units of their CRB")
+    spread_over_crb_se: NotNegative = maybe("Its standard error")
+    pull_std: NotNegative = maybe("The same in units of σ")
+    frame_within_1: Share = maybe("Share whose frame is off by one at most")
+    frame_in_interval: Share = maybe("Share whose frame lies inside frame_ci95")
+
+
+class Distribution(Document):
+    """Species, as a mixture fitted to the events that are ok, each with its own error."""
+
+    branch: Literal["magnitude", "landing", "leaving"] = key("Which events; magnitude: all, |mass|")
+    events: Count = key("Events used")
+    species: list[dict[str, Any]] = key(
+        "By rising mass [kDa]; *_low and *_high are 95 % intervals of a parametric bootstrap; "
+        "width_kda is beyond measurement error; count is of the events seen, count_corrected and "
+        "fraction are of the particles that came; an outlier holds fewer than three events"
+    )
+    selection: list[dict[str, Any]] = key("Log-likelihood and BIC of each number of species tried")
+    support: Number = key("Share of simulated repetitions in which BIC chose the same number")
+    histogram: dict[str, Any] = key(
+        "Columns low_kda, high_kda [kDa], count, and its 95 % interval count_low, count_high"
+    )
+    curves: dict[str, Any] = key(
+        "Columns mass_kda [kDa]; density (kernel), density_se, model and model_corrected [events "
+        "per kDa]; efficiency"
+    )
+    bandwidth_kda: Number = key("Bandwidth of the kernel density [kDa]")
+    draws: int = key("Simulated repetitions")
+    seed: int = key("Seed of the bootstrap")
+    notes: list[str] = key("What the user should know")
+
+
+class Summary(Document):
+    """What iscat fit writes into its output folder as summary.json."""
+
+    events: Count = key("How many events there are")
+    mode: Mode = key("What was free")
+    scheme: Scheme = key("Optical scheme")
+    emission: Emission = key("Emission model")
+    convention: Convention = key("Formulas")
+    mass_scale: str = key("Where the mass scale comes from: a calibration, or the model")
+    status: dict[str, Count] = key("Events by status")
+    frames_before: tuple[Count, Count] | None = key("Background frames [start, stop)")
+    frames_after: tuple[Count, Count] | None = key("Fitted frames [start, stop)")
+    power_ratio: Number = key("Total laser power after over before")
+    power_spread: Number = key("Standard deviation of the relative power")
+    masked_pixels: Count = key("Dead, hot or saturated pixels that were left out")
+    detection_threshold_snr: Number = key("Signal over noise above which a candidate counts")
+    medians: dict[str, Number] = key("Medians over the events with status ok")
+    precision: dict[Parameter, Medians] = key("Spread beside the bounds, by free parameter")
+    seconds: dict[str, NotNegative] = key("Wall time by stage [s]")
+    input: Input = key("The movie")
+    seed: int | None = key("Seed of the posterior sampler")
+    versions: Versions = key("Of this program, Python and the numerical libraries")
+    warnings: list[str] = key("What the user should know, one line each")
+    interrupted: bool = maybe("Landing movies: whether an interrupt ended the run early")
+    background: Background = maybe("Movies with background frames: noise and drift")
+    landing: Landing = maybe("Landing movies: windows, search, noise and drift")
+    injection: Injection = maybe("With --inject: known particles added to the movie")
+    distribution: Distribution | None = maybe(
+        "Species; null where masses are not fitted once per event"
+    )
+
+
+class Fit(Summary):
+    """What iscat fit prints: the summary, with the events in place of their number."""
+
+    events: list[Event] = key("The rows of fits.csv")  # type: ignore[assignment]
+    out: str = key("Output folder")
+
+
+class TrueEvent(Closed):
+    """One particle of a simulated movie."""
+
+    event: Count = key("Number of the particle")
+    frame: int = key("First frame with the particle")
+    leave: int | None = key("First frame without it again")
+    x_px: float = key("Column, 0-based; an integer is a pixel's centre [px]")
+    y_px: float = key("Row, downwards, 0-based; an integer is a pixel's centre [px]")
+    x_nm: float = key("x_px times the pixel size [nm]")
+    y_nm: float = key("y_px times the pixel size [nm]")
+    z_nm: float = key("Height above the coverslip [nm]")
+    mass_kda: float = key("Mass [kDa]")
+    contrast: Number = key("Signed peak contrast; null in dark field")
+
+
+class Simulate(Document):
+    """What iscat simulate prints: the movie that was written and the truth beside it."""
+
+    stack: str = key("The movie")
+    truth: str = key("The CSV file of the truth")
+    events: list[TrueEvent] = key("The rows of that file")

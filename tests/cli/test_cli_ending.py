@@ -1,0 +1,87 @@
+"""A request to end is answered within two seconds, wherever the program is."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+SECONDS = 2.0
+LOADED = 3.0  # more, for a machine that does other things as well
+
+BUSY = """
+import hashlib, sys
+from concurrent.futures import ThreadPoolExecutor
+import typer
+import iscat_cli
+from iscat_cli import app
+from iscat_cli.console import Messages, failures
+
+def compiled():
+    hashlib.pbkdf2_hmac("sha512", b"", b"", 200_000_000)  # minutes in C, without Python's lock
+
+def in_a_thread():
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(compiled).result()
+
+def main(arguments):
+    try:
+        with failures(Messages("iscat busy"), debug=False):
+            print("busy", flush=True)
+            {where}()
+    except typer.Exit as end:
+        return end.exit_code
+    return 0
+
+app.main = main
+sys.exit(iscat_cli.main())
+"""
+
+
+@pytest.mark.parametrize("where", ["compiled", "in_a_thread"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_compiled_code_does_not_hold_the_program(where: str, number: signal.Signals) -> None:
+    code = BUSY.replace("{where}", where)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "busy\n"
+        time.sleep(0.3)
+        begun = time.monotonic()
+        process.send_signal(number)
+        _, err = process.communicate(timeout=SECONDS + LOADED)
+        seconds = time.monotonic() - begun
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "interrupted" in err
+    assert len(err.splitlines()) == 1
+    assert seconds < SECONDS + LOADED
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ("optics.wavelength_nm=0.525", "write 525"),
+        ("optics.wavelength_nm=5.25", "not between 200 and 3000 nm"),
+        ("bounds.pixels=4096", "MB"),
+    ],
+)
+def test_impossible_lengths_end_at_once_and_small(setting: str, expected: str) -> None:
+    code = (
+        "import resource, sys; from iscat_cli import main; "
+        "resource.setrlimit(resource.RLIMIT_AS, (6 * 2**30,) * 2); sys.exit(main(sys.argv[1:]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "bounds", "--set", "camera.pixel_size_nm=84.4",
+         "--set", setting],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert expected in done.stderr
+    assert len(done.stderr.splitlines()) == 1
