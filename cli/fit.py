@@ -189,7 +189,8 @@ def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: 
     counts = Counter(str(row["status"]) for row in rows)
     verdict = ", ".join(f"{count} {status}" for status, count in counts.most_common())
     kind = "rows" if analysis.mode == "track" else "events"
-    print_result(f"{len(rows)} {kind}{': ' if verdict else ''}{verdict}; results in {folder}")
+    number = len(rows) - counts["sidelobe"]
+    print_result(f"{number} {kind}{': ' if verdict else ''}{verdict}; results in {folder}")
 
 
 def events_table(

@@ -83,8 +83,8 @@ _ADVICE = {
     Status.POOR_FIT: "The model does not describe the data: check focus, NA, gain and neighbours.",
     Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
     "treat the mass as shared between them.",
-    Status.SIDELOBE: "Not larger than what the model leaves over of the brighter particle beside it: not "
-    "counted; calibrate the optics (focus, NA, aberrations) to tell whether it is a particle.",
+    Status.SIDELOBE: "Not larger than what the model leaves over of a brighter particle beside it, "
+    "and not counted: check focus, NA and aberrations to tell whether it is a particle.",
     Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
 }
 
@@ -182,6 +182,8 @@ class Candidate:
         Linear estimate of the mass [kDa]; negative where the contrast has the other sign.
     snr : float
         Matched-filter signal over its noise.
+    beside : float
+        Height of the ratio elsewhere at its distance from a known particle, the largest of all near.
     """
 
     x_px: float
@@ -189,6 +191,7 @@ class Candidate:
     z_nm: float
     mass_kda: float
     snr: float
+    beside: float = 0.0
 
 
 @dataclass(frozen=True)

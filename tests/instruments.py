@@ -129,9 +129,7 @@ class Pictures:
     def _terms(self, dx_nm: FloatArray, dy_nm: FloatArray) -> tuple[FloatArray, FloatArray]:
         r, phi = np.hypot(dx_nm, dy_nm), np.arctan2(dy_nm, dx_nm)
         parts = self._spline(r)
-        e = sum(
-            parts[n] * np.exp(1j * h * phi)[..., None] for n, h in enumerate(self._orders)
-        )
+        e = sum(parts[n] * np.exp(1j * h * phi)[..., None] for n, h in enumerate(self._orders))
         linear = 2 * np.real(e @ np.conj(self._reference))
         return linear, np.sum(np.abs(e) ** 2, axis=-1)
 
@@ -203,7 +201,9 @@ class InstrumentMovie:
                     float(landings.mass_kda[i]),
                 )
             power = 1 + 0.01 * rng.standard_normal()
-            noisy = power * expected + np.sqrt(power * expected) * rng.standard_normal((rows, columns))
+            noisy = power * expected + np.sqrt(power * expected) * rng.standard_normal(
+                (rows, columns)
+            )
             counts[t] = np.floor(noisy / gain_e_per_adu + rng.random((rows, columns)))
         self.counts = counts
         self.shape = shape

@@ -40,15 +40,14 @@ from iscat_analysis.pipeline.chunks import (
 )
 from iscat_analysis.pipeline.diagnosis import DRIFT_PX
 from iscat_analysis.pipeline.injection import InjectedMovie, draw_particles, recovery
-from iscat_analysis.pipeline.neighbours import LARGEST_IMAGE
 from iscat_analysis.pipeline.pattern import follow
 from iscat_analysis.pipeline.results import Row, table_of, view_of
 from iscat_analysis.pipeline.resume import Store
 from iscat_analysis.pipeline.scene import Scene, reported_steps, search_both
 from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
-from iscat_analysis.records import EventView, FloatArray, Progress, Windows
+from iscat_analysis.records import EventView, FloatArray, Progress, Status, Windows
 from iscat_analysis.search.sliding import STRIDES, Chunk
-from iscat_analysis.search.templates import make_templates
+from iscat_analysis.search.templates import LARGEST_IMAGE, make_templates
 
 POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""
@@ -191,7 +190,9 @@ def analyse_landings(
                 if done is None:
                     chunk = reader.chunk(span, stride, pool)
                     budget = POSTERIORS - merged.sampled if posterior else 0
-                    done = _analyse_chunk(scene, chunk, core, window, pool, budget, noise.gain_message)
+                    done = _analyse_chunk(
+                        scene, chunk, core, window, pool, budget, noise.gain_message
+                    )
                     store.save(number, done)
                 merged.add(done)
                 progress("landing", core[1] - first, last - first)
@@ -211,13 +212,14 @@ def analyse_landings(
             "background.power_normalization = false has no effect on a landing movie: each frame "
             "is weighed by its own light"
         )
-    found = table["mass_kda"] < 0
+    counted = table[table["status"] != Status.SIDELOBE]
+    left = counted["mass_kda"] < 0
     summary = {
         "window_frames": window,
         "stride_frames": stride,
         "boundaries_searched": count,
-        "landings": int((~found).sum()),
-        "leavings": int(found.sum()),
+        "landings": int((~left).sum()),
+        "leavings": int(left.sum()),
         "shot_noise_limited_frames": curve.shot_limited,
         "noise_frames": list(curve.frames),
         "noise_variance_over_shot": list(curve.variance_over_shot),
@@ -294,7 +296,7 @@ def inject_and_recover(
         raise KeyboardInterrupt
     return recovery(
         particles,
-        again.table,
+        again.table[again.table["status"] != Status.SIDELOBE],
         frames[1],
         result.scene.roi_px / 2,
         window,

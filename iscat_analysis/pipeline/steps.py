@@ -16,14 +16,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.errors import DataError
 from iscat_analysis.inference.fit import POOR_FIT_P, fit_particle, search_box, start_theta
-from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pipeline.bias import unbiased
 from iscat_analysis.pipeline.field import Event
 from iscat_analysis.pipeline.neighbours import (
-    LARGEST_IMAGE,
     Neighbours,
     Step,
     distance_px,
@@ -40,8 +37,14 @@ from iscat_analysis.records import (
     Status,
     Windows,
 )
+from iscat_analysis.search.residue import (
+    EXCEEDS,
+    EXPLAINS,
+    LISTED,
+    chi2_excess,
+    size_on_ring,
+)
 from iscat_analysis.search.sliding import (
-    NORMAL_QUARTILE,
     STRIDES,
     Chunk,
     Filter,
@@ -52,27 +55,10 @@ from iscat_analysis.search.sliding import (
     make_filter,
     sliding_maps,
 )
+from iscat_analysis.search.templates import FLOOD, LARGEST_IMAGE, refuse_flood
 
 ROUNDS = 6
 """Searches at most; each takes what was found so far off the contrast."""
-
-EXCEEDS = 1.5
-"""Times the next largest peak on its ring around a brighter particle that a particle must have."""
-
-EXPLAINS = 0.5
-"""Share of a brighter particle's χ² in excess that a particle in its region must explain."""
-
-EXCESS_SIGMAS = 3.0
-_LISTED = 0.7  # of what a particle would need, below which a peak is not even listed
-RING_PX = 2.0
-PATCH_PX = 5.0
-
-FLOOD = 1000
-"""Candidates in a chunk beyond which the noise is looked at before they are fitted."""
-
-FLOOD_SPREAD = 1.2
-"""Spread of the signal-to-noise ratio over the field, 1 where the noise is as expected, from which
-so many candidates are noise."""
 
 _SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
 _SIDELOBE = 0.5  # of a stronger peak, below which a peak in its region waits for the next round
@@ -215,9 +201,13 @@ class ChunkFitter:
         # steps of the other polarity are fitted too: their rings have the one that is reported
         sign = reported_steps(self._scene)
         own = [
-            i for i, s in enumerate(everything) if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
+            i
+            for i, s in enumerate(everything)
+            if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
         ]
-        found = self._pool.map(lambda i: self._finish(i, everything, seen, lobe=i >= len(steps)), own)
+        found = self._pool.map(
+            lambda i: self._finish(i, everything, seen, lobe=i >= len(steps)), own
+        )
         fitted = [f for f in found if f is not None]
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
 
@@ -260,7 +250,13 @@ class ChunkFitter:
             self.strongest = np.stack([np.abs(best), best / np.sqrt(frames * matched.norm)])
         peaks = find_steps(chunk, matched, snr, effective, scene.templates.threshold)
         if not steps and len(peaks) > FLOOD:
-            self._refuse_flood(snr, len(peaks))
+            cause = self._gain_message or (
+                "the light flickers or the fixed pattern moves: look at the laser, set "
+                "background.drift_correction = true, or shorten background.window_frames"
+            )
+            refuse_flood(
+                snr, len(peaks), frames=f" in frames {chunk.first}:{chunk.stop}", cause=cause
+            )
         fresh: list[Peak] = []
         doubtful: list[Peak] = []
         taller: list[Peak] = []
@@ -273,19 +269,13 @@ class ChunkFitter:
             size = max((self._misfit(step, peak, steps, snr) for step in steps), default=0.0)
             if abs(peak.snr) > size:
                 fresh.append(peak)
-            elif abs(peak.snr) > _LISTED * size:
+            elif abs(peak.snr) > LISTED * size:
                 doubtful.append(peak)
         self._doubtful = doubtful
         return [self._begin(peak) for peak in fresh]
 
-    def _misfit(
-        self, step: Step, peak: Peak, steps: Sequence[Step], snr: MapArray
-    ) -> float:
-        """Signal-to-noise ratio that a peak beside a step must exceed not to be what its fit left.
-
-        A second particle fills a part of the ring around the step on which it lies, and explains
-        most of the χ² in excess there; a misfit has other peaks on that ring, as large.
-        """
+    def _misfit(self, step: Step, peak: Peak, steps: Sequence[Step], snr: MapArray) -> float:
+        """Signal-to-noise ratio that a peak must exceed not to be what the fit of a step left."""
         if not self._meet(step, peak):
             return 0.0
         x0, y0 = step.start.x_px, step.start.y_px
@@ -295,41 +285,16 @@ class ChunkFitter:
         # a window that holds the step only in part sees that part of the misfit
         part = max(1 - abs(step.at.frame - peak.frame) / self._window, 0.0)
         whole = part * math.sqrt(EXPLAINS * step.excess) if distance < self._roi_px / 2 else 0.0
-        far = distance + 2 * RING_PX
-        (top, bottom), (left, right) = (
-            (max(math.floor(c - far), 0), min(math.ceil(c + far) + 1, n))
-            for c, n in zip((y0, x0), self._chunk.shape, strict=True)
-        )
-        y, x = np.mgrid[top:bottom, left:right]
-        away = np.hypot(y - y0, x - x0)
-        ring = np.abs(away - max(distance, RING_PX)) < RING_PX
-        y, x, away = y[ring], x[ring], away[ring]
-        own = np.hypot(y - peak.y_px, x - peak.x_px) > PATCH_PX
-        for other in steps:  # what is nearer to another step is what that one's fit left over
-            if other is not step and self._meet(other, peak):
-                own &= np.hypot(y - other.start.y_px, x - other.start.x_px) > away
+        others = [
+            (s.start.x_px, s.start.y_px) for s in steps if s is not step and self._meet(s, peak)
+        ]
         j = round((peak.frame - self._chunk.first) / self._stride) - 1
-        largest = float(np.abs(snr[j, y[own], x[own]]).max(initial=0.0))
-        return max(whole, EXCEEDS * largest)
+        beside = size_on_ring(snr[j], (x0, y0), (peak.x_px, peak.y_px), others)
+        return max(whole, EXCEEDS * beside)
 
     def _meet(self, step: Step, peak: Peak) -> bool:
         """Whether a step is seen at the boundary of a peak."""
         return abs(step.at.frame - peak.frame) <= (self._strides + 1) * self._stride
-
-    def _refuse_flood(self, snr: MapArray, candidates: int) -> None:
-        """Give up where noise itself passes the threshold; many true steps are no reason to."""
-        spread = float(np.median(np.abs(snr[:, ::4, ::4]))) / NORMAL_QUARTILE
-        if spread < FLOOD_SPREAD:
-            return
-        chunk = self._chunk
-        cause = self._gain_message or (
-            "the light flickers or the fixed pattern moves: look at the laser, set "
-            "background.drift_correction = true, or shorten background.window_frames"
-        )
-        raise DataError(
-            f"{candidates} places in frames {chunk.first}:{chunk.stop} pass the detection threshold "
-            f"because the noise there is {spread**2:.2g} times what was expected; {cause}"
-        )
 
     def _shadows(self, one: Peak, peak: Peak) -> bool:
         """Whether a peak may be nothing but the side lobe of a stronger one."""
@@ -404,9 +369,13 @@ class ChunkFitter:
             snr = math.sqrt(2 * max(best.log_likelihood, 0.0))
             return self._neighbours.drawn(
                 replace(
-                    step, at=task.at, start=moved, theta=best.theta, snr=snr,
-                    excess=_excess(likelihood, best.theta),
-                )  # fmt: skip
+                    step,
+                    at=task.at,
+                    start=moved,
+                    theta=best.theta,
+                    snr=snr,
+                    excess=chi2_excess(likelihood.residuals(best.theta)),
+                )
             )
 
         improved = list(steps)
@@ -476,13 +445,6 @@ def _judged(scene: Scene, fit: FitResult, task: Task, *, lobe: bool) -> FitResul
         *([Status.POOR_FIT] if poor else []),
     ]
     return replace(fit, status=Status(flags[0]) if flags else Status.OK, flags=tuple(flags))
-
-
-def _excess(likelihood: Likelihood, theta: FloatArray) -> float:
-    """χ² above its expectation, 0 unless it stands out of its scatter."""
-    n = likelihood.n_pixels
-    excess = float(np.nansum(likelihood.residuals(theta) ** 2)) - n
-    return excess if excess > EXCESS_SIGMAS * math.sqrt(2 * n) else 0.0
 
 
 def _ids(steps: Sequence[Step]) -> set[int]:

@@ -194,6 +194,7 @@ def _bins(extent: float, spread: FloatArray) -> int:
 
 
 def _histogram(table: pd.DataFrame, name: str) -> Figure:
+    table = table[table["status"] != Status.SIDELOBE.value]
     values = table[name].to_numpy(float)
     finite = np.isfinite(values)
     good = (table["status"] == Status.OK.value).to_numpy()

@@ -12,7 +12,6 @@ from iscat_analysis.search.sliding.frames import Chunk, Patch, make_chunk, measu
 from iscat_analysis.search.sliding.noise import (
     LONGEST_WINDOW,
     MOVIE_SHARE,
-    NORMAL_QUARTILE,
     SHORTEST_MOVIE,
     SHORTEST_WINDOW,
     SHOT_LIMITED,
@@ -35,7 +34,6 @@ __all__ = [
     "CREDIBLE",
     "LONGEST_WINDOW",
     "MOVIE_SHARE",
-    "NORMAL_QUARTILE",
     "SHORTEST_MOVIE",
     "SHORTEST_WINDOW",
     "SHOT_LIMITED",

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.records import Mapper
+from iscat_analysis.search.templates import NORMAL_QUARTILE
 
 LONGEST_WINDOW = 100
 """Frames that a window chosen from the noise may have; beyond it events overlap too often."""
@@ -28,8 +29,6 @@ SHOT_LIMITED = 1.2
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
 _ROWS = 16  # on which the noise is measured
-NORMAL_QUARTILE = 0.6744897501960817
-"""Median magnitude of a standard normal number."""
 
 
 @dataclass(frozen=True)
