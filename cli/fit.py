@@ -43,8 +43,8 @@ Exit status: 0 done; 1 the data cannot be analysed; 2 usage or configuration;
 
 def fit(
     context: typer.Context,
-    stack: Annotated[
-        Path,
+    stacks: Annotated[
+        list[Path],
         typer.Argument(
             metavar="STACK", help="The movie: TIFF, OME-TIFF, ImageJ TIFF or Refeyn .mp."
         ),
@@ -108,6 +108,15 @@ def fit(
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug, options={"inject": "--inject"}):
         from iscat_analysis.config import load_config
+        from iscat_analysis.errors import ConfigError
+
+        if len(stacks) > 1:
+            raise ConfigError(
+                f"{len(stacks)} movies were given ({stacks[0]}, {stacks[1]}, …), but one is "
+                "analysed at a time: name one, or let the shell repeat the command, as in "
+                'for movie in *.tif; do iscat-fit "$movie" --config setup.toml; done'
+            )
+        (stack,) = stacks
 
         changes = _changes(settings, mode, frames, background, posterior, workers)
         resolved = load_config(config, changes)

@@ -16,6 +16,7 @@ CURVES: dict[str, Any] = json.loads((GOLDEN / "dong2021_curves.json").read_text(
 NAMES = [case["name"] for case in CASES]
 PAPER = {
     "wavelength_nm": 517.5, "na": 1.3, "n_immersion": 1.5, "n_glass": 1.5, "n_sample": 1.33,
+    "emission": "dong2021",
 }  # fmt: skip
 GOLD = {"kind": "gold", "permittivity": (-3.7328, 2.7725), "diameter_nm": 30.0}
 

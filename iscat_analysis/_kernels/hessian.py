@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.image import Lens, Pixels
+from iscat_analysis._kernels.lattice_rows import lattice_fields
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -32,8 +33,8 @@ def signal_hessian(
 
     Parameters
     ----------
-    profile : ndarray, shape (12, intervals, 6)
-        From `radial_profile` with three orders.
+    profile : ndarray
+        Three orders: radial, shape (12, intervals, 6), or on a lattice.
     lens, pixels, x_p, y_p, amplitude
         As in `iscat_analysis._kernels.image.signal_gradient`.
     first : ndarray, shape (5, ny, nx)
@@ -41,7 +42,8 @@ def signal_hessian(
     second : ndarray, shape (4, 4, ny, nx)
         Filled with the second derivatives.
     """
-    inv_step, rho, cos_psi, sin_psi = lens
+    rho = lens.rho
+    cos_psi, sin_psi = (1.0, 0.0) if lens.half else (lens.cos_psi, lens.sin_psi)
     x, y, offsets, weights = pixels
     first[:] = 0.0
     second[:] = 0.0
@@ -63,7 +65,10 @@ def signal_hessian(
                     dx = x[column] + offsets[ix] - x_p
                     dy = y[row] + offsets[iy] - y_p
                     u, v = cos_psi * dx + sin_psi * dy, cos_psi * dy - sin_psi * dx
-                    _fields(profile, inv_step, u, v, radial, e, de, dde)
+                    if lens.half:
+                        lattice_fields(profile, lens, u, v, e, de, dde)
+                    else:
+                        _fields(profile, lens, u, v, radial, e, de, dde)
                     s = 2 * rho * a * e[0].real
                     g[:], h[:] = 0.0, 0.0
                     for c in range(2):
@@ -96,7 +101,7 @@ def signal_hessian(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fields(
     profile: FloatArray,
-    inv_step: float,
+    lens: Lens,
     u: float,
     v: float,
     radial: ComplexArray,
@@ -105,6 +110,7 @@ def _fields(
     dde: ComplexArray,
 ) -> None:
     """Fill e, its first derivatives and its second in (u, v, z)."""
+    inv_step, co, cross, ring = lens.inv_step, lens.co, lens.cross, lens.ring
     r = np.sqrt(u * u + v * v)
     t = r * inv_step
     i = int(t)
@@ -124,14 +130,15 @@ def _fields(
     along_u, along_v = u / safe, v / safe
     if r <= 1e-6:
         along_u, along_v = 1.0, 0.0
-    quad = (u * u - v * v, 2 * u * v)
-    quad_u = (2 * u, 2 * v)
-    quad_v = (-2 * v, 2 * u)
+    quad = (co * (u * u - v * v), cross * 2 * u * v + ring * (u * u + v * v))
+    quad_u = (co * 2 * u, cross * 2 * v + ring * 2 * u)
+    quad_v = (-co * 2 * v, cross * 2 * u + ring * 2 * v)
     for comp in range(2):
         base = 1.0 if comp == 0 else 0.0
         w, wu, wv = quad[comp], quad_u[comp], quad_v[comp]
-        w_uu = 2.0 if comp == 0 else 0.0
-        w_uv = 0.0 if comp == 0 else 2.0
+        w_uu = 2 * co if comp == 0 else 2 * ring
+        w_vv = -2 * co if comp == 0 else 2 * ring
+        w_uv = 0.0 if comp == 0 else 2 * cross
         p1 = base * f0[1] + w * f2[1]
         p2 = base * f0[2] + w * f2[2]
         bend = p1 / safe if r > 1e-6 else p2
@@ -143,7 +150,7 @@ def _fields(
             p2 * along_u**2 + bend * along_v**2 + 2 * wu * f2[1] * along_u + w_uu * f2[0]
         )
         dde[1, 1, comp] = (
-            p2 * along_v**2 + bend * along_u**2 + 2 * wv * f2[1] * along_v - w_uu * f2[0]
+            p2 * along_v**2 + bend * along_u**2 + 2 * wv * f2[1] * along_v + w_vv * f2[0]
         )
         dde[0, 1, comp] = (
             (p2 - bend) * along_u * along_v + f2[1] * (wu * along_v + wv * along_u) + w_uv * f2[0]

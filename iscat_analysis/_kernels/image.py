@@ -21,9 +21,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lattice_rows import (
+    interpolate_columns,
+    lattice_gradient,
+    lattice_signal,
+    rows_needed,
+)
 
-FAST = {"contract", "reassoc", "nsz", "arcp"}
+FloatArray = NDArray[np.float64]
 
 SCRATCH = 13
 """Rows of scratch a row of pixels needs: 8 fields, 4 slopes, the distance in steps."""
@@ -35,17 +41,31 @@ class Lens(NamedTuple):
     Attributes
     ----------
     inv_step : float
-        One over the radial step [1/nm].
+        One over the step of the radial profile or of the lattice [1/nm].
     rho : float
         1 with a reference, 0 in dark field.
     cos_psi, sin_psi : float
-        Polarisation angle.
+        Polarisation angle of a radial profile.
+    co, cross, ring : float
+        How a radial profile makes the components; see the module's docstring.
+    half : int
+        Nodes of the lattice on either side of the particle; 0 for a radial profile.
+    components : int
+        Components of the field on the lattice.
+    window : ndarray, shape (TAPS, degree + 1)
+        Weights of the lattice's nodes.
     """
 
     inv_step: float
     rho: float
     cos_psi: float
     sin_psi: float
+    co: float
+    cross: float
+    ring: float
+    half: int
+    components: int
+    window: FloatArray
 
 
 class Pixels(NamedTuple):
@@ -133,26 +153,29 @@ def _row_gradient(
 
     `dy` is the row's y minus the particle's; the profile has 8 channels or more.
     """
-    inv_step, rho, cos_psi, sin_psi = lens
+    inv_step, rho, cos_psi, sin_psi = lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi
+    co, cross, ring = lens.co, lens.cross, lens.ring
     _row_fields(profile, inv_step, x, x_p, dy, True, f)
     a = amplitude
     for j in range(x.size):
         dx = x[j] - x_p
         u, v = cos_psi * dx + sin_psi * dy, cos_psi * dy - sin_psi * dx
         per_r = inv_step * inv_step / (f[12, j] + 1e-30)
-        c2, s2 = u * u - v * v, 2 * u * v
+        c2, s2 = co * (u * u - v * v), cross * (2 * u * v) + ring * (u * u + v * v)
         eu_r, eu_i = f[0, j] + f[2, j] * c2, f[1, j] + f[3, j] * c2
         ev_r, ev_i = f[2, j] * s2, f[3, j] * s2
         # (1/r) d/dr of the fields at fixed u² − v² and 2uv
         p_r, p_i = (f[8, j] + f[10, j] * c2) * per_r, (f[9, j] + f[11, j] * c2) * per_r
         q_r, q_i = f[10, j] * s2 * per_r, f[11, j] * s2 * per_r
-        # ∂s = Re(g* ∂e_u + h* ∂e_v), with ∂u e_u = p u + 2u F2, ∂v e_u = p v − 2v F2,
-        # ∂u e_v = q u + 2v F2, ∂v e_v = q v + 2u F2
+        # ∂s = Re(g* ∂e_u + h* ∂e_v), with ∂u e_u = p u + 2u F2 co, ∂v e_u = p v − 2v F2 co,
+        # ∂u e_v = q u + 2 F2 (v cross + u ring), ∂v e_v = q v + 2 F2 (u cross + v ring)
         g_r, g_i = 2 * a * rho + 2 * a * a * eu_r, 2 * a * a * eu_i
         h_r, h_i = 2 * a * a * ev_r, 2 * a * a * ev_i
         along_r = g_r * p_r + g_i * p_i + h_r * q_r + h_i * q_i
-        along_u = 2 * (g_r * f[2, j] + g_i * f[3, j])
-        along_v = 2 * (h_r * f[2, j] + h_i * f[3, j])
+        along_u = 2 * co * (g_r * f[2, j] + g_i * f[3, j])
+        both = 2 * (h_r * f[2, j] + h_i * f[3, j])
+        along_r += ring * both
+        along_v = cross * both
         s_u = along_r * u + along_u * u + along_v * v
         s_v = along_r * v - along_u * v + along_v * u
         power = eu_r * eu_r + eu_i * eu_i + ev_r * ev_r + ev_i * ev_i
@@ -180,17 +203,40 @@ def _row_signal(
     out: FloatArray,
 ) -> None:
     """Add weight × s of one row to `out`, shape (nx,); the profile has 4 channels or more."""
-    inv_step, rho, cos_psi, sin_psi = lens
+    inv_step, rho, cos_psi, sin_psi = lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi
+    co, cross, ring = lens.co, lens.cross, lens.ring
     _row_fields(profile, inv_step, x, x_p, dy, False, f)
     a = amplitude
     for j in range(x.size):
         dx = x[j] - x_p
         u, v = cos_psi * dx + sin_psi * dy, cos_psi * dy - sin_psi * dx
-        c2, s2 = u * u - v * v, 2 * u * v
+        c2, s2 = co * (u * u - v * v), cross * (2 * u * v) + ring * (u * u + v * v)
         eu_r, eu_i = f[0, j] + f[2, j] * c2, f[1, j] + f[3, j] * c2
         ev_r, ev_i = f[2, j] * s2, f[3, j] * s2
         power = eu_r * eu_r + eu_i * eu_i + ev_r * ev_r + ev_i * ev_i
         out[j] += weight * a * (2 * rho * eu_r + a * power)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def workspace(lens: Lens, pixels: Pixels) -> FloatArray:
+    """Scratch for the rows of an image, wherever the particle is."""
+    rows = rows_needed(lens, pixels) if lens.half else SCRATCH
+    return np.empty((rows, pixels.x.size))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def begin_image(
+    profile: FloatArray,
+    lens: Lens,
+    pixels: Pixels,
+    x_p: float,
+    y_p: float,
+    with_gradient: bool,
+    f: FloatArray,
+) -> None:
+    """Prepare the scratch for the rows of one image."""
+    if lens.half:
+        interpolate_columns(profile, lens, pixels, x_p, y_p, with_gradient, f)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -206,6 +252,9 @@ def row_gradient(
     out: FloatArray,
 ) -> None:
     """Fill `out` (5, nx) with signal and gradient of one row, averaged over the samples."""
+    if lens.half:
+        lattice_gradient(lens, pixels, row, y_p, amplitude, f, out)
+        return
     out[:] = 0.0
     for i in range(pixels.offsets.size):
         dy = pixels.y[row] + pixels.offsets[i] - y_p
@@ -229,6 +278,9 @@ def row_signal(
     out: FloatArray,
 ) -> None:
     """Fill `out` (nx,) with the signal of one row, averaged over the samples in each pixel."""
+    if lens.half:
+        lattice_signal(lens, pixels, row, y_p, amplitude, f, out)
+        return
     out[:] = 0.0
     for i in range(pixels.offsets.size):
         dy = pixels.y[row] + pixels.offsets[i] - y_p
@@ -250,7 +302,8 @@ def signal_image(
     out: FloatArray,
 ) -> None:
     """Fill `out` (ny, nx) with the signal on a pixel grid; the rest as in `signal_gradient`."""
-    f = np.empty((SCRATCH, pixels.x.size))
+    f = workspace(lens, pixels)
+    begin_image(profile, lens, pixels, x_p, y_p, False, f)
     for row in range(pixels.y.size):
         row_signal(profile, lens, pixels, row, x_p, y_p, amplitude, f, out[row])
 
@@ -269,8 +322,8 @@ def signal_gradient(
 
     Parameters
     ----------
-    profile : ndarray, shape (8 or more, intervals, 6)
-        From `radial_profile`.
+    profile : ndarray
+        Radial, shape (8 or more, intervals, 6), or on a lattice, shape (channels, nodes, nodes).
     lens : Lens
         Step, reference, polarisation.
     pixels : Pixels
@@ -282,6 +335,7 @@ def signal_gradient(
     out : ndarray, shape (ny, 5, nx)
         Filled with s, ∂s/∂x_p, ∂s/∂y_p, ∂s/∂z, ∂s/∂a.
     """
-    f = np.empty((SCRATCH, pixels.x.size))
+    f = workspace(lens, pixels)
+    begin_image(profile, lens, pixels, x_p, y_p, True, f)
     for row in range(pixels.y.size):
         row_gradient(profile, lens, pixels, row, x_p, y_p, amplitude, f, out[row])

@@ -5,8 +5,10 @@ Lengths are nm, wavenumbers rad/nm.  Angles θ are those in the immersion oil.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +48,13 @@ class Pupil:
 
 
 def gauss_legendre(
-    alpha: float, critical: float | None, nodes: int, nodes_above: int
+    alpha: float,
+    critical: float | None,
+    nodes: int,
+    nodes_above: int,
+    edge: float = 0.0,
 ) -> tuple[FloatArray, FloatArray]:
-    """Nodes and weights on [0, α], spectrally exact across the critical angle.
+    """Nodes and weights on [0, α], spectrally exact across the critical angle and a mask's edge.
 
     cosθ_s has a square-root branch at θ_c; θ = θ_c ∓ u² on either side makes the integrand
     analytic in u.
@@ -60,27 +66,34 @@ def gauss_legendre(
     critical : float or None
         Critical angle [rad], None where it is far above α.
     nodes : int
-        Nodes below the critical angle, or altogether.
+        Nodes of a panel below the critical angle.
     nodes_above : int
-        Nodes above it.
+        Nodes of a panel above it.
+    edge : float
+        Angle at which the integrand steps [rad]; outside (0, α) it does not.
 
     Returns
     -------
     theta, weight : ndarray
         Ascending nodes and their weights [rad].
     """
-    x, w = _unit_gauss_legendre(nodes)
-    if critical is None:
-        return alpha * x, alpha * w
-    if critical >= alpha:
-        least = np.sqrt(1 - alpha / critical)
-        u = least + (1 - least) * x[::-1]
-        return critical * (1 - u**2), 2 * critical * (1 - least) * u * w[::-1]
-    x2, w2 = _unit_gauss_legendre(nodes_above)
-    below, above = critical, alpha - critical
-    theta = np.concatenate([(critical - below * x**2)[::-1], critical + above * x2**2])
-    weight = np.concatenate([(2 * below * x * w)[::-1], 2 * above * x2 * w2])
-    return theta, weight
+    ends = {0.0, alpha} | {b for b in (critical, edge) if b is not None and 0 < b < alpha}
+    bounds = sorted(ends)
+    panels = []
+    for low, high in pairwise(bounds):
+        above = critical is not None and low >= critical
+        x, w = _unit_gauss_legendre(nodes_above if above else nodes)
+        if critical is None:
+            panels.append((low + (high - low) * x, (high - low) * w))
+            continue
+        sign = 1.0 if above else -1.0
+        first, last = math.sqrt(abs(low - critical)), math.sqrt(abs(high - critical))
+        u = first + (last - first) * x
+        panels.append((critical + sign * u**2, 2 * abs(last - first) * u * w))
+    return (
+        np.concatenate([theta for theta, _ in panels]),
+        np.concatenate([weight for _, weight in panels]),
+    )
 
 
 @cache

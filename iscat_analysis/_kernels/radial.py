@@ -39,8 +39,8 @@ class AxialTable(NamedTuple):
 
     Attributes
     ----------
-    heights : ndarray, shape (n, 3, 4, intervals·6)
-        At each height: the profile, step·∂z and step²·∂z² of it.
+    heights : ndarray, shape (n, 3, channels, width)
+        At each height: the flattened profile, step·∂z and step²·∂z² of it.
     first_nm, step_nm : float
         First height and step [nm].
     kappa : float
@@ -244,11 +244,12 @@ def _turn(
 def profile_at(
     axial: AxialTable,
     z_nm: float,
-    intervals: int,
+    start: int,
+    stop: int,
     work: FloatArray,
     profile: FloatArray,
 ) -> None:
-    """Fill the first intervals of a profile by interpolation along z.
+    """Fill a range of a flattened profile by interpolation along z.
 
     Parameters
     ----------
@@ -256,12 +257,12 @@ def profile_at(
         Profiles along z.
     z_nm : float
         Height [nm], inside the table.
-    intervals : int
-        How many are wanted.
-    work : ndarray, shape (4, 2, intervals·6)
+    start, stop : int
+        Range of the flattened profile.
+    work : ndarray, shape (channels, 2, width)
         Scratch.
-    profile : ndarray, shape (8 or 4, intervals, 6)
-        Filled; with 8 channels ∂/∂z too.
+    profile : ndarray, shape (channels or twice as many, …, …)
+        Filled; with twice the channels of the table ∂/∂z too.
     """
     heights, first_nm, step_nm, kappa = axial
     place = (z_nm - first_nm) / step_nm
@@ -282,20 +283,21 @@ def profile_at(
     d[4] = -12 * t2 + 28 * t3 - 15 * t4
     d[5] = 1.5 * t2 - 4 * t3 + 2.5 * t4
     d /= step_nm
-    used = 6 * min(intervals, profile.shape[1])
-    with_slope = profile.shape[0] == 8
+    channels, width = heights.shape[2:]
+    with_slope = profile.shape[0] > channels
     cos, sin = np.cos(kappa * z_nm), np.sin(kappa * z_nm)
-    flat = profile.reshape(profile.shape[0], heights.shape[3])
-    for channel in range(4):
-        _mix(heights, i, channel, v, work[channel, 0, :used])
+    flat = profile.reshape(profile.shape[0], width)[:, start:stop]
+    used = heights[:, :, :, start:stop]
+    for channel in range(channels):
+        _mix(used, i, channel, v, work[channel, 0, start:stop])
         if with_slope:
-            _mix(heights, i, channel, d, work[channel, 1, :used])
-    for c in range(0, 4, 2):
-        re, im = work[c, 0, :used], work[c + 1, 0, :used]
+            _mix(used, i, channel, d, work[channel, 1, start:stop])
+    for c in range(0, channels, 2):
+        re, im = work[c, 0, start:stop], work[c + 1, 0, start:stop]
         if with_slope:
-            slope_re, slope_im = work[c, 1, :used], work[c + 1, 1, :used]
-            for j in range(used):
+            slope_re, slope_im = work[c, 1, start:stop], work[c + 1, 1, start:stop]
+            for j in range(re.size):
                 slope_re[j] -= kappa * im[j]
                 slope_im[j] += kappa * re[j]
-            _turn(slope_re, slope_im, cos, sin, flat[c + 4], flat[c + 5])
+            _turn(slope_re, slope_im, cos, sin, flat[c + channels], flat[c + channels + 1])
         _turn(re, im, cos, sin, flat[c], flat[c + 1])

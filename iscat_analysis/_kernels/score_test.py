@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.image import FAST
+from iscat_analysis._kernels.lattice import FAST
 
 FloatArray = NDArray[np.float64]
 

@@ -19,7 +19,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.image import FAST, SCRATCH, Lens, Pixels, row_gradient, row_signal
+from iscat_analysis._kernels.image import (
+    Lens,
+    Pixels,
+    begin_image,
+    row_gradient,
+    row_signal,
+    workspace,
+)
+from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lattice_rows import lattice_span
 from iscat_analysis._kernels.radial import AxialTable, profile_at
 
 FloatArray = NDArray[np.float64]
@@ -172,7 +181,8 @@ def score_pass(
 ) -> float:
     """Fill score (5) and Fisher matrix (5, 5) at θ and return the log-likelihood."""
     level = np.exp(theta[4])
-    f = np.empty((SCRATCH, pixels.x.size))
+    f = workspace(lens, pixels)
+    begin_image(profile, lens, pixels, theta[0], theta[1], True, f)
     g = np.empty((5, pixels.x.size))
     sums = np.zeros(20)
     total = 0.0
@@ -200,7 +210,8 @@ def value_pass(
 ) -> float:
     """Log-likelihood at θ, without derivatives."""
     level = np.exp(theta[4])
-    f = np.empty((SCRATCH, pixels.x.size))
+    f = workspace(lens, pixels)
+    begin_image(profile, lens, pixels, theta[0], theta[1], False, f)
     s = np.empty(pixels.x.size)
     total = 0.0
     for row in range(pixels.y.size):
@@ -210,20 +221,25 @@ def value_pass(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _intervals(pixels: Pixels, theta: FloatArray, inv_step: float) -> int:
-    """Radial intervals between the particle and the farthest sample."""
+def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int, int]:
+    """Range of the flattened profile, `width` long, that an image needs."""
     x, y = pixels.x, pixels.y
     margin = abs(pixels.offsets[-1])
+    if lens.half:
+        first, last = lattice_span(lens, x, margin, theta[0])
+        return first, last
     dx = max(abs(x[0] - theta[0]), abs(x[-1] - theta[0])) + margin
     dy = max(abs(y[0] - theta[1]), abs(y[-1] - theta[1])) + margin
-    return int(np.sqrt(dx * dx + dy * dy) * inv_step) + 1
+    return 0, min(6 * (int(np.sqrt(dx * dx + dy * dy) * lens.inv_step) + 1), width)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scratch(axial: AxialTable, channels: int) -> tuple[FloatArray, FloatArray]:
+def scratch(axial: AxialTable, lens: Lens, orders: int) -> tuple[FloatArray, FloatArray]:
     """Work space and profile for `profile_at`."""
-    width = axial.heights.shape[3]
-    return np.empty((4, 2, width)), np.empty((channels, width // 6, 6))
+    channels, width = axial.heights.shape[2:]
+    last = 2 * lens.half + 1 if lens.half else 6
+    work = np.empty((channels, 2, width))
+    return work, np.empty((orders * channels, width // last, last))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -237,13 +253,16 @@ def value_batch(
     out: FloatArray,
 ) -> None:
     """Fill `out` (n) with the log-likelihood at θ (n, 5); where z repeats, so does the profile."""
-    work, profile = _scratch(axial, 4)
-    z, known = np.nan, 0
+    work, profile = scratch(axial, lens, 1)
+    width = axial.heights.shape[3]
+    z, first, last = np.nan, 0, 0
     for k in range(thetas.shape[0]):
-        reach = _intervals(pixels, thetas[k], lens.inv_step)
-        if thetas[k, 2] != z or reach > known:
-            z, known = thetas[k, 2], reach
-            profile_at(axial, z, known, work, profile)
+        start, stop = span(lens, pixels, thetas[k], width)
+        if thetas[k, 2] != z or start < first or stop > last:
+            if thetas[k, 2] == z:
+                start, stop = min(start, first), max(stop, last)
+            z, first, last = thetas[k, 2], start, stop
+            profile_at(axial, z, first, last, work, profile)
         out[k] = value_pass(profile, lens, pixels, kind, data, thetas[k])
 
 
@@ -315,8 +334,8 @@ def maximize(
 
     Parameters
     ----------
-    heights, first_nm, height_step, kappa, inv_step, rho, x, y, cos_psi, sin_psi, offsets, weights
-        The model; see `radial_profile` and `signal_gradient`.
+    axial, lens, pixels
+        The model; see `profile_at` and `signal_gradient`.
     kind : int
         CONDITIONAL or POISSON.
     data : ndarray, shape (4, ny, nx)
@@ -345,13 +364,14 @@ def maximize(
     outcome : int
         CONVERGED, STALLED or EXHAUSTED.
     """
-    work, profile = _scratch(axial, 8)
+    work, profile = scratch(axial, lens, 2)
+    width = axial.heights.shape[3]
     step, trial = np.empty(5), np.empty(5)
     trial_score, trial_fisher = np.empty(5), np.empty((5, 5))
     active = np.empty(5, dtype=np.bool_)
     damping = 0.0
-    reach = profile.shape[1] if not free[2] else _intervals(pixels, theta, lens.inv_step)
-    profile_at(axial, theta[2], reach, work, profile)
+    start, stop = (0, width) if not free[2] else span(lens, pixels, theta, width)
+    profile_at(axial, theta[2], start, stop, work, profile)
     value = score_pass(profile, lens, pixels, kind, data, theta, score, fisher)
     passes = 1
     while passes < iterations:
@@ -379,8 +399,8 @@ def maximize(
             theta[:] = trial
             return value + gain, passes, CONVERGED
         if free[2]:
-            reach = _intervals(pixels, trial, lens.inv_step)
-            profile_at(axial, trial[2], reach, work, profile)
+            start, stop = span(lens, pixels, trial, width)
+            profile_at(axial, trial[2], start, stop, work, profile)
         trial_value = score_pass(
             profile, lens, pixels, kind, data, trial, trial_score, trial_fisher
         )
@@ -414,15 +434,15 @@ def scan_heights(
     Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the rest and the start.  An
     empty amplitude range holds the amplitude fixed.
     """
-    work, profile = _scratch(axial, 8)
+    work, profile = scratch(axial, lens, 2)
     score, fisher = np.empty(5), np.empty((5, 5))
     here = theta.copy()
     low, high = amplitude_range
     for k in range(heights.size):
         here[2] = heights[k]
         here[3] = theta[3]
-        reach = _intervals(pixels, here, lens.inv_step)
-        profile_at(axial, here[2], reach, work, profile)
+        start, stop = span(lens, pixels, here, axial.heights.shape[3])
+        profile_at(axial, here[2], start, stop, work, profile)
         if low < high:
             for _ in range(2):
                 score_pass(profile, lens, pixels, kind, data, here, score, fisher)

@@ -15,6 +15,7 @@ from iscat_analysis.bounds.quantum import (
     incompatible_pairs,
     quantum_bounds,
     quantum_information,
+    transmitted_over_collected,
     z_nm_phase_free,
 )
 from iscat_analysis.config import Config
@@ -254,6 +255,14 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
         "qcrb_joint": _named(PARAMETERS, together * per_step / root_light),
         "qcrb_dong2021": _named(PARAMETERS, paper * per_step / root_light),
     }
+    losses = {}
+    if config.optics.analyzer or config.optics.mask_na:
+        share = transmitted_over_collected(model, z_nm)
+        passed, _ = quantum_bounds(quantum_information(model, z_nm, light="transmitted"))
+        passed = passed * per_step
+        per_photon["qcrb_transmitted"] = _named(NAMES, passed * to_rel)
+        actual["qcrb_transmitted"] = _named(PARAMETERS, passed / root_light / math.sqrt(share))
+        losses = {"transmitted_over_collected": share}
     if not model.rho:
         alone = z_nm_phase_free(model, z_nm)
         per_photon["qcrb"]["z_nm_phase_free"] = alone
@@ -278,6 +287,7 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
             "n_after": config.bounds.n_after,
         },
         "n_scattered": {"camera": experiment.on_camera, "collected": experiment.collected},
+        **losses,
         "per_photon": per_photon,
         "actual": actual,
         "fisher": whole.fisher,

@@ -32,6 +32,7 @@ SCHEMES = ("iscat", "cobri", "darkfield")
 
 OPTICS: dict[str, Any] = {
     "wavelength_nm": 517.5, "na": 1.3, "n_immersion": 1.5, "n_glass": 1.5, "n_sample": 1.33,
+    "emission": "dong2021",
 }  # fmt: skip
 PARTICLE: dict[str, Any] = {
     "kind": "gold", "permittivity": (-3.7328, 2.7725), "density_kg_m3": 19300.0,

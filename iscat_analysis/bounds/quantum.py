@@ -10,6 +10,9 @@ where it is not zero, no single measurement is optimal for both parameters (weak
 
 Moving the particle multiplies ε by −i k n_i sinθ (cosφ, sinφ) and by iκ, κ = k n_s (cosθ_s + ξ);
 beyond the critical angle κ is complex and Im κ is the evanescent decay, which ties z to the mass.
+
+Aberrations multiply ε by the same phase for every position of the particle and change nothing.  A
+mask and an analyser take light away: what they let through is bounded like what was collected.
 """
 
 from __future__ import annotations
@@ -20,13 +23,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.forward import NEAR_CRITICAL, ForwardModel
+from iscat_analysis.optics.aperture import Aperture, aperture
+from iscat_analysis.optics.forward import ForwardModel
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Measure = Literal["exact", "dong2021"]
+Light = Literal["collected", "transmitted"]
 
 NAMES = ("x_nm", "y_nm", "z_nm", "mass_rel")
 """Parameters of the quantum matrix: position and relative mass."""
@@ -34,14 +38,21 @@ NAMES = ("x_nm", "y_nm", "z_nm", "mass_rel")
 NODES = 96
 """Gauss–Legendre nodes on each side of the critical angle; the integrals converge below 1e-12."""
 
+AZIMUTHS = 16
+"""Equally spaced azimuths; |A|² times a squared slope is a trigonometric polynomial of order 8."""
+
 COMMUTES = 1e-9
 """|Im Q_ij| over √(Q_ii Q_jj) below which a pair counts as commuting: rounding."""
 
 
 def quantum_information(
-    model: ForwardModel, z_nm: float, *, measure: Measure = "exact"
+    model: ForwardModel,
+    z_nm: float,
+    *,
+    measure: Measure = "exact",
+    light: Light = "collected",
 ) -> ComplexArray:
-    """Quantum Fisher information of one collected scattered photon.
+    """Quantum Fisher information of one scattered photon.
 
     Parameters
     ----------
@@ -53,6 +64,8 @@ def quantum_information(
         Weight of the directions: |A|² sinθ, or D21's |sinθ √cosθ A|² with n_s dropped from the
         axial phase where the light passes the particle first, as in D21's program
         (physics.md, section 7, points 3 and 4).
+    light : {"collected", "transmitted"}
+        Which photons: all that the pupil collects, or those that mask and analyser let through.
 
     Returns
     -------
@@ -65,26 +78,49 @@ def quantum_information(
     ConfigError
         The height is negative.
     """
-    light = _collected(model, z_nm, measure)
-    pupil, ns = light.pupil, model.optics.n_sample
+    opening, density = _photons(model, z_nm, measure, light)
+    pupil = opening.pupil
     kappa = pupil.axial
     if measure == "dong2021" and model.optics.scheme != "iscat":
-        kappa = kappa / ns
-    q2 = pupil.transverse**2
-    along = light.mean(q2, light.p * 0.75 + light.s * 0.25)
-    across = light.mean(q2, light.p * 0.25 + light.s * 0.75)
-    both = light.p + light.s
-    psi = math.radians(model.optics.polarization_deg)
-    c, s = math.cos(psi), math.sin(psi)
+        kappa = kappa / model.optics.n_sample
+    density = density / density.sum()
+    phi = _azimuths()
+    slopes = np.broadcast_arrays(
+        -1j * pupil.transverse[:, None] * np.cos(phi),
+        -1j * pupil.transverse[:, None] * np.sin(phi),
+        1j * kappa[:, None],
+        np.complex128(1.0),
+    )
     out = np.zeros((4, 4), dtype=np.complex128)
-    out[0, 0] = c**2 * along + s**2 * across
-    out[1, 1] = s**2 * along + c**2 * across
-    out[0, 1] = out[1, 0] = c * s * (along - across)
-    out[2, 2] = light.mean(np.abs(kappa) ** 2, both)
-    out[2, 3] = light.mean(-1j * kappa.conj(), both)
-    out[3, 2] = out[2, 3].conjugate()
-    out[3, 3] = 1.0
-    return 4 * out
+    for i in range(4):
+        for j in range(i, 4):
+            out[i, j] = 4 * np.sum(slopes[i].conj() * slopes[j] * density)
+            out[j, i] = out[i, j].conj()
+    out[np.diag_indices(4)] = out.diagonal().real
+    # the pupil is symmetric under reflection through its centre: exact zeros, not rounding
+    out[:2, 2:] = out[2:, :2] = 0.0
+    return out
+
+
+def transmitted_over_collected(model: ForwardModel, z_nm: float) -> float:
+    """Share of the collected light that mask and analyser let through.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Optics.
+    z_nm : float
+        Height of the particle [nm].
+
+    Returns
+    -------
+    float
+        Between 0 and 1; an attenuation above 1 behind a mask may exceed it.
+    """
+    return float(
+        _photons(model, z_nm, "exact", "transmitted")[1].sum()
+        / _photons(model, z_nm, "exact", "collected")[1].sum()
+    )
 
 
 def z_nm_phase_free(model: ForwardModel, z_nm: float) -> float:
@@ -105,11 +141,11 @@ def z_nm_phase_free(model: ForwardModel, z_nm: float) -> float:
     float
         Standard deviation for one collected photon [nm].
     """
-    light = _collected(model, z_nm, "exact")
-    both, kappa = light.p + light.s, light.pupil.axial
+    opening, photons = _photons(model, z_nm, "exact", "collected")
+    density, kappa = photons.sum(1) / photons.sum(), opening.pupil.axial
     # centred before squaring: the mean is large beside the spread
-    centre = light.mean(kappa.real, both).real
-    spread = light.mean((kappa.real - centre) ** 2 + kappa.imag**2, both).real
+    centre = np.sum(kappa.real * density)
+    spread = float(np.sum(((kappa.real - centre) ** 2 + kappa.imag**2) * density))
     return 1 / math.sqrt(4 * spread)
 
 
@@ -156,42 +192,26 @@ def incompatible_pairs(information: ComplexArray) -> dict[tuple[str, str], float
     }
 
 
-class _Light:
-    """The collected light: p- and s-polarised photons at each angle, normalised to one in all."""
-
-    def __init__(self, pupil: Pupil, density: FloatArray) -> None:
-        self.pupil = pupil
-        p = np.abs(pupil.t_p_cos) ** 2 * density
-        s = np.abs(pupil.t_s) ** 2 * density
-        total = float(np.sum(p + s))
-        self.p, self.s = p / total, s / total
-
-    def mean(self, values: NDArray[np.number], weight: FloatArray) -> complex:
-        return complex(np.sum(values * weight))
+def _azimuths() -> FloatArray:
+    return np.arange(AZIMUTHS, dtype=np.float64) * (2 * math.pi / AZIMUTHS)
 
 
-def _collected(model: ForwardModel, z_nm: float, measure: Measure) -> _Light:
+def _photons(
+    model: ForwardModel, z_nm: float, measure: Measure, light: Light
+) -> tuple[Aperture, FloatArray]:
+    """Pupil and the photons in each of its directions, shape (angles, AZIMUTHS)."""
     if not z_nm >= 0:
         raise ConfigError(
             f"z_nm = {z_nm:g}: the particle would lie inside the coverslip; give a height >= 0"
         )
-    optics = model.optics
-    alpha = math.asin(optics.na / optics.n_immersion)
-    critical = None
-    if NEAR_CRITICAL * optics.n_sample < optics.na and optics.n_sample < optics.n_immersion:
-        critical = math.asin(optics.n_sample / optics.n_immersion)
-    theta, weight = gauss_legendre(alpha, critical, NODES, NODES)
-    pupil = make_pupil(
-        theta,
-        weight,
-        wavenumber=model.wavenumber,
-        n_immersion=optics.n_immersion,
-        n_glass=optics.n_glass,
-        n_sample=optics.n_sample,
-        direction=1.0 if optics.scheme == "iscat" else -1.0,
-        reciprocal=optics.emission == "reciprocal",
-    )
-    solid = np.sin(theta)
+    opening = aperture(model.optics, NODES, NODES)
+    pupil = opening.pupil
+    solid = pupil.weight * np.sin(pupil.theta)
     if measure == "dong2021":
-        solid = solid**2 * np.cos(theta)
-    return _Light(pupil, weight * solid * np.exp(-2 * pupil.axial.imag * z_nm))
+        solid = solid * np.sin(pupil.theta) * np.cos(pupil.theta)
+    wave = opening.polarised(_azimuths())
+    if light == "transmitted":
+        wave = wave[: 1 if model.optics.analyzer else 2] * opening.transmission[:, None]
+    solid = solid * np.exp(-2 * pupil.axial.imag * z_nm)
+    density: FloatArray = (np.abs(wave) ** 2).sum(0) * solid[:, None]
+    return opening, density

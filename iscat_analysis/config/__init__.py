@@ -11,6 +11,7 @@ from __future__ import annotations
 from iscat_analysis.config.files import OpticsFile, config_to_toml, read_optics_file
 from iscat_analysis.config.overrides import configure, load_config, parse_config
 from iscat_analysis.config.schema import (
+    ABERRATIONS,
     PIXEL_NM,
     BackgroundConfig,
     BoundsConfig,
@@ -33,6 +34,7 @@ from iscat_analysis.config.schema import (
 )
 
 __all__ = [
+    "ABERRATIONS",
     "PIXEL_NM",
     "BackgroundConfig",
     "BoundsConfig",

@@ -68,7 +68,8 @@ def configure(
     if isinstance(source, Config):
         if not settings:
             return source
-        values, where = source.model_dump(exclude_none=True), "settings"
+        values = source.model_dump(exclude_none=True)
+        where = "arguments" if called else "settings"
     elif source is None:
         values, where = {}, "configuration"
     elif isinstance(source, Mapping):

@@ -105,6 +105,25 @@ def plausible_pixel(size_nm: float) -> float:
     return size_nm
 
 
+MOST_WAVES = 0.5
+"""Largest Zernike term over the wavelength; ten times that of a poor objective."""
+
+ABERRATIONS = tuple(f"z{j}" for j in range(5, 38))
+"""Zernike terms on offer, by Noll's index."""
+
+
+def _noll_names(terms: dict[str, float]) -> dict[str, float]:
+    for name in terms:
+        if name not in ABERRATIONS:
+            known = {"z1": "piston", "z2": "tilt", "z3": "tilt", "z4": "defocus"}
+            reason = f" ({known[name]} is not an aberration here)" if name in known else ""
+            raise ValueError(
+                f"{name} is not on offer{reason}: name Zernike terms z5 to z37 by Noll's index; "
+                "defocus is optics.focus_nm"
+            )
+    return terms
+
+
 def _length(low_nm: float, high_nm: float) -> AfterValidator:
     """Accept lengths whose magnitude lies in a range, and guess the unit of the others."""
 
@@ -146,8 +165,24 @@ class Optics(Section):
     attenuation: NonNegative = Field(
         1.0, description="amplitude of the reference that passes; ignored in dark field"
     )
+    polarization: Literal["linear", "circular"] = Field(
+        "linear", description='of the illumination: "linear" | "circular"'
+    )
     polarization_deg: Finite = Field(
-        0.0, description="of the illumination, from the image's x axis towards y"
+        0.0, description="of linear light, from the image's x axis towards y"
+    )
+    analyzer: bool = Field(
+        False, description="only light polarised as the reference reaches the camera"
+    )
+    mask_na: NonNegative = Field(
+        0.0, description="a disc in the pupil attenuates below this NA; 0: the reference alone"
+    )
+    reference_phase_deg: Finite = Field(
+        0.0, description="delay of the reference against the scattered light"
+    )
+    aberrations_nm: Annotated[dict[str, Finite], AfterValidator(_noll_names)] = Field(
+        default_factory=dict,
+        description="Zernike terms, Noll z5 to z37, rms path over the pupil: { z11 = 8.0 }",
     )
     focus_nm: Annotated[Finite, _length(0.0, LARGEST_NM)] = Field(
         -300.0,
@@ -159,8 +194,9 @@ class Optics(Section):
     axial: Literal["stage", "refocus"] = Field(
         "stage", description='what a moving particle holds fixed: "stage" | "refocus"'
     )
-    emission: Literal["dong2021", "reciprocal"] = Field(
-        "dong2021", description='"dong2021" | "reciprocal" (energy-conserving)'
+    emission: Literal["reciprocal", "dong2021"] = Field(
+        "reciprocal",
+        description='"reciprocal" (energy-conserving) | "dong2021" (the paper\'s own)',
     )
     psf: Literal["model", "measured"] = Field(
         "model", description='"model" | "measured" (from the movie itself; mode mass only)'
@@ -169,8 +205,26 @@ class Optics(Section):
         "auto", description='"auto" | "always" | "never": learn the optics from the movie'
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _emission_of_the_convention(cls, values: Any) -> Any:
+        if isinstance(values, dict) and values.get("convention") == "dong2021":
+            return {"emission": "dong2021", **values}
+        return values
+
     @model_validator(mode="after")
     def _possible(self) -> Optics:
+        if self.mask_na >= self.na:
+            raise ValueError(
+                f"mask_na = {self.mask_na} must be below na = {self.na}: a mask that covers the "
+                "whole pupil is attenuation without mask_na"
+            )
+        for name, size in self.aberrations_nm.items():
+            if abs(size) > MOST_WAVES * self.wavelength_nm:
+                raise ValueError(
+                    f"aberrations_nm.{name} = {size:g} exceeds {MOST_WAVES:g} wavelengths rms: "
+                    "give nanometres of path, rms over the pupil"
+                )
         if self.na >= self.n_immersion:
             raise ValueError(
                 f"na = {self.na} must be below n_immersion = {self.n_immersion}: "

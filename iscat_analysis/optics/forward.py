@@ -7,8 +7,9 @@ the contrast C in the interferometric schemes and |E_sca|² for unit incident am
 
 from __future__ import annotations
 
+import cmath
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
@@ -17,27 +18,50 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.hessian import signal_hessian
 from iscat_analysis._kernels.image import Lens, Pixels, signal_gradient, signal_image
-from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil, rectangle
-from iscat_analysis._kernels.radial import STEP, AxialTable, bessel_table, radial_profile
+from iscat_analysis._kernels.lattice import LATTICE_STEP, reach_of_samples
+from iscat_analysis._kernels.pupil import rectangle
+from iscat_analysis._kernels.radial import STEP, AxialTable
 from iscat_analysis.config import Calibration, Config, Optics
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.aperture import (
+    NEAR_CRITICAL,
+    Aperture,
+    aperture,
+    aperture_on,
+    critical_angle,
+    harmonics,
+)
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.materials import Material, material
 from iscat_analysis.optics.scale import MassScale
+from iscat_analysis.optics.sensitivity import (
+    check_names,
+    sensitivity_lattices,
+    signal_derivatives,
+)
+from iscat_analysis.optics.waves import (
+    Field,
+    LatticeField,
+    RadialField,
+    axial_table,
+    check_table,
+    radial_field,
+)
 from iscat_analysis.units import KILODALTON_KG, NM
 
-__all__ = ["ForwardModel", "MassScale", "PixelGrid", "forward_model"]
+__all__ = [
+    "NEAR_CRITICAL",
+    "ForwardModel",
+    "MassScale",
+    "PixelGrid",
+    "check_table",
+    "forward_model",
+]
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-NEAR_CRITICAL = 0.98
-"""NA over n_sample from which the quadrature minds the critical angle."""
-
-_HEIGHTS_KEPT = 8  # profiles at hand; where z is fixed, every image asks for the same one
-
-TABLE_LIMIT_MB = 400
-"""No table of the model is larger: a length in the wrong unit would fill the memory."""
+_SENSITIVITIES_KEPT = 4  # heights whose derivatives are at hand, some MB each
 
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
@@ -53,24 +77,25 @@ class ForwardModel:
         The ``[optics]`` section.
     material : Material
         Permittivity, density, nominal mass.
-    pupil : Pupil
-        The scattered wave on the quadrature.
+    aperture : Aperture
+        The pupil on its quadrature.
     height_nm : float
         The height for which the focus was set [nm].
     reference : float
         |E_ref| for unit incident amplitude; 0 in dark field.
     rho : float
         1 with a reference, 0 in dark field: the reference in the unit of the field.
-    source : complex ndarray, shape (2, n)
-        Pupil weights of F0 and F2 per unit amplitude, over the reference.
-    axial : complex ndarray, shape (n,)
-        Phase per height of the particle [rad/nm], for the configured `axial`.
+    factor : complex
+        What multiplies the field's integral over the pupil, per unit amplitude and over the
+        reference.
+    oil_nm : float
+        Excess thickness of the oil that stays when the particle moves [nm].
+    wave : RadialField or LatticeField
+        The scattered field, tabulated.
     strength : complex
         E1·e^{iψ0} per unit amplitude [nm].
-    table : ndarray, shape (2, n, 3, intervals + 1)
-        Bessel matrices.
-    step_nm : float
-        Radial step [nm].
+    reach_nm : float
+        Largest distance from the particle that images may have [nm].
     z_range_nm : (float, float)
         Heights that fits may ask for [nm].
     samples : (ndarray, ndarray)
@@ -81,15 +106,15 @@ class ForwardModel:
 
     optics: Optics
     material: Material
-    pupil: Pupil
+    aperture: Aperture
     height_nm: float
     reference: float
     rho: float
-    source: ComplexArray
-    axial: ComplexArray
+    factor: complex
+    oil_nm: float
+    wave: Field
     strength: complex
-    table: FloatArray
-    step_nm: float
+    reach_nm: float
     z_range_nm: tuple[float, float]
     samples: tuple[FloatArray, FloatArray]
     scale: MassScale = field(default_factory=MassScale)
@@ -100,15 +125,9 @@ class ForwardModel:
         return 2 * math.pi / self.optics.wavelength_nm
 
     @property
-    def reach_nm(self) -> float:
-        """Largest distance from the particle that the radial table covers [nm]."""
-        return self.step_nm * float(self.table.shape[3] - 1)
-
-    @property
     def lens(self) -> Lens:
-        """Step, reference and polarisation, as the kernels take them."""
-        psi = math.radians(self.optics.polarization_deg)
-        return Lens(1 / self.step_nm, self.rho, math.cos(psi), math.sin(psi))
+        """What turns a profile into a signal, as the kernels take it."""
+        return self.wave.lens(self.rho)
 
     def pixels(self, grid: PixelGrid) -> Pixels:
         """Return a grid with the samples inside its pixels, as the kernels take them."""
@@ -121,7 +140,7 @@ class ForwardModel:
         return self.optics.wavelength_nm / (2 * self.optics.n_sample)
 
     def profile(self, z_nm: float, orders: int = 2) -> FloatArray:
-        """Radial profile at a height.
+        """Profile of the field at a height.
 
         Parameters
         ----------
@@ -132,38 +151,16 @@ class ForwardModel:
 
         Returns
         -------
-        ndarray, shape (4·orders, intervals, 6)
-            See `iscat_analysis._kernels.radial`.  The last few are kept: not to be written to.
+        ndarray
+            See `iscat_analysis._kernels.radial` and `iscat_analysis._kernels.lattice`.  The last
+            few are kept: not to be written to.
         """
-        return self._profiles(z_nm, orders)
-
-    @cached_property
-    def _profiles(self) -> Callable[[float, int], FloatArray]:
-        return lru_cache(_HEIGHTS_KEPT)(self._profile)
-
-    def _profile(self, z_nm: float, orders: int) -> FloatArray:
-        points = self.table.shape[3]
-        nodes = np.empty((4 * orders, 3 * points))
-        out = np.empty((4 * orders, points - 1, 6))
-        radial_profile(self.table, self.source, self.axial, z_nm, orders, nodes, out)
-        return out
+        return self.wave.profile(z_nm, orders)
 
     @cached_property
     def axial_table(self) -> AxialTable:
         """Profiles at the heights of `z_range_nm`, for the kernels that interpolate along z."""
-        low, high = self.z_range_nm
-        kappa = float(self.axial.real.min() + self.axial.real.max()) / 2
-        step = STEP / float(np.abs(self.axial - kappa).max())
-        count = max(math.ceil((high - low) / step), 1) + 1
-        points = self.table.shape[3]
-        check_table("the table along z", 72.0 * count * (points - 1))
-        nodes, out = np.empty((12, 3 * points)), np.empty((12, points - 1, 6))
-        heights = np.empty((count, 3, 4, 6 * (points - 1)))
-        for i in range(count):
-            z = low + i * step
-            radial_profile(self.table, self.source, self.axial - kappa, z, 3, nodes, out)
-            heights[i] = out.reshape(3, 4, -1) * (step ** np.arange(3))[:, None, None]
-        return AxialTable(heights, low, step, kappa)
+        return axial_table(self.wave, self.z_range_nm)
 
     def image(
         self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
@@ -293,6 +290,59 @@ class ForwardModel:
         signal_hessian(self.profile(z_nm, 3), *geometry, first, second)
         return first[0], first[1:], second
 
+    def optics_gradient(
+        self,
+        grid: PixelGrid,
+        x_nm: float,
+        y_nm: float,
+        z_nm: float,
+        mass_kda: float,
+        names: Sequence[str],
+    ) -> tuple[FloatArray, FloatArray]:
+        """Signal and its analytic derivatives with respect to the microscope.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        mass_kda : float
+            Mass [kDa].
+        names : sequence of str
+            Parameters of ``[optics]``: ``focus_nm``, ``na``, ``reference_phase_deg``, ``mask_na``,
+            ``attenuation`` and ``z5`` to ``z37`` [nm].
+
+        Returns
+        -------
+        signal : ndarray, shape (ny, nx)
+            As `image` gives it.
+        derivatives : ndarray, shape (len(names), ny, nx)
+            Per unit of each parameter, at fixed amplitude of the scattered field: where a
+            calibration ties mass to contrast, the mass of that amplitude changes with the optics.
+
+        Raises
+        ------
+        ConfigError
+            A name is unknown, or the convention is D21's.
+        """
+        check_names(self.optics, names)
+        lens, stack = self._sensitivities(z_nm, tuple(names))
+        amplitude = self.scale.amplitude(mass_kda)
+        _, pixels, *_ = self._geometry(grid, x_nm, y_nm, amplitude)
+        return signal_derivatives(stack, lens, pixels, x_nm, y_nm, amplitude)
+
+    @cached_property
+    def _sensitivities(self) -> Callable[[float, tuple[str, ...]], tuple[Lens, FloatArray]]:
+        def at(z_nm: float, names: tuple[str, ...]) -> tuple[Lens, FloatArray]:
+            return sensitivity_lattices(
+                self.aperture,
+                lambda opening: _weight_on(opening, self.factor, self.oil_nm),
+                z_nm, names, rho=self.rho, reach_nm=self.reach_nm,
+            )  # fmt: skip
+
+        return lru_cache(_SENSITIVITIES_KEPT)(at)
+
     def field(
         self, dx_nm: FloatArray, dy_nm: FloatArray, z_nm: float, mass_kda: float
     ) -> ComplexArray:
@@ -309,20 +359,15 @@ class ForwardModel:
 
         Returns
         -------
-        complex ndarray, shape (2, *dx_nm.shape)
-            Components along and across the polarisation.
+        complex ndarray, shape (1 or 2, *dx_nm.shape)
+            Component along the reference's polarisation p, and, without an analyser, the other:
+            across it where p is linear, along p* where it is circular.
         """
-        _, _, c, s = self.lens
-        u, v = c * dx_nm + s * dy_nm, c * dy_nm - s * dx_nm
-        f0, f2 = self._radial(np.hypot(u, v), z_nm)
         amplitude = self.scale.amplitude(mass_kda)
-        return amplitude * np.stack([f0 + f2 * (u**2 - v**2), f2 * (2 * u * v)])
+        return amplitude * self.wave.components(dx_nm, dy_nm, z_nm)
 
     def peak_contrast(self, z_nm: float, mass_kda: float) -> float:
         """Signal of largest magnitude over the plane, with its sign.
-
-        At fixed r the signal is linear in cos 2φ, so its extremes lie along or across the
-        polarisation.
 
         Parameters
         ----------
@@ -353,11 +398,12 @@ class ForwardModel:
         float
             Peak contrast, or the peak of |E_sca|² in dark field.
         """
-        linear, quadratic, _ = self._peak(z_nm, amplitude)
-        return linear + quadratic
+        return sum(self.wave.peak(z_nm, amplitude, self.rho))
 
     def collected_area_nm2(self, z_nm: float, mass_kda: float) -> float:
         """Scattered light that the pupil collects, as an equivalent area of reference.
+
+        Before mask and analyser; aberrations do not matter.
 
         Multiplied by the background per area it gives the collected scattered photons
         (physics.md, section 1).
@@ -374,8 +420,8 @@ class ForwardModel:
         float
             Area [nm²]; in dark field per unit incident intensity.
         """
-        p = self.pupil
-        decay = np.exp(-2 * self.axial.imag * z_nm)
+        p = self.aperture.pupil
+        decay = np.exp(-2 * p.axial.imag * z_nm)
         density = (np.abs(p.t_p_cos) ** 2 + np.abs(p.t_s) ** 2) * np.sin(p.theta) * decay
         pupil_integral = math.pi * float(np.sum(p.weight * density))
         medium = 1.0 if self.optics.emission == "reciprocal" else 1 / self.optics.n_immersion**2
@@ -400,44 +446,6 @@ class ForwardModel:
         """
         area = self.collected_area_nm2(self.height_nm, self.material.mass_kda)
         return photons_per_frame * pixel_nm**2 / area
-
-    def _radial(self, r: FloatArray, z_nm: float) -> tuple[ComplexArray, ComplexArray]:
-        """F0 and F2 at distances r, from the table."""
-        profile = self.profile(z_nm, 1)
-        index = np.minimum((r / self.step_nm).astype(int), profile.shape[1] - 1)
-        t = r / self.step_nm - index
-        powers = t[..., None] ** np.arange(6)
-        values = np.einsum("...p,c...p->...c", powers, profile[:, index])
-        return values[..., 0] + 1j * values[..., 1], values[..., 2] + 1j * values[..., 3]
-
-    def _peak(self, z_nm: float, amplitude: float) -> tuple[float, float, float]:
-        """Linear and quadratic part of the extreme signal, and its distance [nm]."""
-        r, fields = self._axes(z_nm)
-
-        def parts(along: ComplexArray) -> tuple[FloatArray, FloatArray]:
-            return 2 * self.rho * amplitude * along.real, amplitude**2 * np.abs(along) ** 2
-
-        linear, quadratic = parts(fields)
-        axis, best = np.unravel_index(np.argmax(np.abs(linear + quadratic)), linear.shape)
-        if 0 < best < r.size - 1:
-            low, mid, high = (linear + quadratic)[axis, best - 1 : best + 2]
-            bend = low - 2 * mid + high
-            shift = 0.5 * (low - high) / bend if bend else 0.0
-            r_peak = r[best] + shift * r[1]
-        else:
-            r_peak = r[best]
-        linear, quadratic = parts(self._along(np.array([r_peak]), z_nm))
-        return float(linear[axis, 0]), float(quadratic[axis, 0]), float(r_peak)
-
-    def _along(self, r: FloatArray, z_nm: float) -> ComplexArray:
-        """Field along the polarisation and across it, shape (2, n)."""
-        f0, f2 = self._radial(r, z_nm)
-        return np.stack([f0 + f2 * r**2, f0 - f2 * r**2])
-
-    @cached_property
-    def _axes(self) -> Callable[[float], tuple[FloatArray, ComplexArray]]:
-        r = np.linspace(0, self.reach_nm, 8 * (self.table.shape[3] - 1), endpoint=False)
-        return lru_cache(_HEIGHTS_KEPT)(lambda z_nm: (r, self._along(r, z_nm)))
 
     def _geometry(
         self, grid: PixelGrid, x_nm: float, y_nm: float, amplitude: float
@@ -500,34 +508,7 @@ def forward_model(
     oil_nm = height - optics.focus_nm - height * ni / ns
     if z_max_nm is None:
         z_max_nm = max(config.fit.z_range_nm[1], height)
-    alpha = math.asin(optics.na / ni)
-    near = NEAR_CRITICAL * ns < optics.na and ns < ni
-    critical = math.asin(ns / ni) if near else None
-    step = STEP / (k * optics.na)
-    intervals = math.ceil(reach_nm / step) + 1
-    turns = k * (optics.na * reach_nm + ns * z_max_nm + ni * abs(oil_nm) * (1 - math.cos(alpha)))
-    check_table("the radial table", 6 * (30 + 0.45 * turns) * (intervals + 1))
-    if paper:
-        theta, weight = rectangle(alpha, nodes or DONG2021_FIELD_NODES)
-    else:
-        beyond = max(0.0, (alpha - critical) / alpha) if critical else 0.0
-        theta, weight = gauss_legendre(
-            alpha,
-            critical,
-            nodes or 16 + math.ceil(0.45 * turns),
-            nodes or 14 + math.ceil(0.45 * turns * beyond),
-        )
-    padding = -theta.size % 4  # the radial kernel takes the nodes in fours
-    pupil = make_pupil(
-        np.pad(theta, (0, padding), mode="edge"),
-        np.pad(weight, (0, padding)),
-        wavenumber=k,
-        n_immersion=ni,
-        n_glass=ng,
-        n_sample=ns,
-        direction=1.0 if optics.scheme == "iscat" else -1.0,
-        reciprocal=reciprocal,
-    )
+    opening = _pupil(optics, reach_nm, ns * z_max_nm, ni * abs(oil_nm), nodes)
     reflection = (ng - ns) / (ng + ns)
     transmission = math.sqrt(1 - reflection**2) if paper else 2 * ng / (ng + ns)
     if optics.scheme == "darkfield":
@@ -551,34 +532,24 @@ def forward_model(
         if paper:
             strength *= ns**2
         front = -1j * k / 2
-    axial = pupil.axial
-    fixed_oil_nm = oil_nm
-    if optics.axial == "refocus":
-        axial = axial + (1 - ni / ns) * pupil.oil
-        fixed_oil_nm = -optics.focus_nm
-    common = pupil.weight * pupil.apodization * np.exp(1j * pupil.oil * fixed_oil_nm)
-    common = common * front * strength / (reference or 1.0)
-    source = np.stack([common * (pupil.t_s + pupil.t_p_cos), common * (pupil.t_s - pupil.t_p_cos)])
-    same = (
-        like is not None
-        and like.step_nm == step
-        and like.table.shape[3] == intervals + 1
-        and np.array_equal(like.pupil.transverse, pupil.transverse)
-    )
-    table = like.table if same and like else bessel_table(pupil.transverse, step, intervals)
+    factor = 2 * front * strength / (reference or 1.0)
+    if reference:
+        factor *= cmath.exp(-1j * math.radians(optics.reference_phase_deg))
+    fixed_oil_nm = -optics.focus_nm if optics.axial == "refocus" else oil_nm
+    wave = _wave(opening, *_weight_on(opening, factor, fixed_oil_nm), reach_nm, like)
     points, weights = np.polynomial.legendre.leggauss(config.camera.samples_per_pixel)
     model = ForwardModel(
         optics=optics,
         material=matter,
-        pupil=pupil,
+        aperture=opening,
         height_nm=height,
         reference=reference,
         rho=1.0 if reference else 0.0,
-        source=source,
-        axial=axial,
+        factor=factor,
+        oil_nm=fixed_oil_nm,
+        wave=wave,
         strength=strength,
-        table=table,
-        step_nm=step,
+        reach_nm=wave.reach_nm,
         z_range_nm=(min(config.fit.z_range_nm[0], height), z_max_nm),
         samples=(points / 2, weights / 2),
     )
@@ -587,36 +558,76 @@ def forward_model(
     return replace(model, scale=_mass_scale(model, config.calibration))
 
 
-def check_table(what: str, numbers: float) -> None:
-    """Refuse a table that would not fit into the memory, before it is allocated.
+def _pupil(
+    optics: Optics, reach_nm: float, sample_nm: float, oil_nm: float, nodes: int | None
+) -> Aperture:
+    """Pupil with as many nodes as its phase turns; optical paths in sample and oil [nm]."""
+    alpha = math.asin(optics.na / optics.n_immersion)
+    k = 2 * math.pi / optics.wavelength_nm
+    critical = critical_angle(optics)
+    aberrations = sum(abs(size) for size in optics.aberrations_nm.values())
+    if aberrations:
+        reach_nm = reach_of_samples(reach_nm, LATTICE_STEP / (k * optics.na))
+    path = optics.na * reach_nm + sample_nm + oil_nm * (1 - math.cos(alpha)) + 4 * aberrations
+    intervals = math.ceil(reach_nm * k * optics.na / STEP) + 2
+    check_table("the radial table", 6 * (30 + 0.45 * k * path) * intervals)
+    if optics.convention == "dong2021":
+        return aperture_on(optics, *rectangle(alpha, nodes or DONG2021_FIELD_NODES))
+    beyond = max(0.0, (alpha - critical) / alpha) if critical else 0.0
+    return aperture(
+        optics,
+        nodes or 16 + math.ceil(0.45 * k * path),
+        nodes or 14 + math.ceil(0.45 * k * path * beyond),
+    )
 
-    Parameters
-    ----------
-    what : str
-        What the message calls it.
-    numbers : float
-        How many 8-byte numbers it holds.
 
-    Raises
-    ------
-    ConfigError
-        It is larger than `TABLE_LIMIT_MB`.
-    """
-    megabytes = 8e-6 * numbers
-    if megabytes > TABLE_LIMIT_MB:
-        raise ConfigError(
-            f"{what} of the model would take {megabytes:,.0f} MB, more than {TABLE_LIMIT_MB} MB: "
-            "check that optics.wavelength_nm, optics.focus_nm, particle.height_nm, "
-            "fit.z_range_nm, fit.roi_nm and camera.pixel_size_nm are in nanometres, or take a "
-            "smaller field or range"
-        )
+def _weight_on(
+    opening: Aperture, factor: complex, oil_nm: float
+) -> tuple[ComplexArray, ComplexArray]:
+    """Weigh the components in the field's integral at z = 0, and give the phase per height."""
+    optics, pupil = opening.optics, opening.pupil
+    axial = pupil.axial
+    if optics.axial == "refocus":
+        axial = axial + (1 - optics.n_immersion / optics.n_sample) * pupil.oil
+    weight = pupil.weight * pupil.apodization * np.exp(1j * pupil.oil * oil_nm) * factor
+    return weight, axial
+
+
+def _wave(
+    opening: Aperture,
+    weight: ComplexArray,
+    axial: ComplexArray,
+    reach_nm: float,
+    like: ForwardModel | None,
+) -> Field:
+    """Tabulate the field of a pupil, as the pupil's symmetry allows."""
+    optics, pupil = opening.optics, opening.pupil
+    band = opening.wavenumber * optics.na
+    if not opening.is_round:
+        series = harmonics(opening.seen(opening.azimuths()), np.abs(weight))
+        return LatticeField(series * weight, axial, pupil.transverse, band, reach_nm)
+    turn = np.exp(1j * opening.wavenumber * opening.path_nm(np.zeros(1))[:, 0])
+    common = weight / 2 * turn * opening.transmission
+    source = np.stack([common * (pupil.t_s + pupil.t_p_cos), common * (pupil.t_s - pupil.t_p_cos)])
+    before = like.wave if like else None
+    return radial_field(
+        source,
+        axial,
+        pupil.transverse,
+        band=band,
+        reach_nm=reach_nm,
+        psi=math.radians(optics.polarization_deg),
+        circular=optics.polarization == "circular",
+        analyzer=optics.analyzer,
+        like=before if isinstance(before, RadialField) else None,
+    )
 
 
 def _mass_scale(model: ForwardModel, line: Calibration) -> MassScale:
     if not model.rho:
         raise ConfigError("[calibration] relates contrast to mass; dark field has no contrast")
     weak = 1e-6 / math.sqrt(model.collected_area_nm2(model.height_nm, 1.0))
-    linear, quadratic, _ = model._peak(model.height_nm, weak)
+    linear, quadratic = model.wave.peak(model.height_nm, weak, model.rho)
     linear, quadratic = linear / weak, quadratic / weak**2
     if linear * line.gradient_per_kda < 0:
         seen = "bright" if linear > 0 else "dark"

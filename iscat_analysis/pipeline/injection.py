@@ -248,7 +248,8 @@ def recovery(
     Returns
     -------
     dict
-        ``added``, ``recovered``, ``recall``; of the isolated ones ``isolated``,
+        ``stay_frames``, the shortest stay among the particles, ``added``, ``recovered``,
+        ``recall``, which says nothing of briefer stays; of the isolated ones ``isolated``,
         ``recall_isolated``, ``bias_rel`` and ``bias_rel_se`` (mass), ``spread_over_crb`` with its
         standard error, ``pull_std``, ``frame_within_1``, ``frame_in_interval``.
     """
@@ -280,6 +281,7 @@ def recovery(
     isolated = sum(alone for _, alone, _, _ in rows)
     recovered = sum(best >= 0 for best, _, _, _ in rows)
     result: dict[str, Any] = {
+        "stay_frames": min((p.leave - p.frame for p in particles), default=None),
         "added": len(rows),
         "recovered": recovered,
         "recall": recovered / len(rows) if rows else None,

@@ -244,6 +244,7 @@ def _distribution(scene: Scene, good: pd.DataFrame) -> dict[str, Any] | None:
         efficiency=efficiency,
         seed=scene.config.compute.seed,
         scale_error=_scale_error(good),
+        window_frames=int(good["n_after"].max()) if len(good) else None,
     )
     return found.to_dict()
 

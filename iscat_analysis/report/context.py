@@ -363,6 +363,8 @@ def _measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
             f"Of {injection['added']} landings and leavings added to the movie, "
             f"{injection['recovered']} were found again."
         )
+        if injection.get("stay_frames"):
+            text += f" Every particle stayed at least {injection['stay_frames']} frames."
         if injection.get("bias_rel") is not None:
             bias, error = (100 * injection[key] for key in ("bias_rel", "bias_rel_se"))
             spread, doubt = (injection[key] for key in ("spread_over_crb", "spread_over_crb_se"))

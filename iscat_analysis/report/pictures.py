@@ -10,7 +10,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from iscat_analysis.errors import DataError
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, PosteriorResult, Status
 from iscat_analysis.report import figures
 from iscat_analysis.report.style import STYLE
@@ -122,7 +122,11 @@ def view_of(analysis: Analysis, event: int) -> EventView:
     ------
     DataError
         There is no such event.
+    ConfigError
+        `event` is not a whole number.
     """
+    if isinstance(event, bool) or not isinstance(event, (int, np.integer)):
+        raise ConfigError(f"event = {event!r}: events have whole numbers, as in view(0)")
     for view in analysis.views:
         if view.event == event:
             return view

@@ -150,6 +150,9 @@ class Landing(Document):
 class Injection(Closed):
     """Known particles added to the movie: how many were found again, and how well."""
 
+    stay_frames: Count | None = maybe(
+        "Frames that every added particle stays at least; recall says nothing of briefer visitors"
+    )
     added: Count = key("Steps added: each particle lands, and leaves unless the movie ends first")
     recovered: Count = key("Steps found again")
     recall: Share = key("Their share")
@@ -173,8 +176,11 @@ class Distribution(Document):
     events: Count = key("Events used")
     species: list[dict[str, Any]] = key(
         "By rising mass [kDa]; *_low and *_high are 95 % intervals of a parametric bootstrap; "
-        "width_kda is beyond measurement error; count is of the events seen, count_corrected and "
-        "fraction are of the particles that came; an outlier holds fewer than three events"
+        "width_kda is beyond measurement error; mass_systematic is the error of the mass scale, "
+        "which the mass's interval holds; efficiency is of particles that stay as long as the "
+        "window, and every other one that stays stay_frames is found; count is of the events "
+        "seen, count_corrected and fraction are of the particles that came; an outlier holds "
+        "fewer than three events"
     )
     selection: list[dict[str, Any]] = key("Log-likelihood and BIC of each number of species tried")
     support: Number = key("Share of simulated repetitions in which BIC chose the same number")

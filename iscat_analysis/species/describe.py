@@ -36,11 +36,13 @@ SPECIES_COLUMNS = (
     "mass_kda", "mass_se", "mass_low", "mass_high", "mass_systematic",
     "width_kda", "width_low", "width_high",
     "fraction", "fraction_low", "fraction_high", "count", "count_low", "count_high",
-    "landing", "leaving", "efficiency", "count_corrected", "corrected_low", "corrected_high",
-    "outlier",
+    "landing", "leaving", "efficiency", "stay_frames",
+    "count_corrected", "corrected_low", "corrected_high", "outlier",
 )  # fmt: skip
 """Columns of the table of species: `mass_se` is the statistical standard error, `mass_systematic`
 the error of the mass scale, 0 where none is known, and the interval of the mass holds both.
+`efficiency` is of particles that stay as long as the window; of those that stay `stay_frames` every
+other one is found (NaN where the window is not known, or where it is too short for that).
 Intervals are 95 %, `fraction` and `count_corrected` are of the
 particles that came, the other counts of those that were seen; `outlier` where these are fewer than
 `LEAST_SPECIES`."""
@@ -127,6 +129,7 @@ def describe(
     branch: Branch = "magnitude",
     draws: int = 100,
     scale_error: Callable[[FloatArray], FloatArray] | None = None,
+    window_frames: int | None = None,
 ) -> Distribution:
     """Describe a set of masses as a mixture of species.
 
@@ -149,6 +152,9 @@ def describe(
     scale_error : callable, optional
         Gives the standard deviation of the mass scale at masses [kDa]; it is common to all events
         and widens the intervals of the species' masses.
+    window_frames : int, optional
+        Frames that the search averages: the efficiency is that of particles that stay as long.  A
+        visitor of fewer frames d changes their mean by d/window_frames of its contrast only.
 
     Returns
     -------
@@ -190,7 +196,7 @@ def describe(
     best = fits[int(np.argmin(bic))].by_mass()
     repeats, support = bootstrap(events, best, draws=draws, least=LEAST_EVENTS, seed=seed)
     scale = np.zeros(best.mean.shape) if scale_error is None else scale_error(best.mean)
-    species = _table(events, best, repeats, mass[usable] > 0, scale)
+    species = _table(events, best, repeats, mass[usable] > 0, scale, window_frames)
     bandwidth = bandwidth_of(events, len(species))
     return Distribution(
         species=species,
@@ -210,7 +216,7 @@ def describe(
         branch=branch,
         draws=draws,
         seed=seed,
-        notes=(*notes, *_remarks(species)),
+        notes=(*notes, *_remarks(species), *_brief(species, window_frames)),
     )
 
 
@@ -220,6 +226,7 @@ def _table(
     repeats: Sequence[Repeat],
     lands: BoolArray,
     scale: FloatArray,
+    window_frames: int | None,
 ) -> pd.DataFrame:
     """Lay out the species, with intervals from the repetitions and from the mass scale."""
     share = best.shares(events)
@@ -257,6 +264,7 @@ def _table(
             "landing": share[lands].sum(axis=0),
             "leaving": share[~lands].sum(axis=0),
             "efficiency": best.chance(events).mean(axis=0),
+            "stay_frames": _stay(events, best, window_frames),
             "count_corrected": best.weight * best.arrived(events),
             "corrected_low": came_low,
             "corrected_high": came_high,
@@ -264,6 +272,14 @@ def _table(
         },
         columns=list(SPECIES_COLUMNS),
     )
+
+
+def _stay(events: Events, best: Mixture, window_frames: int | None) -> FloatArray:
+    """Frames that a particle of each species must stay to be found every other time."""
+    if window_frames is None or events.efficiency is None:
+        return np.full(best.mean.shape, math.nan)
+    frames = np.ceil(window_frames * events.efficiency.threshold_kda / best.mean)
+    return np.where(frames <= window_frames, np.maximum(frames, 1.0), math.nan)
 
 
 def _widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
@@ -294,6 +310,21 @@ def _remarks(species: pd.DataFrame) -> list[str]:
         text.format(", ".join(f"{mass:.3g}" for mass in species["mass_kda"][which]))
         for which, text in cases
         if which.any()
+    ]
+
+
+def _brief(species: pd.DataFrame, window_frames: int | None) -> list[str]:
+    """Say for how long a particle must stay for its efficiency to be what the table says."""
+    known = species[np.isfinite(species["stay_frames"].to_numpy(dtype=float)) & ~species["outlier"]]
+    if window_frames is None or known.empty:
+        return []
+    stays = ", ".join(
+        f"{row.mass_kda:.3g} kDa from {row.stay_frames:.0f} frames" for row in known.itertuples()
+    )
+    return [
+        f"efficiencies and corrected counts are of particles that stay {window_frames} frames or "
+        f"longer; briefer visitors are missed more often and appear lighter: every other one is "
+        f"found of {stays}"
     ]
 
 

@@ -74,6 +74,13 @@ def test_the_movie_of_these_tests_is_good(movie: Path, capsys) -> None:
     assert (movie.with_suffix(".iscat") / "report.html").is_file()
 
 
+def test_several_movies_are_not_one(refused: Run, movie: Path, tmp_path: Path) -> None:
+    second = _save(tmp_path / "second.tif", _counts())
+    line = refused(movie, str(second), status=USAGE)
+    assert "2 movies were given" in line
+    assert "for movie in *.tif" in line
+
+
 # ---- files -----------------------------------------------------------------------------------
 
 

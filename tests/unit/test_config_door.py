@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ import iscat_analysis as ia
 from iscat_analysis.config import Config, config_to_toml, configure, load_config, read_optics_file
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.pipeline.landing import has_landings
+from iscat_analysis.pipeline.scene import make_scene, photons_scale
 
 SETTINGS: list[tuple[str, Any]] = [
     ("optics.na", 1.3),
@@ -240,3 +242,44 @@ def test_an_optics_file_without_optics_is_refused(tmp_path: Path) -> None:
     path.write_text("[camera]\npixel_size_nm = 84.4\n")
     with pytest.raises(ConfigError, match=r"has no table \[optics\]"):
         configure(settings={"optics.file": str(path)})
+
+
+# ---- the simulation and the analysis ---------------------------------------------------------
+
+
+def test_the_simulation_says_nothing_of_dark_field_masses() -> None:
+    dark = {
+        "optics": {"scheme": "darkfield"},
+        "camera": {"pixel_size_nm": 84.4},
+        "particle": {"photons_per_frame": 2000.0},
+        "background": {"frames": [0, 10]},
+    }
+    scales = []
+    for photons in (1e3, 1e5):
+        config = configure(dark, settings={"simulation.photons_per_pixel": photons})
+        scene = make_scene(config, (48, 48))
+        windows = SimpleNamespace(power_ratio=1.0, n_before=10)
+        scales.append(photons_scale(scene, windows))  # type: ignore[arg-type]
+    assert scales[0] == scales[1] > 0
+    bare = make_scene(configure(dark, settings={"particle.photons_per_frame": None}), (48, 48))
+    with pytest.raises(ConfigError, match=r"particle\.photons_per_frame is needed"):
+        photons_scale(bare, windows)  # type: ignore[arg-type]
+
+
+def test_only_the_simulator_and_one_announced_fallback_read_the_simulation() -> None:
+    package = Path(ia.__file__).parent
+    readers = {
+        str(path.relative_to(package))
+        for path in package.rglob("*.py")
+        if re.search(r"\.simulation\b(?! import)", path.read_text("utf-8"))
+        and path.parent.name != "config"
+    }
+    assert readers <= {"study/simulate.py", "pipeline/__init__.py"}
+
+
+def test_a_blank_is_a_movie_without_particles(tmp_path: Path) -> None:
+    blank = {"simulation": {"count": 0, "shape": [16, 16], "frames": 4}}
+    setup = configure(blank, settings={"camera.pixel_size_nm": 84.4})
+    truth = ia.simulate_movie(setup, tmp_path / "blank.tif")
+    assert truth.empty
+    assert (tmp_path / "blank.truth.csv").read_text().startswith("event,frame")

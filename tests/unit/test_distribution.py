@@ -230,3 +230,25 @@ def test_far_below_the_threshold_the_chance_is_that_of_scipy(mean: float) -> Non
     assert value == pytest.approx(float(log_ndtr(mean / 5)), rel=1e-9)
     hazard = math.exp(norm.logpdf(mean / 5) - float(log_ndtr(mean / 5)))
     assert slopes[1, 0] == pytest.approx(hazard / 5, rel=1e-6)
+
+
+def test_efficiency_is_stated_for_stays_as_long_as_the_window() -> None:
+    """A visitor of d of n frames has d/n of its contrast, and is found like such a particle."""
+    rng = np.random.default_rng(21)
+    window, threshold, noise = 40, 5.0, 6.0
+    mass = np.abs(rng.normal(480.0, 8.0, 200))
+    efficiency = Efficiency(threshold, noise)
+    found = describe(
+        mass, np.full(200, 6.0), efficiency=efficiency, seed=1, draws=0, max_species=1,
+        window_frames=window,
+    )  # fmt: skip
+    (species,) = found.species.to_dict("records")
+    assert species["efficiency"] > 0.999
+    assert species["stay_frames"] == math.ceil(window * threshold * noise / 480.0) == 3
+    brief = {d: float(efficiency(480.0 * d / window)) for d in (2, 3)}
+    assert brief[2] < 0.5 < brief[3]
+    (note,) = [note for note in found.notes if "stay" in note]
+    assert "stay 40 frames or longer" in note
+    assert "480 kDa from 3 frames" in note
+    without = describe(mass, np.full(200, 6.0), seed=1, draws=0, max_species=1)
+    assert not any("stay" in note for note in without.notes)

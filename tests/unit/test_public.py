@@ -5,10 +5,12 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+import tifffile
 from matplotlib.figure import Figure
 
 import iscat_analysis as ia
@@ -245,3 +247,35 @@ def test_bounds_are_frames(config) -> None:
     assert list(curve["focus"]) == [-200, 0, 200]
     with pytest.raises(ia.ConfigError):
         bounds.scan("focsu=0:1:1")
+
+
+def test_an_array_is_a_movie(movie: Path, result: ia.Result, config: ia.Config) -> None:
+    counts = tifffile.imread(movie)
+    again = ia.fit_movie(counts, config=config, posterior=False)
+    assert np.allclose(again.table["mass_kda"], result.table["mass_kda"], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ({"background": 200}, "background: [start, stop) takes two numbers"),
+        ({"frames": 200}, "frames: [start, stop) takes two numbers"),
+        ({"mode": "masses"}, "mode: input should be 'mass'"),
+        ({"pixel_size_nm": 0.0844}, "if 0.0844 is in micrometres, write 84.4"),
+        ({"workers": 0}, "workers: "),
+        ({"config": 200}, "not from a int"),
+        ({"config": {"optics": {"nna": 1.4}}}, "did you mean na?"),
+    ],
+)
+def test_messages_name_the_argument(arguments: dict[str, Any], expected: str) -> None:
+    with pytest.raises(ia.ConfigError) as caught:
+        ia.fit_movie("absent.tif", **arguments)
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("event", ["0", 0.0, True, None])
+def test_events_have_whole_numbers(result: ia.Result, event: Any) -> None:
+    with pytest.raises(ia.ConfigError, match="events have whole numbers"):
+        result.view(event)
+    assert result.view(np.int64(0)) is not None

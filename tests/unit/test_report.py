@@ -337,6 +337,8 @@ def test_the_histogram_keeps_species_apart() -> None:
     ],
 )
 def test_what_was_injected_is_told(further: dict[str, float], words: str) -> None:
-    (line,) = _measured_lines({"injection": {"added": 20, "recovered": 19, **further}})
+    added = {"stay_frames": 120, "added": 20, "recovered": 19}
+    (line,) = _measured_lines({"injection": {**added, **further}})
     assert line.startswith("Of 20 landings and leavings added to the movie, 19 were found again.")
+    assert "Every particle stayed at least 120 frames." in line
     assert words in line

@@ -1,0 +1,352 @@
+"""Rows of pixels of a particle whose field is tabulated on a lattice; see `lattice`.
+
+The work space of a row is an array (rows, nx): `FIELDS` rows hold the fields of the row at hand and
+their slopes, the rest the fields at the columns of pixels and the rows of nodes, made once for each
+image by `interpolate_columns`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.lattice import FAST, TAPS
+
+if TYPE_CHECKING:
+    from iscat_analysis._kernels.image import Lens, Pixels
+
+FloatArray = NDArray[np.float64]
+
+FIELDS = 16
+"""Rows for a row of pixels: the fields (4), their ∂/∂z, slopes along x and slopes along y."""
+
+BEFORE = TAPS // 2 - 1
+"""Nodes before the one at the floor of a position."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def taps(weights: FloatArray, t: float, value: FloatArray, slope: FloatArray) -> None:
+    """Fill the weights of the nodes at distance t ∈ [0, 1) and their derivative."""
+    degree = weights.shape[1] - 1
+    for k in range(weights.shape[0]):
+        v, d = weights[k, degree], 0.0
+        for p in range(degree - 1, -1, -1):
+            d = d * t + v
+            v = v * t + weights[k, p]
+        value[k] = v
+        slope[k] = d
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def node_rows(lens: Lens, pixels: Pixels, y_p: float) -> tuple[int, int]:
+    """First row of nodes that an image needs, and how many."""
+    margin = abs(pixels.offsets[-1])
+    low = (pixels.y.min() - margin - y_p) * lens.inv_step + lens.half
+    high = (pixels.y.max() + margin - y_p) * lens.inv_step + lens.half
+    first = int(low) - BEFORE
+    return first, int(high) - BEFORE + TAPS - first
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def rows_needed(lens: Lens, pixels: Pixels) -> int:
+    """Rows of work space that an image needs, wherever the particle is."""
+    span = pixels.y.max() - pixels.y.min() + 2 * abs(pixels.offsets[-1])
+    rows = int(span * lens.inv_step) + TAPS + 2
+    return FIELDS + pixels.offsets.size * 6 * lens.components * rows
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _blend(nodes: FloatArray, w: FloatArray, out: FloatArray) -> None:
+    """Fill `out` (n) with the combination w of the rows of `nodes` (TAPS, n).
+
+    Four rows at a time: against more that might overlap, the compiler gives up on vectors.
+    """
+    a, b, c, d = nodes[0], nodes[1], nodes[2], nodes[3]
+    wa, wb, wc, wd = w[0], w[1], w[2], w[3]
+    for j in range(out.size):
+        out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+    a, b, c, d = nodes[4], nodes[5], nodes[6], nodes[7]
+    wa, wb, wc, wd = w[4], w[5], w[6], w[7]
+    for j in range(out.size):
+        out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def interpolate_columns(
+    profile: FloatArray,
+    lens: Lens,
+    pixels: Pixels,
+    x_p: float,
+    y_p: float,
+    with_gradient: bool,
+    f: FloatArray,
+) -> None:
+    """Interpolate along x: fields and slopes at every column of pixels and row of nodes."""
+    first, rows = node_rows(lens, pixels, y_p)
+    value, slope = np.empty(TAPS), np.empty(TAPS)
+    line = np.empty(rows)
+    width = 2 * lens.components
+    nodes = profile[:, :, first : first + rows]
+    start = FIELDS
+    for sample in range(pixels.offsets.size):
+        for j in range(pixels.x.size):
+            place = (pixels.x[j] + pixels.offsets[sample] - x_p) * lens.inv_step + lens.half
+            i = int(place)
+            taps(lens.window, place - i, value, slope)
+            for k in range(TAPS):
+                slope[k] *= lens.inv_step
+            left, right = i - BEFORE, i - BEFORE + TAPS
+            for k in range(width):
+                _blend(nodes[k, left:right], value, line)
+                here = start + k * rows
+                for r in range(rows):
+                    f[here + r, j] = line[r]
+            if with_gradient:
+                for k in range(width):
+                    _blend(nodes[width + k, left:right], value, line)
+                    here = start + (width + k) * rows
+                    for r in range(rows):
+                        f[here + r, j] = line[r]
+                    _blend(nodes[k, left:right], slope, line)
+                    here = start + (2 * width + k) * rows
+                    for r in range(rows):
+                        f[here + r, j] = line[r]
+        start += (3 if with_gradient else 1) * width * rows
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _add_gradient(
+    rho: float, amplitude: float, weight: float, f: FloatArray, part: int, out: FloatArray
+) -> None:
+    """Add one component's share of signal and gradient to `out` (5, nx)."""
+    a = amplitude
+    e_r, e_i = f[part], f[part + 1]
+    z_r, z_i = f[4 + part], f[5 + part]
+    x_r, x_i = f[8 + part], f[9 + part]
+    y_r, y_i = f[12 + part], f[13 + part]
+    for j in range(e_r.size):
+        g_r, g_i = 2 * weight * a * (rho + a * e_r[j]), 2 * weight * a * a * e_i[j]
+        out[1, j] -= g_r * x_r[j] + g_i * x_i[j]
+        out[2, j] -= g_r * y_r[j] + g_i * y_i[j]
+    for j in range(e_r.size):
+        g_r, g_i = 2 * weight * a * (rho + a * e_r[j]), 2 * weight * a * a * e_i[j]
+        power = e_r[j] * e_r[j] + e_i[j] * e_i[j]
+        out[3, j] += g_r * z_r[j] + g_i * z_i[j]
+        out[0, j] += weight * a * (2 * rho * e_r[j] + a * power)
+        out[4, j] += weight * (2 * rho * e_r[j] + 2 * a * power)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lattice_gradient(
+    lens: Lens,
+    pixels: Pixels,
+    row: int,
+    y_p: float,
+    amplitude: float,
+    f: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Fill `out` (5, nx) with signal and gradient of one row, averaged over the samples."""
+    first, rows = node_rows(lens, pixels, y_p)
+    value, slope = np.empty(TAPS), np.empty(TAPS)
+    width = 2 * lens.components
+    q = pixels.offsets.size
+    out[:] = 0.0
+    for i in range(q):
+        place = (pixels.y[row] + pixels.offsets[i] - y_p) * lens.inv_step + lens.half
+        top = int(place) - BEFORE - first
+        taps(lens.window, place - int(place), value, slope)
+        for k in range(TAPS):
+            slope[k] *= lens.inv_step
+        for sample in range(q):
+            start = FIELDS + sample * 3 * width * rows + top
+            for k in range(width):
+                here = start + k * rows
+                _blend(f[here : here + TAPS], value, f[k])
+                _blend(f[here : here + TAPS], slope, f[12 + k])
+                here += width * rows
+                _blend(f[here : here + TAPS], value, f[4 + k])
+                here += width * rows
+                _blend(f[here : here + TAPS], value, f[8 + k])
+            weight = pixels.weights[i] * pixels.weights[sample]
+            _add_gradient(lens.rho, amplitude, weight, f, 0, out)
+            if lens.components == 2:
+                _add_gradient(0.0, amplitude, weight, f, 2, out)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _add_signal(
+    rho: float, a: float, weight: float, e_r: FloatArray, e_i: FloatArray, out: FloatArray
+) -> None:
+    """Add one component's share of the signal to `out` (nx)."""
+    for j in range(out.size):
+        out[j] += weight * a * (2 * rho * e_r[j] + a * (e_r[j] * e_r[j] + e_i[j] * e_i[j]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lattice_signal(
+    lens: Lens,
+    pixels: Pixels,
+    row: int,
+    y_p: float,
+    amplitude: float,
+    f: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Fill `out` (nx) with the signal of one row, averaged over the samples in each pixel."""
+    first, rows = node_rows(lens, pixels, y_p)
+    value, slope = np.empty(TAPS), np.empty(TAPS)
+    width = 2 * lens.components
+    q = pixels.offsets.size
+    out[:] = 0.0
+    for i in range(q):
+        place = (pixels.y[row] + pixels.offsets[i] - y_p) * lens.inv_step + lens.half
+        top = int(place) - BEFORE - first
+        taps(lens.window, place - int(place), value, slope)
+        for sample in range(q):
+            start = FIELDS + sample * width * rows + top
+            for k in range(width):
+                here = start + k * rows
+                _blend(f[here : here + TAPS], value, f[k])
+            weight = pixels.weights[i] * pixels.weights[sample]
+            _add_signal(lens.rho, amplitude, weight, f[0], f[1], out)
+            if lens.components == 2:
+                _add_signal(0.0, amplitude, weight, f[2], f[3], out)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _add_product(
+    rho: float, weight: float, f: FloatArray, field: int, change: int, out: FloatArray
+) -> None:
+    """Add weight × Re (ρ + e)* d to `out`; e and d are pairs of rows of f."""
+    e_r, e_i, d_r, d_i = f[field], f[field + 1], f[change], f[change + 1]
+    for j in range(out.size):
+        out[j] += weight * ((rho + e_r[j]) * d_r[j] + e_i[j] * d_i[j])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lattice_values(
+    stack: FloatArray,
+    lens: Lens,
+    pixels: Pixels,
+    x_p: float,
+    y_p: float,
+    amplitude: float,
+    components: int,
+    out: FloatArray,
+) -> None:
+    """Signal of a field and its derivatives along changes of that field.
+
+    Parameters
+    ----------
+    stack : ndarray, shape (k·components·2, nodes, nodes)
+        Real and imaginary part of each component: of the field, then of each change of it.
+    lens, pixels, x_p, y_p, amplitude
+        As in `signal_gradient`.
+    components : int
+        Components of the field.
+    out : ndarray, shape (k, ny, nx)
+        Filled with the signal and its derivatives.
+    """
+    first, rows = node_rows(lens, pixels, y_p)
+    value, slope = np.empty(TAPS), np.empty(TAPS)
+    line = np.empty(rows)
+    channels, a = stack.shape[0], amplitude
+    across = np.empty((channels, rows, pixels.x.size))
+    f = np.empty((channels, pixels.x.size))
+    out[:] = 0.0
+    for sample in range(pixels.offsets.size):
+        for j in range(pixels.x.size):
+            place = (pixels.x[j] + pixels.offsets[sample] - x_p) * lens.inv_step + lens.half
+            left = int(place) - BEFORE
+            taps(lens.window, place - int(place), value, slope)
+            for k in range(channels):
+                _blend(stack[k, left : left + TAPS, first : first + rows], value, line)
+                across[k, :, j] = line
+        for row in range(pixels.y.size):
+            for i in range(pixels.offsets.size):
+                place = (pixels.y[row] + pixels.offsets[i] - y_p) * lens.inv_step + lens.half
+                top = int(place) - BEFORE - first
+                taps(lens.window, place - int(place), value, slope)
+                for k in range(channels):
+                    _blend(across[k, top : top + TAPS], value, f[k])
+                weight = pixels.weights[i] * pixels.weights[sample]
+                for c in range(components):
+                    rho = lens.rho if c == 0 else 0.0
+                    _add_signal(rho, a, weight, f[2 * c], f[2 * c + 1], out[0, row])
+                    for j in range(f.shape[1]):
+                        f[2 * c, j] *= a
+                        f[2 * c + 1, j] *= a
+                    for k in range(1, out.shape[0]):
+                        change = 2 * (k * components + c)
+                        _add_product(rho, 2 * a * weight, f, 2 * c, change, out[k, row])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lattice_span(lens: Lens, x: FloatArray, margin: float, x_p: float) -> tuple[int, int]:
+    """Range of the flattened lattice that an image needs."""
+    side = 2 * lens.half + 1
+    first = int((x.min() - margin - x_p) * lens.inv_step + lens.half) - BEFORE
+    last = int((x.max() + margin - x_p) * lens.inv_step + lens.half) - BEFORE + TAPS
+    return max(first, 0) * side, min(last, side) * side
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lattice_fields(
+    profile: FloatArray,
+    lens: Lens,
+    dx: float,
+    dy: float,
+    e: NDArray[np.complex128],
+    de: NDArray[np.complex128],
+    dde: NDArray[np.complex128],
+) -> None:
+    """Fill the fields at one point, their first derivatives and their second in (x, y, z)."""
+    h = lens.inv_step
+    px, py = dx * h + lens.half, dy * h + lens.half
+    i, j = int(px), int(py)
+    wx, wy = np.zeros((3, TAPS)), np.zeros((3, TAPS))
+    _bent_taps(lens.window, px - i, h, wx)
+    _bent_taps(lens.window, py - j, h, wy)
+    i -= BEFORE
+    j -= BEFORE
+    width = 2 * lens.components
+    e[:], de[:], dde[:] = 0j, 0j, 0j
+    for c in range(lens.components):
+        for k in range(TAPS):
+            for m in range(TAPS):
+                here = profile[2 * c :, i + k, j + m]
+                v = here[0] + 1j * here[1]
+                z = here[width] + 1j * here[width + 1]
+                zz = here[2 * width] + 1j * here[2 * width + 1]
+                plain, along_x, along_y = (
+                    wx[0, k] * wy[0, m],
+                    wx[1, k] * wy[0, m],
+                    wx[0, k] * wy[1, m],
+                )
+                e[c] += plain * v
+                de[0, c] += along_x * v
+                de[1, c] += along_y * v
+                de[2, c] += plain * z
+                dde[0, 0, c] += wx[2, k] * wy[0, m] * v
+                dde[0, 1, c] += wx[1, k] * wy[1, m] * v
+                dde[1, 1, c] += wx[0, k] * wy[2, m] * v
+                dde[0, 2, c] += along_x * z
+                dde[1, 2, c] += along_y * z
+                dde[2, 2, c] += plain * zz
+        dde[1, 0, c], dde[2, 0, c], dde[2, 1, c] = dde[0, 1, c], dde[0, 2, c], dde[1, 2, c]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _bent_taps(weights: FloatArray, t: float, h: float, out: FloatArray) -> None:
+    """Fill the weights (3, TAPS) of the nodes for value, slope and second derivative."""
+    for k in range(weights.shape[0]):
+        v, d, s = 0.0, 0.0, 0.0
+        for p in range(weights.shape[1] - 1, -1, -1):
+            s = s * t + 2 * d
+            d = d * t + v
+            v = v * t + weights[k, p]
+        out[0, k], out[1, k], out[2, k] = v, d * h, s * h * h

@@ -1,0 +1,207 @@
+"""What the microscope's pupil does to the scattered light (microscope.md, section 2).
+
+Polarisation, analyser, mask, aberrations and the phase of the reference, on a quadrature of polar
+angles θ and of azimuths φ; and the Fourier series along φ that the field is made of.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil
+from iscat_analysis._kernels.zernike import orders, zernike
+from iscat_analysis.config import Optics
+from iscat_analysis.errors import ConfigError
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+NEAR_CRITICAL = 0.98
+"""NA over n_sample from which the quadrature minds the critical angle."""
+
+NEGLIGIBLE = 1e-8
+"""Share of the pupil's light amplitude below which azimuthal harmonics are left out."""
+
+_FEWEST_AZIMUTHS, _MOST_AZIMUTHS = 64, 1024
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """A pupil on a quadrature; build it with `aperture`.
+
+    Attributes
+    ----------
+    optics : Optics
+        The ``[optics]`` section.
+    pupil : Pupil
+        The unaberrated wave on the quadrature.
+    """
+
+    optics: Optics
+    pupil: Pupil
+
+    @property
+    def wavenumber(self) -> float:
+        """2π over the vacuum wavelength [rad/nm]."""
+        return 2 * math.pi / self.optics.wavelength_nm
+
+    @property
+    def rho(self) -> FloatArray:
+        """Radius in the pupil, 1 at its edge, shape (n,)."""
+        return self.optics.n_immersion * np.sin(self.pupil.theta) / self.optics.na
+
+    @property
+    def is_round(self) -> bool:
+        """Whether no aberration depends on the azimuth."""
+        return all(orders(j)[1] == 0 for j, _ in self.terms)
+
+    @property
+    def terms(self) -> tuple[tuple[int, float], ...]:
+        """Noll's index and size [nm] of every aberration."""
+        return tuple((int(k[1:]), v) for k, v in self.optics.aberrations_nm.items() if v)
+
+    @property
+    def transmission(self) -> FloatArray:
+        """Amplitude that the mask lets through, shape (n,)."""
+        inside = self.optics.n_immersion * np.sin(self.pupil.theta) < self.optics.mask_na
+        return np.where(inside, self.optics.attenuation, 1.0)
+
+    def path_nm(self, phi: FloatArray) -> FloatArray:
+        """Aberration W [nm], shape (n, phi.size)."""
+        total = np.zeros((self.pupil.theta.size, phi.size))
+        for j, size in self.terms:
+            total += size * zernike(j, self.rho[:, None], phi)[0]
+        return total
+
+    def path_slope_nm(self, phi: FloatArray) -> FloatArray:
+        """∂W/∂ρ [nm], shape (n, phi.size)."""
+        total = np.zeros((self.pupil.theta.size, phi.size))
+        for j, size in self.terms:
+            total += size * zernike(j, self.rho[:, None], phi)[1]
+        return total
+
+    def polarised(self, phi: FloatArray) -> ComplexArray:
+        """Wave without its aberrations: along the reference's polarisation, and across it.
+
+        Parameters
+        ----------
+        phi : ndarray, shape (m,)
+            Azimuths [rad].
+
+        Returns
+        -------
+        complex ndarray, shape (2, n, m)
+            p*·A and the other component, before the analyser.
+        """
+        p, s = self.pupil.t_p_cos[:, None], self.pupil.t_s[:, None]
+        if self.optics.polarization == "circular":
+            return np.stack([(p + s) / 2 * np.ones(phi.size), (p - s) / 2 * np.exp(2j * phi)])
+        turned = phi - math.radians(self.optics.polarization_deg)
+        c, d = np.cos(turned), np.sin(turned)
+        return np.stack([p * c**2 + s * d**2, (p - s) * (c * d)])
+
+    def seen(self, phi: FloatArray, *, masked: bool = True) -> ComplexArray:
+        """Components that reach the camera, with mask and aberrations, shape (1 or 2, n, m)."""
+        components = self.polarised(phi)[: 1 if self.optics.analyzer else 2]
+        wave: ComplexArray = components * np.exp(1j * self.wavenumber * self.path_nm(phi))
+        return wave * self.transmission[:, None] if masked else wave
+
+    def azimuths(self) -> FloatArray:
+        """Azimuths that resolve the pupil's finest harmonic, equally spaced from 0 [rad]."""
+        count = _FEWEST_AZIMUTHS
+        while True:
+            phi: FloatArray = np.arange(count, dtype=np.float64) * (2 * math.pi / count)
+            size = np.abs(np.fft.fft(self.seen(phi), axis=2)).sum((0, 1))
+            fine = size[count // 4 : -(count // 4)]
+            if fine.max() < NEGLIGIBLE * size.sum():
+                return phi
+            count *= 2
+            if count > _MOST_AZIMUTHS:
+                raise ConfigError(
+                    "optics.aberrations_nm: these terms turn the phase too fast across the pupil "
+                    "to be computed; lower them"
+                )
+
+
+def harmonics(waves: ComplexArray, weight: FloatArray) -> ComplexArray:
+    """Fourier series along the azimuth, as far as it is not negligible.
+
+    Parameters
+    ----------
+    waves : complex ndarray, shape (k, n, m)
+        Pupil functions at m equally spaced azimuths.
+    weight : ndarray, shape (n,)
+        Moduli of the quadrature's weights, which say what is negligible.
+
+    Returns
+    -------
+    complex ndarray, shape (k, 2·M + 1, n)
+        Harmonics −M…M.
+    """
+    series = np.fft.fft(waves, axis=2) / waves.shape[2]
+    size = (np.abs(series) * weight[:, None]).sum(1)
+    half = waves.shape[2] // 2 - 1
+    both = np.maximum(size[:, 1 : half + 1], size[:, : -half - 1 : -1])
+    kept = np.nonzero((both > NEGLIGIBLE * size.sum(1, keepdims=True)).any(0))[0]
+    largest = int(kept[-1]) + 1 if kept.size else 0
+    order = np.arange(-largest, largest + 1)
+    return np.ascontiguousarray(np.moveaxis(series[:, :, order], 2, 1))
+
+
+def critical_angle(optics: Optics) -> float | None:
+    """Angle in the oil at which light grazes the sample, where the pupil comes near it [rad]."""
+    near = NEAR_CRITICAL * optics.n_sample < optics.na and optics.n_sample < optics.n_immersion
+    return math.asin(optics.n_sample / optics.n_immersion) if near else None
+
+
+def aperture_on(optics: Optics, theta: FloatArray, weight: FloatArray) -> Aperture:
+    """Make the pupil on given angles.
+
+    Parameters
+    ----------
+    optics : Optics
+        The microscope.
+    theta, weight : ndarray, shape (n,)
+        Quadrature [rad].
+
+    Returns
+    -------
+    Aperture
+        There.
+    """
+    pupil = make_pupil(
+        theta,
+        weight,
+        wavenumber=2 * math.pi / optics.wavelength_nm,
+        n_immersion=optics.n_immersion,
+        n_glass=optics.n_glass,
+        n_sample=optics.n_sample,
+        direction=1.0 if optics.scheme == "iscat" else -1.0,
+        reciprocal=optics.emission == "reciprocal",
+    )
+    return Aperture(optics, pupil)
+
+
+def aperture(optics: Optics, nodes: int, nodes_above: int) -> Aperture:
+    """Make the pupil on panels that end at the mask's edge and at the critical angle.
+
+    Parameters
+    ----------
+    optics : Optics
+        The microscope.
+    nodes, nodes_above : int
+        Nodes of each panel below the critical angle, and above.
+
+    Returns
+    -------
+    Aperture
+        Ready.
+    """
+    alpha = math.asin(optics.na / optics.n_immersion)
+    edge = math.asin(optics.mask_na / optics.n_immersion)
+    theta, weight = gauss_legendre(alpha, critical_angle(optics), nodes, nodes_above, edge)
+    return aperture_on(optics, theta, weight)

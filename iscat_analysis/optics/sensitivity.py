@@ -1,0 +1,176 @@
+"""How the picture of a particle changes with the microscope: analytic derivatives of the signal.
+
+Every parameter of the optics changes the light in the pupil, ray by ray.  The derivative of the
+field is the integral of that change: a factor inside the pupil, and where an edge moves (aperture,
+mask) the light on that edge.  Each is tabulated on the lattice of the field itself, once for each
+height, and combined with the field at the pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.image import Lens, Pixels
+from iscat_analysis._kernels.lattice_rows import lattice_values
+from iscat_analysis._kernels.zernike import zernike
+from iscat_analysis.config import ABERRATIONS, Optics
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.aperture import Aperture, aperture_on, harmonics
+from iscat_analysis.optics.waves import LatticeField
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+Weight = Callable[[Aperture], tuple[ComplexArray, ComplexArray]]
+"""Factor of the field's integral, and phase per height, on any quadrature."""
+
+PARAMETERS = ("focus_nm", "na", "reference_phase_deg", "mask_na", "attenuation", *ABERRATIONS)
+"""Parameters of the optics that have a derivative."""
+
+
+def check_names(optics: Optics, names: Sequence[str]) -> None:
+    """Refuse what has no derivative.
+
+    Parameters
+    ----------
+    optics : Optics
+        The microscope.
+    names : sequence of str
+        Parameters asked for.
+
+    Raises
+    ------
+    ConfigError
+        A name is unknown, or the paper's convention, whose quadrature has no derivative, is set.
+    """
+    unknown = [name for name in names if name not in PARAMETERS]
+    if unknown:
+        raise ConfigError(f"names = {unknown}: choose among {', '.join(PARAMETERS)}")
+    if optics.convention == "dong2021":
+        raise ConfigError(
+            'optics.convention = "dong2021" has no derivatives: use convention = "exact"'
+        )
+
+
+def sensitivity_lattices(
+    opening: Aperture,
+    weight_on: Weight,
+    z_nm: float,
+    names: tuple[str, ...],
+    *,
+    rho: float,
+    reach_nm: float,
+) -> tuple[Lens, FloatArray]:
+    """Lattices of the field and of its derivatives at one height.
+
+    Parameters
+    ----------
+    opening : Aperture
+        The pupil on the model's quadrature.
+    weight_on : callable
+        See `Weight`.
+    z_nm : float
+        Height [nm].
+    names : tuple of str
+        Parameters; an empty tuple for the field alone.
+    rho : float
+        1 with a reference, 0 in dark field.
+    reach_nm : float
+        Largest distance from the particle [nm].
+
+    Returns
+    -------
+    lens : Lens
+        How the kernels read them.
+    stack : ndarray, shape (1 + len(names), components, 2, nodes, nodes)
+        The field's lattice, then that of each derivative.
+    """
+    optics = opening.optics
+    rim, edge = (math.asin(na / optics.n_immersion) for na in (optics.na, optics.mask_na))
+    # two more directions, of no weight but where an edge moves
+    theta = np.concatenate([opening.pupil.theta, [rim, edge]])
+    whole = aperture_on(optics, theta, np.concatenate([opening.pupil.weight, [1.0, 1.0]]))
+    weight, axial = weight_on(whole)
+    weight = weight * np.exp(1j * axial * z_nm)
+    inner = np.ones(theta.size)
+    inner[-2:] = 0.0
+    at_rim, at_edge = np.zeros(theta.size), np.zeros(theta.size)
+    at_rim[-2] = 1 / (optics.n_immersion * math.cos(rim))
+    at_edge[-1] = 1 / (optics.n_immersion * math.cos(edge)) if optics.mask_na else 0.0
+    phi = opening.azimuths()
+    k = opening.wavenumber
+    seen, clear = whole.seen(phi), whole.seen(phi, masked=False)
+    behind = inner * (optics.n_immersion * np.sin(theta) < optics.mask_na)
+    field = seen * inner[:, None]
+
+    def change(name: str) -> Any:
+        if name == "focus_nm":
+            return field * (-1j * whole.pupil.oil[:, None])
+        if name == "na":
+            stretch = -1j * k / optics.na * whole.rho[:, None] * whole.path_slope_nm(phi)
+            return field * (stretch + _log_efficiency_slope(optics)) + seen * at_rim[:, None]
+        if name == "reference_phase_deg":
+            return field * (-1j * math.pi / 180 * rho)
+        if name == "mask_na":
+            return clear * ((optics.attenuation - 1) * at_edge[:, None])
+        if name == "attenuation":
+            return clear * behind[:, None] - field * (rho / (optics.attenuation or 1.0))
+        path: FloatArray = zernike(int(name[1:]), whole.rho[:, None], phi)[0]
+        return field * (1j * k * path)
+
+    waves = np.concatenate([field, *(change(name) for name in names)])
+    series = harmonics(waves, np.abs(weight)) * weight
+    count = len(field)
+    lattice = LatticeField(series[:count], axial, whole.pupil.transverse, k * optics.na, reach_nm)
+    stack = lattice.lattices(series, whole.pupil.transverse)
+    return lattice.lens(rho), stack.reshape(1 + len(names), count, *stack.shape[1:])
+
+
+def _log_efficiency_slope(optics: Optics) -> float:
+    """∂ ln η/∂NA: D21's scattered amplitude grows with the collected angle (physics.md, 2)."""
+    if optics.emission == "reciprocal" or optics.na >= optics.n_sample:
+        return 0.0
+    sine = optics.na / optics.n_sample
+    return 1 / (optics.n_sample * math.sqrt(1 - sine**2) * math.asin(sine))
+
+
+def signal_derivatives(
+    stack: FloatArray,
+    lens: Lens,
+    pixels: Pixels,
+    x_nm: float,
+    y_nm: float,
+    amplitude: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Signal and its derivatives from lattices.
+
+    Parameters
+    ----------
+    stack : ndarray, shape (1 + n, components, 2, nodes, nodes)
+        From `sensitivity_lattices`.
+    lens : Lens
+        Beside them.
+    pixels : Pixels
+        Where.
+    x_nm, y_nm : float
+        Particle [nm].
+    amplitude : float
+        a.
+
+    Returns
+    -------
+    signal : ndarray, shape (ny, nx)
+        The signal.
+    derivatives : ndarray, shape (n, ny, nx)
+        Its derivatives, at fixed amplitude.
+    """
+    count, components = stack.shape[:2]
+    out = np.empty((count, pixels.y.size, pixels.x.size))
+    flat = stack.reshape(count * components * 2, *stack.shape[3:])
+    lattice_values(flat, lens, pixels, x_nm, y_nm, amplitude, components, out)
+    return out[0], out[1:]

@@ -1,0 +1,432 @@
+"""The scattered field around one particle, per unit amplitude and over the reference.
+
+Two tables behind one interface.  A pupil that knows no direction but that of the polarisation has a
+`RadialField`: quintics along r.  Any other has a `LatticeField`.  Both give the kernels a profile
+at a height, a table of profiles along z, and the field at any point.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.hessian import signal_hessian
+from iscat_analysis._kernels.image import Lens, Pixels, signal_image
+from iscat_analysis._kernels.lattice import (
+    LATTICE_STEP,
+    lattice_half,
+    radial_waves,
+    reach_of_samples,
+    spread,
+    sum_waves,
+    window,
+)
+from iscat_analysis._kernels.radial import STEP, AxialTable, bessel_table, radial_profile
+from iscat_analysis.errors import ConfigError
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+TABLE_LIMIT_MB = 400
+"""No table of the model is larger: a length in the wrong unit would fill the memory."""
+
+_HEIGHTS_KEPT = 8  # profiles at hand; where z is fixed, every image asks for the same one
+_PEAK_STEP = 1 / 3  # of the lattice: the grid on which the largest signal is looked for
+_NEWTON = 4  # steps from there
+_AT_ONCE = 16  # heights of the axial table made together
+
+
+def check_table(what: str, numbers: float) -> None:
+    """Refuse a table that would not fit into the memory, before it is allocated.
+
+    Parameters
+    ----------
+    what : str
+        What the message calls it.
+    numbers : float
+        How many 8-byte numbers it holds.
+
+    Raises
+    ------
+    ConfigError
+        It is larger than `TABLE_LIMIT_MB`.
+    """
+    megabytes = 8e-6 * numbers
+    if megabytes > TABLE_LIMIT_MB:
+        raise ConfigError(
+            f"{what} of the model would take {megabytes:,.0f} MB, more than {TABLE_LIMIT_MB} MB: "
+            "check that optics.wavelength_nm, optics.focus_nm, particle.height_nm, "
+            "fit.z_range_nm, fit.roi_nm and camera.pixel_size_nm are in nanometres, or take a "
+            "smaller field or range"
+        )
+
+
+@dataclass(frozen=True)
+class RadialField:
+    """Field of a pupil whose only direction is the polarisation's.
+
+    Attributes
+    ----------
+    source : complex ndarray, shape (2, n)
+        Pupil weights of F0 and F2 at z = 0.
+    axial : complex ndarray, shape (n,)
+        Phase per height of the particle [rad/nm].
+    transverse : ndarray, shape (n,)
+        Transverse wavenumbers [rad/nm].
+    table : ndarray, shape (2, n, 3, intervals + 1)
+        Bessel matrices.
+    step_nm : float
+        Radial step [nm].
+    psi : float
+        Angle of the polarisation [rad].
+    circular, analyzer : bool
+        State of polarisation, and whether only the reference's is seen.
+    """
+
+    source: ComplexArray
+    axial: ComplexArray
+    transverse: FloatArray
+    table: FloatArray
+    step_nm: float
+    psi: float
+    circular: bool
+    analyzer: bool
+
+    @property
+    def reach_nm(self) -> float:
+        """Largest distance from the particle that the table covers [nm]."""
+        return self.step_nm * float(self.table.shape[3] - 1)
+
+    @property
+    def width(self) -> int:
+        """Numbers in the profile of one order."""
+        return 24 * (int(self.table.shape[3]) - 1)
+
+    def lens(self, rho: float) -> Lens:
+        """How the kernels make a signal of a profile, with the reference ρ."""
+        seen = 0.0 if self.analyzer else 1.0
+        linear = 0.0 if self.circular else 1.0
+        return Lens(
+            1 / self.step_nm, rho, math.cos(self.psi), math.sin(self.psi),
+            linear, linear * seen, (1 - linear) * seen, 0, 2, window()[0],
+        )  # fmt: skip
+
+    def profile(self, z_nm: float, orders: int) -> FloatArray:
+        """Profile at a height, shape (4·orders, intervals, 6); the last few are kept."""
+        profile: FloatArray = self._profiles(z_nm, orders)
+        return profile
+
+    @cached_property
+    def _profiles(self):  # type: ignore[no-untyped-def]
+        return lru_cache(_HEIGHTS_KEPT)(lambda z, orders: self._profile(z, orders, 0.0))
+
+    def _profile(self, z_nm: float, orders: int, kappa: float) -> FloatArray:
+        points = self.table.shape[3]
+        nodes = np.empty((4 * orders, 3 * points))
+        out = np.empty((4 * orders, points - 1, 6))
+        radial_profile(self.table, self.source, self.axial - kappa, z_nm, orders, nodes, out)
+        return out
+
+    def profiles(self, heights_nm: FloatArray, kappa: float) -> FloatArray:
+        """Profiles with ∂/∂z and ∂²/∂z² without exp(iκz), shape (n, 3, channels, width)."""
+        return np.stack([self._profile(float(z), 3, kappa).reshape(3, 4, -1) for z in heights_nm])
+
+    def components(self, dx_nm: FloatArray, dy_nm: FloatArray, z_nm: float) -> ComplexArray:
+        """Components of the field at points, shape (1 or 2, *dx_nm.shape); see `ForwardModel`."""
+        c, s = math.cos(self.psi), math.sin(self.psi)
+        u, v = c * dx_nm + s * dy_nm, c * dy_nm - s * dx_nm
+        f0, f2 = self._radial(np.hypot(u, v), z_nm)
+        if self.circular:
+            both = np.stack([f0, f2 * (u + 1j * v) ** 2])
+        else:
+            both = np.stack([f0 + f2 * (u**2 - v**2), f2 * (2 * u * v)])
+        return both[:1] if self.analyzer else both
+
+    def peak(self, z_nm: float, amplitude: float, rho: float) -> tuple[float, float]:
+        """Parts of the signal of largest magnitude that are linear and quadratic in a.
+
+        At fixed r the signal is a function of cos 2φ, with its extremes at ±1 or where its slope
+        vanishes.
+        """
+        r, f0, f2 = self._line(z_nm)
+        linear, quadratic = self._extremes(f0, f2, amplitude, rho)
+        way, best = np.unravel_index(np.argmax(np.abs(linear + quadratic)), linear.shape)
+        place = r[best]
+        if 0 < best < r.size - 1:
+            low, mid, high = (linear + quadratic)[way, best - 1 : best + 2]
+            bend = low - 2 * mid + high
+            place += 0.5 * (low - high) / bend * r[1] if bend else 0.0
+        at = np.array([place])
+        f0, f2 = self._radial(at, z_nm)
+        linear, quadratic = self._extremes(f0, f2 * at**2, amplitude, rho)
+        return float(linear[way, 0]), float(quadratic[way, 0])
+
+    def _extremes(
+        self, f0: ComplexArray, f2: ComplexArray, a: float, rho: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Linear and quadratic part of the signal in the directions that matter, (k, n)."""
+        if self.circular:
+            along, power = f0[None], np.abs(f0) ** 2 + (0 if self.analyzer else np.abs(f2) ** 2)
+            return 2 * rho * a * along.real, a**2 * np.atleast_2d(power)
+        turns = [np.ones(f0.size), -np.ones(f0.size)]
+        if self.analyzer:
+            slope = rho * f2.real + a * (f0.conj() * f2).real
+            turns.append(np.clip(-slope / np.maximum(abs(a) * np.abs(f2) ** 2, 1e-300)
+                                 * np.sign(a or 1.0), -1, 1))  # fmt: skip
+        along = f0 + np.stack(turns) * f2
+        return 2 * rho * a * along.real, a**2 * np.abs(along) ** 2
+
+    @cached_property
+    def _line(self):  # type: ignore[no-untyped-def]
+        r = np.linspace(0, self.reach_nm, 8 * (self.table.shape[3] - 1), endpoint=False)
+
+        def at(z_nm: float) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+            f0, f2 = self._radial(r, z_nm)
+            return r, f0, f2 * r**2
+
+        return lru_cache(_HEIGHTS_KEPT)(at)
+
+    def _radial(self, r: FloatArray, z_nm: float) -> tuple[ComplexArray, ComplexArray]:
+        """F0 and F2 at distances r, from the table."""
+        profile = self.profile(z_nm, 1)
+        index = np.minimum((r / self.step_nm).astype(int), profile.shape[1] - 1)
+        t = r / self.step_nm - index
+        powers = t[..., None] ** np.arange(6)
+        values = np.einsum("...p,c...p->...c", powers, profile[:, index])
+        return values[..., 0] + 1j * values[..., 1], values[..., 2] + 1j * values[..., 3]
+
+
+@dataclass(frozen=True)
+class LatticeField:
+    """Field of any pupil.
+
+    Attributes
+    ----------
+    harmonics : complex ndarray, shape (components, 2·M + 1, n)
+        Azimuthal harmonics −M…M of the pupil weights at z = 0.
+    axial : complex ndarray, shape (n,)
+        Phase per height of the particle [rad/nm].
+    transverse : ndarray, shape (n,)
+        Transverse wavenumbers [rad/nm].
+    band : float
+        The largest transverse wavenumber, k·NA [rad/nm].
+    reach_nm : float
+        Largest distance from the particle at which images are wanted [nm].
+    """
+
+    harmonics: ComplexArray
+    axial: ComplexArray
+    transverse: FloatArray
+    band: float
+    reach_nm: float
+
+    @property
+    def step_nm(self) -> float:
+        """Step of the lattice [nm]."""
+        return LATTICE_STEP / self.band
+
+    @property
+    def radial_step_nm(self) -> float:
+        """Step of the radial functions [nm]."""
+        return STEP / self.band
+
+    @property
+    def half(self) -> int:
+        """Nodes on either side of the particle."""
+        return lattice_half(self.reach_nm, self.step_nm)
+
+    @property
+    def width(self) -> int:
+        """Numbers in the profile of one order."""
+        return 2 * len(self.harmonics) * (2 * self.half + 1) ** 2
+
+    def lens(self, rho: float) -> Lens:
+        """How the kernels make a signal of a profile, with the reference ρ."""
+        return Lens(
+            1 / self.step_nm, rho, 1.0, 0.0, 0.0, 0.0, 0.0,
+            self.half, len(self.harmonics), window()[0],
+        )  # fmt: skip
+
+    def profile(self, z_nm: float, orders: int) -> FloatArray:
+        """Profile at a height, shape (channels, nodes, nodes); the last few are kept."""
+        profile: FloatArray = self._profiles(z_nm, orders)
+        return profile
+
+    @cached_property
+    def _profiles(self):  # type: ignore[no-untyped-def]
+        def at(z_nm: float, orders: int) -> FloatArray:
+            side = 2 * self.half + 1
+            check_table("the field around a particle", orders * self.width)
+            return self._stack(np.array([z_nm]), orders, 0.0).reshape(-1, side, side)
+
+        return lru_cache(_HEIGHTS_KEPT)(at)
+
+    def profiles(self, heights_nm: FloatArray, kappa: float) -> FloatArray:
+        """Profiles with ∂/∂z and ∂²/∂z² without exp(iκz), shape (n, 3, channels, width)."""
+        parts = [
+            self._stack(heights_nm[i : i + _AT_ONCE], 3, kappa)
+            for i in range(0, heights_nm.size, _AT_ONCE)
+        ]
+        return np.concatenate(parts).reshape(heights_nm.size, 3, 2 * len(self.harmonics), -1)
+
+    def lattices(self, harmonics: ComplexArray, transverse: FloatArray) -> FloatArray:
+        """Coefficients of any fields in this pupil, shape (k, 2, nodes, nodes)."""
+        waves = self._waves(harmonics, transverse)
+        return spread(waves, self.radial_step_nm, self.step_nm, self.half)
+
+    def _waves(self, harmonics: ComplexArray, transverse: FloatArray) -> FloatArray:
+        reach = reach_of_samples(self.reach_nm, self.step_nm)
+        intervals = math.ceil(reach / self.radial_step_nm)
+        return radial_waves(harmonics, transverse, self.radial_step_nm, intervals)
+
+    def _stack(self, heights_nm: FloatArray, orders: int, kappa: float) -> FloatArray:
+        """Lattices of every height, order and component."""
+        weights = self._weights(heights_nm, orders, kappa)
+        return self.lattices(weights.reshape(-1, *self.harmonics.shape[1:]), self.transverse)
+
+    def _weights(self, heights_nm: FloatArray, orders: int, kappa: float) -> ComplexArray:
+        """Harmonics at heights, times (i·axial)^order: (heights, orders, components, 2M+1, n)."""
+        rate = 1j * (self.axial - kappa)
+        turn = np.exp(np.multiply.outer(heights_nm, rate))[:, None] * (
+            rate ** np.arange(orders)[:, None]
+        )
+        return turn[:, :, None, None] * self.harmonics
+
+    def components(self, dx_nm: FloatArray, dy_nm: FloatArray, z_nm: float) -> ComplexArray:
+        """Components of the field at points, shape (1 or 2, *dx_nm.shape); see `ForwardModel`."""
+        dx, dy = (np.ascontiguousarray(d, dtype=float).ravel() for d in (dx_nm, dy_nm))
+        out = np.empty((dx.size, 2, len(self.harmonics)))
+        sum_waves(self._waves_at(z_nm), 1 / self.radial_step_nm, dx, dy, out)
+        return (out[:, 0] + 1j * out[:, 1]).T.reshape(-1, *np.shape(dx_nm))
+
+    @cached_property
+    def _waves_at(self):  # type: ignore[no-untyped-def]
+        def at(z_nm: float) -> FloatArray:
+            weights = self._weights(np.array([z_nm]), 1, 0.0)[0, 0]
+            return self._waves(weights, self.transverse)
+
+        return lru_cache(_HEIGHTS_KEPT)(at)
+
+    def peak(self, z_nm: float, amplitude: float, rho: float) -> tuple[float, float]:
+        """Parts of the signal of largest magnitude that are linear and quadratic in a.
+
+        The largest on a fine grid, then Newton's method.
+        """
+        grid, along, power = self._plane(z_nm)
+        signal = 2 * rho * amplitude * along + amplitude**2 * power
+        row, column = np.unravel_index(np.argmax(np.abs(signal)), signal.shape)
+        x, y = float(grid.x[column]), float(grid.y[row])
+        lens, step = self.lens(rho), float(grid.x[1] - grid.x[0])
+        point, one = np.zeros(1), np.ones(1)
+        first, second = np.empty((5, 1, 1)), np.empty((4, 4, 1, 1))
+        if 0 < row < grid.y.size - 1 and 0 < column < grid.x.size - 1:
+            profile = self.profile(z_nm, 3)
+            for _ in range(_NEWTON):
+                pixels = Pixels(np.array([x]), np.array([y]), point, one)
+                signal_hessian(profile, lens, pixels, 0.0, 0.0, amplitude, first, second)
+                # the particle's derivatives: those of the camera's position with the sign changed
+                move = np.linalg.solve(second[:2, :2, 0, 0], first[1:3, 0, 0])
+                x, y = (
+                    x + float(np.clip(move[0], -step, step)),
+                    y + float(np.clip(move[1], -step, step)),
+                )
+        field = self.components(np.array([x]), np.array([y]), z_nm)[:, 0]
+        return (
+            2 * rho * amplitude * float(field[0].real),
+            amplitude**2 * float(np.sum(np.abs(field) ** 2)),
+        )
+
+    @cached_property
+    def _plane(self):  # type: ignore[no-untyped-def]
+        half = int(self.reach_nm / math.sqrt(2) / (self.step_nm * _PEAK_STEP))
+        axis = self.step_nm * _PEAK_STEP * np.arange(-half, half + 1, dtype=np.float64)
+        pixels = Pixels(axis, axis, np.zeros(1), np.ones(1))
+
+        def at(z_nm: float) -> tuple[Pixels, FloatArray, FloatArray]:
+            profile, lens = self.profile(z_nm, 3), self.lens(1.0)
+            above, below = np.empty((2, axis.size, axis.size))
+            signal_image(profile, lens, pixels, 0.0, 0.0, 1.0, above)
+            signal_image(profile, lens, pixels, 0.0, 0.0, -1.0, below)
+            return pixels, (above - below) / 4, (above + below) / 2
+
+        return lru_cache(_HEIGHTS_KEPT)(at)
+
+
+Field = RadialField | LatticeField
+
+
+def axial_table(field: Field, z_range_nm: tuple[float, float]) -> AxialTable:
+    """Profiles along z, for the kernels that interpolate there.
+
+    Parameters
+    ----------
+    field : RadialField or LatticeField
+        The field.
+    z_range_nm : (float, float)
+        Heights to cover [nm].
+
+    Returns
+    -------
+    AxialTable
+        See there.
+    """
+    low, high = z_range_nm
+    kappa = float(field.axial.real.min() + field.axial.real.max()) / 2
+    step = STEP / float(np.abs(field.axial - kappa).max())
+    count = max(math.ceil((high - low) / step), 1) + 1
+    check_table("the table along z", 3.0 * count * field.width)
+    heights = field.profiles(low + step * np.arange(count, dtype=np.float64), kappa)
+    heights *= (step ** np.arange(3))[:, None, None]
+    return AxialTable(heights, low, step, kappa)
+
+
+def radial_field(
+    source: ComplexArray,
+    axial: ComplexArray,
+    transverse: FloatArray,
+    *,
+    band: float,
+    reach_nm: float,
+    psi: float,
+    circular: bool,
+    analyzer: bool,
+    like: RadialField | None,
+) -> RadialField:
+    """Tabulate a round pupil.
+
+    Parameters
+    ----------
+    source, axial, psi, circular, analyzer
+        As in `RadialField`.
+    transverse : ndarray, shape (n,)
+        Transverse wavenumbers [rad/nm].
+    band : float
+        The largest of them [rad/nm].
+    reach_nm : float
+        Largest distance wanted [nm].
+    like : RadialField or None
+        One whose Bessel table is taken over where it is the same.
+
+    Returns
+    -------
+    RadialField
+        Ready.
+    """
+    step = STEP / band
+    intervals = math.ceil(reach_nm / step) + 1
+    padding = -axial.size % 4  # the radial kernel takes the nodes in fours
+    source = np.pad(source, ((0, 0), (0, padding)))
+    axial = np.pad(axial, (0, padding), mode="edge")
+    transverse = np.pad(transverse, (0, padding), mode="edge")
+    same = (
+        like is not None
+        and like.step_nm == step
+        and like.table.shape[3] == intervals + 1
+        and np.array_equal(like.transverse, transverse)
+    )
+    table = like.table if same and like else bessel_table(transverse, step, intervals)
+    return RadialField(source, axial, transverse, table, step, psi, circular, analyzer)
