@@ -183,7 +183,7 @@ class Candidate:
     snr : float
         Matched-filter signal over its noise.
     beside : float
-        Height of the ratio elsewhere at its distance from a known particle, the largest of all near.
+        Height of the ratio elsewhere at its distance from a known particle; the largest of them.
     """
 
     x_px: float

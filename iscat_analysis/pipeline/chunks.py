@@ -18,6 +18,7 @@ from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera, check_counts
 from iscat_analysis.movie.drift import Trajectory, measure_drift
 from iscat_analysis.movie.metadata import diagnose_gain
+from iscat_analysis.pipeline.diagnosis import EXCESS_NOISE
 from iscat_analysis.pipeline.results import table_of
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import (
@@ -195,11 +196,14 @@ class Noise:
         Frames before, and as many after, each step.
     gain_message : str
         One line where the noise does not agree with the configured gain, else empty.
+    excess : str
+        What is known of noise beyond the expected, else empty.
     """
 
     curve: NoiseCurve
     window: int
     gain_message: str
+    excess: str
 
 
 def judge_noise(reader: Reader, config: Config, mapper: Mapper = map) -> Noise:
@@ -240,11 +244,21 @@ def judge_noise(reader: Reader, config: Config, mapper: Mapper = map) -> Noise:
     opening = reader.opening(mapper)
     longest = min(given or longest_window(frames), _NOISE_FRAMES // 4)
     curve = measure_noise(opening, reader.camera, longest, mapper=mapper)
+    window = given or choose_window(curve, frames)
+    message, ratio = "", 1.0
     try:
-        message = diagnose_gain(opening[:_GAIN_FRAMES], reader.camera).message or ""
+        gain = diagnose_gain(opening[:_GAIN_FRAMES], reader.camera)
+        message, ratio = gain.message or "", gain.noise_ratio
     except DataError:  # too dark to tell
-        message = ""
-    return Noise(curve, given or choose_window(curve, frames), message)
+        pass
+    excess = message if ratio > EXCESS_NOISE else ""
+    if not excess and curve.at(window) > EXCESS_NOISE:
+        excess = (
+            f"between averages of {window} frames the noise variance is {curve.at(window):.2g} "
+            "times that of the light; look at the laser, set background.drift_correction = true, "
+            "or lower background.window_frames"
+        )
+    return Noise(curve, window, message, excess)
 
 
 def counts_budget(config: Config) -> int:

@@ -13,7 +13,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import follow_pattern
-from iscat_analysis.movie.metadata import diagnose_gain
+from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain
 from iscat_analysis.records import Windows
 from iscat_analysis.search.sliding import measure_noise
 
@@ -27,8 +27,12 @@ _SMALLEST_PX = 32  # side of a field in which a pattern is followed
 _SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
 
 
-def camera_warnings(movie: Stack, camera: Camera, windows: Windows) -> Iterator[str]:
-    """Say what the background frames reveal about the camera.
+EXCESS_NOISE = 1.4
+"""Noise variance over the expected from which a thousand candidates are taken for noise."""
+
+
+def judge_gain(movie: Stack, camera: Camera, windows: Windows) -> GainDiagnosis | None:
+    """Compare the noise of the background frames with the gain.
 
     Parameters
     ----------
@@ -39,20 +43,32 @@ def camera_warnings(movie: Stack, camera: Camera, windows: Windows) -> Iterator[
     windows : Windows
         The background.
 
+    Returns
+    -------
+    GainDiagnosis or None
+        None where there is no shot noise to look at.
+    """
+    if windows.n_before < 2 or not _is_lit(windows):
+        return None
+    try:
+        return diagnose_gain(_first(movie, windows, _GAIN_FRAMES), camera, masked=windows.masked)
+    except DataError:  # too dark to tell
+        return None
+
+
+def pixel_warnings(windows: Windows) -> Iterator[str]:
+    """Say which pixels are left out.
+
+    Parameters
+    ----------
+    windows : Windows
+        The background.
+
     Yields
     ------
     str
         One line each.
     """
-    if windows.n_before >= 2 and _is_lit(windows):  # else there is no shot noise to look at
-        try:
-            message = diagnose_gain(
-                _first(movie, windows, _GAIN_FRAMES), camera, masked=windows.masked
-            ).message
-        except DataError:
-            message = None  # too dark to tell
-        if message:
-            yield message
     defects = int(np.sum(windows.masked & ~windows.saturated))
     if defects:
         yield f"{defects} dead or hot pixels are left out"

@@ -37,8 +37,8 @@ from iscat_analysis.records import (
     Windows,
     silent,
 )
-from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, LISTED
-from iscat_analysis.search.templates import find_particles
+from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, LISTED, is_dwarfed
+from iscat_analysis.search.templates import LARGEST_IMAGE, find_particles
 
 MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""
@@ -75,6 +75,7 @@ def fit_field(
     windows: Windows,
     *,
     starts: Sequence[Candidate] = (),
+    excess_noise: str = "",
     pool: ThreadPoolExecutor,
     progress: Progress = silent,
 ) -> tuple[tuple[Event, ...], Windows]:
@@ -88,6 +89,9 @@ def fit_field(
         Sums before and after.
     starts : sequence of Candidate
         Particles known beforehand, fitted first.
+    excess_noise : str
+        What is known of noise beyond the expected; with it a search that a thousand places pass is
+        given up.
     pool : ThreadPoolExecutor
         Runs the fits; the result does not depend on its size.
     progress : Progress
@@ -105,7 +109,7 @@ def fit_field(
     for number in range(MAX_ROUNDS):
         progress("detect", number, MAX_ROUNDS)
         if number or not fresh:
-            fresh, doubtful = _search(scene, windows, events)
+            fresh, doubtful = _search(scene, windows, events, excess_noise)
         if not fresh and (number or not starts):
             break
         events = _fit_all(scene, windows, [*(e.candidate for e in events), *fresh], events, pool)
@@ -166,7 +170,7 @@ def _add_signal(scene: Scene, event: Event, region: Region, total: FloatArray) -
 
 
 def _search(
-    scene: Scene, windows: Windows, events: Sequence[Event]
+    scene: Scene, windows: Windows, events: Sequence[Event], excess_noise: str
 ) -> tuple[list[Candidate], list[Candidate]]:
     """Find new particles, and what may be but the side lobe of a known one."""
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
@@ -177,6 +181,7 @@ def _search(
         search_both(scene.config.detection),
         roi_px=scene.roi_px,
         explained=explained,
+        excess_noise=excess_noise,
         known=[(e.candidate.x_px, e.candidate.y_px) for e in events],
     )
     near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na) / scene.pixel_nm
@@ -294,12 +299,24 @@ def _judged(
             other is not event and math.hypot(other.fit.x_nm - x, other.fit.y_nm - y) < limit
             for other in events
         )
+        brightest = max(
+            (
+                other.snr
+                for other in events
+                if math.hypot(other.fit.x_nm - x, other.fit.y_nm - y)
+                < LARGEST_IMAGE * scene.roi_px * scene.pixel_nm
+            ),
+            default=0.0,
+        )
+        lobe = number >= len(events) or is_dwarfed(
+            event.snr, event.fit.chi2_reduced, event.likelihood.n_pixels, brightest
+        )
         rows, columns = np.nonzero(windows.saturated[event.region.slices])
         dx = (columns + event.region.columns[0]) * scene.pixel_nm - x
         dy = (rows + event.region.rows[0]) * scene.pixel_nm - y
         burnt = bool(np.any(np.hypot(dx, dy) < _SATURATION_NM))
         flags = [
-            *([Status.SIDELOBE] if number >= len(events) else []),
+            *([Status.SIDELOBE] if lobe else []),
             *([Status.SATURATED] if burnt else []),
             *(f for f in event.fit.flags if f != Status.POOR_FIT),
             *([Status.TOO_CLOSE] if crowded else []),

@@ -190,9 +190,7 @@ def analyse_landings(
                 if done is None:
                     chunk = reader.chunk(span, stride, pool)
                     budget = POSTERIORS - merged.sampled if posterior else 0
-                    done = _analyse_chunk(
-                        scene, chunk, core, window, pool, budget, noise.gain_message
-                    )
+                    done = _analyse_chunk(scene, chunk, core, window, pool, budget, noise.excess)
                     store.save(number, done)
                 merged.add(done)
                 progress("landing", core[1] - first, last - first)
@@ -381,11 +379,11 @@ def _analyse_chunk(
     window: int,
     pool: ThreadPoolExecutor,
     posteriors: int,
-    gain_message: str,
+    excess_noise: str,
 ) -> Done:
     wanted = scene.config.background.drift_correction
     trajectory = follow(chunk, pool.map) if wanted else None
-    fitter = ChunkFitter(scene, chunk, window, pool, trajectory, gain_message=gain_message)
+    fitter = ChunkFitter(scene, chunk, window, pool, trajectory, excess_noise=excess_noise)
     seam = max(2, window // STRIDES)
     steps = fitter.run((core[0] - seam, core[1] + seam))
     rows = list(pool.map(_row, range(len(steps)), steps))

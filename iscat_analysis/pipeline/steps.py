@@ -42,6 +42,7 @@ from iscat_analysis.search.residue import (
     EXPLAINS,
     LISTED,
     chi2_excess,
+    is_dwarfed,
     size_on_ring,
 )
 from iscat_analysis.search.sliding import (
@@ -55,7 +56,7 @@ from iscat_analysis.search.sliding import (
     make_filter,
     sliding_maps,
 )
-from iscat_analysis.search.templates import FLOOD, LARGEST_IMAGE, refuse_flood
+from iscat_analysis.search.templates import LARGEST_IMAGE, refuse_flood
 
 ROUNDS = 6
 """Searches at most; each takes what was found so far off the contrast."""
@@ -111,8 +112,9 @@ class ChunkFitter:
         Runs the fits; the result does not depend on its size.
     trajectory : Trajectory, optional
         Of the fixed pattern, whose motion is then divided out.
-    gain_message : str
-        What is known of a wrong gain, for the line that says why a search was given up.
+    excess_noise : str
+        What is known of noise beyond the expected; with it a search that a thousand places pass is
+        given up.
 
     Attributes
     ----------
@@ -131,9 +133,9 @@ class ChunkFitter:
         pool: ThreadPoolExecutor,
         trajectory: Trajectory | None = None,
         *,
-        gain_message: str = "",
+        excess_noise: str = "",
     ) -> None:
-        self._gain_message = gain_message
+        self._excess_noise = excess_noise
         pattern = MovingPattern(chunk, trajectory, pool.map) if trajectory else None
         chunk = pattern.chunk if pattern else chunk
         self._scene = scene
@@ -208,7 +210,7 @@ class ChunkFitter:
         found = self._pool.map(
             lambda i: self._finish(i, everything, seen, lobe=i >= len(steps)), own
         )
-        fitted = [f for f in found if f is not None]
+        fitted = self._without_dwarfs([f for f in found if f is not None])
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
 
     # ---- search ----------------------------------------------------------------------------
@@ -249,14 +251,9 @@ class ChunkFitter:
             frames = np.maximum(effective[where], 1e-9)
             self.strongest = np.stack([np.abs(best), best / np.sqrt(frames * matched.norm)])
         peaks = find_steps(chunk, matched, snr, effective, scene.templates.threshold)
-        if not steps and len(peaks) > FLOOD:
-            cause = self._gain_message or (
-                "the light flickers or the fixed pattern moves: look at the laser, set "
-                "background.drift_correction = true, or shorten background.window_frames"
-            )
-            refuse_flood(
-                snr, len(peaks), frames=f" in frames {chunk.first}:{chunk.stop}", cause=cause
-            )
+        refuse_flood(
+            len(peaks), self._excess_noise, frames=f" in frames {chunk.first}:{chunk.stop}"
+        )
         fresh: list[Peak] = []
         doubtful: list[Peak] = []
         taller: list[Peak] = []
@@ -416,6 +413,28 @@ class ChunkFitter:
             return None
         step = replace(step, at=task.at)
         return FittedStep(step, event, task.region, task.windows, task.n_before, task.n_after)
+
+    def _without_dwarfs(self, fitted: Sequence[FittedStep]) -> list[FittedStep]:
+        """Flag what explains less than it leaves over, beside a step that is far brighter."""
+        flagged = []
+        for one in fitted:
+            fit = one.event.fit
+            brightest = max(
+                (
+                    other.event.snr
+                    for other in fitted
+                    if _apart(other.step, one.step) < self._window
+                    and distance_px(other.step, one.step) < LARGEST_IMAGE * self._roi_px
+                ),
+                default=0.0,
+            )
+            if Status.SIDELOBE not in fit.flags and is_dwarfed(
+                one.event.snr, fit.chi2_reduced, one.event.likelihood.n_pixels, brightest
+            ):
+                flags = (Status.SIDELOBE, *fit.flags)
+                fit = replace(fit, status=Status.SIDELOBE, flags=flags)
+            flagged.append(replace(one, event=replace(one.event, fit=fit)))
+        return flagged
 
     def _credible(self, steps: Sequence[Step]) -> list[Step]:
         """Leave out what the others explain, and the weaker of two steps that describe one."""

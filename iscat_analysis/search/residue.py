@@ -24,6 +24,9 @@ EXCEEDS = 1.5
 EXPLAINS = 0.5
 """Share of the χ² in excess that a particle inside the fitted region must explain."""
 
+DWARFS = 3.0
+"""Times the signal-to-noise ratio of an event from which on another one near it dwarfs it."""
+
 LISTED = 0.7
 """Share of what a particle must have from which a candidate is listed, as a side lobe."""
 
@@ -32,6 +35,30 @@ _RING_PX = 2.0  # on either side of the candidate's distance
 _SECTOR_PX = 4.0  # of the ring, along it
 _HEIGHT = 0.8  # share of the ring that is lower than what counts as its height
 _PATCH_PX = 5.0  # around the candidate, which is its own
+
+
+def is_dwarfed(snr: float, chi2_reduced: float, n_pixels: int, brightest: float) -> bool:
+    """Whether a fit explains less than it leaves over, beside a particle that is far brighter.
+
+    Parameters
+    ----------
+    snr : float
+        Of the fitted event.
+    chi2_reduced : float
+        Of its fit.
+    n_pixels : int
+        In its region.
+    brightest : float
+        Largest signal-to-noise ratio of the events that reach there.
+
+    Returns
+    -------
+    bool
+        Whether it is no more than a side lobe, as far as the model can tell.
+    """
+    excess = (chi2_reduced - 1) * n_pixels
+    noise = _EXCESS_SIGMAS * math.sqrt(2 * n_pixels)
+    return excess > noise and snr**2 < EXPLAINS * excess and brightest > DWARFS * snr
 
 
 def chi2_excess(residuals: NDArray[Any]) -> float:

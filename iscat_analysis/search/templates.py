@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,14 +40,7 @@ LARGEST_IMAGE = 3.5
 """Regions from the centre to the edge of a strong particle's image; the rings go on, faintly."""
 
 FLOOD = 1000
-"""Candidates beyond which the noise is looked at before they are fitted."""
-
-FLOOD_SPREAD = 1.2
-"""Spread of the signal-to-noise ratio over the field, 1 where the noise is as expected, from which
-so many candidates are noise."""
-
-NORMAL_QUARTILE = 0.6744897501960817
-"""Median magnitude of a standard normal number."""
+"""Candidates beyond which a search is given up where there is more noise than expected."""
 
 
 @dataclass(frozen=True)
@@ -187,6 +179,7 @@ def find_particles(
     roi_px: float,
     explained: FloatArray | None = None,
     known: Sequence[tuple[float, float]] = (),
+    excess_noise: str = "",
 ) -> tuple[Candidate, ...]:
     """Peaks of the matched filter above the threshold, strongest first.
 
@@ -207,6 +200,8 @@ def find_particles(
         Signal of particles already known.
     known : sequence of (float, float)
         Where those are, (x, y) [pixels].
+    excess_noise : str
+        What is known of noise beyond the expected.
 
     Returns
     -------
@@ -216,7 +211,7 @@ def find_particles(
     Raises
     ------
     DataError
-        Noise itself passes the threshold at a thousand places.
+        There is such noise, and it passes the threshold at a thousand places.
     """
     snr, strength = signal_to_noise(likelihood, templates, explained)
     ranked = np.abs(snr) if templates.two_sided else snr
@@ -229,8 +224,7 @@ def find_particles(
     best = ranked.max(axis=0)
     peaks = (best == maximum_filter(best, size=3)) & (best > templates.threshold)
     rows, columns = np.nonzero(peaks)
-    if not known and rows.size > FLOOD:
-        refuse_flood(snr, rows.size)
+    refuse_flood(rows.size, excess_noise)
     found: list[Candidate] = []
     strongest_first = np.argsort(-best[rows, columns])
     for row, column in zip(rows[strongest_first], columns[strongest_first], strict=True):
@@ -276,32 +270,25 @@ def _beside(
     )
 
 
-def refuse_flood(snr: NDArray[Any], candidates: int, *, frames: str = "", cause: str = "") -> None:
-    """Give up a search in which noise itself passes the threshold; many particles are no reason to.
+def refuse_flood(candidates: int, excess_noise: str, frames: str = "") -> None:
+    """Give up a search in which noise passes the threshold; many particles are no reason to.
 
     Parameters
     ----------
-    snr : ndarray, shape (n, y, x)
-        Matched-filter maps.
     candidates : int
         Places above the threshold.
+    excess_noise : str
+        What is known of noise beyond the expected; empty where there is none.
     frames : str
         Of which they are, for the message.
-    cause : str
-        What is known of it already.
 
     Raises
     ------
     DataError
-        The ratio spreads by more than `FLOOD_SPREAD`.
+        There is such noise, and there are more than `FLOOD` places.
     """
-    spread = float(np.median(np.abs(snr[:, ::4, ::4]))) / NORMAL_QUARTILE
-    if spread > FLOOD_SPREAD:
-        raise DataError(
-            f"{candidates} places{frames} pass the detection threshold, because the noise is "
-            f"{spread**2:.2g} times what was expected; "
-            + (cause or "check camera.gain_e_per_adu, the laser, and drift of the sample")
-        )
+    if excess_noise and candidates > FLOOD:
+        raise DataError(f"{candidates} places{frames} pass the detection threshold: {excess_noise}")
 
 
 def _correlate(image: FloatArray, kernels: FloatArray) -> FloatArray:

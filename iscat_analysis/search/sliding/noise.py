@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.records import Mapper
-from iscat_analysis.search.templates import NORMAL_QUARTILE
 
 LONGEST_WINDOW = 100
 """Frames that a window chosen from the noise may have; beyond it events overlap too often."""
@@ -28,6 +27,7 @@ SHOT_LIMITED = 1.2
 """Noise variance over shot noise up to which averaging is called shot-noise limited."""
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
+_NORMAL_QUARTILE = 0.6744897501960817
 _ROWS = 16  # on which the noise is measured
 
 
@@ -56,6 +56,10 @@ class NoiseCurve:
                 break
             limit = n
         return limit
+
+    def at(self, length: int) -> float:
+        """Noise variance over shot noise of averages of a length."""
+        return float(np.interp(length, self.frames, self.variance_over_shot))
 
     @property
     def best(self) -> int:
@@ -111,7 +115,7 @@ def measure_noise(
         contrast = after / (power * before) - 1
         variance = (before + n * read[lit]) / before**2 + (after + n * read[lit]) / after**2
         deviation = float(np.median(np.abs(contrast) / np.sqrt(variance)))
-        return (deviation / NORMAL_QUARTILE) ** 2
+        return (deviation / _NORMAL_QUARTILE) ** 2
 
     lengths = sorted({*_LENGTHS[:-1], max(longest, 1)})
     lengths = [n for n in lengths if n <= longest and 2 * n <= len(strip)]
