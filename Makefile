@@ -7,18 +7,24 @@ STAMP  := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 LOWEST := $(VENV)/lowest
 
+# Of the large tests: how much of them `make test-all` runs.
+SHARE  ?= 1
+# Module by module, so that a module's fixtures are made once; in the order of tests/conftest.py.
+PYTEST := pytest -n auto --dist loadscope --no-loadscope-reorder
+
 DEMO_CONFIG := sample_configs/landing.toml
 DEMO        := demo
 
-.PHONY: help install demo test test-lowest lint bench docs clean
+.PHONY: help install demo test test-all test-lowest lint bench docs clean
 
 help:
 	@echo "make demo         simulate a landing movie, analyse it, say where the report is"
-	@echo "make test         style, types, architecture, docstrings, tests with coverage"
-	@echo "make test-lowest  the quick tests with the lowest versions that pyproject.toml admits"
-	@echo "make lint         the same without the tests"
+	@echo "make test         style, types, architecture, docstrings, tests"
+	@echo "make test-all     the same with coverage, and the large tests: statistics, random kills"
+	@echo "make test-lowest  unit and physics tests with the lowest versions that pyproject.toml admits"
+	@echo "make lint         style, types, architecture, docstrings"
 	@echo "make bench        speed and efficiency, against peers"
-	@echo "make docs         the manual, in docs/_build/html"
+	@echo "make docs         the manual, in docs/_build/html; runs all of its code blocks"
 	@echo "make clean        remove what these made, the environment included"
 
 install: $(STAMP)
@@ -48,11 +54,14 @@ lint: $(STAMP)
 	$(BIN)/numpydoc lint $$(find iscat_analysis -name '*.py' -not -path '*/_*')
 
 test: lint
-	$(BIN)/pytest -n auto --cov --cov-fail-under=90
+	$(BIN)/$(PYTEST)
+
+test-all: lint
+	$(BIN)/$(PYTEST) --share=$(SHARE) --cov --cov-fail-under=90
 
 # Old libraries may use what new ones deprecate, so that warnings are errors above but not here.
 test-lowest: $(LOWEST)/.installed
-	$(LOWEST)/bin/python -m pytest -q -n auto -p no:cacheprovider tests/unit tests/physics \
+	$(LOWEST)/bin/python -m $(PYTEST) -q -p no:cacheprovider tests/unit tests/physics \
 	    -W default::DeprecationWarning -W default::PendingDeprecationWarning -W default::FutureWarning
 
 $(LOWEST)/.installed: pyproject.toml .ci/lowest.py
@@ -70,5 +79,5 @@ docs: $(DOCS_STAMP)
 	@echo "The manual: docs/_build/html/index.html"
 
 clean:
-	rm -rf $(VENV) $(DEMO) build dist docs/_build docs/reference/api *.egg-info .coverage* \
+	rm -rf $(VENV) .kernels $(DEMO) build dist docs/_build docs/reference/api *.egg-info .coverage* \
 	    .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         Exit status.
     """
-    return _start("main", arguments)
+    return _start("iscat", arguments)
 
 
 def main_fit(arguments: Sequence[str] | None = None) -> int:
@@ -46,7 +46,7 @@ def main_fit(arguments: Sequence[str] | None = None) -> int:
     int
         Exit status.
     """
-    return _start("main_fit", arguments)
+    return _start("iscat-fit", arguments)
 
 
 def _start(program: str, arguments: Sequence[str] | None) -> int:
@@ -63,7 +63,7 @@ def _start(program: str, arguments: Sequence[str] | None) -> int:
         finally:
             if ours:
                 signal.signal(signal.SIGINT, signal.default_int_handler)
-        status: int = getattr(app, program)(arguments)
+        status = app.run(program, sys.argv[1:] if arguments is None else arguments)
         if arguments is None:  # the process ends; looking through what is left takes half a second
             gc.freeze()
     except KeyboardInterrupt:  # before a command began or after it ended

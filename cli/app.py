@@ -41,41 +41,30 @@ COMMANDS = (
 GROUPS = (("calibrate", CALIBRATE_SUMMARY, ((camera, CAMERA_EXAMPLE), (mass, MASS_EXAMPLE))),)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `iscat`.
+def run(program: str, arguments: Sequence[str]) -> int:
+    """Run one of the two programs.
 
     Parameters
     ----------
-    arguments : sequence of str, optional
-        Without the program's name; default those of the process.
+    program : str
+        ``"iscat"`` or ``"iscat-fit"``, which is ``iscat fit``.
+    arguments : sequence of str
+        Without the program's name.
 
     Returns
     -------
     int
         Exit status.
     """
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if not given or (len(given) == 1 and given[0] in [name for name, _, _ in GROUPS]):
-        given.append("--help")
-    return _run(_umbrella(), "iscat", given)
-
-
-def main_fit(arguments: Sequence[str] | None = None) -> int:
-    """Run `iscat-fit`, which is ``iscat fit``.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Without the program's name; default those of the process.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
-    app = _empty()
-    app.command(epilog=_as_written(FIT_EXAMPLE.replace("iscat fit", "iscat-fit")))(fit)
-    return _run(app, "iscat-fit", list(sys.argv[1:] if arguments is None else arguments))
+    given = list(arguments)
+    if program == "iscat-fit":
+        app = _empty()
+        app.command(epilog=_as_written(FIT_EXAMPLE.replace("iscat fit", "iscat-fit")))(fit)
+    else:
+        app = _umbrella()
+        if not given or (len(given) == 1 and given[0] in [name for name, _, _ in GROUPS]):
+            given.append("--help")
+    return _run(app, program, given)
 
 
 def _umbrella() -> typer.Typer:

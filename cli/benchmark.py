@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from iscat_cli.console import Messages, failures, print_json, print_result
+from iscat_cli.console import Messages, failures, print_json, print_result, short, table
 from iscat_cli.options import (
     DebugOption,
     JsonOption,
@@ -105,38 +104,22 @@ def benchmark_table(study: Mapping[str, Any]) -> Table:
     rich.table.Table
         Spread, bounds and their ratios.
     """
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD if Console().is_terminal else None, pad_edge=False)
-    table.add_column("mode", no_wrap=True)
-    table.add_column("parameter", no_wrap=True)
-    for heading in (
-        "bias", "spread", "CRB", "QCRB", "spread/CRB", "95 % interval", "coverage 68 %", "failed",
-    ):  # fmt: skip
-        table.add_column(heading, justify="right", no_wrap=True)
+    headings = ("bias", "spread", "CRB", "QCRB", "spread/CRB", "95 % interval", "coverage 68 %")
+    found = table("mode", "parameter", *headings, "failed")
+    found.columns[1].justify = "left"
     for mode in MODES:
         entry = study[mode]
         for name, values in entry.items():
             if not isinstance(values, Mapping) or "spread_over_crb" not in values:
                 continue
-            table.add_row(
+            low, high = (short(end, 3) for end in values["spread_over_crb_ci95"])
+            found.add_row(
                 mode,
                 name,
-                *(_short(values[key]) for key in ("bias", "spread", "crb", "qcrb")),
-                _short(values["spread_over_crb"]),
-                _interval(values["spread_over_crb_ci95"]),
-                _short(values["coverage68"]),
+                *(short(values[key], 3) for key in ("bias", "spread", "crb", "qcrb")),
+                short(values["spread_over_crb"], 3),
+                "–" if "–" in (low, high) else f"{low}–{high}",
+                short(values["coverage68"], 3),
                 f"{entry['failed']} of {entry['trials']}",
             )
-    return table
-
-
-def _interval(ends: Sequence[float | None]) -> str:
-    low, high = (_short(end) for end in ends)
-    return "–" if "–" in (low, high) else f"{low}–{high}"
-
-
-def _short(value: float | None) -> str:
-    return "–" if value is None or not math.isfinite(value) else f"{value:.3g}"
+    return found

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from iscat_cli.console import Messages, failures, print_json, print_result
+from iscat_cli.console import Messages, failures, print_json, print_result, short, table
 from iscat_cli.options import (
     ConfigOption,
     DebugOption,
@@ -176,8 +176,8 @@ def bounds(
 def _print(report: Mapping[str, Any]) -> None:
     photons = report["n_scattered"]
     print_result(
-        f"scattered photons: {_short(photons['camera'])} on the camera, "
-        f"{_short(photons['collected'])} collected"
+        f"scattered photons: {short(photons['camera'])} on the camera, "
+        f"{short(photons['collected'])} collected"
     )
     if "scan" in report:
         print_result(_scan_table(report["scan"], report["at"]["free"]))
@@ -190,8 +190,8 @@ def _print(report: Mapping[str, Any]) -> None:
         if report["target"]["note"]:
             print_result(report["target"]["note"])
     else:
-        print_result(bounds_table("per photon", report["per_photon"]))
-        print_result(bounds_table("for these photons", report["actual"]))
+        print_result(_bounds_table("per photon", report["per_photon"]))
+        print_result(_bounds_table("for these photons", report["actual"]))
         print_result(_information(report))
     for line in report["unidentifiable"]:
         print_result(f"unidentifiable: {line}")
@@ -279,124 +279,78 @@ def _paper(messages: Messages, out: Path, *, overwrite: bool, as_json: bool) -> 
     if as_json:
         print_json("comparison", {"table_1": found.table.to_dict("records")})
         return
-    table = _table("quantum bound of one photon")
     names = ("printed", "authors", "dong2021", "exact", "reciprocal")
-    for name in names:
-        table.add_column(name, justify="right", no_wrap=True)
+    quantum = table("quantum bound of one photon", *names)
     for row in found.table.to_dict("records"):
         unit = " [nm]" if row["unit"] == "nm" else ""
-        table.add_row(f"{row['quantity']}{unit}", *(_short(row[name]) for name in names))
-    print_result(table)
+        quantum.add_row(f"{row['quantity']}{unit}", *(short(row[name]) for name in names))
+    print_result(quantum)
 
 
-def bounds_table(title: str, values: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Tabulate bounds: one row per parameter, one column per kind.
-
-    Parameters
-    ----------
-    title : str
-        Heading of the first column.
-    values : mapping
-        Kind → parameter → bound.
-
-    Returns
-    -------
-    rich.table.Table
-        What a kind does not know is a dash.
-    """
-    table = _table(title)
+def _bounds_table(title: str, values: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Tabulate bounds: one row per parameter, one column per kind."""
     kinds = [kind for kind in KINDS if kind in values]
-    for kind in kinds:
-        table.add_column(KINDS[kind], justify="right", no_wrap=True)
+    found = table(title, *(KINDS[kind] for kind in kinds))
     for name in dict.fromkeys(name for kind in kinds for name in values[kind]):
-        table.add_row(name, *(_short(values[kind].get(name)) for kind in kinds))
-    return table
+        found.add_row(name, *(short(values[kind].get(name)) for kind in kinds))
+    return found
 
 
 def _information(report: Mapping[str, Any]) -> Table:
-    table = _table("information used")
-    table.add_column("of the light's", justify="right", no_wrap=True)
-    table.add_column("no single measurement is best for it and", no_wrap=True)
+    found = table("information used", "of the light's")
+    found.add_column("no single measurement is best for it and", no_wrap=True)
     rivals = [pair.split("–") for pair in report["incompatible"]]
     for name, share in report["information_fraction"].items():
         alias = name.replace("_kda", "_rel")
         others = [a if b == alias else b for a, b in rivals if alias in (a, b)]
-        table.add_row(
+        found.add_row(
             name,
             "–" if share is None or not math.isfinite(share) else f"{100 * share:.1f} %",
             ", ".join(other.replace("_rel", "_kda") for other in others) or "–",
         )
-    return table
+    return found
 
 
-def _scan_table(found: Mapping[str, Any], free: list[str]) -> Table:
-    table = _table(found["label"])
-    columns = found["columns"]
-    for name in free:
-        table.add_column(f"CRB {name}", justify="right", no_wrap=True)
-        table.add_column("QCRB", justify="right", no_wrap=True)
-    for i, value in enumerate(columns[found["name"]]):
-        cells = []
-        for name in free:
-            cells += [_short(columns[f"crb_joint_{name}"][i]), _short(columns[f"qcrb_{name}"][i])]
-        table.add_row(f"{value:g}", *cells)
-    return table
+def _scan_table(scanned: Mapping[str, Any], free: list[str]) -> Table:
+    kinds = [(f"crb_joint_{name}", f"qcrb_{name}") for name in free]
+    found = table(scanned["label"], *(h for name in free for h in (f"CRB {name}", "QCRB")))
+    columns = scanned["columns"]
+    for i, value in enumerate(columns[scanned["name"]]):
+        found.add_row(f"{value:g}", *(short(columns[key][i]) for pair in kinds for key in pair))
+    return found
 
 
 def _optimum_table(best: Mapping[str, Any]) -> Table:
-    table = _table(str(best["of"]))
-    table.add_column("value", justify="right", no_wrap=True)
-    table.add_column(f"CRB {best['for']}", justify="right", no_wrap=True)
-    table.add_row("best", _short(best["value"]), _short(best["bound"]))
-    table.add_row("configured", _short(best["configured"]), _short(best["bound_configured"]))
-    return table
+    found = table(str(best["of"]), "value", f"CRB {best['for']}")
+    found.add_row("best", short(best["value"]), short(best["bound"]))
+    found.add_row("configured", short(best["configured"]), short(best["bound_configured"]))
+    return found
+
+
+def _unit(target: Mapping[str, Any]) -> str:
+    return str(target["parameter"]).split("_")[1].replace("kda", "kDa")
 
 
 def _effort_table(target: Mapping[str, Any]) -> Table:
-    unit = target["parameter"].split("_")[1].replace("kda", "kDa")
-    table = _table(f"{target['value']:g} {unit} takes, with the background")
-    for name in ("frames before", "frames after", "seconds", "collected photons"):
-        table.add_column(name, justify="right", no_wrap=True)
+    title = f"{target['value']:g} {_unit(target)} takes, with the background"
+    found = table(title, "frames before", "frames after", "seconds", "collected photons")
     for way in target["effort"]:
-        if not math.isfinite(way["n_after"]):
-            table.add_row(way["background"], _count(way["n_before"]), "never enough", "–", "–")
-            continue
-        table.add_row(
-            way["background"], _count(way["n_before"]), _count(way["n_after"]),
-            _short(way["seconds"]), _short(way["collected"]),
-        )  # fmt: skip
-    return table
+        before = f"{way['n_before']:,.0f}".replace(",", " ")
+        if math.isfinite(way["n_after"]):
+            after = f"{way['n_after']:,.0f}".replace(",", " ")
+            times = short(way["seconds"]), short(way["collected"])
+        else:
+            after, times = "never enough", ("–", "–")
+        found.add_row(way["background"], before, after, *times)
+    return found
 
 
 def _budget_table(target: Mapping[str, Any]) -> Table:
-    unit = target["parameter"].split("_")[1].replace("kda", "kDa")
-    table = _table("now")
-    table.add_column("factor", justify="right", no_wrap=True)
-    table.add_column(f"σ [{unit}]", justify="right", no_wrap=True)
-    product = 1.0
-    for line in target["budget"]:
-        first = line["cause"] == "quantum bound"
-        product *= line["factor"]
-        table.add_row(
-            line["cause"], "" if first else f"{line['factor']:.3f}", _short(line["bound"])
+    found = table("now", "factor", f"σ [{_unit(target)}]")
+    for number, line in enumerate(target["budget"]):
+        found.add_row(
+            line["cause"], f"{line['factor']:.3f}" if number else "", short(line["bound"])
         )
-    table.add_row("all", f"{product:.3f}", _short(target["budget"][-1]["bound"]))
-    return table
-
-
-def _table(title: str) -> Table:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD if Console().is_terminal else None, pad_edge=False)
-    table.add_column(title, no_wrap=True)
-    return table
-
-
-def _count(value: float) -> str:
-    return f"{value:,.0f}".replace(",", " ")
-
-
-def _short(value: float | None) -> str:
-    return "–" if value is None or not math.isfinite(value) else f"{value:.4g}"
+    product = math.prod(line["factor"] for line in target["budget"])
+    found.add_row("all", f"{product:.3f}", short(target["budget"][-1]["bound"]))
+    return found

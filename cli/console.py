@@ -25,6 +25,7 @@ from iscat_cli import INTERRUPTED
 if TYPE_CHECKING:
     from rich.progress import Progress as Bars
     from rich.progress import TaskID
+    from rich.table import Table
 
     from iscat_analysis.records import Progress
 
@@ -357,6 +358,49 @@ def print_result(result: RenderableType) -> None:
     with _failing_once(sys.stdout), console.capture() as captured:
         console.print(result, soft_wrap=isinstance(result, str))
     _write(sys.stdout, "".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))
+
+
+def table(title: str, *headings: str) -> Table:
+    """Begin a table: what its rows are about, then a right-aligned column for each heading.
+
+    Parameters
+    ----------
+    title : str
+        Heading of the first column.
+    *headings : str
+        Of the others.
+
+    Returns
+    -------
+    rich.table.Table
+        With a frame on a terminal, plain elsewhere; it has no rows yet.
+    """
+    from rich import box
+    from rich.table import Table
+
+    made = Table(box=box.SIMPLE_HEAD if Console().is_terminal else None, pad_edge=False)
+    made.add_column(title, no_wrap=True)
+    for heading in headings:
+        made.add_column(heading, justify="right", no_wrap=True)
+    return made
+
+
+def short(value: float | None, digits: int = 4) -> str:
+    """Write a number to a few significant digits, and a dash for one that is not known.
+
+    Parameters
+    ----------
+    value : float or None
+        Any number.
+    digits : int
+        How many are significant.
+
+    Returns
+    -------
+    str
+        As in ``"3.142"``.
+    """
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}g}"
 
 
 def print_json(document: str, values: Mapping[str, Any]) -> None:

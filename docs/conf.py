@@ -12,19 +12,23 @@ import re
 import shutil
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
 
-import iscat_analysis
-from iscat_analysis.schemas import schema, schema_names
-
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))
 
 from blocks import blocks_of, prepare, run_page  # noqa: E402
+from kernel_cache import share_kernels  # noqa: E402
+
+share_kernels(HERE.parent)
+
+import iscat_analysis  # noqa: E402
+from iscat_analysis.schemas import schema, schema_names  # noqa: E402
 
 project = "iscat-analysis"
 author = "The iscat-analysis developers"
@@ -139,27 +143,35 @@ def _write_schemas() -> None:
 
 
 def _run_pages() -> None:
-    """Run the pages that show what their blocks print or draw."""
-    for page in sorted(HERE.rglob("*.md")):
-        if "_build" in page.parts or not any(block.keep for block in blocks_of(page)):
-            continue
-        target = GENERATED / page.stem
-        if target.is_dir() and os.environ.get("DOCS_REUSE"):  # while writing
-            continue
-        shutil.rmtree(target, ignore_errors=True)
-        target.mkdir(parents=True)
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            prepare(HERE.parent, folder)
-            for outcome in run_page(page, folder, PROGRAMS):
-                if outcome.failed:
-                    raise RuntimeError(f"{page}:{outcome.block.line}: {outcome.failed}")
-                if outcome.block.keep:
-                    kept = target / f"{outcome.block.keep}.txt"
-                    kept.write_text(outcome.out, encoding="utf-8")
-            for pattern in ("*.png", "*.iscat/figures/*.png", "scan/**/*.png"):
-                for picture in folder.glob(pattern):
-                    shutil.copy(picture, target / picture.name)
+    """Run every block of the manual and of README, as many pages at a time as there are cores."""
+    pages = [
+        page
+        for page in sorted([HERE.parent / "README.md", *HERE.rglob("*.md")])
+        if "_build" not in page.parts and any(block.not_run is None for block in blocks_of(page))
+    ]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(_run_one_page, pages))
+
+
+def _run_one_page(page: Path) -> None:
+    """Run a page's blocks and keep what they print or draw."""
+    target = GENERATED / page.stem
+    if target.is_dir() and os.environ.get("DOCS_REUSE"):  # while writing
+        return
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir(parents=True)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        prepare(HERE.parent, folder)
+        for outcome in run_page(page, folder, PROGRAMS):
+            if outcome.failed:
+                raise RuntimeError(f"{page}:{outcome.block.line}: {outcome.failed}")
+            if outcome.block.keep:
+                kept = target / f"{outcome.block.keep}.txt"
+                kept.write_text(outcome.out, encoding="utf-8")
+        for pattern in ("*.png", "*.iscat/figures/*.png", "scan/**/*.png"):
+            for picture in folder.glob(pattern):
+                shutil.copy(picture, target / picture.name)
 
 
 def _mathml(text: str, *, as_block: bool) -> str:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "docs"))
 
+from kernel_cache import share_kernels  # noqa: E402
+
+share_kernels(ROOT)
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 # A shell starts what runs in its background with Ctrl-C ignored, and so would be every command that
@@ -22,6 +28,45 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 settings.register_profile("here", deadline=None)
 settings.register_profile("ci", deadline=None, derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "here")
+
+
+LONGEST_FIRST = ("statistical", "hardening", "cli", "physics")
+"""Folders whose modules take longest; they are begun first, so that no worker is left with one."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--share",
+        type=float,
+        default=0.0,
+        help="how much of the tests marked 'large' to run: 0 leaves them out, 1 is all of them",
+    )
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out large tests, or all but a share of the parameters of each; order the rest."""
+    share = config.getoption("--share")
+    large: dict[str, list[pytest.Item]] = {}
+    for item in sorted(items, key=lambda item: item.nodeid):
+        if item.get_closest_marker("large"):
+            large.setdefault(item.nodeid.partition("[")[0], []).append(item)
+    left_out = {item for same in large.values() for item in same[math.ceil(share * len(same)) :]}
+    if left_out:
+        items[:] = [item for item in items if item not in left_out]
+        config.hook.pytest_deselected(items=list(left_out))
+
+    def rank(item: pytest.Item) -> int:
+        folder = item.path.parent.name
+        return LONGEST_FIRST.index(folder) if folder in LONGEST_FIRST else len(LONGEST_FIRST)
+
+    items.sort(key=rank)
+
+
+@pytest.fixture(scope="session")
+def share(request: pytest.FixtureRequest) -> float:
+    """Return the share of a large test's repetitions that is wanted, up to 1."""
+    return float(request.config.getoption("--share"))
 
 
 @pytest.fixture(scope="session")

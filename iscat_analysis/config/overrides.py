@@ -203,6 +203,11 @@ def _change(
     table = values.setdefault(section, {})
     if not isinstance(table, dict):
         raise ConfigError(f"{section}.{key}: {section} is not a section but {table!r}")
+    key, dot, inner = key.partition(".")
+    if dot:  # a key of a table, as in optics.aberrations_nm.z11
+        held = table.get(key)
+        value = {**(held if isinstance(held, dict) else {}), inner: value}
+        value = {name: each for name, each in value.items() if each is not None}
     if value is None:
         table.pop(key, None)
         return

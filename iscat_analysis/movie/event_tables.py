@@ -11,6 +11,7 @@ import csv
 import math
 from array import array
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -189,7 +190,7 @@ def _table(
 
 
 def _from_hdf5(path: Path) -> tuple[dict[str, FloatArray], StoredCalibration | None]:
-    with Hdf5Reader(path) as reader:
+    with closing(Hdf5Reader(path)) as reader:
         try:
             group = _group(reader, path)
             columns = {}

@@ -1,22 +1,22 @@
 """HDF5 files whose structure is checked before any of it is believed.
 
-libhdf5 is asked where the bytes of a dataset lie, never for the bytes: it inflates chunks without
-a limit, follows links into other files, and needs a plugin for the filters that instruments use.
-Here every chunk is decoded into the size it declares, which the file's own size bounds.
+h5py is asked where the bytes of a dataset lie, never for the bytes: libhdf5 inflates chunks without
+a limit, follows links into other files, runs in circles in the heap of a damaged file, and needs a
+plugin for the filters that instruments use.  Here imagecodecs decodes every chunk into the size
+that it declares, which the file's own size bounds.
 Format: HDF5 File Format Specification 3.0 (The HDF Group).
 """
 
 from __future__ import annotations
 
+import functools
 import math
 import mmap
 import struct
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import h5py
 import imagecodecs
@@ -24,9 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.mapped import map_file, refuse_changed
-
-IntArray = NDArray[np.int64]
+from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, map_file, refuse_changed
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -34,51 +32,19 @@ _LARGEST_CHUNK_BYTES = 2**28
 _LARGEST_TEXT_BYTES = 4096
 _BOMB_RATIO = 2000  # decoded over stored; Deflate reaches 1032, on constant images only
 _BOMB_BYTES = 64_000_000  # an array smaller than this is harmless whatever its ratio
-_CACHE_BYTES = 64_000_000
-_WHAT_IT_RAISES = (
-    OSError, RuntimeError, ValueError, TypeError, KeyError, AttributeError, OverflowError,
-    MemoryError, SystemError, struct.error,
-)  # fmt: skip
-
+_CACHE_BYTES = 64_000_000  # of decoded chunks that are kept
 _HEAP = struct.Struct("<4s4xQ")  # signature, version, size of the whole
 _HEAP_OBJECT = struct.Struct("<H6xQ")  # index, then references and reserved bytes, size
 
-_Decoder = Callable[[bytes, int, int], bytes]
-
-
-def _inflate(raw: bytes, size: int, itemsize: int) -> bytes:
-    del itemsize
-    stream = zlib.decompressobj()
-    found = stream.decompress(raw, size + 1)
-    if len(found) == size and not stream.eof:
-        raise ValueError("its checksum is missing")
-    return found
-
-
-def _unshuffle(raw: bytes, size: int, itemsize: int) -> bytes:
-    del size
-    planes = np.frombuffer(raw, np.uint8).reshape(itemsize, -1)
-    return planes.T.tobytes()
-
-
-def _imagecodecs(name: str) -> _Decoder:
-    def decode(raw: bytes, size: int, itemsize: int) -> bytes:
-        del itemsize
-        return bytes(getattr(imagecodecs, f"{name}_decode")(raw, out=size))
-
-    return decode
-
-
-_DECODERS: Mapping[int, _Decoder] = {
-    1: _inflate,
-    2: _unshuffle,
-    32000: _imagecodecs("lzf"),
-    32001: _imagecodecs("blosc"),
-    32004: _imagecodecs("lz4h5"),
-    32015: _imagecodecs("zstd"),
+_SHUFFLE = 2
+_CODECS: Mapping[int, Callable[..., Any]] = {
+    1: imagecodecs.zlib_decode,
+    32000: imagecodecs.lzf_decode,
+    32001: imagecodecs.blosc_decode,
+    32004: imagecodecs.lz4h5_decode,
+    32015: imagecodecs.zstd_decode,
 }
-"""What undoes each filter, by its registered number: Deflate, shuffle, LZF, Blosc, LZ4, Zstandard.
-Each is given the stored bytes, the size they must have afterwards, and the size of one number."""
+"""What undoes each filter, by its registered number."""
 
 
 class StoredArray:
@@ -98,8 +64,8 @@ class StoredArray:
         As in the file, byte order included.
     chunk : tuple of int
         Shape of one chunk; the whole shape where the bytes lie in one piece.
-    starts, sizes, masks : ndarray of int64, shape (chunk,)
-        Where each chunk lies, how long it is, and which filters it left out.
+    where : ndarray of int64, shape (chunk, 3)
+        Where each chunk lies, how long it is, and a mask of the filters that it left out.
     filters : tuple of int
         As they were applied; empty for plain bytes.
     """
@@ -113,9 +79,7 @@ class StoredArray:
         shape: tuple[int, ...],
         stored: np.dtype[Any],
         chunk: tuple[int, ...],
-        starts: IntArray,
-        sizes: IntArray,
-        masks: IntArray,
+        where: NDArray[np.int64],
         filters: tuple[int, ...],
     ) -> None:
         self._data = data
@@ -123,100 +87,56 @@ class StoredArray:
         self._name = name
         self.shape = shape
         self._stored = stored
-        self.dtype = stored.newbyteorder("=")
+        self.dtype: np.dtype[Any] = stored.newbyteorder("=")
         self._chunk = chunk
+        self._chunk_bytes = math.prod(chunk) * stored.itemsize
         self._grid = tuple(-(-n // c) for n, c in zip(shape, chunk, strict=True))
-        self._starts = starts
-        self._sizes = sizes
-        self._masks = masks
+        self._where = where
         self._filters = filters
-        self._cached: tuple[int, NDArray[Any]] | None = None
+        # A chunk that spans several frames is wanted again for the next ones.
+        kept = _CACHE_BYTES // max(1, self._chunk_bytes) if chunk[0] > 1 else 0
+        self._decoded = functools.lru_cache(maxsize=kept)(self._decode)
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Read rows of the first axis.
-
-        Parameters
-        ----------
-        start, stop : int
-            Half-open range inside the array.
-
-        Returns
-        -------
-        ndarray, shape (stop − start, …)
-            A new array in native byte order.
-
-        Raises
-        ------
-        DataError
-            The file has changed since it was opened, or a chunk cannot be decoded.
-        """
+        """Read rows of the first axis, ``[start, stop)``, as a new array in native byte order."""
         refuse_changed(self._path, self._data)
         block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
+        if len(self._where) == 1 and not self._filters:
+            first = int(self._where[0, 0]) + start * math.prod(self.shape[1:]) * self.dtype.itemsize
+            block[:] = np.ndarray(block.shape, self._stored, buffer=self._data, offset=first)
+            return block
         depth = self._chunk[0]
-        rest = math.prod(self.shape[1:]) * self.dtype.itemsize
-        if len(self._starts) == 1 and not self._filters:
-            offset = int(self._starts[0]) + start * rest
-            block[:] = np.ndarray(block.shape, self._stored, buffer=self._data, offset=offset)
-        elif depth == 1 or depth * rest > _CACHE_BYTES:
-            self._fill(block, start)
-        else:
-            for slab in range(start // depth, -(-stop // depth)):
-                first, rows = slab * depth, self._slab(slab)
-                begin, end = max(start, first), min(stop, first + len(rows))
-                block[begin - start : end - start] = rows[begin - first : end - first]
-        return block
-
-    def _slab(self, number: int) -> NDArray[Any]:
-        """All chunks that share their place on the first axis; the last ones are remembered."""
-        cached = self._cached
-        if cached is not None and cached[0] == number:
-            return cached[1]
-        first = number * self._chunk[0]
-        rows = min(self._chunk[0], self.shape[0] - first)
-        slab = np.empty((rows, *self.shape[1:]), dtype=self.dtype)
-        self._fill(slab, first)
-        self._cached = (number, slab)
-        return slab
-
-    def _fill(self, block: NDArray[Any], start: int) -> None:
-        depth = self._chunk[0]
-        stop = start + len(block)
-        first = start // depth
-        for place in np.ndindex(-(-stop // depth) - first, *self._grid[1:]):
-            index = (place[0] + first, *place[1:])
+        first_slab, last_slab = start // depth, -(-stop // depth)
+        for place in np.ndindex(max(0, last_slab - first_slab), *self._grid[1:]):
+            index = (place[0] + first_slab, *place[1:])
             pixels = self._decoded(int(np.ravel_multi_index(index, self._grid)))
             source, target = [], []
             for axis, number in enumerate(index):
-                low = number * self._chunk[axis]
-                begin, end = (start, stop) if axis == 0 else (0, self.shape[axis])
-                begin, end = max(begin, low), min(end, low + self._chunk[axis])
-                shift = start if axis == 0 else 0
-                source.append(slice(begin - low, end - low))
-                target.append(slice(begin - shift, end - shift))
+                origin, size = number * self._chunk[axis], self._chunk[axis]
+                low, high = (start, stop) if axis == 0 else (0, self.shape[axis])
+                begin, end = max(low, origin), min(high, origin + size)
+                source.append(slice(begin - origin, end - origin))
+                target.append(slice(begin - low, end - low))
             block[tuple(target)] = pixels[tuple(source)]
+        return block
 
-    def _decoded(self, number: int) -> NDArray[Any]:
-        start, size = int(self._starts[number]), int(self._sizes[number])
-        mask = int(self._masks[number])
-        expected = math.prod(self._chunk) * self._stored.itemsize
+    def _decode(self, number: int) -> NDArray[Any]:
+        start, size, left_out = self._where[number].tolist()
         raw = self._data[start : start + size]
         try:
             for position in reversed(range(len(self._filters))):
-                if not mask >> position & 1:
-                    decode = _DECODERS[self._filters[position]]
-                    raw = decode(raw, expected, self._stored.itemsize)
-        except (ValueError, TypeError, RuntimeError, MemoryError, zlib.error) as error:
-            raise self._undecodable(number, str(error) or type(error).__name__) from None
-        if len(raw) != expected:
-            how = "more than" if len(raw) > expected else f"{len(raw)} of"
-            raise self._undecodable(number, f"it holds {how} {expected} bytes")
-        return np.frombuffer(raw, self._stored).reshape(self._chunk)
-
-    def _undecodable(self, number: int, how: str) -> DataError:
-        return DataError(
-            f"{self._path}: chunk {number} of {self._name} cannot be decompressed ({how}); "
-            "copy the file again or export it again"
-        )
+                if left_out >> position & 1:
+                    continue
+                if self._filters[position] == _SHUFFLE:
+                    raw = np.frombuffer(raw, "u1").reshape(self._stored.itemsize, -1).T.tobytes()
+                else:
+                    raw = bytes(_CODECS[self._filters[position]](raw, out=self._chunk_bytes))
+            return np.frombuffer(raw, self._stored).reshape(self._chunk)
+        except WHAT_LIBRARIES_RAISE as error:
+            raise DataError(
+                f"{self._path}: chunk {number} of {self._name} cannot be decompressed "
+                f"({str(error) or type(error).__name__}); copy the file again or export it again"
+            ) from None
 
 
 class Hdf5Reader:
@@ -230,18 +150,14 @@ class Hdf5Reader:
     Raises
     ------
     DataError
-        It is not an HDF5 file, or is damaged.
+        It is not an HDF5 file, or is damaged; or what is asked for is a link, lies in other files,
+        is incomplete, or cannot be decoded.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        try:
+        with self._believing_nothing():
             self._file = h5py.File(path, "r", locking=False)
-        except _WHAT_IT_RAISES as error:
-            raise DataError(
-                f"{path}: begins like an HDF5 file but cannot be opened as one ({_said(error)}); "
-                "copy it again or export it again"
-            ) from None
         try:
             with self._believing_nothing():
                 if self._file.userblock_size:
@@ -251,15 +167,8 @@ class Hdf5Reader:
             self._file.close()
             raise
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Let h5py go of the file; its mapped bytes stay."""
         with self._believing_nothing():
             self._file.close()
 
@@ -270,23 +179,7 @@ class Hdf5Reader:
             return sorted(found) if isinstance(found, h5py.Group) else []
 
     def array(self, name: str) -> StoredArray | None:
-        """Find a dataset of numbers and all of its bytes.
-
-        Parameters
-        ----------
-        name : str
-            Path inside the file.
-
-        Returns
-        -------
-        StoredArray or None
-            None where there is none of that name.
-
-        Raises
-        ------
-        DataError
-            It is a link, lies in other files, is incomplete, or cannot be decoded.
-        """
+        """Find a dataset of numbers and all of its bytes; None where there is none."""
         with self._believing_nothing():
             dataset = self._dataset(name)
             return None if dataset is None else self._stored(dataset, name)
@@ -304,21 +197,15 @@ class Hdf5Reader:
         with self._believing_nothing():
             dataset = self._dataset(name)
             start = None if dataset is None else dataset.id.get_offset()
-            if dataset is None or start is None or not _single(dataset):
-                return None
-            kind = h5py.check_string_dtype(dataset.dtype)
-            if kind is None:
+            kind = None if dataset is None else h5py.check_string_dtype(dataset.dtype)
+            if dataset is None or start is None or kind is None or not _single(dataset):
                 return None
             if kind.length is None:
                 return _heap_text(self.data, start)
             return _decoded_text(self.data[start : start + min(kind.length, _LARGEST_TEXT_BYTES)])
 
     def has_attribute(self, name: str, key: str) -> bool:
-        """Whether something of this name is attached to a dataset.
-
-        What it says is not read: the texts that h5py writes lie in a heap, in which libhdf5 runs
-        in circles where a damaged file tells it to.
-        """
+        """Whether something of this name is attached to a dataset; it may be a text in the heap."""
         with self._believing_nothing():
             dataset = self._dataset(name)
             return dataset is not None and key in dataset.attrs
@@ -338,9 +225,11 @@ class Hdf5Reader:
     def _believing_nothing(self) -> Iterator[None]:
         try:
             yield
-        except _WHAT_IT_RAISES as error:
+        except WHAT_LIBRARIES_RAISE as error:
+            said = next(iter(str(error).splitlines()), "") or type(error).__name__
             raise DataError(
-                f"{self._path}: is damaged ({_said(error)}); copy it again or export it again"
+                f"{self._path}: begins like an HDF5 file but is damaged ({said}); "
+                "copy it again or export it again"
             ) from None
 
     def _find(self, name: str) -> h5py.Group | h5py.Dataset | None:
@@ -365,42 +254,51 @@ class Hdf5Reader:
         return found if isinstance(found, h5py.Dataset) else None
 
     def _stored(self, dataset: h5py.Dataset, name: str) -> StoredArray:
-        dtype = dataset.dtype
+        dtype, shape = dataset.dtype, tuple(int(n) for n in dataset.shape or ())
         if dataset.is_virtual or dataset.external:
             raise DataError(
                 f"{self._path}: the data of {name} lie in other files; "
                 "export the file with its data inside"
             )
         plain = dtype.kind in "iuf" and dataset.id.get_type().equal(h5py.h5t.py_create(dtype))
-        if not plain or not dataset.shape:
+        if not plain or not shape:
             raise DataError(
-                f"{self._path}: {name} holds {dtype}, shape {dataset.shape}, "
+                f"{self._path}: {name} holds {dtype}, shape {shape}, "
                 "not an array of integers or floats; export it again"
             )
-        shape = tuple(int(n) for n in dataset.shape)
         total = math.prod(shape) * dtype.itemsize
-        if total == 0:
-            return self._array(name, shape, dtype, shape, np.zeros((0, 3), np.int64), ())
         if total > max(_BOMB_BYTES, _BOMB_RATIO * len(self.data)):
             raise DataError(
                 f"{self._path}: {name} would grow from a file of {len(self.data)} to {total} "
                 "bytes, which no recording does; the file is damaged, export it again"
             )
-        if dataset.chunks is None:
+        filters: tuple[int, ...] = ()
+        chunk = tuple(max(1, n) for n in shape)
+        if total == 0:
+            where = np.zeros((0, 3), np.int64)
+        elif dataset.chunks is None:
             start = dataset.id.get_offset()
-            if start is None or dataset.external:
+            if start is None:
                 raise self._incomplete(name, "no data were written")
             where = np.array([[start, total, 0]], np.int64)
-            if start + total > len(self.data):
-                raise self._incomplete(name, f"it should reach byte {start + total}")
-            return self._array(name, shape, dtype, shape, where, ())
-        return self._chunked(dataset, name, shape)
+        else:
+            chunk = tuple(int(n) for n in dataset.chunks)
+            settings = dataset.id.get_create_plist()
+            filters = tuple(settings.get_filter(k)[0] for k in range(settings.get_nfilters()))
+            where = self._chunks(dataset, name, filters)
+        if (where[:, 0] > len(self.data) - where[:, 1]).any():
+            raise self._incomplete(name, "its data reach beyond the end of the file")
+        return StoredArray(
+            self.data, self._path, name,
+            shape=shape, stored=dtype, chunk=chunk, where=where, filters=filters,
+        )  # fmt: skip
 
-    def _chunked(self, dataset: h5py.Dataset, name: str, shape: tuple[int, ...]) -> StoredArray:
-        chunk = tuple(int(n) for n in dataset.chunks)
-        settings = dataset.id.get_create_plist()
-        filters = tuple(settings.get_filter(k)[0] for k in range(settings.get_nfilters()))
-        unknown = [number for number in filters if number not in _DECODERS]
+    def _chunks(
+        self, dataset: h5py.Dataset, name: str, filters: tuple[int, ...]
+    ) -> NDArray[np.int64]:
+        """Where every chunk lies, how long it is, and which filters it left out."""
+        chunk = dataset.chunks
+        unknown = [number for number in filters if number != _SHUFFLE and number not in _CODECS]
         if unknown:
             raise DataError(
                 f"{self._path}: {name} is compressed by HDF5 filter {unknown[0]}, which is not "
@@ -411,7 +309,7 @@ class Hdf5Reader:
                 f"{self._path}: {name} is stored in chunks of {chunk}, too large to be decoded "
                 "one at a time; save it with smaller chunks"
             )
-        grid = tuple(-(-n // c) for n, c in zip(shape, chunk, strict=True))
+        grid = tuple(-(-n // c) for n, c in zip(dataset.shape, chunk, strict=True))
         expected = math.prod(grid)
         if expected > len(self.data):  # a chunk is a byte at least
             raise self._incomplete(name, f"it needs {expected} chunks")
@@ -431,41 +329,13 @@ class Hdf5Reader:
         dataset.id.chunk_iter(note)
         if count != expected or (where[:, :2] <= 0).any():
             raise self._incomplete(name, f"it lists {count} chunks where it needs {expected}")
-        if (where[:, 0] > len(self.data) - where[:, 1]).any():
-            raise self._incomplete(name, "a chunk reaches beyond the end of the file")
-        return self._array(name, shape, dataset.dtype, chunk, where, filters)
-
-    def _array(
-        self,
-        name: str,
-        shape: tuple[int, ...],
-        dtype: np.dtype[Any],
-        chunk: tuple[int, ...],
-        where: IntArray,
-        filters: tuple[int, ...],
-    ) -> StoredArray:
-        return StoredArray(
-            self.data,
-            self._path,
-            name,
-            shape=shape,
-            stored=dtype,
-            chunk=tuple(max(1, n) for n in chunk),
-            starts=where[:, 0],
-            sizes=where[:, 1],
-            masks=where[:, 2],
-            filters=filters,
-        )
+        return where
 
     def _incomplete(self, name: str, how: str) -> DataError:
         return DataError(
             f"{self._path}: {name} is incomplete ({how}); "
             "the recording or the copy was interrupted: export it again"
         )
-
-
-def _said(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _single(dataset: h5py.Dataset) -> bool:

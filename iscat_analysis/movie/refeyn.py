@@ -11,6 +11,7 @@ attribute ``indices`` names, or else the last one at its end.
 from __future__ import annotations
 
 import threading
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,8 +43,6 @@ class _Dialect:
     frame_binning: str
     pixel_binning: str
     exposure: str
-    height: str | None
-    width: str | None
     names: tuple[str, ...]
     instrument: str | None
 
@@ -56,8 +55,6 @@ _DIALECTS = (
         frame_binning="configuration/Engines/AcqMovieEngine/FrameBinning",
         pixel_binning="configuration/Engines/AcqMovieEngine/PixelBinning",
         exposure="configuration/Devices/AcqCam/ExposureTime",
-        height="configuration/Devices/AcqCam/Height",
-        width="configuration/Devices/AcqCam/Width",
         names=("device_info/InstrumentName",),
         instrument="Refeyn OneMP",
     ),
@@ -68,8 +65,6 @@ _DIALECTS = (
         frame_binning="movie/configuration/acq_camera/frame_binning",
         pixel_binning="movie/configuration/acq_camera/pixel_binning",
         exposure="movie/configuration/acq_camera/exposure_time",
-        height=None,
-        width=None,
         names=("movie/device_serials/InstrumentName", "movie/device_info/InstrumentName"),
         instrument="Refeyn TwoMP",
     ),
@@ -80,8 +75,6 @@ _DIALECTS = (
         frame_binning="movie/configuration/Devices/AcqCam/SoftwareFrameBinning",
         pixel_binning="movie/configuration/Devices/AcqCam/SoftwarePixelBinning",
         exposure="movie/configuration/Devices/AcqCam/ExposureTime",
-        height="movie/configuration/Devices/AcqCam/Height",
-        width="movie/configuration/Devices/AcqCam/Width",
         names=("movie/device_info/InstrumentName", "movie/device_serials/InstrumentName"),
         instrument=None,
     ),
@@ -99,62 +92,20 @@ class RefeynFrames:
         Of the file; only its mapped bytes are kept.
     path : Path
         What messages call it.
-    metadata : StackMetadata
-        What the file says of itself.
-    notes : tuple of str
-        What a user should know about it.
     """
 
-    def __init__(
-        self,
-        stored: StoredArray,
-        reader: Hdf5Reader,
-        path: Path,
-        *,
-        metadata: StackMetadata,
-        notes: tuple[str, ...],
-    ) -> None:
+    def __init__(self, stored: StoredArray, reader: Hdf5Reader, path: Path) -> None:
         t, y, x = stored.shape
         self._stored = stored
         self._data = reader.data
         self._path = path
-        self._shape = (t, y, x)
-        self._metadata = metadata
-        self._notes = notes
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Frames, rows, columns."""
-        return self._shape
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the stored numbers, in native byte order."""
-        return self._stored.dtype
-
-    @property
-    def metadata(self) -> StackMetadata:
-        """What the file says of itself."""
-        return self._metadata
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Where the pixel size comes from."""
-        return self._notes
+        self.shape = (t, y, x)
+        self.dtype = stored.dtype
+        self.metadata = StackMetadata()
+        self.notes: tuple[str, ...] = ()
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Read frames.
-
-        Parameters
-        ----------
-        start, stop : int
-            Half-open range inside the movie.
-
-        Returns
-        -------
-        ndarray, shape (stop − start, y, x)
-            A new array in native byte order [counts].
-        """
+        """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""
         return self._stored.read(start, stop)
 
     def close(self) -> None:
@@ -176,10 +127,6 @@ class DifferenceFrames(RefeynFrames):
         As in `RefeynFrames`.
     path : Path
         What messages call the file.
-    metadata : StackMetadata
-        What the file says of itself.
-    notes : tuple of str
-        What a user should know about it.
     known : (int, ndarray of shape (y, x)) or None
         Number of a frame, and what it must sum to.
     """
@@ -190,40 +137,22 @@ class DifferenceFrames(RefeynFrames):
         reader: Hdf5Reader,
         path: Path,
         *,
-        metadata: StackMetadata,
-        notes: tuple[str, ...],
         known: tuple[int, NDArray[Any]] | None,
     ) -> None:
-        super().__init__(stored, reader, path, metadata=metadata, notes=notes)
+        super().__init__(stored, reader, path)
         self._known = known
-        frame_bytes = self._shape[1] * self._shape[2] * stored.dtype.itemsize
-        kept = max(1, min(self._shape[0], _ANCHOR_BYTES // frame_bytes))
-        self._spacing = -(-self._shape[0] // kept)
+        frame_bytes = self.shape[1] * self.shape[2] * stored.dtype.itemsize
+        kept = max(1, min(self.shape[0], _ANCHOR_BYTES // frame_bytes))
+        self._spacing = -(-self.shape[0] // kept)
         self._step = max(1, _BLOCK_BYTES // frame_bytes)
         self._anchors: dict[int, NDArray[Any]] = {}
         self._newest: tuple[int, NDArray[Any]] | None = None
         self._lock = threading.Lock()
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Read frames.
-
-        Parameters
-        ----------
-        start, stop : int
-            Half-open range inside the movie.
-
-        Returns
-        -------
-        ndarray, shape (stop − start, y, x)
-            A new array in native byte order [counts].
-
-        Raises
-        ------
-        DataError
-            A frame that the file gives in full is not the sum of the differences.
-        """
+        """Read frames ``[start, stop)``; a file that does not add up is refused."""
         refuse_changed(self._path, self._data)
-        block = np.empty((stop - start, *self._shape[1:]), dtype=self.dtype)
+        block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
         if start == stop:
             return block
         with self._lock:
@@ -246,8 +175,7 @@ class DifferenceFrames(RefeynFrames):
 
     def _nearest(self, start: int) -> tuple[int, NDArray[Any] | None]:
         """Find the last remembered frame before `start`; −1 and None where there is none."""
-        before = [number for number in self._anchors if number < start]
-        found = max(before, default=-1)
+        found = max((number for number in self._anchors if number < start), default=-1)
         if self._newest is not None and found < self._newest[0] < start:
             return self._newest
         return found, self._anchors.get(found)
@@ -284,7 +212,7 @@ def open_refeyn(path: Path) -> RefeynFrames:
     DataError
         It is not such a movie, is incomplete, or contradicts itself.
     """
-    with Hdf5Reader(path) as reader:
+    with closing(Hdf5Reader(path)) as reader:
         try:
             return _open(reader, path)
         except BaseException:
@@ -318,22 +246,16 @@ def _open(reader: Hdf5Reader, path: Path) -> RefeynFrames:
             f"{path}: a frame of {rows} x {columns} pixels would be {frame_bytes} bytes, from a "
             f"file of {len(reader.data)}; the file is damaged, export it again"
         )
-    hints, notes = _hints(reader, dialect)
-    metadata = merge([hints], path)
+    frames = RefeynFrames(stored, reader, path)
     if stored.dtype.kind == "u" and dialect.keyframes is not None:
-        frames = _differences(reader, dialect, stored, path, metadata, notes)
-        if frames is not None:
-            return frames
-    return RefeynFrames(stored, reader, path, metadata=metadata, notes=notes)
+        frames = _differences(reader, dialect, stored, path) or frames
+    hints, frames.notes = _hints(reader, dialect)
+    frames.metadata = merge([hints], path)
+    return frames
 
 
 def _differences(
-    reader: Hdf5Reader,
-    dialect: _Dialect,
-    stored: StoredArray,
-    path: Path,
-    metadata: StackMetadata,
-    notes: tuple[str, ...],
+    reader: Hdf5Reader, dialect: _Dialect, stored: StoredArray, path: Path
 ) -> DifferenceFrames | None:
     """Decide how the frames are encoded; None for plain ones.
 
@@ -345,7 +267,7 @@ def _differences(
         return None
     if known is None and not reader.has_attribute(dialect.frames, "encoding"):
         return None
-    frames = DifferenceFrames(stored, reader, path, metadata=metadata, notes=notes, known=known)
+    frames = DifferenceFrames(stored, reader, path, known=known)
     if known is not None:
         frames.read(known[0], known[0] + 1)
     return frames

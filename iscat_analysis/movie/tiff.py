@@ -55,6 +55,7 @@ _FRAME_BOMB_RATIO = 100  # of one frame, which is held in memory whole
 _BOMB_BYTES = 64_000_000  # smaller than this, anything is harmless whatever its ratio
 _OVERLAP = 2  # values of tags over the size of the file; each lies in it once
 _OVERLAP_BYTES = 1_000_000
+_INLINE = 8  # elements that may stand in the list of tags itself
 
 _PLAIN = dict.fromkeys(("is_lsm", "is_ndpi", "is_ome", "is_scanimage", "is_stk"), False)
 """Dialects whose images tifffile would guess rather than read."""
@@ -294,7 +295,7 @@ def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[_I
         if len(tags) != len(page.tags) and set(tags) & _ESSENTIAL - set(page.tags.keys()):
             raise _damaged(path, f"the header of image {number} is truncated or cannot be read")
         # Images that share one long value would cost its length each time.
-        values += sum(tag.count for tag in page.tags)
+        values += sum(tag.valuebytecount for tag in page.tags if tag.count > _INLINE)
         if values > _OVERLAP * len(data) + _OVERLAP_BYTES:
             raise _damaged(path, "the headers of its images overlap")
         _refuse_unread_pixels(page, len(data), path)

@@ -27,7 +27,7 @@ def in_a_thread():
     with ThreadPoolExecutor(1) as pool:
         pool.submit(compiled).result()
 
-def main(arguments):
+def run(program, arguments):
     try:
         with failures(Messages("iscat busy"), debug=False):
             print("busy", flush=True)
@@ -36,7 +36,7 @@ def main(arguments):
         return end.exit_code
     return 0
 
-app.main = main
+app.run = run
 sys.exit(iscat_cli.main())
 """
 

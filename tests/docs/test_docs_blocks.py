@@ -1,4 +1,4 @@
-"""Every code block of the manual and of README runs, page by page, in a folder of its own."""
+"""The runner of the manual's code blocks; `make docs` runs the blocks themselves."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import re
 import sys
 from pathlib import Path
 from types import ModuleType
-
-import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(
@@ -27,21 +25,6 @@ def _load_blocks() -> ModuleType:
 
 
 BLOCKS = _load_blocks()
-WITH_BLOCKS = [page for page in PAGES if list(BLOCKS.blocks_of(page))]
-
-
-def _name(page: Path) -> str:
-    return str(page.relative_to(ROOT))
-
-
-@pytest.mark.parametrize("page", WITH_BLOCKS, ids=_name)
-def test_every_block_runs(page: Path, tmp_path: Path) -> None:
-    BLOCKS.prepare(ROOT, tmp_path)
-    outcomes = BLOCKS.run_page(page, tmp_path, Path(sys.executable).parent)
-    for outcome in outcomes:
-        assert outcome.failed is None, f"{_name(page)}:{outcome.block.line}\n{outcome.failed}"
-    runnable = [block for block in BLOCKS.blocks_of(page) if block.not_run is None]
-    assert len(outcomes) == len(runnable)
 
 
 def test_a_block_that_is_not_run_says_why_and_few_are() -> None:

@@ -5,7 +5,8 @@ at the same time, each ``{"run": [argument, …], "cwd": folder}``, with
 
 - ``"kill": [signal, share]`` to be ended after that share of an undisturbed run's duration, which
   is the first order's or ``"duration": seconds``;
-- ``"die": [word, number]`` to end by SIGKILL ``before`` or ``after`` its so manieth renaming;
+- ``"die": [word, number]`` to end by SIGKILL ``before`` or ``after`` its so manieth renaming
+  or replacing of a file;
 - ``"limit": bytes`` for the largest file it may write;
 - ``"memory_share": share`` to cut a landing movie into many chunks;
 - ``"figures": true`` to draw the figures, which take nine tenths of a small run; otherwise files of
@@ -25,6 +26,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from iscat_analysis import report
@@ -59,20 +61,23 @@ def _sketch_figures(analysis: Any, folder: pathlib.Path, **options: Any) -> dict
 
 
 def _die_while_renaming(word: str, number: int) -> None:
-    rename = pathlib.Path.rename
     count = 0
 
-    def deadly(self: pathlib.Path, target: Any) -> Any:
-        nonlocal count
-        count += 1
-        if count == number and word == "before":
-            os.kill(os.getpid(), signal.SIGKILL)
-        done = rename(self, target)
-        if count == number:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return done
+    def deadly(rename: Callable[..., Any]) -> Callable[..., Any]:
+        def renamed(self: pathlib.Path, target: Any) -> Any:
+            nonlocal count
+            count += 1
+            if count == number and word == "before":
+                os.kill(os.getpid(), signal.SIGKILL)
+            done = rename(self, target)
+            if count == number:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return done
 
-    pathlib.Path.rename = deadly  # type: ignore[method-assign]
+        return renamed
+
+    for name in ("rename", "replace"):
+        setattr(pathlib.Path, name, deadly(getattr(pathlib.Path, name)))
 
 
 def _start(order: dict[str, Any], duration: float) -> tuple[int, int, int]:

@@ -27,6 +27,9 @@ from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_outp
 from iscat_analysis.study.simulate import write_stack
 
 KILLS = 50
+"""Runs that are killed, where all of the large tests are run."""
+
+SEED = 20_261_121
 REQUIRED = OUTPUT_NAMES - {"posterior.nc"}
 SETUP = """
 [optics]
@@ -206,12 +209,12 @@ def differing(one: dict[str, bytes], two: dict[str, bytes]) -> list[str]:
     return found
 
 
-def test_killed_at_random_moments(forker: Forker, place: Path) -> None:
-    rng = np.random.default_rng()
-    seen = set()
+@pytest.mark.large
+def test_killed_at_random_moments(forker: Forker, place: Path, share: float) -> None:
+    rng = np.random.default_rng(SEED)
     expected = contents(forker.bench / "result")
     result = place / "result"
-    for number in range(KILLS):
+    for number in range(max(10, round(share * KILLS))):
         if rng.random() < 0.5:
             shutil.rmtree(result, ignore_errors=True)
         order = {
@@ -223,7 +226,6 @@ def test_killed_at_random_moments(forker: Forker, place: Path) -> None:
         assert answer["status"] in (0, -signal.SIGKILL)
         hidden = [name for name in names(place) if name.startswith(".iscat-")]
         assert len(hidden) <= 3  # what the last run left; what earlier ones left is gone
-        seen.add((answer["status"], result.exists()))
         if result.exists():
             assert_whole(result)
         if number % 10 == 9:
@@ -231,43 +233,64 @@ def test_killed_at_random_moments(forker: Forker, place: Path) -> None:
             assert again["status"] == 0, again["err"]
             assert differing(contents(result), expected) == []
             assert names(place) == ["movie.tif", "result", "setup.toml"]
-    assert (-signal.SIGKILL, False) in seen
-    assert (-signal.SIGKILL, True) in seen
 
 
-def test_a_landing_movie_killed_at_random_moments_resumes(forker: Forker, tmp_path: Path) -> None:
-    (tmp_path / "setup.toml").write_text(LANDING)
-    write_stack(load_config(tmp_path / "setup.toml"), tmp_path / "movie.tif")
-    order = {"run": FIT, "cwd": str(tmp_path), "memory_share": 0.0031}
-    result, kept = tmp_path / "result", tmp_path / ".result.partial"
+@pytest.fixture(scope="module")
+def landing(
+    forker: Forker, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[dict[str, Any], float, dict[str, bytes]]:
+    """Return the order for a landing movie of several chunks, its duration and its result."""
+    place = tmp_path_factory.mktemp("landing")
+    (place / "setup.toml").write_text(LANDING)
+    write_stack(load_config(place / "setup.toml"), place / "movie.tif")
+    order = {"run": FIT, "cwd": str(place), "memory_share": 0.0031}
     forker.run(order)  # compiles what landing movies need
     (whole,) = forker.run(order)
     assert whole["status"] == 0, whole["err"]
-    assert not kept.exists()
-    summary = json.loads((result / "summary.json").read_text(encoding="utf-8"))
+    assert not (place / ".result.partial").exists()
+    summary = json.loads((place / "result" / "summary.json").read_text(encoding="utf-8"))
     assert summary["landing"]["chunks"] >= 4
     assert summary["events"] >= 3
-    expected = contents(result)
-    rng = np.random.default_rng()
-    resumed = 0
-    for number in range(KILLS // 2):
+    return order, whole["seconds"], contents(place / "result")
+
+
+@pytest.mark.parametrize("chunks", [1, 3])
+def test_a_landing_movie_killed_between_chunks_resumes(
+    forker: Forker, landing: tuple[dict[str, Any], float, dict[str, bytes]], chunks: int
+) -> None:
+    order, _, expected = landing
+    place = Path(order["cwd"])
+    shutil.rmtree(place / "result", ignore_errors=True)
+    (answer,) = forker.run({**order, "die": ["after", chunks]})
+    assert answer["status"] == -signal.SIGKILL
+    assert len(list((place / ".result.partial").glob("*.npz"))) == chunks
+    (again,) = forker.run(order)
+    assert again["status"] == 0, again["err"]
+    assert differing(contents(place / "result"), expected) == []
+    assert names(place) == ["movie.tif", "movie.truth.csv", "result", "setup.toml"]
+
+
+@pytest.mark.large
+def test_a_landing_movie_killed_at_random_moments_resumes(
+    forker: Forker, landing: tuple[dict[str, Any], float, dict[str, bytes]], share: float
+) -> None:
+    order, seconds, expected = landing
+    place = Path(order["cwd"])
+    result = place / "result"
+    rng = np.random.default_rng(SEED)
+    for number in range(max(10, round(share * KILLS / 2))):
         shutil.rmtree(result, ignore_errors=True)
-        share = float(rng.uniform(0, 1))
-        resumed += any(kept.glob("*.npz"))
-        (answer,) = forker.run(
-            {**order, "kill": [signal.SIGKILL, share], "duration": whole["seconds"]}
-        )
+        kill = [signal.SIGKILL, float(rng.uniform(0, 1))]
+        (answer,) = forker.run({**order, "kill": kill, "duration": seconds})
         assert answer["status"] in (0, -signal.SIGKILL)
         if result.exists():
             assert_whole(result, extra=("frame_ci95",))
         if number % 5 == 4:
             shutil.rmtree(result, ignore_errors=True)
-            resumed += any(kept.glob("*.npz"))
             (again,) = forker.run(order)
             assert again["status"] == 0, again["err"]
             assert differing(contents(result), expected) == []
-            assert names(tmp_path) == ["movie.tif", "movie.truth.csv", "result", "setup.toml"]
-    assert resumed >= 2
+            assert names(place) == ["movie.tif", "movie.truth.csv", "result", "setup.toml"]
 
 
 @pytest.mark.parametrize("word", ["before", "after"])
@@ -292,8 +315,8 @@ def test_killed_between_two_renamings(forker: Forker, place: Path, word: str, nu
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_asked_to_end(forker: Forker, place: Path, number: int) -> None:
-    rng = np.random.default_rng()
-    for _ in range(5):
+    rng = np.random.default_rng(SEED)
+    for _ in range(3):
         order = {"run": FIT, "cwd": str(place), "kill": [number, float(rng.uniform(0, 1))]}
         (answer,) = forker.run(order)
         assert answer["status"] in (0, 130, -number, 70)  # the last two: before it has begun

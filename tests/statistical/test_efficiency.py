@@ -24,6 +24,8 @@ from iscat_analysis.study import (
     spread_error,
 )
 
+pytestmark = pytest.mark.large
+
 TRIALS = 500
 SEED = 2021
 STANDARD_ERRORS = 4.0

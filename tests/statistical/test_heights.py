@@ -10,6 +10,8 @@ from scipy.stats import binom
 from iscat_analysis.records import Status
 from iscat_analysis.study import Setting, Trials, run_trials
 
+pytestmark = pytest.mark.large
+
 SEED = 8
 TRIALS = 400
 WRONG_FRINGES = 1e-3

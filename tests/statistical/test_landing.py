@@ -21,6 +21,8 @@ from iscat_analysis.pipeline.landing import analyse_landings, make_landing_scene
 from iscat_analysis.records import Candidate
 from iscat_analysis.study.simulate import Movie
 
+pytestmark = pytest.mark.large
+
 PIXEL_NM = 84.0
 LEVEL_E = 1e5
 WINDOW = 40

@@ -22,6 +22,8 @@ from iscat_analysis.pipeline.scene import make_scene
 from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.study.simulate import Movie
 
+pytestmark = pytest.mark.large
+
 STANDARD_ERRORS = 4.0
 PLACES, DRAWS, PARTICLES = 5, 8, 8  # 320 particles
 BOUND_REACHED = 0.05  # the project's promise: σ within 5 % of the CRB

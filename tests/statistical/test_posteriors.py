@@ -22,6 +22,8 @@ from iscat_analysis.study import (
     van_trees,
 )
 
+pytestmark = pytest.mark.large
+
 SEED = 12
 DRAWS = 40
 BINS = 5

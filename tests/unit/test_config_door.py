@@ -95,6 +95,15 @@ def test_the_later_of_two_that_exclude_each_other_wins(first: str, second: str) 
         assert getattr(config.particle, second) is not None
 
 
+def test_a_key_of_a_table_is_changed_alone() -> None:
+    config = configure(settings=["optics.aberrations_nm.z5=3", "optics.aberrations_nm.z11=12.5"])
+    assert config.optics.aberrations_nm == {"z5": 3.0, "z11": 12.5}
+    fewer = configure(config, settings={"optics.aberrations_nm.z5": None})
+    assert fewer.optics.aberrations_nm == {"z11": 12.5}
+    with pytest.raises(ConfigError, match=r"optics\.aberrations_nm: zz is not on offer"):
+        configure(settings=["optics.aberrations_nm.zz=1"])
+
+
 def test_count_and_events_replace_each_other() -> None:
     event = {"frame": 5, "x_px": 10.0, "y_px": 10.0}
     config = configure({"simulation": {"events": [event]}}, settings=["simulation.count=0"])
