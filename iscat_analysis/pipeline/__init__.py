@@ -30,6 +30,7 @@ from iscat_analysis.pipeline.diagnosis import (
     drift_warning,
     examine_background,
     judge_gain,
+    misfit_warning,
     pixel_warnings,
 )
 from iscat_analysis.pipeline.field import fit_field
@@ -365,7 +366,7 @@ def _measured_background(
             noisy = gain is not None and gain.noise_ratio > EXCESS_NOISE
             excess = (gain.message or "") if gain is not None and noisy else ""
             found = _bound_particles(
-                scene, windows, clock, excess_noise=excess, pool=pool, progress=progress
+                scene, windows, clock, excess_noise=excess, tell=tell, pool=pool, progress=progress
             )
     windows = found.windows
     image = field_likelihood(scene, windows).measured_signal()
@@ -381,6 +382,7 @@ def _bound_particles(
     clock: _Clock,
     *,
     excess_noise: str,
+    tell: Notify,
     pool: ThreadPoolExecutor,
     progress: Progress,
 ) -> Found:
@@ -389,6 +391,9 @@ def _bound_particles(
         scene, windows, excess_noise=excess_noise, pool=pool, progress=progress
     )
     clock.lap("fit")
+    cause = misfit_warning(scene.config, events)
+    if cause:
+        tell(cause)
     rows = [Row(number, event, windows) for number, event in enumerate(events)]
     interrupted = False
     if scene.config.samples_posterior:

@@ -342,6 +342,7 @@ class Done:
     sampled: int = field(default=0)
     stopped: bool = False  # in the middle of its chains
     trajectory: Trajectory | None = None  # of the pattern, in all frames that were read
+    cause: str = ""  # what the model probably has wrong
 
 
 class Merged:
@@ -357,12 +358,14 @@ class Merged:
         self._done: list[Done] = []
         self._strongest = np.zeros((2, *shape))
         self.sampled = 0
+        self.cause = ""
 
     def add(self, done: Done) -> None:
         """Take one more."""
         stronger = done.strongest[0] > self._strongest[0]
         self._strongest = np.where(stronger, done.strongest, self._strongest)
         self.sampled += done.sampled
+        self.cause = self.cause or done.cause
         # the images are merged; holding them for every chunk would grow with the movie
         small = np.empty((2, 0, 0))
         kept = done.views if sum(len(d.views) for d in self._done) < 2 * VIEWS else ()

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.inference.cause import likely_cause
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import follow_pattern
 from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain
-from iscat_analysis.records import Windows
+from iscat_analysis.pipeline.field import Event
+from iscat_analysis.records import Status, Windows
 from iscat_analysis.search.sliding import measure_noise
 
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""
 
+_BRIGHTEST = 8  # isolated particles on which the model is judged
+_DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
 _GAIN_FRAMES = 64  # on which the gain is judged
 _NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
 _LONGEST = 100  # average of the noise curve
@@ -150,6 +155,30 @@ def drift_warning(name: str, background: dict[str, Any]) -> str | None:
         "background and the frames after it; its edges look like particles: take background frames "
         "nearer to them (--background), or fewer frames (fit.frames)"
     )
+
+
+def misfit_warning(config: Config, events: Sequence[Event]) -> str:
+    """Say what is probably wrong with the model, where it misses the brightest particles.
+
+    Parameters
+    ----------
+    config : Config
+        The microscope as it is configured.
+    events : sequence of Event
+        Fitted particles.
+
+    Returns
+    -------
+    str
+        One line; empty where most of the brightest are described, or nothing stands out.
+    """
+    alone = [e for e in events if not _DISTURBED.intersection(e.fit.flags)]
+    brightest = sorted(alone, key=lambda e: -e.snr)[:_BRIGHTEST]
+    missed = [e for e in brightest if Status.POOR_FIT in e.fit.flags]
+    if 2 * len(missed) <= len(brightest):
+        return ""
+    cause = likely_cause(config, [(e.likelihood, e.fit.theta, e.fit.box.free) for e in missed])
+    return cause.message if cause else ""
 
 
 def _first(movie: Stack, windows: Windows, most: int) -> NDArray[Any]:

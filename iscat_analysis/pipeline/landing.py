@@ -38,7 +38,7 @@ from iscat_analysis.pipeline.chunks import (
     judge_noise,
     plan_chunks,
 )
-from iscat_analysis.pipeline.diagnosis import DRIFT_PX
+from iscat_analysis.pipeline.diagnosis import DRIFT_PX, misfit_warning
 from iscat_analysis.pipeline.injection import InjectedMovie, draw_particles, recovery
 from iscat_analysis.pipeline.pattern import follow
 from iscat_analysis.pipeline.results import Row, table_of, view_of
@@ -205,6 +205,8 @@ def analyse_landings(
     wanted = config.background.drift_correction
     for text in frame_warnings(movie.name, merged, light, first, window, corrected=wanted):
         tell(text)
+    if merged.cause:
+        tell(f"{movie.name}: {merged.cause}")
     if not config.background.power_normalization:
         tell(
             "background.power_normalization = false has no effect on a landing movie: each frame "
@@ -426,6 +428,7 @@ def _analyse_chunk(
         sampled=sampled,
         stopped=stopped,
         trajectory=trajectory,
+        cause=misfit_warning(scene.config, [s.event for s in steps]),
     )
 
 

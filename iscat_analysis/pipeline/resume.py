@@ -89,6 +89,7 @@ class Store:
                     strongest=data["strongest"],
                     ends_e=data["ends_e"],
                     trajectory=_trajectory(data["trajectory"]),
+                    cause=str(data["cause"]),
                 )
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
             return None  # never finished, or cut short
@@ -119,6 +120,7 @@ class Store:
                     strongest=done.strongest,
                     ends_e=done.ends_e,
                     trajectory=_columns(done.trajectory),
+                    cause=np.array(done.cause),
                 )
             building.replace(path)
         except OSError:
