@@ -189,7 +189,7 @@ def _search(
     doubtful: list[Candidate] = []
     for candidate in found:
         size = max(
-            (_misfit(candidate, event, scene.roi_px, near) for event in events),
+            (_misfit(candidate, event, scene, near) for event in events),
             default=0.0,
         )
         size = max(size, EXCEEDS * candidate.beside)
@@ -200,13 +200,15 @@ def _search(
     return fresh, doubtful
 
 
-def _misfit(candidate: Candidate, event: Event, roi_px: int, near_px: float) -> float:
+def _misfit(candidate: Candidate, event: Event, scene: Scene, near_px: float) -> float:
     """Signal-to-noise ratio that a candidate must exceed not to be what a fit left over."""
     here = event.candidate
     distance = math.hypot(candidate.x_px - here.x_px, candidate.y_px - here.y_px)
     if distance <= near_px:
         return math.inf
-    if distance > 0.75 * roi_px or Status.POOR_FIT not in event.fit.flags:
+    # in dark field a wrong level of the background reaches farther than the region
+    reach = (2 if scene.additive else 0.75) * scene.roi_px
+    if distance > reach or Status.POOR_FIT not in event.fit.flags:
         return 0.0
     return math.sqrt(EXPLAINS * max(event.fit.chi2_reduced - 1, 0.0) * event.likelihood.n_pixels)
 
