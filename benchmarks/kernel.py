@@ -1,17 +1,22 @@
 """Where a pass of the fit spends its time, and what the processor could do.
 
-    python benchmarks/kernel.py [--quick]
+    python benchmarks/kernel.py [--quick] [--against COMMIT]
 
 One pass gives value, score and Fisher matrix of five parameters on n × n pixels.  Its parts are
 timed one at a time on rows of 32 pixels, beside a chain of scalar fused multiply-adds that keeps
 every unit busy, and the time per pass of three sizes is split into a part per pass and one per
-pixel.
+pixel.  The whole pass is compared with that of an earlier commit, and that of a pupil with
+astigmatism and coma with that of a round one, in turns; each counts by the best of its turns, so
+that a busy machine changes no ratio.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +32,10 @@ RESULTS = Path(__file__).resolve().parent / "results"
 SIDES = (13, 32, 64)
 SIDE = 32
 CHAINS = 16
+COMPARED_SIDE = 96
+TURNS = 3
+BEFORE = "399f8a7"
+"""The last commit whose only pupil was round and linearly polarised."""
 
 
 @njit(fastmath={"contract"}, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -43,9 +52,9 @@ def multiply_add(repeats: int, a: float, b: float) -> float:
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
-def heights(repeats, axial, z, intervals, work, profile):  # type: ignore[no-untyped-def]
+def heights(repeats, axial, z, stop, work, profile):  # type: ignore[no-untyped-def]
     for k in range(repeats):
-        radial.profile_at(axial, z + 1e-3 * k, intervals, work, profile)
+        radial.profile_at(axial, z + 1e-3 * k, 0, stop, work, profile)
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
@@ -76,10 +85,10 @@ def scores(repeats, kind, data, g, sums):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def passes(  # type: ignore[no-untyped-def]
-    repeats, axial, theta, reach, work, profile, lens, pixels, kind, data, score, fisher
+    repeats, axial, theta, start, stop, work, profile, lens, pixels, kind, data, score, fisher
 ):
     for _ in range(repeats):
-        radial.profile_at(axial, theta[2], reach, work, profile)
+        radial.profile_at(axial, theta[2], start, stop, work, profile)
         scoring.score_pass(profile, lens, pixels, kind, data, theta, score, fisher)
 
 
@@ -95,27 +104,94 @@ def seconds(run: Callable[..., object], repeats: int, *arguments: object) -> flo
 
 
 def pass_seconds(side: int, repeats: int) -> float:
-    """Processor time of one whole pass."""
-    likelihood, start, _ = Batch(side, 1).sets[0]
-    arguments = likelihood._arguments
-    axial, lens, pixels, kind, data = arguments
-    work = np.empty((4, 2, axial.heights.shape[3]))
-    profile = np.empty((8, axial.heights.shape[3] // 6, 6))
-    reach = scoring._intervals(pixels, start, lens.inv_step)
+    """Processor time of one whole pass, with the profile at a new height."""
+    likelihood, theta, _ = Batch(side, 1).sets[0]
+    axial, arguments = likelihood.model.axial_table, likelihood._arguments
+    lens, pixels = arguments[:2]
+    work, profile = scoring.scratch(axial, lens, 2)
+    start, stop = scoring.span(lens, pixels, theta, axial.heights.shape[3])
     score, fisher = np.empty(5), np.empty((5, 5))
-
     return seconds(
-        passes, repeats, axial, start, reach, work, profile, lens, pixels, kind, data, score, fisher
+        passes, repeats, axial, theta, start, stop, work, profile, *arguments, score, fisher
     )
+
+
+COMPARED = """
+import json, sys, time
+import numpy as np
+try:
+    from iscat_analysis.optics.forward import PixelGrid, forward_model
+    from iscat_analysis.inference.likelihood import asimov_conditional
+except ImportError:
+    from iscat_analysis.forward import PixelGrid, forward_model
+    from iscat_analysis.likelihood import asimov_conditional
+from iscat_analysis.config import parse_config
+repeats, side, pixel = int(sys.argv[1]), int(sys.argv[2]), 84.4
+def work(**optics):
+    config = parse_config({
+        "optics": {"wavelength_nm": 525.0, "na": 1.42, "emission": "reciprocal", **optics},
+        "camera": {"pixel_size_nm": pixel},
+        "particle": {"kind": "protein", "mass_kda": 1000.0, "height_nm": 5.0},
+        "fit": {"z_range_nm": [0.0, 100.0]},
+    })
+    grid = PixelGrid.centred(side, pixel)
+    model = forward_model(config, grid.diagonal_nm)
+    theta = np.array([17.0, -29.0, 50.0, 1000.0, 0.0])
+    likelihood = asimov_conditional(model, grid, theta, 1e4, 200, 200)
+    return lambda: likelihood.score_fisher(theta)
+jobs = {"round": work()}
+if len(sys.argv) > 3:
+    jobs["circular"] = work(polarization="circular", analyzer=True)
+    jobs["general"] = work(aberrations_nm={"z5": 15.0, "z6": -10.0, "z7": 12.0, "z8": 20.0})
+best = dict.fromkeys(jobs, np.inf)
+for turn in range(8):
+    for name, job in jobs.items():
+        job()
+        begun = time.process_time()
+        for _ in range(repeats):
+            job()
+        best[name] = min(best[name], (time.process_time() - begun) / repeats / side**2)
+print(json.dumps(best))
+"""
+"""Seconds per pixel and pass, through names that every version has; large enough a field that the
+call itself does not count."""
+
+
+def versions(commit: str, repeats: int) -> dict[str, float]:
+    """Compare this version's pass with an earlier commit's, and a general pupil's with a round."""
+    folder = RESULTS / f"kernel-{commit}"
+    folder.mkdir(parents=True, exist_ok=True)
+    root = Path(__file__).resolve().parents[1]
+    archive = subprocess.run(
+        ["git", "archive", commit, "iscat_analysis"], cwd=root, check=True, capture_output=True
+    )
+    subprocess.run(["tar", "-x", "-C", str(folder)], input=archive.stdout, check=True)
+    best: dict[str, float] = {}
+    for _ in range(TURNS):
+        for where, more in ((folder, ()), (root, ("all",))):
+            done = subprocess.run(
+                [sys.executable, "-c", COMPARED, str(repeats), str(COMPARED_SIDE), *more],
+                env={**os.environ, "PYTHONPATH": str(where)},
+                cwd=where, check=True, capture_output=True, text=True,
+            )  # fmt: skip
+            found = json.loads(done.stdout.splitlines()[-1])
+            if where is folder:
+                found = {"before": found["round"]}
+            best = {key: min(best.get(key, np.inf), value) for key, value in (best | found).items()}
+    return {
+        **{f"{key}_ns_per_pixel": 1e9 * value for key, value in best.items()},
+        "speed_of_round_over_before": best["before"] / best["round"],
+        "time_of_general_over_round": best["general"] / best["round"],
+    }
 
 
 def parts(repeats: int) -> dict[str, float]:
     """Nanoseconds of each part: of a pass, then of a pixel."""
     likelihood, start, _ = Batch(SIDE, 1).sets[0]
-    axial, lens, pixels, kind, data = likelihood._arguments
-    work = np.empty((4, 2, axial.heights.shape[3]))
-    profile = np.empty((8, axial.heights.shape[3] // 6, 6))
-    reach = scoring._intervals(pixels, start, lens.inv_step)
+    axial = likelihood.model.axial_table
+    lens, pixels, kind, data = likelihood._arguments
+    work, profile = scoring.scratch(axial, lens, 2)
+    _, stop = scoring.span(lens, pixels, start, axial.heights.shape[3])
     x = pixels.x - pixels.x.mean()
     f: FloatArray = np.zeros((image.SCRATCH, x.size))
     g, sums = np.zeros((5, x.size)), np.zeros(20)
@@ -130,7 +206,7 @@ def parts(repeats: int) -> dict[str, float]:
     per = 1e9 / x.size
     return {
         "heights_ns_per_pass": 1e9
-        * seconds(heights, repeats, axial, start[2], reach, work, profile),
+        * seconds(heights, repeats, axial, start[2], stop, work, profile),
         "quintics_ns_per_pixel": radii * samples * per,
         "fields_ns_per_pixel": (whole - radii) * samples * per,
         "value_ns_per_pixel": value * per,
@@ -141,7 +217,9 @@ def parts(repeats: int) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description="The parts of a pass of the fit.")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions")
-    repeats = 2_000 if parser.parse_args().quick else 20_000
+    parser.add_argument("--against", default=BEFORE, help="commit to compare with")
+    given = parser.parse_args()
+    repeats = 2_000 if given.quick else 20_000
     RESULTS.mkdir(exist_ok=True)
     found = parts(repeats)
     whole = {side: pass_seconds(side, repeats // 10) for side in SIDES}
@@ -150,6 +228,7 @@ def main() -> None:
     found |= {f"pass_us_{side}": 1e6 * t for side, t in whole.items()}
     found |= {"ns_per_pixel": float(per_pixel), "ns_per_pass": float(per_pass)}
     found["multiply_add_ns"] = 1e9 * seconds(multiply_add, 50 * repeats, 0.5, 0.25) / CHAINS
+    found |= versions(given.against, repeats // 400)
     for key, value in found.items():
         print(f"{key:42} {value:.4g}")
     (RESULTS / "kernel.json").write_text(json.dumps(found, indent=2) + "\n")

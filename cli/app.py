@@ -18,7 +18,14 @@ from iscat_cli.benchmark import EXAMPLE as BENCHMARK_EXAMPLE
 from iscat_cli.benchmark import benchmark
 from iscat_cli.bounds import EXAMPLE as BOUNDS_EXAMPLE
 from iscat_cli.bounds import bounds
-from iscat_cli.calibrate import CAMERA_EXAMPLE, MASS_EXAMPLE, camera, mass
+from iscat_cli.calibrate import (
+    CAMERA_EXAMPLE,
+    MASS_EXAMPLE,
+    OPTICS_EXAMPLE,
+    camera,
+    mass,
+    optics,
+)
 from iscat_cli.calibrate import SUMMARY as CALIBRATE_SUMMARY
 from iscat_cli.config import EXAMPLE as CONFIG_EXAMPLE
 from iscat_cli.config import config
@@ -38,7 +45,8 @@ COMMANDS = (
 )
 
 # A command with commands of its own: its name, what it is for, and they.
-GROUPS = (("calibrate", CALIBRATE_SUMMARY, ((camera, CAMERA_EXAMPLE), (mass, MASS_EXAMPLE))),)
+_CALIBRATIONS = ((camera, CAMERA_EXAMPLE), (optics, OPTICS_EXAMPLE), (mass, MASS_EXAMPLE))
+GROUPS = (("calibrate", CALIBRATE_SUMMARY, _CALIBRATIONS),)
 
 
 def run(program: str, arguments: Sequence[str]) -> int:

@@ -1,4 +1,4 @@
-"""`iscat calibrate`: the camera from its own noise, mass from standards."""
+"""`iscat calibrate`: the camera from its noise, the optics from particles, mass from standards."""
 
 from __future__ import annotations
 
@@ -9,13 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from iscat_cli.console import Messages, failures, print_json, print_result
-from iscat_cli.options import DebugOption, JsonOption, OverwriteOption, QuietOption
+from iscat_cli.options import (
+    ConfigOption,
+    DebugOption,
+    JsonOption,
+    OverwriteOption,
+    QuietOption,
+    SetOption,
+)
 
 if TYPE_CHECKING:
     from iscat_analysis.calibration.camera import CameraCalibration, Estimate
     from iscat_analysis.calibration.mass import MassCalibration
+    from iscat_analysis.calibration.optics import OpticsCalibration
 
-SUMMARY = "Calibrate the camera, or contrast against mass."
+SUMMARY = "Calibrate the camera, the optics, or contrast against mass."
 
 CAMERA_EXAMPLE = """Example: gain, offset and read noise from a movie and a dark.
 
@@ -25,6 +33,12 @@ CAMERA_EXAMPLE = """Example: gain, offset and read noise from a movie and a dark
 MASS_EXAMPLE = """Example: three standards in a measured table of events.
 
     iscat calibrate mass standards.iscat/fits.csv --standards 66,146,480
+"""
+
+
+OPTICS_EXAMPLE = """Example: focus, aperture, phase and aberrations from the movie itself.
+
+    iscat calibrate optics landing.tif --config landing.toml --out microscope
 """
 
 
@@ -147,8 +161,7 @@ def mass(
     Writes calibration.json, calibration.toml (a section to paste) and calibration.html.
     """
     messages = Messages(context.command_path, quiet=quiet)
-    options = {"standards_kda": "--standards", "landing": "--landing"}
-    with failures(messages, debug=debug, options=options):
+    with failures(messages, debug=debug):
         masses, errors = _standards(standards)
 
         from iscat_analysis.pipeline.calibrations import mass_calibration
@@ -168,6 +181,84 @@ def mass(
         else:
             _print_mass(found)
         messages.notify(f"wrote {folder}; open {folder / 'calibration.html'}")
+
+
+def optics(
+    context: typer.Context,
+    movie: Annotated[
+        Path,
+        typer.Argument(
+            metavar="MOVIE",
+            help="A landing movie, one with background frames, or a scan of the focus.",
+            show_default=False,
+        ),
+    ],
+    *,
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    free: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="What may change, some of focus,na,phase,mask,zernike,polarization; default all.",
+            show_default=False,
+        ),
+    ] = None,
+    focus_step: Annotated[
+        float | None,
+        typer.Option(
+            metavar="NM",
+            help="The movie is a scan of immobile particles: rise of the focus per frame [nm].",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Output folder; default the movie's name with .optics.",
+            show_default=False,
+        ),
+    ] = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Learn focus, aperture, phase, mask, aberrations and polarisation from a movie.
+
+    Writes optics.toml (name it as optics.file in a configuration), optics.json and optics.html.
+    """
+    messages = Messages(context.command_path, quiet=quiet)
+    with failures(messages, debug=debug):
+        from iscat_analysis.config import load_config
+        from iscat_analysis.errors import DataError
+        from iscat_analysis.pipeline.calibrations import optics_calibration
+
+        folder = out if out is not None else movie.with_suffix(".optics")
+        with messages.progress() as progress:
+            found = optics_calibration(
+                movie,
+                load_config(config, settings or ()),
+                folder,
+                free=free,
+                focus_step_nm=focus_step,
+                overwrite=overwrite,
+                progress=progress,
+                notify=messages.notify,
+            )
+        if as_json:
+            shown = found.to_dict()
+            del shown["pictures"]
+            print_json("optics", {**shown, "out": str(folder)})
+        else:
+            _print_optics(found)
+        messages.notify(f"wrote {folder}; open {folder / 'optics.html'}")
+        if not found.accepted:
+            raise DataError(
+                f"{movie}: the optics are refused: {'; '.join(found.measured.refusals)}; record "
+                "brighter or more particles that stand alone, or let more change with --free"
+            )
 
 
 def _standards(text: str) -> tuple[list[float], list[float]]:
@@ -209,6 +300,19 @@ def _cells(estimate: Estimate | None) -> list[str]:
     if estimate is None:
         return ["–", "–", "–"]
     return [f"{value:.5g}" for value in (estimate.value, *estimate.ci95)]
+
+
+def _print_optics(found: OpticsCalibration) -> None:
+    table = _table("optics")
+    for name in ("value", "±", "CRB", "configured"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("")
+    for row in found.parameters.to_dict("records"):
+        numbers = ("value", "sigma", "crb", "configured")
+        cells = ("–" if row[name] != row[name] else f"{row[name]:.6g}" for name in numbers)
+        table.add_row(row["parameter"], *cells, row["state"])
+    print_result(table)
+    print_result(found.headline())
 
 
 def _print_mass(found: MassCalibration) -> None:

@@ -201,9 +201,7 @@ def _ignore(stage: str, done: int, total: int) -> None:
 
 
 @contextmanager
-def failures(
-    messages: Messages, *, debug: bool, options: Mapping[str, str] | None = None
-) -> Iterator[None]:
+def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
     """Turn whatever a command raises into one line and an exit status.
 
     Parameters
@@ -212,9 +210,6 @@ def failures(
         Where the line goes.
     debug : bool
         Show the traceback as well.
-    options : mapping of str to str, optional
-        Argument of the library → option of the command: what the library calls ``name = value`` is
-        shown as ``--option value``.
 
     Yields
     ------
@@ -252,9 +247,7 @@ def failures(
             if debug:
                 _write(sys.stderr, traceback.format_exc())
             line, status = _verdict(error, debug=debug)
-            for argument, option in (options or {}).items():
-                line = re.sub(rf"\b{argument} = ", f"{option} ", line)
-            messages.error(line)
+            messages.error(_with_options(line))
             raise typer.Exit(status) from error
 
 
@@ -332,11 +325,52 @@ def _termination_interrupts() -> Iterator[None]:
             signal.signal(number, signal.SIG_DFL)
 
 
+_OPTIONS = {
+    **{
+        name: name
+        for name in ("dark", "inject", "landing", "maps", "optimize", "out", "overwrite", "scan",
+                     "target")
+    },
+    "offset_adu": "offset",
+    "standards_kda": "standards",
+}  # fmt: skip
+"""Argument of the library → option of a command."""
+
+_KEYS_WITH_OPTIONS = (
+    (r"\bbackground\.frames = \[(\w+), (\w+)\]", r"--background \1:\2"),
+    (r"\bfit\.frames = \[(\w+), (\w+)\]", r"--frames \1:\2"),
+    (r'\bfit\.mode = "(\w+)"', r"--mode \1"),
+    (r"\bas in ([a-z]+\.[a-z_]+) = ([\w.]+)", r"as in --set \1=\2"),
+)
+"""How keys of the configuration are given on the command line."""
+
+
+def _with_options(text: str) -> str:
+    """Name options where the library names its arguments, which it writes in backquotes."""
+
+    def option(match: re.Match[str]) -> str:
+        return f"--{_OPTIONS[match[1]]}{' ' if match[2] else ''}"
+
+    text = re.sub(rf"`({'|'.join(_OPTIONS)})`( = )?", option, text)
+    for pattern, replacement in _KEYS_WITH_OPTIONS:
+        text = re.sub(pattern, replacement, text)
+    return text
+
+
+def _interrupted(error: Exception) -> bool:
+    """Whether an interrupt hides behind an error, as it does where it meets compiled code."""
+    return isinstance(error, SystemError) and isinstance(
+        error.__cause__ or error.__context__, KeyboardInterrupt
+    )
+
+
 def _verdict(error: Exception, *, debug: bool) -> tuple[str, int]:
     from iscat_analysis.errors import IscatError
 
     if isinstance(error, IscatError):
         return str(error), error.exit_status
+    if _interrupted(error):
+        return "interrupted", INTERRUPTED
     said = f": {error}" if str(error) else ""
     hint = "" if debug else "; run again with --debug for the traceback"
     return f"unexpected {type(error).__name__}{said}{hint}", UNEXPECTED

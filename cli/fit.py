@@ -106,7 +106,7 @@ def fit(
     output folder.
     """
     messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug, options={"inject": "--inject"}):
+    with failures(messages, debug=debug):
         from iscat_analysis.config import load_config
         from iscat_analysis.errors import ConfigError
 
@@ -178,32 +178,51 @@ def _is_flagged(row: Mapping[str, Any]) -> bool:
 def _advise(messages: Messages, flagged: Sequence[Mapping[str, Any]]) -> None:
     from iscat_analysis.records import Status
 
-    for status, count in Counter(str(row["status"]) for row in flagged).most_common():
-        if status != Status.OK:
-            messages.notify(f"{count} {status}: {Status(status).advice}")
+    remarks = Counter(
+        remark
+        for row in flagged
+        for remark in {str(row["status"]), *str(row["flags"] or "").split(";")}
+    )
+    for status in Status:
+        if status != Status.OK and remarks[status.value]:
+            messages.notify(f"{remarks[status.value]} {status}: {status.advice}")
 
 
 def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
     from rich.console import Console
 
     from iscat_analysis.records import FREE_PARAMETERS
+    from iscat_analysis.report.headline import NOT_A_MASS, as_contrasts, caution, main_quantity
+    from iscat_analysis.report.headline import is_uncalibrated as uncalibrated
+    from iscat_analysis.report.numbers import count
 
     if rows:
         console = Console()
         width = console.width if console.is_terminal else None
+        if (flagged := caution(analysis.table)) is not None:
+            print_result(flagged)
+        shown, mass = analysis.table.head(ROWS_SHOWN), ("mass", "kDa")
+        if uncalibrated(analysis):
+            print_result(NOT_A_MASS)
+            mass = ("mass, model scale", "kDa")
+            if main_quantity(analysis).column == "contrast":
+                shown, mass = as_contrasts(shown), ("contrast", "")
         free = FREE_PARAMETERS[analysis.mode]
-        print_result(events_table(rows[:ROWS_SHOWN], free, width=width))
+        print_result(events_table(shown.to_dict("records"), free, mass=mass, width=width))
     if len(rows) > ROWS_SHOWN:
-        print_result(f"… and {len(rows) - ROWS_SHOWN} more")
+        print_result(f"… and {len(rows) - ROWS_SHOWN} more in {folder / 'fits.csv'}")
     counts = Counter(str(row["status"]) for row in rows)
-    verdict = ", ".join(f"{count} {status}" for status, count in counts.most_common())
-    kind = "rows" if analysis.mode == "track" else "events"
-    number = len(rows) - counts["sidelobe"]
-    print_result(f"{number} {kind}{': ' if verdict else ''}{verdict}; results in {folder}")
+    verdict = ", ".join(f"{n} {status}" for status, n in counts.most_common())
+    found = count(len(rows) - counts["sidelobe"], "row" if analysis.mode == "track" else "event")
+    print_result(f"{found}{': ' if verdict else ''}{verdict}; results in {folder}")
 
 
 def events_table(
-    rows: Sequence[Mapping[str, Any]], free: Sequence[str], *, width: int | None = None
+    rows: Sequence[Mapping[str, Any]],
+    free: Sequence[str],
+    *,
+    mass: tuple[str, str] = ("mass", "kDa"),
+    width: int | None = None,
 ) -> Table:
     """Tabulate fitted events: every parameter ± σ, and the bounds of z and mass where free.
 
@@ -213,6 +232,8 @@ def events_table(
         Rows of ``fits.csv``.
     free : sequence of str
         Names of the free parameters.
+    mass : tuple of two str
+        What the column ``mass_kda`` is called, and its unit, which may be empty.
     width : int, optional
         Characters there is room for; what fits least is left out.  Default all there are.
 
@@ -224,10 +245,10 @@ def events_table(
     from rich import box
     from rich.table import Table
 
-    columns = _columns(free, compact=width is not None)
+    columns = _columns(free, mass, compact=width is not None)
     cells = {heading: [cell(row) for row in rows] for heading, cell in columns.items()}
     if width is not None:
-        spare = [heading for heading in _SPARE if heading in cells]
+        spare = [heading for heading in _spare(mass[0]) if heading in cells]
         while spare and sum(_widest(h, cells[h]) + GAP for h in cells) > width:
             del cells[spare.pop(0)]
     table = Table(box=box.SIMPLE_HEAD if width is not None else None, pad_edge=False)
@@ -239,31 +260,35 @@ def events_table(
 
 
 _SYMBOLS = {"x_nm": ("x", "nm"), "y_nm": ("y", "nm"), "z_nm": ("z", "nm")}
-_SYMBOLS["mass_kda"] = ("mass", "kDa")
 
-_SPARE = ("QCRB\nz", "CRB\nz", "QCRB\nmass", "CRB\nmass", "frame", "y ± σ\n[nm]", "x ± σ\n[nm]")
-"""What a narrow terminal does without, first to go first."""
+
+def _spare(mass: str) -> tuple[str, ...]:
+    """Name what a narrow terminal does without, the first to go first."""
+    bounds = ("QCRB\nz", "CRB\nz", f"QCRB\n{mass}", f"CRB\n{mass}")
+    return (*bounds, "frame", "y ± σ\n[nm]", "x ± σ\n[nm]")
 
 
 def _columns(
-    free: Sequence[str], *, compact: bool
+    free: Sequence[str], mass: tuple[str, str], *, compact: bool
 ) -> dict[str, Callable[[Mapping[str, Any]], str]]:
     """Give heading → cell; compact, what is not free is left out and headings have two lines."""
     columns: dict[str, Callable[[Mapping[str, Any]], str]] = {
         "event": lambda row: str(row["event"]),
         "frame": lambda row: str(row["frame"]),
     }
-    for name, (symbol, unit) in _SYMBOLS.items():
+    symbols = {**_SYMBOLS, "mass_kda": mass}
+    for name, (symbol, unit) in symbols.items():
         if name in free or not compact:
-            heading = f"{symbol} ± σ{chr(10) if compact else ' '}[{unit}]"
+            heading = f"{symbol} ± σ{chr(10) if compact else ' '}{f'[{unit}]' if unit else ''}"
             columns[heading] = lambda row, name=name: _with_spread(  # type: ignore[misc]
                 row[name], row[f"sigma_{name}"]
             )
     for name in ("z_nm", "mass_kda"):
-        symbol, unit = _SYMBOLS[name]
+        symbol, unit = symbols[name]
         for kind in ("crb", "qcrb") if name in free else ():
             title = kind.upper()
-            heading = f"{title}\n{symbol}" if compact else f"{title} {symbol} [{unit}]"
+            heading = f"{title}\n{symbol}" if compact else f"{title} {symbol}"
+            heading += f" [{unit}]" if unit and not compact else ""
             columns[heading] = lambda row, key=f"{kind}_{name}": _short(row[key])  # type: ignore[misc]
     columns["status"] = lambda row: str(row["status"])
     return columns

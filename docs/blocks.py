@@ -5,6 +5,8 @@ the other in one folder, the Python blocks in one interpreter.  Comments in the 
 
 ``<!-- not run: REASON -->``
     before a block that needs what is not there.
+``<!-- needs: MODULE -->``
+    before a block that is run only where a module of another package is installed.
 ``<!-- first: COMMAND -->``
     before a block: a command that is run and not shown.
 ``<!-- keep: NAME -->``
@@ -13,6 +15,7 @@ the other in one folder, the Python blocks in one interpreter.  Comments in the 
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -24,7 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 FENCE = re.compile(r"^(?P<indent> *)(?P<ticks>```+)(?P<language>[^`]*?)\s*$")
-COMMENT = re.compile(r"^ *<!-- (?P<kind>not run|first|keep): (?P<text>.*?) -->$")
+COMMENT = re.compile(r"^ *<!-- (?P<kind>not run|needs|first|keep): (?P<text>.*?) -->$")
 RUNNABLE = ("console", "python")
 
 
@@ -76,6 +79,9 @@ def blocks_of(page: Path) -> Iterator[Block]:
             first.append(comment["text"])
         elif comment and comment["kind"] == "keep":
             keep = comment["text"]
+        elif comment and comment["kind"] == "needs":
+            missing = importlib.util.find_spec(comment["text"]) is None
+            not_run = f"{comment['text']}, which is not installed here" if missing else None
         elif comment:
             not_run = comment["text"]
         elif fence:

@@ -1,8 +1,20 @@
 """Particles in interferometric scattering movies, and how near their fits come to the bound.
 
-The flow of a measurement, each step a name of this package::
+Pieces, which take arrays and a microscope, and need neither a file nor a movie::
 
     import iscat_analysis as ia
+
+    optics, camera = ia.Optics(na=1.42, focus_nm=-300), ia.Camera(pixel_size_nm=84.4)
+    protein = ia.Particle(mass_kda=480)
+
+    ia.psf(optics, protein, camera, z_nm=[0, 50, 100])          # images, (3, y, x)
+    ia.fit_rois(before, after, optics, protein, camera,
+                n_before=200, n_after=200)                      # pandas.DataFrame, one row each
+    ia.log_likelihood(...)                                      # of θ in nm and kDa, with gradient
+    ia.crb(optics, protein, camera, photons_per_pixel=1e4)      # what no estimate can beat
+    ia.qcrb(...)                                                # whatever the camera
+
+Whole jobs, from a movie to a report::
 
     setup = ia.configure("setup.toml", settings={"optics.na": 1.42})
     result = ia.fit_movie("movie.tif", config=setup, background=(0, 200))
@@ -11,6 +23,7 @@ The flow of a measurement, each step a name of this package::
     result.view(0)              # matplotlib Figure: data, model, residual
     result.posterior(0)         # arviz.InferenceData
     result.save("movie.iscat")  # report.html, fits.csv, fits.parquet, …
+    ia.calibrate_optics("movie.tif", config=setup)  # focus, aberrations… from the movie itself
     ia.compute_bounds(setup)    # what no estimate from such frames can beat
 
 `fit_movie` runs load → calibrate → background → detect → fit → posterior → bounds.  The modules of
@@ -31,7 +44,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from iscat_analysis.config import Calibration as Calibration
     from iscat_analysis.config import Config as Config
+    from iscat_analysis.config import Optics as Optics
+    from iscat_analysis.config import Particle as Particle
     from iscat_analysis.config import config_to_toml as config_to_toml
     from iscat_analysis.config import configure as configure
     from iscat_analysis.config import load_config as load_config
@@ -42,9 +58,17 @@ if TYPE_CHECKING:
     from iscat_analysis.movie import open_stack as open_stack
     from iscat_analysis.notebook import Bounds as Bounds
     from iscat_analysis.notebook import Result as Result
+    from iscat_analysis.notebook import calibrate_optics as calibrate_optics
     from iscat_analysis.notebook import compute_bounds as compute_bounds
     from iscat_analysis.notebook import fit_movie as fit_movie
     from iscat_analysis.notebook import simulate_movie as simulate_movie
+    from iscat_analysis.pieces import Camera as Camera
+    from iscat_analysis.pieces import LogLikelihood as LogLikelihood
+    from iscat_analysis.pieces import crb as crb
+    from iscat_analysis.pieces import fit_rois as fit_rois
+    from iscat_analysis.pieces import log_likelihood as log_likelihood
+    from iscat_analysis.pieces import psf as psf
+    from iscat_analysis.pieces import qcrb as qcrb
     from iscat_analysis.pipeline import fit_stack as fit_stack
     from iscat_analysis.records import EVENT_COLUMNS as EVENT_COLUMNS
     from iscat_analysis.records import FREE_PARAMETERS as FREE_PARAMETERS
@@ -53,10 +77,21 @@ if TYPE_CHECKING:
     from iscat_analysis.schemas import schema as schema
 
 _HOME = {
+    "Optics": "config",
+    "Particle": "config",
+    "Camera": "pieces",
+    "Calibration": "config",
+    "psf": "pieces",
+    "fit_rois": "pieces",
+    "log_likelihood": "pieces",
+    "LogLikelihood": "pieces",
+    "crb": "pieces",
+    "qcrb": "pieces",
     "configure": "config",
     "fit_movie": "notebook",
     "Result": "notebook",
     "simulate_movie": "notebook",
+    "calibrate_optics": "notebook",
     "compute_bounds": "notebook",
     "Bounds": "notebook",
     "Config": "config",
@@ -80,20 +115,31 @@ __all__ = [
     "FREE_PARAMETERS",
     "Analysis",
     "Bounds",
+    "Calibration",
+    "Camera",
     "Config",
     "ConfigError",
     "DataError",
     "IscatError",
+    "LogLikelihood",
+    "Optics",
+    "Particle",
     "Result",
     "Stack",
     "Status",
+    "calibrate_optics",
     "compute_bounds",
     "config_to_toml",
     "configure",
+    "crb",
     "fit_movie",
+    "fit_rois",
     "fit_stack",
     "load_config",
+    "log_likelihood",
     "open_stack",
+    "psf",
+    "qcrb",
     "schema",
     "simulate_movie",
 ]

@@ -7,8 +7,9 @@ configuration are given as a mapping.
 from __future__ import annotations
 
 import html
+import textwrap
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,13 +18,26 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from iscat_analysis.bounds import bounds_report, parse_scan, scan
+from iscat_analysis.calibration.optics import OpticsCalibration
 from iscat_analysis.config import Config, configure
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.pipeline import analyse
+from iscat_analysis.pipeline.calibrations import optics_calibration
+from iscat_analysis.pipeline.microscope import calibrate_movie
 from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Progress, silent
 from iscat_analysis.report import check_output, write_report
-from iscat_analysis.report.numbers import LABELS, UNITS
+from iscat_analysis.report.headline import (
+    as_contrasts,
+    caution,
+    headline,
+    label_of,
+    main_quantity,
+    precision_of,
+)
+from iscat_analysis.report.numbers import UNITS, count, number
 from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
+from iscat_analysis.report.posterior import posterior_groups
+from iscat_analysis.report.tables import event_table
 from iscat_analysis.study.simulate import write_stack
 
 if TYPE_CHECKING:
@@ -114,6 +128,63 @@ def fit_movie(
     if folder is not None:
         result.save(folder, overwrite=overwrite)
     return result
+
+
+def calibrate_optics(
+    movie: str | Path,
+    *,
+    config: str | Path | Mapping[str, Any] | Config | None = None,
+    settings: Mapping[str, Any] | Iterable[str] | None = None,
+    free: str | Sequence[str] | None = None,
+    focus_step_nm: float | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> OpticsCalibration:
+    """Learn the optics from a movie of particles; in memory, unless `out` names a folder.
+
+    Parameters
+    ----------
+    movie : str or Path
+        A landing movie, one with background frames, or a scan of the focus.
+    config : str, Path, mapping or Config, optional
+        As for `configure`: the microscope as far as it is known.
+    settings : mapping of str to Any, or iterable of str, optional
+        As for `configure`; they win over `config`.
+    free : str or sequence of str, optional
+        What may change, some of ``focus, na, phase, mask, zernike, polarization``; default all.
+    focus_step_nm : float, optional
+        The movie is a scan of immobile particles: rise of the focus from frame to frame [nm].
+    out : str or Path, optional
+        Folder for optics.toml, optics.json and optics.html.
+    overwrite : bool
+        Replace an earlier result in `out`.
+    progress : Progress
+        Called with the stage and the steps done and in all.
+
+    Returns
+    -------
+    OpticsCalibration
+        Its `config` holds the measured optics, unless they are refused.
+
+    Raises
+    ------
+    DataError
+        The movie shows too few bright particles, or `out` may not be written.
+    ConfigError
+        A setting is unknown or impossible, or cannot be calibrated.
+    """
+    resolved, path = configure(config, settings=settings), Path(movie)
+    folder = _path(out)
+    if folder is not None:
+        return optics_calibration(
+            path, resolved, folder, free=free, focus_step_nm=focus_step_nm, overwrite=overwrite,
+            progress=progress,
+        )  # fmt: skip
+    with open_stack(path) as stack:
+        return calibrate_movie(
+            stack, resolved, free=free, focus_step_nm=focus_step_nm, progress=progress
+        )
 
 
 def simulate_movie(
@@ -342,31 +413,13 @@ class Result:
         DataError
             There is no such event, it was not sampled, or its chain did not converge.
         """
-        found = posterior_of(self.analysis, event)
+        posterior_of(self.analysis, event)
         with warnings.catch_warnings():
             # ArviZ announces its next major version on import, once a day.
             warnings.simplefilter("ignore", FutureWarning)
             import arviz
-            import xarray
-        axes = ("chain", "draw")
-        chains, draws, _ = found.samples.shape
-        coordinates = {"chain": range(chains), "draw": range(draws)}
-        variables = {
-            name: (axes, found.samples[..., k], {"units": UNITS[name]})
-            for k, name in enumerate(found.names)
-        }
-        about = {
-            "event": int(event),
-            "sampling_library": "emcee",
-            "input_path": self.analysis.provenance.input_path,
-            "input_sha256": self.analysis.provenance.input_sha256,
-        }
-        return arviz.InferenceData(
-            posterior=xarray.Dataset(variables, coords=coordinates, attrs=about),
-            sample_stats=xarray.Dataset(
-                {"log_likelihood": (axes, found.log_likelihood)}, coords=coordinates, attrs=about
-            ),
-        )
+        groups = posterior_groups(self.analysis, [view_of(self.analysis, event)])
+        return arviz.InferenceData(**{name: group.isel(event=0) for name, group in groups.items()})
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write the report, the tables and the figures into a folder.
@@ -391,30 +444,29 @@ class Result:
         return write_report(self.analysis, Path(folder), overwrite=overwrite)
 
     def _heading(self) -> str:
-        count, analysis = len(self), self.analysis
+        analysis = self.analysis
         name = Path(analysis.provenance.input_path).name or "movie"
-        return f"{count} event{'' if count == 1 else 's'} in {name}, mode {analysis.mode}"
+        return f"{count(len(self), 'event')} in {name}, mode {analysis.mode}"
 
     def _facts(self) -> list[tuple[str, str]]:
-        status: Mapping[str, int] = self.summary.get("status", {})
-        facts = [("status", ", ".join(f"{n} {name}" for name, n in status.items()) or "no events")]
-        precision: Mapping[str, Mapping[str, float | None]] = self.summary.get("precision", {})
-        for name in FREE_PARAMETERS[self.mode]:
-            medians = precision.get(name, {})
-            cells = [
-                f"{symbol} {medians[key]:.3g}"
-                for symbol, key in (
-                    ("σ", "sigma_median"), ("CRB", "crb_median"), ("QCRB", "qcrb_median"),
-                )
-                if medians.get(key) is not None
-            ]  # fmt: skip
-            if cells:
-                facts.append((LABELS[name], f"{', '.join(cells)} {UNITS[name]} (medians)"))
-        facts += [("warning", text) for text in self.warnings]
-        return facts
+        table = event_table(self.analysis)
+        facts = [("", text) for text in headline(self.analysis, table)] if len(self) else []
+        counts = table["status"].value_counts()
+        facts.append(("status", ", ".join(f"{n} {s}" for s, n in counts.items()) or "no events"))
+        for name in FREE_PARAMETERS[self.mode] if caution(table) is None else ():
+            p = precision_of(table, name)
+            if p.events:
+                text = f"σ {number(p.sigma)}, CRB {number(p.crb)}, QCRB {number(p.qcrb)}"
+                facts.append((label_of(self.analysis, name), f"{text} {UNITS[name]} (medians)"))
+        return facts + [("warning", text) for text in self.warnings]
 
     def __repr__(self) -> str:
-        lines = [f"  {name:<8}{text}" for name, text in self._facts()]
+        lines = [
+            line
+            for name, text in self._facts()
+            for line in textwrap.wrap(f"{name} {text}".strip(), 78, initial_indent="  ",
+                                      subsequent_indent="    ")
+        ]  # fmt: skip
         hint = "  look at .table, .view(0), .histogram(), .posterior(0); keep with .save(folder)"
         return "\n".join([f"Result: {self._heading()}", *lines, hint])
 
@@ -425,7 +477,13 @@ class Result:
             for name, text in self._facts()
         )
         names = [*_COLUMNS, *(f"sigma_{name}" for name in FREE_PARAMETERS[self.mode]), "status"]
-        shown = self.table[names].head(ROWS_SHOWN)
+        shown = self.table.head(ROWS_SHOWN)
+        if main_quantity(self.analysis).column == "contrast":
+            shown = as_contrasts(shown)
+        shown = shown[names]
+        if main_quantity(self.analysis).column == "contrast":
+            new = {"mass_kda": "contrast", "sigma_mass_kda": "sigma_contrast"}
+            shown = shown.rename(columns=new)
         rest = len(self) - len(shown)
         more = f"<p>… and {rest} more in <code>.table</code></p>" if rest else ""
         body = shown.to_html(index=False, float_format="{:.4g}".format, border=0, escape=True)

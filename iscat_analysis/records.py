@@ -77,7 +77,8 @@ class Status(StrEnum):
 _ADVICE = {
     Status.OK: "The fit converged, inside its bounds, and agrees with the data.",
     Status.NOT_CONVERGED: "The fit did not settle: check the optics, or enlarge fit.roi_nm.",
-    Status.AT_BOUND: "A parameter lies on its bound: widen fit.z_range_nm, or leave the event out.",
+    Status.AT_BOUND: "The data pull a parameter beyond its bound: widen fit.z_range_nm; where that "
+    "begins at 0, the coverslip, check optics.focus_nm and the indices; or leave the event out.",
     Status.AMBIGUOUS_Z: "Another height explains the data almost as well: use more frames, "
     "another focus, or a narrower fit.z_range_nm.",
     Status.POOR_FIT: "The model does not describe the data: check focus, NA, gain and neighbours.",
@@ -87,6 +88,39 @@ _ADVICE = {
     "and not counted: check focus, NA and aberrations to tell whether it is a particle.",
     Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
 }
+
+
+SEVERITY = (
+    Status.SIDELOBE,
+    Status.NOT_CONVERGED,
+    Status.AT_BOUND,
+    Status.POOR_FIT,
+    Status.AMBIGUOUS_Z,
+    Status.TOO_CLOSE,
+    Status.SATURATED,
+)
+"""What is remarked on a fit, worst first: perhaps no particle; no estimate; none inside the bounds; a
+model that does not describe the data; one of several heights; a mass shared with a neighbour; pixels
+left out."""
+
+
+def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
+    """Put the remarks on a fit in order.
+
+    Parameters
+    ----------
+    flags : iterable of Status
+        Every condition that was noticed, in any order.
+
+    Returns
+    -------
+    status : Status
+        The worst of them, or ok.
+    flags : tuple of Status
+        All of them, worst first, each once.
+    """
+    ordered = tuple(sorted(set(flags) - {Status.OK}, key=SEVERITY.index))
+    return (ordered[0] if ordered else Status.OK), ordered
 
 
 @dataclass(frozen=True)
@@ -236,7 +270,9 @@ class FitResult:
     x_nm, y_nm, z_nm, mass_kda : float
         Estimate in the full frame [nm, kDa]; a parameter that was not free holds its fixed value.
     theta : ndarray, shape (5,)
-        The estimate as the likelihood takes it, in the full frame.
+        Where the likelihood has its maximum, as it takes its parameters.
+    estimate : ndarray, shape (5,)
+        The same with the bias of order 1/N taken off; what the estimates above say.
     box : Box
         Where it was searched.
     free : tuple of str
@@ -247,17 +283,17 @@ class FitResult:
     covariance : ndarray, shape (n_free, n_free)
         Inverse observed information.
     contrast : float
-        Signed peak contrast of the fitted model over the plane.
+        Signed peak contrast of the model over the plane, at the estimate.
     log_likelihood : float
-        At the estimate, without terms that do not depend on the parameters.
+        At its maximum, without terms that do not depend on the parameters.
     iterations : int
         Scoring steps taken by the best start.
     chi2_reduced, p_value : float
         Goodness of fit of the fitted pixels.
     status : Status
         The verdict.
-    flags : tuple of str
-        Every condition that was noticed, the status among them unless it is ok.
+    flags : tuple of Status
+        Every condition that was noticed, worst first, the status among them unless it is ok.
     alternatives : tuple of Alternative
         Other heights, best first.
     """
@@ -267,6 +303,7 @@ class FitResult:
     z_nm: float
     mass_kda: float
     theta: FloatArray
+    estimate: FloatArray
     box: Box
     free: tuple[str, ...]
     sigma: FloatArray
@@ -277,7 +314,7 @@ class FitResult:
     chi2_reduced: float
     p_value: float
     status: Status
-    flags: tuple[str, ...] = ()
+    flags: tuple[Status, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
 
 

@@ -161,7 +161,7 @@ def summary_of(table: pd.DataFrame, mode: str, scheme: str) -> dict[str, object]
         "scheme": scheme,
         "emission": "reciprocal",
         "convention": "exact",
-        "mass_scale": "model",
+        "mass_scale": "calibration",
         "status": table["status"].value_counts().to_dict(),
         "frames_before": (0, 200),
         "frames_after": (200, 400),

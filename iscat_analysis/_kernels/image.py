@@ -52,7 +52,7 @@ class Lens(NamedTuple):
         Nodes of the lattice on either side of the particle; 0 for a radial profile.
     components : int
         Components of the field on the lattice.
-    window : ndarray, shape (TAPS, degree + 1)
+    window : ndarray, shape (degree + 1, TAPS)
         Weights of the lattice's nodes.
     """
 

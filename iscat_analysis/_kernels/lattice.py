@@ -40,7 +40,9 @@ LATTICE_STEP = 1.2
 TAPS = 8
 """Nodes that take part in a value, along each axis."""
 
-_DEGREE = 10  # of the polynomials that stand for the window
+DEGREE = 10
+"""Degree of the polynomials that stand for the window between two nodes."""
+
 _SHARPNESS = 20.0  # of the window, best for TAPS and LATTICE_STEP
 _FILTER = 10  # half length of the filter that undoes the window
 _BLOCK = 48  # radial nodes whose Bessel functions are held at once
@@ -55,13 +57,13 @@ def window() -> tuple[FloatArray, FloatArray]:
 
     Returns
     -------
-    weights : ndarray, shape (TAPS, degree + 1)
+    weights : ndarray, shape (degree + 1, TAPS)
         Weight of node floor(p) − 3 + l at position p: coefficients of the powers of p − floor(p).
     undo : ndarray, shape (2·half + 1,)
         Filter that turns samples of the field into coefficients.
     """
     half = TAPS / 2
-    count = _DEGREE + 1
+    count = DEGREE + 1
     t = (1 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) / 2
     powers = np.vander(t, count, increasing=True)
     x = t + half - 1 - np.arange(TAPS)[:, None]
@@ -76,7 +78,7 @@ def window() -> tuple[FloatArray, FloatArray]:
     waves = np.cos(np.outer(band, np.arange(_FILTER + 1)))
     waves[:, 1:] *= 2
     undo = np.linalg.lstsq(smoothing[:, None] * waves, np.ones(band.size), rcond=1e-14)[0]
-    return np.ascontiguousarray(weights), np.concatenate([undo[:0:-1], undo])
+    return np.ascontiguousarray(weights.T), np.concatenate([undo[:0:-1], undo])
 
 
 def lattice_half(reach_nm: float, step_nm: float) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.lattice import FAST, TAPS
+from iscat_analysis._kernels.lattice import DEGREE, FAST, TAPS
 
 if TYPE_CHECKING:
     from iscat_analysis._kernels.image import Lens, Pixels
@@ -23,19 +23,21 @@ FloatArray = NDArray[np.float64]
 FIELDS = 16
 """Rows for a row of pixels: the fields (4), their ∂/∂z, slopes along x and slopes along y."""
 
+STRIP = 8
+"""Columns of pixels that are interpolated together: a line of the cache."""
+
 BEFORE = TAPS // 2 - 1
 """Nodes before the one at the floor of a position."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def taps(weights: FloatArray, t: float, value: FloatArray, slope: FloatArray) -> None:
     """Fill the weights of the nodes at distance t ∈ [0, 1) and their derivative."""
-    degree = weights.shape[1] - 1
-    for k in range(weights.shape[0]):
-        v, d = weights[k, degree], 0.0
-        for p in range(degree - 1, -1, -1):
+    for k in range(TAPS):
+        v, d = weights[DEGREE, k], 0.0
+        for p in range(DEGREE):
             d = d * t + v
-            v = v * t + weights[k, p]
+            v = v * t + weights[DEGREE - 1 - p, k]
         value[k] = v
         slope[k] = d
 
@@ -59,19 +61,75 @@ def rows_needed(lens: Lens, pixels: Pixels) -> int:
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _blend(nodes: FloatArray, w: FloatArray, out: FloatArray) -> None:
-    """Fill `out` (n) with the combination w of the rows of `nodes` (TAPS, n).
+def _blend(nodes: FloatArray, row: int, first: int, w: FloatArray, out: FloatArray) -> None:
+    """Fill `out` (n) with the combination w of TAPS rows of `nodes`, n columns from the first.
 
     Four rows at a time: against more that might overlap, the compiler gives up on vectors.
     """
-    a, b, c, d = nodes[0], nodes[1], nodes[2], nodes[3]
+    last = first + out.size
+    a, b = nodes[row, first:last], nodes[row + 1, first:last]
+    c, d = nodes[row + 2, first:last], nodes[row + 3, first:last]
     wa, wb, wc, wd = w[0], w[1], w[2], w[3]
     for j in range(out.size):
         out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
-    a, b, c, d = nodes[4], nodes[5], nodes[6], nodes[7]
+    a, b = nodes[row + 4, first:last], nodes[row + 5, first:last]
+    c, d = nodes[row + 6, first:last], nodes[row + 7, first:last]
     wa, wb, wc, wd = w[4], w[5], w[6], w[7]
     for j in range(out.size):
         out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _blend_both(
+    nodes: FloatArray,
+    row: int,
+    first: int,
+    w: FloatArray,
+    v: FloatArray,
+    out: FloatArray,
+    other: FloatArray,
+) -> None:
+    """Fill `out` and `other` with two combinations of the same rows; see `_blend`."""
+    last = first + out.size
+    a, b, c = nodes[row, first:last], nodes[row + 1, first:last], nodes[row + 2, first:last]
+    wa, wb, wc, va, vb, vc = w[0], w[1], w[2], v[0], v[1], v[2]
+    for j in range(out.size):
+        out[j] = wa * a[j] + wb * b[j] + wc * c[j]
+        other[j] = va * a[j] + vb * b[j] + vc * c[j]
+    a, b, c = nodes[row + 3, first:last], nodes[row + 4, first:last], nodes[row + 5, first:last]
+    wa, wb, wc, va, vb, vc = w[3], w[4], w[5], v[3], v[4], v[5]
+    for j in range(out.size):
+        out[j] += wa * a[j] + wb * b[j] + wc * c[j]
+        other[j] += va * a[j] + vb * b[j] + vc * c[j]
+    a, b = nodes[row + 6, first:last], nodes[row + 7, first:last]
+    wa, wb, va, vb = w[6], w[7], v[6], v[7]
+    for j in range(out.size):
+        out[j] += wa * a[j] + wb * b[j]
+        other[j] += va * a[j] + vb * b[j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _columns(
+    plane: FloatArray,
+    left: NDArray[np.int64],
+    weights: FloatArray,
+    first: int,
+    strip: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Interpolate one channel along x, `STRIP` columns of pixels at a time.
+
+    The strip is turned into rows of `out` (rows, nx) at once, so that each line of memory is
+    written once.
+    """
+    rows, columns = out.shape
+    for start in range(0, columns, STRIP):
+        count = min(STRIP, columns - start)
+        for j in range(count):
+            _blend(plane, left[start + j], first, weights[start + j], strip[j])
+        for r in range(rows):
+            for j in range(count):
+                out[r, start + j] = strip[j, r]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -86,35 +144,25 @@ def interpolate_columns(
 ) -> None:
     """Interpolate along x: fields and slopes at every column of pixels and row of nodes."""
     first, rows = node_rows(lens, pixels, y_p)
-    value, slope = np.empty(TAPS), np.empty(TAPS)
-    line = np.empty(rows)
+    columns = pixels.x.size
+    value, slope = np.empty((columns, TAPS)), np.empty((columns, TAPS))
+    left = np.empty(columns, dtype=np.int64)
+    strip = np.empty((STRIP, rows))
     width = 2 * lens.components
-    nodes = profile[:, :, first : first + rows]
-    start = FIELDS
+    here = FIELDS
     for sample in range(pixels.offsets.size):
-        for j in range(pixels.x.size):
+        for j in range(columns):
             place = (pixels.x[j] + pixels.offsets[sample] - x_p) * lens.inv_step + lens.half
-            i = int(place)
-            taps(lens.window, place - i, value, slope)
-            for k in range(TAPS):
-                slope[k] *= lens.inv_step
-            left, right = i - BEFORE, i - BEFORE + TAPS
+            left[j] = int(place) - BEFORE
+            taps(lens.window, place - int(place), value[j], slope[j])
+        slope *= lens.inv_step
+        for k in range(2 * width if with_gradient else width):
+            _columns(profile[k], left, value, first, strip, f[here : here + rows])
+            here += rows
+        if with_gradient:
             for k in range(width):
-                _blend(nodes[k, left:right], value, line)
-                here = start + k * rows
-                for r in range(rows):
-                    f[here + r, j] = line[r]
-            if with_gradient:
-                for k in range(width):
-                    _blend(nodes[width + k, left:right], value, line)
-                    here = start + (width + k) * rows
-                    for r in range(rows):
-                        f[here + r, j] = line[r]
-                    _blend(nodes[k, left:right], slope, line)
-                    here = start + (2 * width + k) * rows
-                    for r in range(rows):
-                        f[here + r, j] = line[r]
-        start += (3 if with_gradient else 1) * width * rows
+                _columns(profile[k], left, slope, first, strip, f[here : here + rows])
+                here += rows
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -165,12 +213,11 @@ def lattice_gradient(
             start = FIELDS + sample * 3 * width * rows + top
             for k in range(width):
                 here = start + k * rows
-                _blend(f[here : here + TAPS], value, f[k])
-                _blend(f[here : here + TAPS], slope, f[12 + k])
+                _blend_both(f, here, 0, value, slope, f[k], f[12 + k])
                 here += width * rows
-                _blend(f[here : here + TAPS], value, f[4 + k])
+                _blend(f, here, 0, value, f[4 + k])
                 here += width * rows
-                _blend(f[here : here + TAPS], value, f[8 + k])
+                _blend(f, here, 0, value, f[8 + k])
             weight = pixels.weights[i] * pixels.weights[sample]
             _add_gradient(lens.rho, amplitude, weight, f, 0, out)
             if lens.components == 2:
@@ -210,7 +257,7 @@ def lattice_signal(
             start = FIELDS + sample * width * rows + top
             for k in range(width):
                 here = start + k * rows
-                _blend(f[here : here + TAPS], value, f[k])
+                _blend(f, here, 0, value, f[k])
             weight = pixels.weights[i] * pixels.weights[sample]
             _add_signal(lens.rho, amplitude, weight, f[0], f[1], out)
             if lens.components == 2:
@@ -252,27 +299,28 @@ def lattice_values(
         Filled with the signal and its derivatives.
     """
     first, rows = node_rows(lens, pixels, y_p)
-    value, slope = np.empty(TAPS), np.empty(TAPS)
-    line = np.empty(rows)
+    columns = pixels.x.size
+    value, slope = np.empty((columns, TAPS)), np.empty((columns, TAPS))
+    left = np.empty(columns, dtype=np.int64)
+    strip = np.empty((STRIP, rows))
     channels, a = stack.shape[0], amplitude
     across = np.empty((channels, rows, pixels.x.size))
     f = np.empty((channels, pixels.x.size))
     out[:] = 0.0
     for sample in range(pixels.offsets.size):
-        for j in range(pixels.x.size):
+        for j in range(columns):
             place = (pixels.x[j] + pixels.offsets[sample] - x_p) * lens.inv_step + lens.half
-            left = int(place) - BEFORE
-            taps(lens.window, place - int(place), value, slope)
-            for k in range(channels):
-                _blend(stack[k, left : left + TAPS, first : first + rows], value, line)
-                across[k, :, j] = line
+            left[j] = int(place) - BEFORE
+            taps(lens.window, place - int(place), value[j], slope[j])
+        for k in range(channels):
+            _columns(stack[k], left, value, first, strip, across[k])
         for row in range(pixels.y.size):
             for i in range(pixels.offsets.size):
                 place = (pixels.y[row] + pixels.offsets[i] - y_p) * lens.inv_step + lens.half
                 top = int(place) - BEFORE - first
-                taps(lens.window, place - int(place), value, slope)
+                taps(lens.window, place - int(place), value[0], slope[0])
                 for k in range(channels):
-                    _blend(across[k, top : top + TAPS], value, f[k])
+                    _blend(across[k], top, 0, value[0], f[k])
                 weight = pixels.weights[i] * pixels.weights[sample]
                 for c in range(components):
                     rho = lens.rho if c == 0 else 0.0
@@ -343,10 +391,10 @@ def lattice_fields(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _bent_taps(weights: FloatArray, t: float, h: float, out: FloatArray) -> None:
     """Fill the weights (3, TAPS) of the nodes for value, slope and second derivative."""
-    for k in range(weights.shape[0]):
+    for k in range(TAPS):
         v, d, s = 0.0, 0.0, 0.0
-        for p in range(weights.shape[1] - 1, -1, -1):
+        for p in range(DEGREE, -1, -1):
             s = s * t + 2 * d
             d = d * t + v
-            v = v * t + weights[k, p]
+            v = v * t + weights[p, k]
         out[0, k], out[1, k], out[2, k] = v, d * h, s * h * h

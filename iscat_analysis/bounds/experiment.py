@@ -70,20 +70,24 @@ class Experiment:
         """Quantum Fisher information of one collected photon, shape (4, 4)."""
         return quantum_information(self.model, self.theta[2])
 
-    def bounds(self, free: tuple[str, ...]) -> EventBounds:
+    def bounds(self, free: tuple[str, ...], *, level: bool = False) -> EventBounds:
         """Bounds over chosen free parameters.
 
         Parameters
         ----------
         free : tuple of str
             A subset of `PARAMETERS`.
+        level : bool
+            Whether the level of the light is unknown too.
 
         Returns
         -------
         EventBounds
             For all frames.
         """
-        return event_bounds(self.likelihood, self.theta, free, self.collected, quantum=self.quantum)
+        return event_bounds(
+            self.likelihood, self.theta, free, self.collected, quantum=self.quantum, level=level
+        )
 
 
 def plan(
@@ -121,12 +125,12 @@ def plan(
     pixel_nm = camera.pixel_size_nm
     if pixel_nm is None:
         raise ConfigError(
-            "camera.pixel_size_nm is missing: give it, as in --set camera.pixel_size_nm=84.4"
+            "camera.pixel_size_nm is missing: give it, as in camera.pixel_size_nm = 84.4"
         )
     if isinstance(camera.read_noise_e, str):
         raise ConfigError(
             f"camera.read_noise_e = {camera.read_noise_e!r} is a map: bounds need a number, as in "
-            "--set camera.read_noise_e=1.5"
+            "camera.read_noise_e = 1.5"
         )
     half = at.pixels * pixel_nm / 2
     if max(abs(at.x_nm), abs(at.y_nm)) > half:
@@ -159,7 +163,16 @@ def plan(
         config=config,
         model=model,
         grid=grid,
-        likelihood=_expected(model, grid, theta, level, per_frame, camera.read_noise_e, config),
+        likelihood=expected_likelihood(
+            model,
+            grid,
+            theta,
+            level,
+            per_frame,
+            n_before=at.n_before,
+            n_after=at.n_after,
+            read_noise_e=camera.read_noise_e,
+        ),
         theta=theta,
         mass_kda=mass,
         on_camera=at.n_after * per_frame * float(scattered.sum()),
@@ -168,24 +181,52 @@ def plan(
     )
 
 
-def _expected(
+def expected_likelihood(
     model: ForwardModel,
     grid: PixelGrid,
     theta: FloatArray,
     level_e: float,
     scale_e: float,
-    read_noise_e: float,
-    config: Config,
+    *,
+    n_before: int,
+    n_after: int,
+    read_noise_e: float = 0.0,
 ) -> Likelihood:
-    before, after = config.bounds.n_before, config.bounds.n_after
+    """Likelihood of the expected counts of a planned experiment.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        The optics.
+    grid : PixelGrid
+        The field.
+    theta : ndarray, shape (5,)
+        The particle.
+    level_e : float
+        Background per pixel and frame [e].
+    scale_e : float
+        Photoelectrons per pixel and frame for unit signal; where there is a reference, the
+        background.
+    n_before, n_after : int
+        Frames; 0 before where the background is known.
+    read_noise_e : float
+        Standard deviation per pixel and frame [e].
+
+    Returns
+    -------
+    Likelihood
+        Conditional where the background is measured and multiplied, Poisson otherwise.
+    """
     read = read_noise_e**2
-    if model.rho and before:
-        return asimov_conditional(model, grid, theta, level_e, before, after, read_variance_e2=read)
-    extra = after * read
-    if before:  # dark field: the measured background adds its own variance
-        extra += after**2 / before * (level_e + read)
+    if model.rho and n_before:
+        return asimov_conditional(
+            model, grid, theta, level_e, n_before, n_after, read_variance_e2=read
+        )
+    extra = n_after * read
+    if n_before:  # dark field: the measured background adds its own variance
+        extra += n_after**2 / n_before * (level_e + read)
     return asimov_poisson(
-        model, grid, theta, after * level_e, after * scale_e, extra_variance_e2=extra
+        model, grid, theta, n_after * level_e, n_after * scale_e, extra_variance_e2=extra
     )
 
 

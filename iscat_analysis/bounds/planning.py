@@ -99,7 +99,7 @@ def optimize(
         The target is unknown or not free in this mode, or no setting works.
     """
     if axis not in ("focus", "attenuation"):
-        raise ConfigError(f"--optimize {axis}: choose focus or attenuation")
+        raise ConfigError(f"`optimize` = {axis}: choose focus or attenuation")
     parameter = _parameter(config, target)
     line = AXES[axis]
     column = f"crb_joint_{parameter}"
@@ -115,8 +115,8 @@ def optimize(
     score = coarse.table[column].where(coarse.table["peak_e"] < well).to_numpy(float)
     if not np.isfinite(score).any():
         raise ConfigError(
-            f"--optimize {axis}: {parameter} is unidentifiable or the camera saturated at every "
-            "setting; lower bounds.photons_per_pixel, or free fewer parameters with --mode"
+            f"`optimize` = {axis}: {parameter} is unidentifiable or the camera saturated at every "
+            "setting; lower bounds.photons_per_pixel, or free fewer parameters with fit.mode"
         )
     best = int(np.nanargmin(score))
     scale = calibrated_scale(config)
@@ -179,7 +179,7 @@ def parse_target(text: str, config: Config) -> Goal:
     """
     match = re.fullmatch(r"\s*(\w+)\s*=\s*([0-9.eE+-]+)\s*([A-Za-zµ]*)\s*", text)
     if match is None:
-        raise ConfigError(f"--target {text}: write it as mass=5kDa or z=2nm")
+        raise ConfigError(f"`target` = {text}: write it as mass=5kDa or z=2nm")
     parameter = _parameter(config, match[1])
     unit = "kDa" if parameter == "mass_kda" else "nm"
     factors = {"kda": 1.0, "mda": 1e3, "da": 1e-3} if unit == "kDa" else {"nm": 1.0, "um": 1e3}
@@ -190,7 +190,7 @@ def parse_target(text: str, config: Config) -> Goal:
         value = math.nan
     if factor is None or not (math.isfinite(value) and value > 0):
         raise ConfigError(
-            f"--target {text}: give a positive number of {unit}, as in {match[1]}=5{unit}"
+            f"`target` = {text}: give a positive number of {unit}, as in {match[1]}=5{unit}"
         )
     return Goal(parameter, value * factor)
 
@@ -256,8 +256,8 @@ def _effort(config: Config, goal: Goal, name: str, before: Callable[[int], int])
     one = bound(1)
     if not math.isfinite(one):
         raise ConfigError(
-            f"--target: {goal.parameter} is unidentifiable here; change the focus or free fewer "
-            "parameters with --mode"
+            f"`target`: {goal.parameter} is unidentifiable here; change the focus or free fewer "
+            "parameters with fit.mode"
         )
     if bound(int(MAX_FRAMES)) > goal.value:
         return Effort(name, before(0), math.inf, None, math.inf)
@@ -384,5 +384,7 @@ def _parameter(config: Config, target: str) -> str:
     if parameter is None:
         raise ConfigError(f"{target}: choose one of {', '.join(TARGETS)}")
     if parameter not in FREE_PARAMETERS[config.fit.mode]:
-        raise ConfigError(f"{target} is not free in mode {config.fit.mode}: choose --mode joint")
+        raise ConfigError(
+            f'{target} is not free in mode {config.fit.mode}: choose fit.mode = "joint"'
+        )
     return parameter

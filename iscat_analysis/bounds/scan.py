@@ -63,7 +63,7 @@ class Axis:
 def _pixel_nm(config: Config) -> float:
     if config.camera.pixel_size_nm is None:
         raise ConfigError(
-            "camera.pixel_size_nm is missing: give it, as in --set camera.pixel_size_nm=84.4"
+            "camera.pixel_size_nm is missing: give it, as in camera.pixel_size_nm = 84.4"
         )
     return config.camera.pixel_size_nm
 
@@ -180,34 +180,34 @@ def parse_scan(text: str) -> tuple[Axis, FloatArray]:
     name = name.strip().lower()
     if not equals or name not in AXES:
         raise ConfigError(
-            f"--scan {text}: write it as NAME=start:stop:step or NAME=a,b,c, "
-            f"with NAME one of {', '.join(AXES)}; as in --scan z=0:2000:50"
+            f"`scan` = {text}: write it as NAME=start:stop:step or NAME=a,b,c, "
+            f"with NAME one of {', '.join(AXES)}; as in `scan` = z=0:2000:50"
         )
     try:
         parts = [float(part) for part in numbers.replace(",", ":").split(":")]
     except ValueError:
         raise ConfigError(
-            f"--scan {text}: {numbers!r} is not start:stop:step nor a,b,c; "
-            f"as in --scan {name}=0:2000:50"
+            f"`scan` = {text}: {numbers!r} is not start:stop:step nor a,b,c; "
+            f"as in `scan` = {name}=0:2000:50"
         ) from None
     if not all(map(math.isfinite, parts)):
-        raise ConfigError(f"--scan {text}: needs finite numbers")
+        raise ConfigError(f"`scan` = {text}: needs finite numbers")
     if ":" not in numbers:
         return AXES[name], np.array(parts)
     if "," in numbers or len(parts) != 3:
         raise ConfigError(
-            f"--scan {text}: needs three numbers start:stop:step, as in --scan {name}=0:2000:50"
+            f"`scan` = {text}: needs three numbers start:stop:step, as in `scan` = {name}=0:2000:50"
         )
     start, stop, step = parts
     if step == 0 or (stop - start) / step < 0:
         raise ConfigError(
-            f"--scan {text}: the step {step:g} does not lead from {start:g} to {stop:g}; "
+            f"`scan` = {text}: the step {step:g} does not lead from {start:g} to {stop:g}; "
             "change its sign or size"
         )
     count = math.floor((stop - start) / step * (1 + 1e-12) + 1e-9) + 1
     if count > MAX_POINTS:
         raise ConfigError(
-            f"--scan {text}: has {count} points, at most {MAX_POINTS}; take a larger step"
+            f"`scan` = {text}: has {count} points, at most {MAX_POINTS}; take a larger step"
         )
     return AXES[name], np.array([start + step * i for i in range(count)])
 

@@ -46,7 +46,7 @@ def complaint(item: Mapping[str, Any], called: Mapping[str, str]) -> str:
     if comma:
         return f"{key}: write {comma[1]}.{comma[2]}, with a decimal point (got {given!r})"
     shown = f" (got {given!r})" if isinstance(given, (str, int, float, list)) else ""
-    if isinstance(given, float) and math.isfinite(given) and f"{given:g} " in message:
+    if isinstance(given, (int, float)) and math.isfinite(given) and f"{given:g} " in message:
         shown = ""
     return f"{key}: {message[:1].lower()}{message[1:]}{shown}"
 
@@ -74,6 +74,25 @@ def known_keys(location: list[str]) -> list[str]:
         annotation = model.model_fields[part].annotation
         model = annotation if isinstance(annotation, type) else model_of(annotation)
     return list(model.model_fields)
+
+
+def section_name(model: type) -> tuple[str, ...]:
+    """Name the section that a class describes.
+
+    Parameters
+    ----------
+    model : type
+        Of a section.
+
+    Returns
+    -------
+    tuple of str
+        Its name in a configuration; empty where it has none.
+    """
+    for name, field in Config.model_fields.items():
+        if model in (field.annotation, *get_args(field.annotation)):
+            return (name,)
+    return ()
 
 
 def model_of(annotation: Any) -> type[Section]:

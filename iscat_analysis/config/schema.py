@@ -7,7 +7,7 @@ beside it.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -15,8 +15,16 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    ValidationError,
     model_validator,
 )
+
+from iscat_analysis.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
 
 Mode = Literal["mass", "localize", "joint", "track"]
 
@@ -142,7 +150,22 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class Section(BaseModel):
+class _Called(ModelMetaclass):
+    """What makes a section from keyword arguments: what is wrong is said in the program's words."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return super().__call__(*args, **kwargs)
+        except ValidationError as error:
+            from iscat_analysis.config.complaints import complaint, section_name
+
+            name = section_name(self)
+            items = ({**item, "loc": (*name, *item["loc"])} for item in error.errors())
+            complaints = dict.fromkeys(complaint(item, {}) for item in items)
+            raise ConfigError("; ".join(complaints)) from None
+
+
+class Section(BaseModel, metaclass=_Called):
     """A section of the file: immutable, and an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

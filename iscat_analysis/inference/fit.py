@@ -1,8 +1,17 @@
-"""Maximum likelihood for one particle: Fisher scoring from every promising height.
+"""The estimator: maximum likelihood for one particle, its bias of order 1/N taken off.
+
+Fixed and sliding windows, moving particles and the benchmark all call `fit_particle`, so that what
+is benchmarked is what users get.
 
 In iSCAT the likelihood along z repeats every λ/(2 n_s), so it is scanned first, with the amplitude
 refitted at each height, and every local maximum starts a fit.  The result carries a `Status`;
 nothing is returned as ok that did not converge inside its bounds and describe the data.
+
+Whether the level of the light is fitted as well is a question of what is known about it.  Between
+one window before the particles and one after, the laser power is known from the whole field, far
+better than a region could tell: the level is held.  In windows that slide over a movie the light
+of a region changes by more than the power does, by slow drifts and by the rings of other particles:
+the level is a nuisance, and bounds count it as one.
 """
 
 from __future__ import annotations
@@ -11,17 +20,20 @@ import math
 
 import numpy as np
 
+from iscat_analysis.inference.bias import first_order_bias
 from iscat_analysis.inference.goodness import goodness_of_fit
-from iscat_analysis.inference.likelihood import Likelihood, Optimum
+from iscat_analysis.inference.likelihood import Derivatives, Likelihood, Optimum
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     PARAMETERS,
     Alternative,
+    BoolArray,
     Box,
     Candidate,
     FitResult,
     FloatArray,
     Status,
+    verdict,
 )
 
 AMBIGUITY_ODDS = 1000.0
@@ -29,6 +41,10 @@ AMBIGUITY_ODDS = 1000.0
 
 POOR_FIT_P = 1e-3
 """p-value below which the model is said not to describe the data: 1 good fit in 1000."""
+
+OUTWARD = 3.0
+"""Standard deviations by which the data pull a height beyond the end of its range before the fit is
+said to be at a bound: fewer are chance, and the end of the range is then where it belongs."""
 
 SCANS_PER_FRINGE = 8
 """Heights scanned per interference fringe before fitting."""
@@ -116,7 +132,8 @@ def fit_particle(
     mode: str,
     z_range_nm: tuple[float, float],
     *,
-    level: bool = False,
+    level: bool,
+    correct_bias: bool = True,
 ) -> FitResult:
     """Fit one particle.
 
@@ -131,7 +148,11 @@ def fit_particle(
     z_range_nm : (float, float)
         Bounds of z where it is free [nm]; elsewhere z is the start's.
     level : bool
-        Also fit a common background level, as a nuisance.
+        Whether a common level of the light is fitted too, as a nuisance: True in windows that
+        slide, False where the power is known from the whole field.
+    correct_bias : bool
+        Take the bias of order 1/N off the estimate.  False leaves the bare maximum, to show what
+        the correction does.
 
     Returns
     -------
@@ -141,37 +162,49 @@ def fit_particle(
     box = search_box(likelihood, start, mode, z_range_nm, level=level)
     optima = _optima(likelihood, start, box)
     best = optima[0]
-    alternatives = _alternatives(optima, likelihood.model.fringe_nm)
+    model = likelihood.model
+    alternatives = _alternatives(optima, model.fringe_nm)
     names = tuple(name for name, free in zip(PARAMETERS, box.free[:4], strict=True) if free)
-    sigma, covariance = _uncertainty(likelihood, best, box)
+    derivatives = likelihood.derivatives(best.theta)
+    sigma, covariance = _uncertainty(likelihood, best, box, derivatives)
     chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free)
+    walls = _walls(best.theta, box)
     flags = []
     if not best.converged or not np.all(np.isfinite(sigma[box.free[:4]])):
         flags.append(Status.NOT_CONVERGED)
-    if _at_bound(best.theta, box):
+    if _at_bound(likelihood, best.theta, walls, sigma[2]):
         flags.append(Status.AT_BOUND)
     if alternatives and alternatives[0].log_likelihood_gap < math.log(AMBIGUITY_ODDS):
         flags.append(Status.AMBIGUOUS_Z)
     if p_value < POOR_FIT_P:
         flags.append(Status.POOR_FIT)
-    mass = float(likelihood.model.scale.mass(best.theta[3]))
+    estimate = best.theta
+    if correct_bias and np.all(np.isfinite(sigma[box.free[:4]])):
+        bias = first_order_bias(likelihood, best.theta, box.free & ~walls, derivatives)
+        units = np.array([1.0, 1.0, 1.0, abs(model.scale.slope(float(best.theta[3])))])
+        # an expansion whose first term exceeds the error has lost its meaning
+        if np.all(np.abs(bias[:4] * units)[box.free[:4]] <= sigma[box.free[:4]]):
+            estimate = np.where(box.free, np.clip(estimate - bias, box.lower, box.upper), estimate)
+    x, y, z, amplitude = (float(value) for value in estimate[:4])
+    status, noticed = verdict(flags)
     return FitResult(
-        x_nm=float(best.theta[0]),
-        y_nm=float(best.theta[1]),
-        z_nm=float(best.theta[2]),
-        mass_kda=mass,
+        x_nm=x,
+        y_nm=y,
+        z_nm=z,
+        mass_kda=float(model.scale.mass(np.asarray(amplitude))),
         theta=best.theta,
+        estimate=estimate,
         box=box,
         free=names,
         sigma=sigma,
         covariance=covariance,
-        contrast=likelihood.model.amplitude_contrast(float(best.theta[2]), float(best.theta[3])),
+        contrast=model.amplitude_contrast(z, amplitude),
         log_likelihood=best.log_likelihood,
         iterations=best.passes,
         chi2_reduced=chi2_reduced,
         p_value=p_value,
-        status=flags[0] if flags else Status.OK,
-        flags=tuple(flags),
+        status=status,
+        flags=noticed,
         alternatives=alternatives,
     )
 
@@ -237,10 +270,12 @@ def _alternatives(optima: list[Optimum], fringe_nm: float) -> tuple[Alternative,
     return tuple(sorted(gaps, key=lambda a: a.log_likelihood_gap))
 
 
-def _uncertainty(likelihood: Likelihood, best: Optimum, box: Box) -> tuple[FloatArray, FloatArray]:
+def _uncertainty(
+    likelihood: Likelihood, best: Optimum, box: Box, derivatives: Derivatives
+) -> tuple[FloatArray, FloatArray]:
     """σ of (x, y, z, mass) and the covariance of the free ones; NaN unless positive definite."""
     index = np.flatnonzero(box.free)
-    information = likelihood.observed_information(best.theta)[np.ix_(index, index)]
+    information = likelihood.observed_information(best.theta, derivatives)[np.ix_(index, index)]
     scale = 1 / np.sqrt(np.maximum(np.diag(best.fisher)[index], 1e-300))
     scaled = information * np.outer(scale, scale)
     sigma = np.full(4, np.nan)
@@ -256,7 +291,26 @@ def _uncertainty(likelihood: Likelihood, best: Optimum, box: Box) -> tuple[Float
     return sigma, covariance
 
 
-def _at_bound(theta: FloatArray, box: Box) -> bool:
+def _walls(theta: FloatArray, box: Box) -> BoolArray:
+    """Which free parameters lie on an end of the box."""
     width = box.upper - box.lower
     near = (theta - box.lower < 1e-6 * width) | (box.upper - theta < 1e-6 * width)
-    return bool(np.any(near & box.free))
+    walls: BoolArray = near & box.free
+    return walls
+
+
+def _at_bound(
+    likelihood: Likelihood, theta: FloatArray, walls: BoolArray, sigma_z_nm: float
+) -> bool:
+    """Whether the search ended where the data do not want it to end.
+
+    Position, amplitude and level are searched in a window of our own, whose end is never an answer.
+    The ends of the heights mean something: the coverslip, or what the user knows.  Noise alone puts
+    a particle near such an end onto it, and the fit is good unless the data pull on significantly.
+    """
+    if np.any(np.delete(walls, 2)):
+        return True
+    if not walls[2]:
+        return False
+    score = likelihood.score_fisher(theta)[1]
+    return not abs(score[2]) * sigma_z_nm < OUTWARD

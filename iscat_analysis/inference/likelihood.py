@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis._kernels.image import Lens, Pixels
 from iscat_analysis._kernels.radial import AxialTable
@@ -43,6 +43,8 @@ from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+Derivatives = tuple[FloatArray, FloatArray, FloatArray]
+"""Signal (ny, nx), gradient (4, ny, nx) and second derivatives (4, 4, ny, nx) in (x, y, z, a)."""
 
 LEVEL = 4
 """Index of the level in θ."""
@@ -123,10 +125,11 @@ class Likelihood:
     @property
     def n_pixels(self) -> int:
         """Pixels that are not masked."""
-        return int(np.count_nonzero(self._used))
+        return int(np.count_nonzero(self.used))
 
     @property
-    def _used(self) -> BoolArray:
+    def used(self) -> BoolArray:
+        """Which pixels are not masked, shape (ny, nx)."""
         column = 3 if self.kind == CONDITIONAL else 2
         used: BoolArray = self.data[column] > 0
         return used
@@ -153,10 +156,10 @@ class Likelihood:
         inside = self.supports(points)
         out = np.full(len(points), -np.inf)
         if inside.all():
-            value_batch(*self._arguments, points, out)
+            value_batch(self._table(points[:, 2]), *self._arguments, points, out)
         elif inside.any():
             known = np.empty(int(inside.sum()))
-            value_batch(*self._arguments, points[inside], known)
+            value_batch(self._table(points[inside, 2]), *self._arguments, points[inside], known)
             out[inside] = known
         out[np.isnan(out)] = -np.inf  # an amplitude so large that the light overflows
         return out
@@ -217,7 +220,7 @@ class Likelihood:
             return -np.inf, np.full(5, np.nan), np.full((5, 5), np.nan)
         score, fisher = np.empty(5), np.empty((5, 5))
         profile = self.model.profile(point[2])
-        value = score_pass(profile, *self._arguments[1:], point, score, fisher)
+        value = score_pass(profile, *self._arguments, point, score, fisher)
         return value, score, fisher
 
     def maximize(
@@ -265,8 +268,19 @@ class Likelihood:
         score, fisher = np.empty(5), np.empty((5, 5))
         wavelength = self.model.optics.wavelength_nm
         max_step = np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, np.inf, 1.0])
+        table = self.model.axial_table if free[2] else self.model.height_table(theta[2])
         value, used, outcome = maximize(
-            *self._arguments, free, lower, upper, max_step, tolerance, passes, theta, score, fisher
+            table,
+            *self._arguments,
+            free,
+            lower,
+            upper,
+            max_step,
+            tolerance,
+            passes,
+            theta,
+            score,
+            fisher,
         )
         return Optimum(theta, value, used, outcome == CONVERGED, fisher)
 
@@ -300,18 +314,46 @@ class Likelihood:
         inside = self.supports(points)
         known = heights[inside]
         found, refitted = np.empty(known.size), np.empty(known.size)
-        scan_heights(*self._arguments, known, amplitude_range or (0.0, 0.0), point, found, refitted)
+        scan_heights(
+            self.model.axial_table, *self._arguments, known, amplitude_range or (0.0, 0.0), point,
+            found, refitted,
+        )  # fmt: skip
         values, amplitudes = np.full(heights.size, -np.inf), np.full(heights.size, np.nan)
         values[inside], amplitudes[inside] = found, refitted
         return values, amplitudes
 
-    def observed_information(self, theta: FloatArray) -> FloatArray:
+    def derivatives(self, theta: FloatArray) -> Derivatives:
+        """Signal and its first and second derivatives.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (5,)
+            Parameters, in the support.
+
+        Returns
+        -------
+        signal, gradient, hessian : ndarray
+            See `Derivatives`.
+
+        Raises
+        ------
+        ConfigError
+            θ lies outside the support.
+        """
+        x, y, z, amplitude, _ = (float(value) for value in self._supported(theta))
+        return self.model.amplitude_hessian(self.grid, x, y, z, amplitude)
+
+    def observed_information(
+        self, theta: FloatArray, derivatives: Derivatives | None = None
+    ) -> FloatArray:
         """Negative Hessian of the log-likelihood.
 
         Parameters
         ----------
         theta : ndarray, shape (5,)
             Parameters.
+        derivatives : Derivatives, optional
+            Of the signal at θ, where they are known already.
 
         Returns
         -------
@@ -323,10 +365,9 @@ class Likelihood:
         ConfigError
             θ lies outside the support.
         """
-        theta = self._supported(theta)
-        s, first, second = self.model.amplitude_hessian(self.grid, *theta[:4])
+        s, first, second = derivatives or self.derivatives(theta)
         level = np.exp(theta[LEVEL])
-        used = self._used
+        used = self.used
         c0, c1, c2, c3 = (np.where(used, c, 0.0) for c in self.data)
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.kind == CONDITIONAL:
@@ -382,7 +423,7 @@ class Likelihood:
             else:
                 rate = level * (c1 + c2 * s) + c3
                 out = (c0 - rate) / np.sqrt(rate)
-        return np.where(self._used, out, np.nan)
+        return np.where(self.used, out, np.nan)
 
     def signal(self, theta: FloatArray) -> FloatArray:
         """Signal of the model at θ, which must lie in the support; shape (ny, nx)."""
@@ -395,7 +436,7 @@ class Likelihood:
         with np.errstate(divide="ignore", invalid="ignore"):
             conditional = self.kind == CONDITIONAL
             out = c0 / ((c1 - c0) * c2) - 1 if conditional else (c0 - c3 - c1) / c2
-        return np.where(self._used, out, np.nan)
+        return np.where(self.used, out, np.nan)
 
     def signal_information(self, signal: FloatArray | None = None) -> FloatArray:
         """Fisher information of each pixel about its own signal.
@@ -418,7 +459,7 @@ class Likelihood:
                 out = c3 * c1 * p * (1 - p) / (1 + s) ** 2
             else:
                 out = c2**2 / np.maximum(c1 + c2 * s + c3, 1.0)
-        return np.where(self._used, out, 0.0)
+        return np.where(self.used, out, 0.0)
 
     def _supported(self, theta: FloatArray) -> FloatArray:
         """Return θ, unless the model is not known there."""
@@ -441,7 +482,7 @@ class Likelihood:
             )
         low, high = np.where(free, lower, start), np.where(free, upper, start)
         low[3:], high[3:] = start[3:], start[3:]
-        corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(5, -1).T
+        corners = np.stack([low, high, [low[0], *high[1:]], [high[0], *low[1:]]])
         if not self.supports(corners).all():
             raise ConfigError(
                 f"lower = {_listed(lower)}, upper = {_listed(upper)}: {self._support()}; narrow "
@@ -455,23 +496,28 @@ class Likelihood:
             f"{self.model.reach_nm:.0f} nm from the particle to the farthest pixel"
         )
 
+    def _table(self, heights_nm: FloatArray) -> AxialTable:
+        """Profiles along z, or at the one height that is asked for."""
+        first = float(heights_nm[0])
+        single = bool(np.all(heights_nm == first))
+        return self.model.height_table(first) if single else self.model.axial_table
+
     @property
-    def _arguments(self) -> tuple[AxialTable, Lens, Pixels, int, FloatArray]:
-        """What every scoring kernel takes first."""
-        model = self.model
-        return model.axial_table, model.lens, model.pixels(self.grid), self.kind, self.data
+    def _arguments(self) -> tuple[Lens, Pixels, int, FloatArray]:
+        """What every scoring kernel takes after the profiles."""
+        return self.model.lens, self.model.pixels(self.grid), self.kind, self.data
 
 
 def conditional(
     model: ForwardModel,
     grid: PixelGrid,
-    before_e: FloatArray,
-    after_e: FloatArray,
-    power_ratio: FloatArray | float,
+    before_e: ArrayLike,
+    after_e: ArrayLike,
+    power_ratio: ArrayLike,
     *,
-    read_variance_before_e2: FloatArray | float = 0.0,
-    read_variance_after_e2: FloatArray | float = 0.0,
-    masked: BoolArray | None = None,
+    read_variance_before_e2: ArrayLike = 0.0,
+    read_variance_after_e2: ArrayLike = 0.0,
+    masked: ArrayLike | None = None,
 ) -> Likelihood:
     """Binomial likelihood of counts before and after landing.
 
@@ -533,12 +579,12 @@ def conditional(
 def poisson(
     model: ForwardModel,
     grid: PixelGrid,
-    counts_e: FloatArray,
-    background_e: FloatArray | float,
-    scale_e: FloatArray | float,
+    counts_e: ArrayLike,
+    background_e: ArrayLike,
+    scale_e: ArrayLike,
     *,
-    extra_variance_e2: FloatArray | float = 0.0,
-    masked: BoolArray | None = None,
+    extra_variance_e2: ArrayLike = 0.0,
+    masked: ArrayLike | None = None,
 ) -> Likelihood:
     """Poisson likelihood with expectation background + scale·signal.
 

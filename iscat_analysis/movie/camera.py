@@ -7,7 +7,6 @@ c = o + (N + σ_r·n)/g counts, n standard normal.  `Camera` undoes it.
 from __future__ import annotations
 
 import math
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,13 +17,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from iscat_analysis.config import CameraConfig
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
 from iscat_analysis.records import BoolArray, FloatArray
-
-_UNREADABLE = (
-    ValueError, RuntimeError, TypeError, LookupError, OSError, ArithmeticError, MemoryError,
-    AttributeError, struct.error,
-)  # fmt: skip
-"""What a damaged TIFF makes its decoders raise."""
 
 CEILING_REPEATS = 4
 """Counts that must share the largest one before it is taken for a converter's full scale."""
@@ -189,7 +183,7 @@ def read_map(path: Path, key: str, shape_yx: tuple[int, int]) -> FloatArray:
             shape = tuple(n for n in tiff.series[0].shape if n != 1)
             # decoded only where it has the right size: a small file may claim any
             image = np.squeeze(tiff.series[0].asarray()) if shape == tuple(shape_yx) else None
-    except _UNREADABLE as error:
+    except WHAT_LIBRARIES_RAISE as error:
         raise DataError(f"{where} needs a TIFF map, but it cannot be read ({error})") from None
     if image is None or image.shape != tuple(shape_yx):
         shown = " x ".join(str(n) for n in shape) or "one number"
@@ -258,11 +252,7 @@ def check_counts(
                 f"{where} is NaN or infinite {_first(bad)}; "
                 "leave the frame out or export the movie again"
             )
-        if is_ratio(frame, camera):
-            raise DataError(
-                f"{where} is ratiometric (floats around 1): its shot noise cannot be known any "
-                "more; give the camera's raw counts, which are divided here"
-            )
+        refuse_ratio(frame, where, camera)
         if low == high == 0:
             raise DataError(
                 f"{where} is zero throughout; it was dropped by the camera: leave it out"
@@ -296,27 +286,33 @@ def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatAr
     return floor
 
 
-def is_ratio(frame: NDArray[Any], camera: Camera) -> bool:
-    """Whether a frame was divided by another: floats whose mean is 1, and a fraction around it.
+def refuse_ratio(frame: NDArray[Any], where: str, camera: Camera) -> None:
+    """Refuse a frame that was divided by another: floats around a mean of 1.
 
     Parameters
     ----------
     frame : ndarray, shape (y, x)
         As stored [counts].
+    where : str
+        What the message calls the frame.
     camera : Camera
-        A gain that makes more than a few photoelectrons of a count of 1 says that the movie was
+        A gain that makes more than a few photoelectrons of a count of 1 says that the counts were
         only scaled.
 
-    Returns
-    -------
-    bool
-        True for what cannot be raw counts.
+    Raises
+    ------
+    DataError
+        It cannot be raw counts.
     """
     if not np.issubdtype(frame.dtype, np.floating):
-        return False
-    mean = float(frame.mean(dtype=np.float64))
-    near = abs(mean - 1) < _RATIO_TOLERANCE and float(frame.std(dtype=np.float64)) < 1 / 2
-    return near and mean * float(np.mean(camera.gain_e_per_adu)) < _RATIO_MOST_E
+        return
+    mean, spread = float(frame.mean(dtype=np.float64)), float(frame.std(dtype=np.float64))
+    scaled = mean * float(np.mean(camera.gain_e_per_adu)) >= _RATIO_MOST_E
+    if abs(mean - 1) < _RATIO_TOLERANCE and spread < 1 / 2 and not scaled:
+        raise DataError(
+            f"{where} is ratiometric (floats around 1): its shot noise cannot be known any more; "
+            "give the camera's raw counts, which are divided here"
+        )
 
 
 def converter_ceiling(counts: NDArray[Any]) -> float:

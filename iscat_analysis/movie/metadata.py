@@ -71,7 +71,7 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
     if config.camera.pixel_size_nm is None and "pixel_size_nm" not in found:
         raise DataError(
             "the pixel size is neither in the configuration nor in the movie's metadata; "
-            "set camera.pixel_size_nm, as in --set camera.pixel_size_nm=84.4"
+            "set camera.pixel_size_nm, as in camera.pixel_size_nm = 84.4"
         )
     camera = config.camera.model_copy(update=found)
     return config.model_copy(update={"camera": camera}), tuple(notes)
@@ -82,7 +82,7 @@ def _refuse_unlikely(pixel_nm: float, source: str) -> None:
         plausible_pixel(pixel_nm)
     except ValueError as error:
         raise DataError(
-            f"the movie's {source} metadata: {error}, as in --set camera.pixel_size_nm=84.4"
+            f"the movie's {source} metadata: {error}, as in camera.pixel_size_nm = 84.4"
         ) from None
 
 

@@ -61,7 +61,11 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_SENSITIVITIES_KEPT = 4  # heights whose derivatives are at hand, some MB each
+_TABLES_KEPT = 4  # heights whose derivatives or tables are at hand, some MB each
+
+PEAK_REACH = 4.0
+"""Distance, over λ/NA, up to which the peak contrast that a calibration is about is looked for: out
+of focus it lies on a ring, and a model made for a few pixels must have the scale of any other."""
 
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
@@ -161,6 +165,25 @@ class ForwardModel:
     def axial_table(self) -> AxialTable:
         """Profiles at the heights of `z_range_nm`, for the kernels that interpolate along z."""
         return axial_table(self.wave, self.z_range_nm)
+
+    def height_table(self, z_nm: float) -> AxialTable:
+        """Profiles at one height, in the form of `axial_table`; the last few are kept.
+
+        Parameters
+        ----------
+        z_nm : float
+            Height [nm].
+
+        Returns
+        -------
+        AxialTable
+            For kernels that stay at this height.
+        """
+        return self._height_tables(z_nm)
+
+    @cached_property
+    def _height_tables(self) -> Callable[[float], AxialTable]:
+        return lru_cache(_TABLES_KEPT)(lambda z_nm: axial_table(self.wave, (z_nm, z_nm)))
 
     def image(
         self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
@@ -341,7 +364,7 @@ class ForwardModel:
                 z_nm, names, rho=self.rho, reach_nm=self.reach_nm,
             )  # fmt: skip
 
-        return lru_cache(_SENSITIVITIES_KEPT)(at)
+        return lru_cache(_TABLES_KEPT)(at)
 
     def field(
         self, dx_nm: FloatArray, dy_nm: FloatArray, z_nm: float, mass_kda: float
@@ -499,6 +522,8 @@ def forward_model(
         this focus cannot give.
     """
     optics = config.optics
+    if config.calibration is not None:
+        reach_nm = max(reach_nm, PEAK_REACH * optics.wavelength_nm / optics.na)
     height = config.particle.height_nm
     matter = material(config.particle, optics.wavelength_nm)
     k = 2 * math.pi / optics.wavelength_nm

@@ -23,7 +23,7 @@ from iscat_analysis.inference.likelihood import compile_kernels
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.background import measure_windows
-from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts
+from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts, refuse_ratio
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pipeline.diagnosis import (
     EXCESS_NOISE,
@@ -195,6 +195,7 @@ def analyse(
         config = config.model_copy(update={"particle": particle})
     shape = (movie.shape[1], movie.shape[2])
     camera = camera_from_config(config.camera, shape, movie.dtype)
+    refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
     hashing = ThreadPoolExecutor(1)
     digest = hashing.submit(movie.sha256)
     hashing.shutdown(wait=False)
@@ -225,7 +226,7 @@ def analyse(
     else:
         if inject:
             raise ConfigError(
-                f"inject = {inject}: particles are added to landing movies only, which have an "
+                f"`inject` = {inject}: particles are added to landing movies only, which have an "
                 'interferometric scheme and background.method = "sliding"; leave it out'
             )
         scene, found, image, further = _measured_background(
@@ -300,8 +301,8 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
         before = None
     elif before is None:
         raise ConfigError(
-            "which frames come before the particles? give them as --background 0:200 "
-            'or background.frames, or a known level with background.method = "known"'
+            "which frames come before the particles? give them as "
+            'background.frames = [0, 200], or a known level with background.method = "known"'
         )
     start = before[1] if before else 0
     after = config.fit.frames or (start, movie.shape[0])

@@ -1,4 +1,4 @@
-"""The two calibrations, from files to a folder: the camera from its noise, mass from standards."""
+"""Calibrations from files to a folder: camera from its noise, optics from particles, mass."""
 
 from __future__ import annotations
 
@@ -13,12 +13,16 @@ import tifffile
 
 from iscat_analysis.calibration.camera import CameraCalibration, measure_camera
 from iscat_analysis.calibration.mass import Landing, MassCalibration, calibrate_mass
+from iscat_analysis.calibration.optics import OpticsCalibration
+from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.event_tables import read_events
+from iscat_analysis.pipeline.microscope import calibrate_movie
 from iscat_analysis.records import Progress, Status, silent
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.calibration import camera_page, mass_page
+from iscat_analysis.report.optics import optics_page
 from iscat_analysis.schemas import jsonable, to_json
 
 CAMERA_FILES = frozenset(
@@ -36,6 +40,9 @@ CAMERA_FILES = frozenset(
 
 MASS_FILES = frozenset({"calibration.json", "calibration.toml", "calibration.html"})
 """Everything a mass calibration may leave in its folder."""
+
+OPTICS_FILES = frozenset({"optics.json", "optics.toml", "optics.html"})
+"""Everything a calibration of the optics may leave in its folder."""
 
 _BINS = 120
 
@@ -107,6 +114,69 @@ def camera_calibration(
             tifffile.imwrite(folder / "masked.tif", masked.astype(np.uint8))
         page = camera_page(title, jsonable(contents), toml)
         (folder / "camera.html").write_text(page, encoding="utf-8")
+    return found
+
+
+def optics_calibration(
+    movie: Path,
+    config: Config,
+    out: Path,
+    *,
+    free: str | Sequence[str] | None = None,
+    focus_step_nm: float | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+    notify: Callable[[str], None] | None = None,
+) -> OpticsCalibration:
+    """Learn the optics from a movie and write what was found.
+
+    Parameters
+    ----------
+    movie : Path
+        A landing movie, one with background frames, or a scan of the focus.
+    config : Config
+        The microscope as far as it is known.
+    out : Path
+        Folder for optics.json, optics.html and, unless the result is refused, optics.toml.
+    free : str or sequence of str, optional
+        What may change; default everything.
+    focus_step_nm : float, optional
+        Rise of the focus from frame to frame of a scan [nm].
+    overwrite : bool
+        Whether an earlier result may be replaced.
+    progress : Progress
+        Told how far it is.
+    notify : callable, optional
+        Given each note, a sentence.
+
+    Returns
+    -------
+    OpticsCalibration
+        What was found.
+
+    Raises
+    ------
+    DataError
+        The movie shows too few particles, or the folder may not be written.
+    ConfigError
+        The configuration cannot be calibrated.
+    """
+    check_output(out, overwrite, known=OPTICS_FILES)
+    with open_stack(movie) as stack:
+        found = calibrate_movie(
+            stack, config, free=free, focus_step_nm=focus_step_nm, progress=progress, notify=notify
+        )
+    for note in found.notes:
+        if notify is not None:
+            notify(note)
+    contents = found.to_dict()
+    toml = found.to_toml()
+    with atomic_folder(out, overwrite, known=OPTICS_FILES) as folder:
+        (folder / "optics.json").write_text(to_json("optics", contents) + "\n", encoding="utf-8")
+        if found.accepted:
+            (folder / "optics.toml").write_text(toml, encoding="utf-8")
+        page = optics_page(movie.name, jsonable(contents), toml)
+        (folder / "optics.html").write_text(page, encoding="utf-8")
     return found
 
 

@@ -160,7 +160,7 @@ class Reader:
         if not good.any():
             raise DataError(
                 f"{self.name}: frames {span[0]}:{span[1]} hold no light that changes; every frame "
-                "is zero or repeats the one before it; analyse the others with --frames A:B"
+                "is zero or repeats the one before it; analyse the others with fit.frames = [A, B]"
             )
         return make_chunk(
             span[0], counts, good, light, self.camera,
@@ -239,7 +239,7 @@ def judge_noise(reader: Reader, config: Config, mapper: Mapper = map) -> Noise:
             f"{reader.name}: has {frames} frames, but {windows} before and after each landing take "
             f"{needed}: record longer"
             + (", or lower background.window_frames" if given else "")
-            + "; or give the frames before the particles bind as --background 0:N"
+            + "; or give the frames before the particles bind as background.frames = [0, N]"
         )
     opening = reader.opening(mapper)
     longest = min(given or longest_window(frames), _NOISE_FRAMES // 4)

@@ -153,7 +153,7 @@ def drift_warning(name: str, background: dict[str, Any]) -> str | None:
     return (
         f"{name}: the fixed pattern moved by {x:+.2f} pixels in x and {y:+.2f} in y between the "
         "background and the frames after it; its edges look like particles: take background frames "
-        "nearer to them (--background), or fewer frames (fit.frames)"
+        "nearer to them (background.frames), or fewer frames (fit.frames)"
     )
 
 

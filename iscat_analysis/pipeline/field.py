@@ -36,6 +36,7 @@ from iscat_analysis.records import (
     Status,
     Windows,
     silent,
+    verdict,
 )
 from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, LISTED, is_dwarfed
 from iscat_analysis.search.templates import LARGEST_IMAGE, find_particles
@@ -118,12 +119,14 @@ def fit_field(
         events = _without_doubles(events, scene)
         events = _fit_all(scene, windows, [e.candidate for e in events], events, pool)
         windows = _refined(scene, windows, events)
-    events = [e for e in events if e.snr > scene.templates.threshold and _wanted(scene, e)]
+    kept = [e for e in events if e.snr > scene.templates.threshold and _wanted(scene, e)]
+    if 0 < len(kept) < len(events):  # what is dropped must leave its neighbours' background too
+        kept = _fit_all(scene, windows, [e.candidate for e in kept], kept, pool)
     lobes: list[Event] = []
     if doubtful and not starts:
-        lobes = _fit_all(scene, windows, doubtful, events, pool, first=len(events))
+        lobes = _fit_all(scene, windows, doubtful, kept, pool, first=len(kept))
         lobes = [e for e in lobes if e.snr > scene.templates.threshold and _wanted(scene, e)]
-    events = _judged(scene, windows, events, lobes)
+    events = _judged(scene, windows, kept, lobes)
     progress("detect", MAX_ROUNDS, MAX_ROUNDS)
     return tuple(sorted(events, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
 
@@ -244,7 +247,7 @@ def _fit_all(
         likelihood = region_likelihood(scene, windows, region, others)
         if likelihood.n_pixels < 0.5 * others.size:
             return None
-        fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm)
+        fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=False)
         return Event(region, fit, likelihood)
 
     return [event for event in pool.map(one, range(len(candidates))) if event is not None]
@@ -317,13 +320,11 @@ def _judged(
         dx = (columns + event.region.columns[0]) * scene.pixel_nm - x
         dy = (rows + event.region.rows[0]) * scene.pixel_nm - y
         burnt = bool(np.any(np.hypot(dx, dy) < _SATURATION_NM))
-        flags = [
+        status, flags = verdict([
+            *event.fit.flags,
             *([Status.SIDELOBE] if lobe else []),
             *([Status.SATURATED] if burnt else []),
-            *(f for f in event.fit.flags if f != Status.POOR_FIT),
             *([Status.TOO_CLOSE] if crowded else []),
-            *(f for f in event.fit.flags if f == Status.POOR_FIT),
-        ]
-        status = Status(flags[0]) if flags else Status.OK
-        judged.append(replace(event, fit=replace(event.fit, status=status, flags=tuple(flags))))
+        ])  # fmt: skip
+        judged.append(replace(event, fit=replace(event.fit, status=status, flags=flags)))
     return judged

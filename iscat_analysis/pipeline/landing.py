@@ -349,7 +349,7 @@ def make_landing_scene(config: Config, field_px: tuple[int, int], *, searches: i
     pixel = config.camera.pixel_size_nm
     if pixel is None:
         raise ConfigError(
-            "camera.pixel_size_nm is needed: set it, as in --set camera.pixel_size_nm=84.4"
+            "camera.pixel_size_nm is needed: set it, as in camera.pixel_size_nm = 84.4"
         )
     roi_px = max(5, round(config.fit.roi_nm / pixel))
     if roi_px > min(field_px):

@@ -10,14 +10,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.bounds import EventBounds, event_bounds
-from iscat_analysis.inference.likelihood import LEVEL
+from iscat_analysis.pieces.regions import row_of, table_from
 from iscat_analysis.pipeline.field import Event
 from iscat_analysis.pipeline.scene import Scene, photons_scale
 from iscat_analysis.records import (
-    EVENT_COLUMNS,
     FREE_PARAMETERS,
-    PARAMETERS,
     EventView,
     FloatArray,
     PosteriorResult,
@@ -104,43 +101,16 @@ def table_of(
     pandas.DataFrame
         Columns `EVENT_COLUMNS`.
     """
-    records = list(mapper(lambda row: _record(scene, row), rows))
-    table = pd.DataFrame(records, columns=list(EVENT_COLUMNS))
-    integers = ["event", "frame", "n_before", "n_after"]
-    numbers = [c for c in EVENT_COLUMNS if c not in (*integers, "status", "flags")]
-    return table.astype({**dict.fromkeys(integers, "int64"), **dict.fromkeys(numbers, "float64")})
+    return table_from(list(mapper(lambda row: _record(scene, row), rows)))
 
 
 def _record(scene: Scene, row: Row) -> dict[str, Any]:
-    fit, windows = row.event.fit, row.windows
-    collected = collected_photons(scene, windows, row.event)
-    bounds: EventBounds = event_bounds(
-        row.event.likelihood, fit.theta, fit.free, collected, level=bool(fit.box.free[LEVEL])
-    )
-    record: dict[str, Any] = {
-        "event": row.number,
-        "frame": windows.frames_after[0],
-        "n_before": windows.n_before,
-        "n_after": windows.n_after,
-        "x_px": fit.x_nm / scene.pixel_nm,
-        "y_px": fit.y_nm / scene.pixel_nm,
-        "x_nm": fit.x_nm,
-        "y_nm": fit.y_nm,
-        "z_nm": fit.z_nm,
-        "mass_kda": fit.mass_kda,
-        "contrast": fit.contrast if scene.model.rho else np.nan,
-        "n_scattered": collected,
-        "snr": row.event.snr,
-        "chi2_reduced": fit.chi2_reduced,
-        "p_value": fit.p_value,
-        "status": str(fit.status),
-        "flags": ";".join(str(f) for f in fit.flags),
-    }
-    for k, name in enumerate(PARAMETERS):
-        record[f"sigma_{name}"] = fit.sigma[k]
-        record[f"crb_{name}"] = bounds.crb_joint[k]
-        record[f"qcrb_{name}"] = bounds.qcrb[k]
-    return record
+    event, windows = row.event, row.windows
+    return row_of(
+        event.likelihood, event.fit, collected_photons(scene, windows, event),
+        event=row.number, frame=windows.frames_after[0],
+        n_before=windows.n_before, n_after=windows.n_after,
+    )  # fmt: skip
 
 
 def view_of(row: Row) -> EventView:

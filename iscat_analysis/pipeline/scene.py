@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from iscat_analysis.config import Config, Detection
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.counts import KNOWN, MEAN, MEDIAN, counts_likelihood
 from iscat_analysis.inference.fit import window_nm
-from iscat_analysis.inference.likelihood import Likelihood, conditional, poisson
-from iscat_analysis.movie.background import smooth_background
+from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Windows
 from iscat_analysis.search.templates import Templates, make_templates
@@ -20,7 +18,7 @@ SPREAD_NM = 10_000.0
 """Farther than this from a particle its rings are left out; they are 1e-4 of its peak."""
 
 
-_VARIANCE_OF_BACKGROUND = {"fixed": 1.0, "sliding": 1.0, "median": math.pi / 2, "known": 0.0}
+_VARIANCE_OF_BACKGROUND = {"fixed": MEAN, "sliding": MEAN, "median": MEDIAN, "known": KNOWN}
 """Variance of a measured background over that of the mean of its frames."""
 
 
@@ -183,30 +181,16 @@ def region_likelihood(
     grid = PixelGrid.region(region.rows, region.columns, scene.pixel_nm)
     model = scene.model if grid.diagonal_nm <= scene.model.reach_nm else scene.wide
     before, after, masked = windows.before_e[cut], windows.after_e[cut], windows.masked[cut]
-    ratio = windows.power_ratio
-    signal = np.zeros(grid.shape) if others is None else others
-    if _uses_conditional(config):
-        return conditional(
-            model, grid, before, after, ratio * (1 + signal),
-            read_variance_before_e2=windows.read_variance_before_e2[cut],
-            read_variance_after_e2=windows.read_variance_after_e2[cut],
-            masked=masked,
-        )  # fmt: skip
-    measured = _VARIANCE_OF_BACKGROUND[config.background.method or "fixed"]
-    read = windows.read_variance_before_e2[cut]
-    steady = smooth_background(before, read, masked) if measured else before
-    # The expected variance is that of the smooth background; the excess is that over the own one.
-    extra = windows.read_variance_after_e2[cut] + ratio**2 * (measured * steady + read)
-    extra = extra + ratio * (steady - before)
-    background = ratio * before
-    if scene.additive:
-        scale = photons_scale(scene, windows)
-        return poisson(
-            model, grid, after, background + scale * signal, scale,
-            extra_variance_e2=extra, masked=masked,
-        )  # fmt: skip
-    level = background * (1 + signal)
-    return poisson(model, grid, after, level, level, extra_variance_e2=extra, masked=masked)
+    return counts_likelihood(
+        model, grid, before, after, windows.power_ratio,
+        background=_VARIANCE_OF_BACKGROUND[config.background.method or "fixed"],
+        use_conditional=_uses_conditional(config),
+        scale_e=photons_scale(scene, windows) if scene.additive else None,
+        others=others,
+        read_variance_before_e2=windows.read_variance_before_e2[cut],
+        read_variance_after_e2=windows.read_variance_after_e2[cut],
+        masked=masked,
+    )  # fmt: skip
 
 
 def photons_scale(scene: Scene, windows: Windows) -> float:
@@ -287,6 +271,6 @@ def _is_counted(config: Config) -> bool:
 def _pixel_nm(config: Config) -> float:
     if config.camera.pixel_size_nm is None:
         raise ConfigError(
-            "camera.pixel_size_nm is needed: set it, as in --set camera.pixel_size_nm=84.4"
+            "camera.pixel_size_nm is needed: set it, as in camera.pixel_size_nm = 84.4"
         )
     return config.camera.pixel_size_nm

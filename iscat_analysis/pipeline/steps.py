@@ -3,8 +3,7 @@
 Each step is fitted on the frames just before and just after it, by the conditional likelihood of
 those very frames.  Turns of all fits with all others in place settle in two or three sweeps; what
 they explain is taken off the sliding contrast, which is then searched again.  `neighbours` says
-what steps do to each other's light, `tasks` sets up the likelihood of one, `bias` takes its
-first-order bias off the mass.
+what steps do to each other's light, `tasks` sets up the likelihood of one.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ import numpy as np
 
 from iscat_analysis.inference.fit import POOR_FIT_P, fit_particle, search_box, start_theta
 from iscat_analysis.movie.drift import Trajectory
-from iscat_analysis.pipeline.bias import unbiased
 from iscat_analysis.pipeline.field import Event
 from iscat_analysis.pipeline.neighbours import (
     Neighbours,
@@ -36,6 +34,7 @@ from iscat_analysis.records import (
     FloatArray,
     Status,
     Windows,
+    verdict,
 )
 from iscat_analysis.search.residue import (
     EXCEEDS,
@@ -401,7 +400,7 @@ class ChunkFitter:
         fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=True)
         if fit.mass_kda <= 0 and "mass_kda" in fit.free:
             return None
-        fit = _judged(scene, unbiased(likelihood, fit), task, lobe=lobe)
+        fit = _judged(scene, fit, task, lobe=lobe)
         pixel = scene.pixel_nm
         fit = replace(fit, x_nm=fit.x_nm - x_px * pixel, y_nm=fit.y_nm - y_px * pixel)
         local = Region(
@@ -431,8 +430,8 @@ class ChunkFitter:
             if Status.SIDELOBE not in fit.flags and is_dwarfed(
                 one.event.snr, fit.chi2_reduced, one.event.likelihood.n_pixels, brightest
             ):
-                flags = (Status.SIDELOBE, *fit.flags)
-                fit = replace(fit, status=Status.SIDELOBE, flags=flags)
+                status, flags = verdict([Status.SIDELOBE, *fit.flags])
+                fit = replace(fit, status=status, flags=flags)
             flagged.append(replace(one, event=replace(one.event, fit=fit)))
         return flagged
 
@@ -455,15 +454,14 @@ def _judged(scene: Scene, fit: FitResult, task: Task, *, lobe: bool) -> FitResul
     rows, columns = np.nonzero(task.windows.saturated)
     dx = (columns + task.region.columns[0]) * scene.pixel_nm - fit.x_nm
     dy = (rows + task.region.rows[0]) * scene.pixel_nm - fit.y_nm
-    poor = Status.POOR_FIT in fit.flags or task.at.p_constant < POOR_FIT_P
-    flags = [
+    status, flags = verdict([
+        *fit.flags,
         *([Status.SIDELOBE] if lobe else []),
         *([Status.SATURATED] if np.any(np.hypot(dx, dy) < _SATURATION_NM) else []),
-        *(f for f in fit.flags if f != Status.POOR_FIT),
         *([Status.TOO_CLOSE] if task.crowded else []),
-        *([Status.POOR_FIT] if poor else []),
-    ]
-    return replace(fit, status=Status(flags[0]) if flags else Status.OK, flags=tuple(flags))
+        *([Status.POOR_FIT] if task.at.p_constant < POOR_FIT_P else []),
+    ])  # fmt: skip
+    return replace(fit, status=status, flags=flags)
 
 
 def _ids(steps: Sequence[Step]) -> set[int]:

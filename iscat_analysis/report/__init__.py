@@ -10,10 +10,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from iscat_analysis.records import Analysis
-from iscat_analysis.report.figures import EVENT_FIGURES, write_figures
+from iscat_analysis.report.event_figures import EVENT_FIGURES
+from iscat_analysis.report.event_figures import event_figures as draw_events
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output
 from iscat_analysis.report.page import render_page, render_report
-from iscat_analysis.report.tables import write_posterior, write_tables
+from iscat_analysis.report.posterior import write_posterior
+from iscat_analysis.report.style import publish
+from iscat_analysis.report.tables import write_tables
 
 __all__ = [
     "EVENT_FIGURES",
@@ -63,7 +66,9 @@ def write_report(
     with atomic_folder(folder, overwrite) as building:
         write_tables(analysis, building)
         write_posterior(analysis, building / "posterior.nc")
-        drawn = write_figures(analysis, building / "figures", events=event_figures)
-        page = render_report(analysis, figures=drawn)
+        pictures = building / "figures"
+        pictures.mkdir()
+        page = render_report(analysis, folder=pictures)
+        publish(draw_events(analysis, event_figures), pictures)
         (building / "report.html").write_text(page, encoding="utf-8")
     return folder

@@ -6,23 +6,27 @@ Everything arrives as the content of ``benchmark.json``; nothing is computed her
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
+from markupsafe import Markup
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.report.numbers import LABELS, UNITS
 from iscat_analysis.report.page import render_page
-from iscat_analysis.report.style import BLUE, INK, STYLE, VERMILLION, new_figure, save_figure
+from iscat_analysis.report.style import BLUE, INK, VERMILLION, new_figure, publish
 
 BENCHMARK_NAMES = frozenset({"benchmark.json", "benchmark.html", "config.toml", "figures"})
 """Everything `write_benchmark` leaves in its folder."""
+
+ENOUGH_RANKS = 100
+"""Posteriors below which the uniformity of their ranks is not tested: a p-value would mislead."""
 
 MODES = ("mass", "localize", "joint")
 
@@ -33,27 +37,36 @@ _TITLES = {
 }
 _SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "dark field"}
 _BASELINES = {"gaussian": "Gaussian least squares", "peak": "peak contrast"}
+_FIGURES = {
+    "photons": "Spread against photons",
+    "heights": "Spread against height",
+    "pulls": "Pulls: (estimate − truth) / σ",
+    "ranks": "Ranks of the truth among the draws of its posterior",
+}
 _AXES = {
     "photons": ("collected scattered photons", "log"),
     "z": ("height [nm]", "linear"),
 }
 
 
-def render_benchmark(study: Mapping[str, Any]) -> str:
-    """Make the page of a study.
+def render_benchmark(study: Mapping[str, Any], *, folder: Path | None = None) -> str:
+    """Make the page of a study, and write its figures.
 
     Parameters
     ----------
     study : mapping
         What ``benchmark.json`` holds.
+    folder : Path, optional
+        Where each figure goes as PNG and SVG.
 
     Returns
     -------
     str
         HTML that needs no other file.
     """
+    drawn = publish(benchmark_figures(study), folder)
     sections = [_summary(study)]
-    sections += [_mode_section(study, mode) for mode in MODES if mode in study]
+    sections += [_mode_section(study, mode, drawn) for mode in MODES if mode in study]
     sections.append(
         {
             "id": "how",
@@ -150,13 +163,15 @@ def _summary(study: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _mode_section(study: Mapping[str, Any], mode: str) -> dict[str, Any]:
+def _mode_section(
+    study: Mapping[str, Any], mode: str, drawn: Mapping[str, Markup]
+) -> dict[str, Any]:
     entry, at = study[mode], study[mode]["at"]
     names = FREE_PARAMETERS[mode]
     charts = [
-        *(_curve_chart(study, mode, axis, name) for axis in _AXES for name in names),
-        *(_pull_chart(study, mode, name) for name in names),
-        *(_rank_chart(study, mode, name) for name in names if study["histograms"]["ranks"][mode]),
+        {"id": f"{mode}-{stem}", "title": title, "svg": drawn[f"{stem}_{mode}"], "wide": True}
+        for stem, title in _FIGURES.items()
+        if f"{stem}_{mode}" in drawn
     ]
     flags = (
         ", ".join(f"{n} {flag.replace('_', ' ')}" for flag, n in entry["flagged"].items() if n)
@@ -225,114 +240,34 @@ def _coverage_row(entry: Mapping[str, Any], name: str) -> list[Any]:
     return [f"{LABELS[name]} [{UNITS[name]}]", *shares]
 
 
-def _curve_chart(study: Mapping[str, Any], mode: str, axis: str, name: str) -> dict[str, Any]:
-    curve = study["curves"][axis][mode]
-    label, scale = _AXES[axis]
-    line, x = curve[name], curve["at"]
-    fine = curve.get("bounds", curve)
-    y_axis = {"label": f"σ of {LABELS[name]} [{UNITS[name]}]", "scale": "log"}
-    series: list[dict[str, Any]] = [
-        {"kind": "line", "name": "CRB", "color": "crb", "x": fine["at"], "y": fine[name]["crb"]},
-        {
-            "kind": "line",
-            "name": "QCRB",
-            "color": "qcrb",
-            "x": fine["at"],
-            "y": fine[name]["qcrb"],
-            "dash": True,
-        },
-        {
-            "kind": "interval",
-            "name": "spread, 95 %",
-            "color": "sigma",
-            "along": "y",
-            "at": x,
-            "mid": line["spread"],
-            "lo": [low for low, _ in line["spread_ci95"]],
-            "hi": [high for _, high in line["spread_ci95"]],
-        },
-    ]
-    along = "photons" if axis == "photons" else "height"
-    return {
-        "id": f"{mode}-{axis}-{name}",
-        "title": f"{LABELS[name]} against {along}",
-        "caption": None,
-        "spec": {"x": {"label": label, "scale": scale}, "y": y_axis, "series": series},
-        "wide": False,
-    }
-
-
-def _pull_chart(study: Mapping[str, Any], mode: str, name: str) -> dict[str, Any]:
-    bins = study["histograms"]["pulls"][mode][name]
-    edges = np.asarray(bins["edges"])
-    middle = ((edges[1:] + edges[:-1]) / 2).tolist()
-    return {
-        "id": f"{mode}-pull-{name}",
-        "title": f"Pull of {LABELS[name]}",
-        "caption": None,
-        "spec": {
-            "x": {"label": "(estimate − truth) / σ", "scale": "linear"},
-            "y": {"label": "fits", "scale": "linear", "zero": True},
-            "series": [
-                {"kind": "bars", "name": "fits", "color": "sigma", "edges": bins["edges"],
-                 "counts": bins["counts"]},
-                {"kind": "line", "name": "normal", "color": "crb", "x": middle,
-                 "y": bins["expected"]},
-            ],
-        },
-        "wide": False,
-    }  # fmt: skip
-
-
-def _rank_chart(study: Mapping[str, Any], mode: str, name: str) -> dict[str, Any]:
-    bins = study["histograms"]["ranks"][mode][name]
-    counts = bins["counts"]
-    edges = np.linspace(0, bins["possible"], len(counts) + 1).tolist()
-    mean = sum(counts) / len(counts)
-    return {
-        "id": f"{mode}-rank-{name}",
-        "title": f"Rank of the true {LABELS[name]}",
-        "caption": f"among the draws of its posterior; uniform with p = {bins['p_value']:.2g}",
-        "spec": {
-            "x": {"label": "rank", "scale": "linear"},
-            "y": {"label": "posteriors", "scale": "linear", "zero": True},
-            "series": [
-                {"kind": "bars", "name": "posteriors", "color": "qcrb", "edges": edges,
-                 "counts": counts},
-                {"kind": "rule", "name": "uniform", "color": "crb", "axis": "y", "value": mean},
-            ],
-        },
-        "wide": False,
-    }  # fmt: skip
-
-
-def draw_benchmark(study: Mapping[str, Any], folder: Path) -> None:
-    """Draw the figures, each as PNG and SVG.
-
-    ``photons_MODE``, ``heights_MODE`` (spread, CRB and QCRB), ``pulls_MODE`` and ``ranks_MODE``.
+def benchmark_figures(study: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
+    """Draw the figures.
 
     Parameters
     ----------
     study : mapping
         What ``benchmark.json`` holds.
-    folder : Path
-        Made if absent.
+
+    Yields
+    ------
+    name : str
+        ``photons_MODE``, ``heights_MODE`` (spread, CRB and QCRB), ``pulls_MODE``, ``ranks_MODE``.
+    figure : Figure
+        One panel for each free parameter.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with mpl.rc_context(STYLE):
-        for mode in MODES:
-            if mode not in study:
-                continue
-            for axis, stem in (("photons", "photons"), ("z", "heights")):
-                curve = study["curves"][axis][mode]
-                _panels(folder / f"{stem}_{mode}", mode, partial(_draw_curve, axis, curve))
-            for kind, draw in (("pulls", _draw_pulls), ("ranks", _draw_ranks)):
-                bins = study["histograms"][kind][mode]
-                if bins:
-                    _panels(folder / f"{kind}_{mode}", mode, partial(draw, bins))
+    for mode in MODES:
+        if mode not in study:
+            continue
+        for axis, stem in (("photons", "photons"), ("z", "heights")):
+            curve = study["curves"][axis][mode]
+            yield f"{stem}_{mode}", _panels(mode, partial(_draw_curve, axis, curve))
+        for kind, draw in (("pulls", _draw_pulls), ("ranks", _draw_ranks)):
+            bins = study["histograms"][kind][mode]
+            if bins:
+                yield f"{kind}_{mode}", _panels(mode, partial(draw, bins))
 
 
-def _panels(stem: Path, mode: str, draw: Callable[[Axes, str], None]) -> None:
+def _panels(mode: str, draw: Callable[[Axes, str], None]) -> Figure:
     names = FREE_PARAMETERS[mode]
     figure = new_figure(2.9 * len(names), 2.9)
     for position, name in enumerate(names):
@@ -343,7 +278,7 @@ def _panels(stem: Path, mode: str, draw: Callable[[Axes, str], None]) -> None:
             axes.set_ylabel("")
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=len(labels), fontsize=8)
-    save_figure(figure, stem)
+    return figure
 
 
 def _draw_curve(axis: str, curve: Mapping[str, Any], axes: Axes, name: str) -> None:
@@ -382,7 +317,8 @@ def _draw_ranks(found: Mapping[str, Any], axes: Axes, name: str) -> None:
     edges = np.linspace(0, bins["possible"], counts.size + 1)
     axes.stairs(counts, edges, fill=True, color=BLUE, label="posteriors")
     axes.axhline(float(counts.mean()), color=INK, linewidth=1, label="uniform")
-    axes.set_title(f"p = {bins['p_value']:.2g}", loc="right", fontsize=8)
+    if counts.sum() >= ENOUGH_RANKS:
+        axes.set_title(f"p = {bins['p_value']:.2g}", loc="right", fontsize=8)
     axes.set_ylim(0, 1.25 * max(counts.max(), 1.0))
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.set_xlabel("rank of the truth")

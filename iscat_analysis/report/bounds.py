@@ -5,11 +5,10 @@ Everything arrives as tables; nothing is computed here.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -17,7 +16,7 @@ from matplotlib.figure import Figure
 from iscat_analysis.records import PARAMETERS
 from iscat_analysis.report.numbers import LABELS, UNITS
 from iscat_analysis.report.output import atomic_folder
-from iscat_analysis.report.style import BLUE, INK, STYLE, VERMILLION, log_y, new_figure, save_figure
+from iscat_analysis.report.style import BLUE, INK, VERMILLION, log_y, new_figure, publish
 from iscat_analysis.schemas import to_json
 
 BOUNDS_FILES = frozenset({"bounds.json", "scan.csv", "scan.png", "scan.svg"})
@@ -67,12 +66,11 @@ def write_bounds(
             table.to_csv(
                 building / "scan.csv", index=False, float_format="%.9g", lineterminator="\n"
             )
-            with mpl.rc_context(STYLE):
-                save_figure(scan_figure(table, label, here), building / "scan")
+            publish(scan_figures(table, label, here), building)
     return folder
 
 
-def scan_figure(table: pd.DataFrame, label: str, here: float) -> Figure:
+def scan_figures(table: pd.DataFrame, label: str, here: float) -> Iterator[tuple[str, Figure]]:
     """Draw bounds and used information along a scan.
 
     Parameters
@@ -84,9 +82,11 @@ def scan_figure(table: pd.DataFrame, label: str, here: float) -> Figure:
     here : float
         Operating point; drawn where it lies inside the scan.
 
-    Returns
-    -------
-    Figure
+    Yields
+    ------
+    name : str
+        ``scan``.
+    figure : Figure
         Two rows: bounds, and the share of the light's information.
     """
     figure = new_figure(11, 5.4)
@@ -126,4 +126,4 @@ def scan_figure(table: pd.DataFrame, label: str, here: float) -> Figure:
             [*labels, f"configured: {here:g}".replace("-", "−")],
         )
     figure.legend(handles, labels, loc="outside upper center", ncols=4)
-    return figure
+    yield "scan", figure

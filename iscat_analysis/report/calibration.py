@@ -5,11 +5,17 @@ Everything arrives as what the JSON files hold; nothing is computed here.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from iscat_analysis.report.numbers import decimals_for, fixed, number
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from iscat_analysis.records import FloatArray
+from iscat_analysis.report.numbers import count, decimals_for, fixed, number
 from iscat_analysis.report.page import render_page
+from iscat_analysis.report.style import GREY, INK, VERMILLION, new_figure, publish
 
 _SOURCES = {
     "dark": "from the dark",
@@ -36,18 +42,13 @@ def camera_page(title: str, found: Mapping[str, Any], toml: str) -> str:
     str
         HTML.
     """
-    charts = []
-    if found["photon_transfer"].get("mean_adu"):
-        charts.append(_transfer_chart(found["photon_transfer"]))
-    if found["noise"].get("n_frames"):
-        charts.append(_noise_chart(found["noise"]))
     sections: list[dict[str, Any]] = [
         {
             "id": "camera",
             "title": "Camera",
             "lead": _sentence(found["verdict"]),
             "facts": _camera_facts(found),
-            "charts": charts,
+            "charts": _charts(_camera_figures(found)),
         }
     ]
     if found["notes"]:
@@ -103,7 +104,7 @@ def mass_page(title: str, found: Mapping[str, Any], toml: str) -> str:
                 {
                     "label": "χ² of the line",
                     "value": number(found["chi2"], 3),
-                    "note": f"{found['dof']} degree{'' if found['dof'] == 1 else 's'} of freedom",
+                    "note": f"{count(found['dof'], 'degree')} of freedom",
                 },
                 {
                     "label": "Largest residual",
@@ -111,7 +112,7 @@ def mass_page(title: str, found: Mapping[str, Any], toml: str) -> str:
                     "unit": "%",
                 },
             ],
-            "charts": [_line_chart(found), _peaks_chart(found)],
+            "charts": _charts(_mass_figures(found)),
             "tables": [_standards_table(standards)],
         }
     ]
@@ -158,10 +159,9 @@ def _camera_facts(found: Mapping[str, Any]) -> list[dict[str, str]]:
             continue
         low, high = estimate["ci95"]
         decimals = decimals_for([(high - low) / 2])
-        note = f"95 %: {fixed(low, decimals)} to {fixed(high, decimals)}"
+        note = f"95 %: {fixed(low, decimals)} to {fixed(high, decimals)}" if low < high else ""
         if key == "offset_adu":
-            source = _SOURCES[found["offset_from"]]
-            note = source if low == high else f"{note}; {source}"
+            note = "; ".join(filter(None, (note, _SOURCES[found["offset_from"]])))
         value = fixed(estimate["value"], decimals)
         facts.append({"label": label, "value": value, "unit": unit, "note": note})
     masked = found["masked_pixels"]
@@ -170,107 +170,97 @@ def _camera_facts(found: Mapping[str, Any]) -> list[dict[str, str]]:
             "label": "Pixels left out",
             "value": str(sum(masked.values())),
             "unit": "",
-            "note": ", ".join(f"{count} {name}" for name, count in masked.items()),
+            "note": ", ".join(f"{n} {reason}" for reason, n in masked.items()),
         }
     )
     return facts
 
 
-def _transfer_chart(curve: Mapping[str, Any]) -> dict[str, Any]:
-    reach = [1.96 * se for se in curve["variance_se"]]
-    return {
-        "id": "transfer",
-        "title": "Photon transfer",
-        "caption": "Variance of a pixel against its mean, in bins of pixels; the slope is one over "
-        "the gain.",
-        "spec": {
-            "height": 320,
-            "x": {"label": "mean [counts]"},
-            "y": {"label": "variance [counts²]"},
-            "series": [
-                {"kind": "line", "name": "fit", "color": "crb",
-                 "x": curve["mean_adu"], "y": curve["fit_adu2"]},
-                {"kind": "interval", "name": "pixels, 95 %", "color": "sigma", "along": "y",
-                 "at": curve["mean_adu"], "mid": curve["variance_adu2"],
-                 "lo": [v - r for v, r in zip(curve["variance_adu2"], reach, strict=True)],
-                 "hi": [v + r for v, r in zip(curve["variance_adu2"], reach, strict=True)]},
-            ],
-        },
-    }  # fmt: skip
+def _camera_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
+    curve, noise = found["photon_transfer"], found["noise"]
+    if curve.get("mean_adu"):
+        figure = new_figure(6.2, 3.4)
+        axes = figure.add_subplot()
+        axes.plot(curve["mean_adu"], _floats(curve["fit_adu2"]), color=INK, label="fit")
+        axes.errorbar(
+            curve["mean_adu"], curve["variance_adu2"], 1.96 * _floats(curve["variance_se"]),
+            fmt="o", color=VERMILLION, ms=3, lw=1, label="pixels, 95 %",
+        )  # fmt: skip
+        axes.set(xlabel="mean [counts]", ylabel="variance [counts²]")
+        axes.legend()
+        yield "transfer", figure
+    if noise.get("n_frames"):
+        figure = new_figure(6.2, 3.4)
+        axes = figure.add_subplot()
+        axes.plot(noise["n_frames"], _floats(noise["shot_noise"]), color=INK, label="shot noise")
+        axes.plot(noise["n_frames"], noise["contrast_noise"], "o", color=VERMILLION, ms=4,
+                  label="measured")  # fmt: skip
+        axes.set(xscale="log", yscale="log", xlabel="frames averaged", ylabel="contrast noise")
+        axes.legend()
+        yield "averaging", figure
 
 
-def _noise_chart(noise: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        "id": "averaging",
-        "title": "Noise against averaging",
-        "caption": "Contrast noise between two successive averages of n frames. Shot noise falls "
-        "as one over the root of n; drift and particles do not.",
-        "spec": {
-            "height": 320,
-            "x": {"label": "frames averaged", "scale": "log"},
-            "y": {"label": "contrast noise", "scale": "log"},
-            "series": [
-                {"kind": "line", "name": "shot noise", "color": "crb",
-                 "x": noise["n_frames"], "y": noise["shot_noise"]},
-                {"kind": "points", "name": "measured", "color": "sigma",
-                 "x": noise["n_frames"], "y": noise["contrast_noise"]},
-            ],
-        },
-    }  # fmt: skip
-
-
-def _line_chart(found: Mapping[str, Any]) -> dict[str, Any]:
-    standards = found["standards"]
-    masses = [s["mass_kda"] for s in standards]
-    top = 1.1 * max(masses)
+def _mass_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
+    standards, histogram = found["standards"], found["histogram"]
     sign = -1.0 if found["landing"] == "dark" else 1.0
-    grid = [top * k / 60 for k in range(61)]
+    masses = [s["mass_kda"] for s in standards]
+    contrasts = [abs(s["contrast"]) for s in standards]
+    grid = np.linspace(0, 1.1 * max(masses), 61)
     (vs, cov), (_, vo) = found["covariance"]
-    line = [found["gradient_per_kda"] * m + found["offset"] for m in grid]
-    reach = [1.96 * max(m * m * vs + 2 * m * cov + vo, 0.0) ** 0.5 for m in grid]
-    edge = {"kind": "line", "color": "crb", "dash": True}
-    return {
-        "id": "standards",
-        "title": "The line through the standards",
-        "caption": "Contrast of landing, with its sign taken off; dashed: 95 % of the line.",
-        "spec": {
-            "height": 320,
-            "x": {"label": "mass [kDa]", "zero": True},
-            "y": {"label": "|contrast|", "zero": True},
-            "series": [
-                {"kind": "line", "name": "line", "color": "crb", "x": grid,
-                 "y": [sign * c for c in line]},
-                {**edge, "x": grid, "y": [sign * c - r for c, r in zip(line, reach, strict=True)]},
-                {**edge, "x": grid, "y": [sign * c + r for c, r in zip(line, reach, strict=True)]},
-                {"kind": "interval", "name": "standards, 95 %", "color": "sigma", "along": "y",
-                 "at": masses, "mid": [abs(s["contrast"]) for s in standards],
-                 "lo": [abs(s["contrast"]) - 1.96 * s["contrast_se"] for s in standards],
-                 "hi": [abs(s["contrast"]) + 1.96 * s["contrast_se"] for s in standards]},
-            ],
-        },
-    }  # fmt: skip
+    line = sign * (found["gradient_per_kda"] * grid + found["offset"])
+    reach = 1.96 * np.sqrt(np.maximum(grid**2 * vs + 2 * grid * cov + vo, 0.0))
+    figure = new_figure(6.2, 3.4)
+    axes = figure.add_subplot()
+    axes.plot(grid, line, color=INK, label="line, 95 %")
+    axes.fill_between(grid, line - reach, line + reach, color=GREY, alpha=0.35, lw=0)
+    errors = [1.96 * s["contrast_se"] for s in standards]
+    axes.errorbar(
+        masses, contrasts, errors, fmt="o", color=VERMILLION, ms=4, label="standards, 95 %"
+    )
+    axes.set(xlabel="mass [kDa]", ylabel="|contrast|")
+    axes.legend()
+    yield "standards", figure
+    figure = new_figure(6.2, 3.4)
+    axes = figure.add_subplot()
+    axes.stairs(histogram["counts"], histogram["edges"], fill=True, color=GREY, label="events")
+    for k, contrast in enumerate(contrasts):
+        axes.axvline(contrast, color=VERMILLION, ls="--", label=None if k else "standards")
+    axes.set(xlabel="|contrast|", ylabel="events")
+    axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
+    axes.legend()
+    yield "peaks", figure
 
 
-def _peaks_chart(found: Mapping[str, Any]) -> dict[str, Any]:
-    histogram = found["histogram"]
-    return {
-        "id": "peaks",
-        "title": "The peaks",
-        "caption": "|Contrast| of the landing events, and the peaks fitted to the events "
-        "themselves.",
-        "spec": {
-            "height": 320,
-            "x": {"label": "|contrast|"},
-            "y": {"label": "events", "zero": True, "whole": True},
-            "series": [
-                {"kind": "bars", "name": "events", "color": "plain",
-                 "edges": histogram["edges"], "counts": histogram["counts"]},
-                *({"kind": "rule", "name": "standards" if not k else None, "color": "sigma",
-                   "axis": "x", "value": abs(s["contrast"])}
-                  for k, s in enumerate(found["standards"])),
-            ],
-        },
-    }  # fmt: skip
+def _floats(values: Sequence[float | None]) -> FloatArray:
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+
+_CAPTIONS = {
+    "transfer": (
+        "Photon transfer",
+        "Variance of a pixel against its mean, in bins of pixels; the slope is one over the gain.",
+    ),
+    "averaging": (
+        "Noise against averaging",
+        "Contrast noise between two successive averages of n frames. Shot noise falls as one over "
+        "the root of n; drift and particles do not.",
+    ),
+    "standards": (
+        "The line through the standards",
+        "Contrast of landing without its sign; the band holds 95 % of the line.",
+    ),
+    "peaks": (
+        "The peaks",
+        "|Contrast| of the landing events, and the peaks fitted to the events themselves.",
+    ),
+}
+
+
+def _charts(figures: Iterator[tuple[str, Figure]]) -> list[dict[str, Any]]:
+    return [
+        {"id": name, "title": _CAPTIONS[name][0], "caption": _CAPTIONS[name][1], "svg": svg}
+        for name, svg in publish(figures).items()
+    ]
 
 
 def _standards_table(standards: list[Mapping[str, Any]]) -> dict[str, Any]:
@@ -293,7 +283,7 @@ def _standards_table(standards: list[Mapping[str, Any]]) -> dict[str, Any]:
         "columns": [{"label": label, "numeric": True} for _, label, _, _ in columns]
         + [{"label": "95 % [kDa]", "numeric": True}],
         "rows": [
-            [{"text": fixed(scale * s[key], d), "sort": s[key]} for key, _, scale, d in columns]
+            [fixed(scale * s[key], d) for key, _, scale, d in columns]
             + [f"{fixed(s['low_kda'], reach)} to {fixed(s['high_kda'], reach)}"]
             for s in standards
         ],

@@ -1,8 +1,7 @@
-"""What the report page is told: headline numbers in words, and compact data for its scripts."""
+"""What the report page of one analysis is made of."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import PurePath
@@ -10,33 +9,23 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from markupsafe import Markup, escape
 
-from iscat_analysis.records import (
-    EVENT_COLUMNS,
-    FREE_PARAMETERS,
-    Analysis,
-    Status,
-)
-from iscat_analysis.report.numbers import LABELS, UNITS, count, number, percent
-from iscat_analysis.report.pack import (
-    event_images,
-    field_image,
-    posterior_densities,
-    rounded,
-    views_of_rows,
-)
-from iscat_analysis.report.precision import (
-    Precision,
-    ladder,
+from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Status
+from iscat_analysis.report.event_figures import event_images
+from iscat_analysis.report.headline import (
+    caution,
+    counted,
+    headline,
+    is_uncalibrated,
+    label_of,
+    main_quantity,
     precision_of,
-    precision_row,
+    precision_rows,
     quantiles,
+    sizes,
 )
-from iscat_analysis.report.tables import event_table
-from iscat_analysis.schemas import jsonable
-
-POWER_POINTS = 1500
-"""Points of the power curve; longer ones keep the extremes of each stretch."""
+from iscat_analysis.report.numbers import LABELS, UNITS, count, decimals_for, fixed, number, percent
 
 _MODES = {
     "mass": "position and mass, height fixed",
@@ -44,320 +33,247 @@ _MODES = {
     "joint": "position in three dimensions and mass",
     "track": "position and mass in every frame, linked into tracks",
 }
+_SIGNS = {
+    "mass_kda": "Negative masses are particles that leave.",
+    "contrast": "Dark particles that land, and bright ones that leave, have negative contrast.",
+}
 _SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "Dark field"}
 
 
-def report_context(analysis: Analysis, figures: Mapping[str, int]) -> dict[str, Any]:
+def report_context(
+    analysis: Analysis, table: pd.DataFrame, figures: Mapping[str, Markup]
+) -> dict[str, Any]:
     """Gather everything ``report.html`` shows.
 
     Parameters
     ----------
     analysis : Analysis
         What was found.
-    figures : mapping of str to int
-        Number of figure files of each kind beside the page: ``events`` and ``corners``.
+    table : pandas.DataFrame
+        From `event_table`.
+    figures : mapping of str to Markup
+        From `publish`: those of `page_figures`, of `corner_figures` and ``species``.
 
     Returns
     -------
     dict
         The template's context.
     """
-    table = event_table(analysis)
-    free = FREE_PARAMETERS[analysis.mode]
-    precision = [precision_of(table, name) for name in free]
-    main = "mass_kda" if "mass_kda" in free else "z_nm"
-    views = views_of_rows(table, analysis.views)
-    images = event_images(views, analysis.scheme)
-    posteriors, refused, sampled = posterior_densities(views, table)
     source = analysis.provenance.input_path
-    name = PurePath(source.replace("\\", "/")).name or "Analysis"
-    sections = [
-        ("summary", "Summary"),
-        ("distributions", "Distributions" if len(table) else "Field"),
-        *([("precision", "Precision"), ("events", "Events")] if len(table) else []),
-        ("posterior", "Posterior"),
-        ("diagnostics", "Diagnostics"),
-        ("configuration", "Configuration"),
-        ("provenance", "Provenance"),
-    ]
-    has_posteriors = any(sampled)
-    if not has_posteriors:
-        sections.remove(("posterior", "Posterior"))
-    n_images = len(images)
+    images = event_images(analysis, table)
+    sampled = [view for view in analysis.views if view.posterior is not None]
+    started = _when(analysis.provenance.started)
+    said = headline(analysis, table)
     return {
-        "title": name,
-        "kicker": "iscat-analysis",
-        "subtitle": (
-            f"{_SCHEMES.get(analysis.scheme, analysis.scheme)}, {analysis.mode} mode: "
-            f"{_MODES[analysis.mode]}. Analysed {_when(analysis.provenance.started)}."
-        ),
-        "nav": sections,
-        "footer": "iscat-analysis " + str(analysis.provenance.versions.get("iscat-analysis", "")),
+        "title": PurePath(source.replace("\\", "/")).name or "Analysis",
+        "subtitle": f"{_SCHEMES[analysis.scheme]}, mode {analysis.mode}: {_MODES[analysis.mode]}. "
+        f"{started}".rstrip(),
+        "footer": "iscat-analysis "
+        f"{analysis.provenance.versions.get('iscat-analysis', '')}, {started}".rstrip(", "),
         "n_events": len(table),
-        "headline": _headline(table, precision, main, analysis.mode),
-        "tiles": _tiles(table, precision, main),
-        "ladder": ladder(precision) if any(p.events for p in precision) else None,
-        "precision_rows": [precision_row(p) for p in precision],
-        "main": main,
-        "main_label": LABELS[main],
-        "main_unit": UNITS[main],
-        "warnings": list(analysis.warnings),
-        "statuses": _statuses(table),
-        "flags": _flags(table),
-        "chi2": _histogram_spec(table["chi2_reduced"], "reduced χ²", rule=1.0),
-        "p_values": _histogram_spec(table["p_value"], "p-value", domain=(0.0, 1.0)),
-        "power": _power_spec(analysis),
-        "noise": _noise_spec(analysis.summary.get("landing") or analysis.summary.get("background")),
-        "measured": _measured_lines(analysis.summary),
-        "embedded": n_images,
-        "embedding_note": (
-            f"To keep this page small it holds the images of the first {n_images} of "
-            f"{len(table)} events; the numbers of all are in the table."
-            if 0 < n_images < len(table)
-            else None
+        "cautions": [text for text in said if text.startswith("Not calibrated")],
+        "headline": [text for text in said if not text.startswith("Not calibrated")],
+        "flagged": caution(table) is not None,
+        "tiles": _tiles(analysis, table),
+        "precision_rows": precision_rows(
+            analysis, [precision_of(table, name) for name in FREE_PARAMETERS[analysis.mode]]
         ),
-        "has_posteriors": has_posteriors,
-        "posterior_counts": {
-            "sampled": sum(sampled),
-            "refused": len(refused),
-            "embedded": len(posteriors),
-        },
-        "refused": bool(refused),
+        "warnings": analysis.warnings,
+        "figures": figures,
+        "histogram": next((name for name in figures if name.endswith("_histogram")), None),
+        "main_label": main_quantity(analysis).label.capitalize(),
+        "signs": _SIGNS.get(main_quantity(analysis).column),
+        "events": event_rows(analysis, table),
+        "images": {str(row): list(packed) for row, packed in images.items()},
+        "embedding_note": f"To keep this page small it holds the images of the first {len(images)} "
+        f"of {len(table)} events."
+        if 0 < len(images) < len(table)
+        else None,
+        "posterior_rows": list(_posterior_rows(sampled, table)),
+        "corners": [name for name in figures if name.startswith("corner_")],
         "refused_rows": [
-            [{"text": str(r["event"]), "sort": r["event"]}, r["message"]] for r in refused
+            [str(view.event), view.posterior.message]
+            for view in sampled
+            if view.posterior is not None and not view.posterior.converged
         ],
+        "statuses": _statuses(table),
+        "measured": list(measured_lines(analysis.summary)),
         "config": analysis.config_toml,
-        "provenance": _provenance(analysis),
-        "versions": [(k, str(v)) for k, v in analysis.provenance.versions.items()],
-        "run_summary": _flatten(
-            jsonable({k: v for k, v in analysis.summary.items() if k != "distribution"})
-        ),
-        "figure_counts": figures,
-        "data": {
-            "mode": analysis.mode,
-            "scheme": analysis.scheme,
-            "pixel_size_nm": analysis.pixel_size_nm,
-            "free": list(free),
-            "main": main,
-            "labels": LABELS,
-            "units": UNITS,
-            "advice": {s.value: s.advice for s in Status},
-            "columns": {
-                name: rounded(table[name])
-                if name not in ("status", "flags")
-                else table[name].tolist()
-                for name in EVENT_COLUMNS
-            },
-            "images": images,
-            "posteriors": posteriors,
-            "refused": {str(item["row"]): item["message"] for item in refused},
-            "field": field_image(analysis),
-        },
+        "provenance": [
+            ("Command", analysis.provenance.command),
+            ("Input", source),
+            ("SHA-256 of the input", analysis.provenance.input_sha256),
+            ("Seed", "none" if analysis.provenance.seed is None else analysis.provenance.seed),
+            ("Started", analysis.provenance.started),
+            *((name, str(version)) for name, version in analysis.provenance.versions.items()),
+        ],
     }
 
 
-def _headline(
-    table: pd.DataFrame, precision: Sequence[Precision], main: str, mode: str
-) -> list[str]:
-    """Say in two or three sentences what was found."""
-    n = len(table)
-    if not n:
-        return [
-            "Nothing was found in this movie that stands out from its noise. If particles can be "
-            "seen by eye, look at the field image and the laser power below, then at "
-            "detection.polarity, detection.false_alarms_per_movie and the two frame ranges."
-        ]
-    rows = "fitted position" if mode == "track" else "event"
-    good = table[table["status"] == Status.OK.value]
-    lines = [
-        f"{count(n, rows)}, of which {len(good)} fitted without reservation."
-        if n > 1
-        else f"One {rows}, fitted with status “{table['status'].iloc[0]}”."
-    ]
-    values = good[main].to_numpy(float)
-    values = values[np.isfinite(values)]
-    if values.size > 1:
-        _, low, middle, high, _ = quantiles(np.abs(values))
-        what = "mass" if main == "mass_kda" else "height"
-        lines[0] += (
-            f" Median {what} {number(middle)} {UNITS[main]}, middle half "
-            f"{number(low)} to {number(high)} {UNITS[main]}."
-        )
-    close = next((p for p in precision if p.name == main and p.events), None)
-    if close is not None:
-        lines.append(
-            f"The spread of {LABELS[main]} is {number(close.sigma)} {UNITS[main]}, "
-            f"{number(close.over_crb[2])} times the Cramér–Rao bound"
-            + (
-                f"; the light itself would allow {number(close.qcrb)} {UNITS[main]}, "
-                f"so {percent(close.information)} of its information on {LABELS[main]} is used."
-                if math.isfinite(close.information)
-                else "."
-            )
-        )
-    return lines
-
-
-def _tiles(table: pd.DataFrame, precision: Sequence[Precision], main: str) -> list[dict[str, str]]:
-    good = table[table["status"] == Status.OK.value]
-    flagged = len(table) - len(good)
+def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
+    """Give the large numbers at the top: how many, how much, how well."""
+    table = counted(table)
+    flagged = int((table["status"] != Status.OK.value).sum())
     tiles = [
         {
-            "label": "Events" if table["event"].is_unique else "Fitted positions",
+            "label": "Events" if analysis.mode != "track" else "Fitted positions",
             "value": str(len(table)),
-            "note": "none found" if table.empty else f"{len(good)} ok, {flagged} flagged",
+            "note": f"{len(table) - flagged} ok, {flagged} flagged",
         }
     ]
-    if not table["event"].is_unique:
-        tiles[0]["note"] = f"{table['event'].nunique()} tracks, " + tiles[0]["note"]
-    values = good[main].to_numpy(float)
-    values = values[np.isfinite(values)]
-    leaving = int((values < 0).sum()) if main == "mass_kda" else 0
-    _, low, middle, high, _ = quantiles(np.abs(values))
-    note = f"middle half {number(low)} to {number(high)}" if values.size > 1 else ""
-    if leaving and values.size == 1:
-        note = "leaving; magnitude"
-    elif leaving:
-        note = f"{values.size - leaving} landing, {leaving} leaving; magnitude"
-    what = "mass" if main == "mass_kda" else "height"
+    if analysis.mode == "track":
+        tiles[0]["note"] = f"{count(table['event'].nunique(), 'track')}, " + tiles[0]["note"]
+    values, main = sizes(analysis, table), main_quantity(analysis)
+    if caution(table) is not None or not values.size:
+        return tiles
+    low, middle, high = quantiles(values)
     tiles.append(
         {
-            "label": f"Median {what}" if values.size > 1 else what.capitalize(),
+            "label": f"Median {main.label}" if values.size > 1 else main.label.capitalize(),
             "value": number(middle),
-            "unit": UNITS[main] if values.size else "",
-            "note": note,
+            "unit": main.unit,
+            "note": f"middle half {number(low)} to {number(high)}" if values.size > 1 else "",
         }
     )
-    p = next(item for item in precision if item.name == main)
-    tiles.append(
-        {
-            "label": f"Spread of {LABELS[main]} over its CRB",
-            "value": number(p.over_crb[2]),
-            "unit": "×" if p.events else "",
-            "note": f"σ {number(p.sigma)}, CRB {number(p.crb)} {UNITS[main]}" if p.events else "",
-        }
-    )
-    tiles.append(
-        {
-            "label": f"Information on {LABELS[main]} used",
-            "value": percent(p.information),
-            "note": f"(QCRB / CRB)², QCRB {number(p.qcrb)} {UNITS[main]}" if p.events else "",
-        }
-    )
+    name = "mass_kda" if "mass_kda" in FREE_PARAMETERS[analysis.mode] else "z_nm"
+    if (p := precision_of(table, name)).events:
+        label, unit = LABELS[name], UNITS[name]
+        said = (
+            f"σ {number(p.sigma)}, CRB {number(p.crb)} {unit}",
+            f", QCRB {number(p.qcrb)} {unit}",
+        )
+        if is_uncalibrated(analysis):
+            label, said = "contrast", ("median of the events' own ratios", "")
+        tiles += [
+            {
+                "label": f"Spread of {label} over its CRB",
+                "value": number(p.over_crb),
+                "unit": "×",
+                "note": said[0],
+            },
+            {
+                "label": f"Information on {label} used",
+                "value": percent(p.information),
+                "note": f"(QCRB / CRB)²{said[1]}",
+            },
+        ]
     return tiles
 
 
-def _statuses(table: pd.DataFrame) -> list[list[Any]]:
-    counts = table["status"].value_counts()
-    return [
-        [
-            {"text": s.value, "class": "status" if s is Status.OK else "status flagged"},
-            {"text": str(counts[s.value]), "sort": int(counts[s.value])},
-            s.advice,
-        ]
-        for s in Status
-        if s.value in counts
-    ]
+def event_rows(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any]:
+    """Write the table of events, one column of one kind with the same decimals throughout.
 
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    table : pandas.DataFrame
+        From `event_table`.
 
-def _flags(table: pd.DataFrame) -> list[tuple[str, int]]:
-    known = {s.value for s in Status}
-    flags = [f for text in table["flags"] for f in str(text).split(";") if f and f not in known]
-    return sorted(((f, flags.count(f)) for f in set(flags)), key=lambda item: -item[1])
-
-
-def _histogram_spec(
-    column: pd.Series,
-    label: str,
-    *,
-    rule: float | None = None,
-    domain: tuple[float, float] | None = None,
-) -> dict[str, Any] | None:
-    values = column.to_numpy(float)
-    values = values[np.isfinite(values)]
-    if values.size < 2:
-        return None
-    bins = int(np.clip(np.sqrt(values.size), 8, 40))
-    counts, edges = np.histogram(values, bins=20 if domain else bins, range=domain)
-    series: list[dict[str, Any]] = [
-        {"kind": "bars", "name": "events", "color": "plain", "edges": edges, "counts": counts}
-    ]
-    if rule is not None:
-        series.append({"kind": "rule", "name": "expected", "color": "ink", "axis": "x",
-                       "value": rule})  # fmt: skip
-    if domain is not None:
-        series.append({"kind": "rule", "name": "expected", "color": "ink", "axis": "y",
-                       "value": values.size / len(counts)})  # fmt: skip
-    x: dict[str, Any] = {"label": label}
-    if domain is not None:
-        x["domain"] = domain
+    Returns
+    -------
+    dict
+        ``columns``: the headings; ``body``: the rows as HTML.
+    """
+    free = FREE_PARAMETERS[analysis.mode]
+    columns = [("x_px", "x [px]"), ("y_px", "y [px]"), ("contrast", "contrast [10⁻³]")]
+    for name in ("z_nm", "mass_kda"):
+        if name in free:
+            columns.append((name, f"{label_of(analysis, name)} [{UNITS[name]}]"))
+            for kind, heading in (
+                ("sigma", "σ"), ("systematic", "systematic"), ("repeat", "repeats"),
+                ("crb", "CRB"), ("qcrb", "QCRB"),
+            ):  # fmt: skip
+                columns.append((f"{kind}_{name}", f"{heading} [{UNITS[name]}]"))
+    columns += [("snr", "SNR"), ("chi2_reduced", "χ²"), ("p_value", "p")]
+    shown = {}
+    for name, heading in columns:
+        if name in table and np.isfinite(values := table[name].to_numpy(float)).any():
+            scaled = 1e3 * values if name == "contrast" else values
+            decimals = 2 if name in ("chi2_reduced", "p_value") else _decimals(scaled)
+            shown[heading] = [fixed(value, decimals) for value in scaled]
+    lines = []
+    for row, cells in enumerate(zip(*shown.values(), strict=True) if shown else [()] * len(table)):
+        status = Status(table["status"].iloc[row])
+        flags = [f for f in str(table["flags"].iloc[row]).split(";") if f and f != status]
+        kind = "status" if status is Status.OK else "status flagged"
+        numbers = "".join(f'<td class="num">{cell}' for cell in cells)
+        lines.append(
+            f'<tr id="row-{row}"><td><button type="button" class="toggle" aria-expanded="false">'
+            f'{table["event"].iloc[row]}</button><td class="num">{table["frame"].iloc[row]}'
+            f'{numbers}<td class="{kind}" title="{escape(status.advice)}">'
+            f"{escape('; '.join([status.value, *flags]))}"
+        )
     return {
-        "height": 250,
-        "x": x,
-        "y": {"label": "events", "zero": True, "whole": True},
-        "series": series,
+        "columns": ["event", "frame", *shown, "status"],
+        "body": Markup("\n".join(lines)),  # the only text, the flags, is escaped
     }
 
 
-def _power_spec(analysis: Analysis) -> dict[str, Any] | None:
-    power = np.asarray(analysis.power, float)
-    frames = np.asarray(analysis.power_frames, float)
-    if power.size < 2 or not np.isfinite(power).any():
-        return None
-    if power.size > POWER_POINTS:
-        stretches = np.array_split(np.arange(power.size), POWER_POINTS // 2)
-        filled = np.where(np.isfinite(power), power, np.nanmedian(power))
-        keep = sorted(
-            {int(s[pick(filled[s])]) for s in stretches for pick in (np.argmin, np.argmax)}
-        )
-        power, frames = power[keep], frames[keep]
-    return {
-        "height": 230,
-        "legend": False,
-        "x": {"label": "frame"},
-        "y": {"label": "laser power, relative"},
-        "series": [
-            {"kind": "line", "name": "power", "color": "ink", "thin": True,
-             "x": frames, "y": np.round(power, 7)},
-            {"kind": "rule", "color": "plain", "axis": "y", "value": 1.0},
-        ],
-    }  # fmt: skip
+def _decimals(values: np.ndarray[Any, Any]) -> int:
+    """Give the decimals that show three digits of the column's median."""
+    return decimals_for([float(np.nanmedian(np.abs(values)))], digits=3)
 
 
-def _noise_spec(noise: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    if not noise or len(noise["noise_frames"]) < 2:
-        return None
-    return {
-        "x": {"label": "frames averaged", "scale": "log"},
-        "y": {"label": "variance over shot noise"},
-        "series": [
-            {"kind": "rule", "name": "shot noise", "color": "ink", "axis": "y", "value": 1.0},
-            {"kind": "points", "name": "measured", "color": "sigma",
-             "x": noise["noise_frames"], "y": noise["noise_variance_over_shot"]},
-        ],
-    }  # fmt: skip
+def _posterior_rows(views: Sequence[EventView], table: pd.DataFrame) -> Iterator[list[str]]:
+    for view in views:
+        if view.posterior is None or not view.posterior.converged:
+            continue
+        row = table[table["event"] == view.event].iloc[0]
+        low, median, high = np.quantile(view.posterior.samples, [0.15865, 0.5, 0.84135], (0, 1))
+        for k, name in enumerate(view.posterior.names):
+            decimals = decimals_for([(high[k] - low[k]) / 2])
+            yield [
+                str(view.event),
+                f"{name.split('_')[0]} [{UNITS[name]}]",
+                fixed(median[k], decimals),
+                f"{fixed(low[k], decimals)} to {fixed(high[k], decimals)}",
+                f"{fixed(row[name], decimals)} ± {number(row[f'sigma_{name}'], 2)}",
+                number(view.posterior.r_hat[k], 4),
+                number(view.posterior.ess_bulk[k]),
+            ]
 
 
-def _measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Say what windows, drift and added particles came to."""
+def _statuses(table: pd.DataFrame) -> list[list[str]]:
+    """Count the verdicts and the other flags, with what each means."""
+    counts = table["status"].value_counts()
+    rows = [[s.value, str(counts[s.value]), s.advice] for s in Status if s.value in counts]
+    flags = table["flags"].str.split(";").explode()
+    others = flags[~flags.isin([*Status, ""])].value_counts()
+    return rows + [
+        [str(flag), str(n), "A remark that makes no verdict."] for flag, n in others.items()
+    ]
+
+
+def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    """Say what windows, drift and added particles came to.
+
+    Parameters
+    ----------
+    summary : mapping
+        What ``summary.json`` holds.
+
+    Yields
+    ------
+    str
+        One sentence or two.
+    """
     landing, injection = summary.get("landing"), summary.get("injection")
     background = summary.get("background")
     if background and background["drift_px"] is not None:
         (y, x), (y_se, x_se) = background["drift_px"], background["drift_error_px"]
         yield (
-            f"Drift of the fixed pattern from the background to the frames after it: {x:+.4f} ± "
-            f"{x_se:.4f} px in x, {y:+.4f} ± {y_se:.4f} px in y."
-        ).replace("-", "−")
+            "Drift of the fixed pattern from the background to the frames after it: "
+            f"{fixed(x, 4)} ± {fixed(x_se, 4)} px in x, {fixed(y, 4)} ± {fixed(y_se, 4)} px in y."
+        )
     if landing:
         yield (
-            f"Windows of {landing['window_frames']} frames; "
+            f"Windows of {count(landing['window_frames'], 'frame')}; "
             f"{count(landing['frames_left_out'], 'frame')} left out."
         )
         if landing["drift_px"] is not None:
             y, x = landing["drift_px"]
-            yield f"Drift of the fixed pattern: {x:+.3f} px in x, {y:+.3f} px in y.".replace(
-                "-", "−"
-            )
+            yield f"Drift of the fixed pattern: {fixed(x, 3)} px in x, {fixed(y, 3)} px in y."
     if injection and injection["added"]:
         text = (
             f"Of {injection['added']} landings and leavings added to the movie, "
@@ -369,48 +285,22 @@ def _measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
             bias, error = (100 * injection[key] for key in ("bias_rel", "bias_rel_se"))
             spread, doubt = (injection[key] for key in ("spread_over_crb", "spread_over_crb_se"))
             text += (
-                f" The masses of isolated ones are off by {bias:+.1f} ± {error:.1f} %, and their "
-                f"spread is {spread:.2f} ± {doubt:.2f} times the bound."
+                f" The masses of isolated ones are off by {fixed(bias, 1)} ± {fixed(error, 1)} %, "
+                f"and their spread is {fixed(spread, 2)} ± {fixed(doubt, 2)} times the bound."
             )
         else:
             text += (
                 " Too few are isolated to say how far their masses are off: add fewer to a movie "
                 "as short as this one."
             )
-        yield text.replace("-", "−")
-
-
-def _provenance(analysis: Analysis) -> list[tuple[str, str]]:
-    p = analysis.provenance
-    return [
-        ("Command", p.command),
-        ("Input", p.input_path),
-        ("SHA-256 of the input", p.input_sha256),
-        ("Seed", "none" if p.seed is None else str(p.seed)),
-        ("Started", p.started),
-    ]
+        yield text
 
 
 def _when(started: str) -> str:
-    """Write an ISO time as people do; what is not one stays as it is."""
+    """Write an ISO time as people do; other text stays as it is."""
     try:
         moment = datetime.fromisoformat(started)
     except ValueError:
         return started
     zone = f" {moment.tzname()}" if moment.tzinfo else ""
     return f"{moment.day} {moment:%B %Y, %H:%M}{zone}"
-
-
-def _flatten(value: Any, name: str = "") -> list[tuple[str, str]]:
-    """Lay a nested mapping out as dotted names and short values."""
-    if isinstance(value, dict):
-        return [
-            pair
-            for key, item in value.items()
-            for pair in _flatten(item, f"{name}.{key}" if name else str(key))
-        ]
-    if isinstance(value, float):
-        return [(name, number(value, 4))]
-    if isinstance(value, list):
-        return [(name, ", ".join(text for item in value for _, text in _flatten(item)))]
-    return [(name, "—" if value is None else str(value))]

@@ -5,10 +5,14 @@ Everything arrives as ``summary["distribution"]``; nothing is computed here.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from matplotlib.figure import Figure
+
 from iscat_analysis.report.numbers import decimals_for, fixed, number
+from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, VERMILLION, new_figure
 
 _COLUMNS = (
     {"label": "mass [kDa]", "numeric": True},
@@ -37,20 +41,19 @@ def distribution_section(found: Mapping[str, Any]) -> dict[str, Any] | None:
     Returns
     -------
     dict or None
-        A section as ``document.html`` takes it (id, title, lead, charts, tables, notes); None where
-        there are no species to show.
+        What ``report.html`` shows: id, title, lead, caption, tables, notes; None where there are no
+        species to show.
     """
     species = found["species"]
     if not species:
         return None
-    charts = [_masses_chart(found)]
-    if min(found["curves"]["efficiency"]) < 1:
-        charts.append(_efficiency_chart(found))
+    width = found["histogram"]["high_kda"][0] - found["histogram"]["low_kda"][0]
     return {
         "id": "species",
         "title": "Species",
         "lead": _lead(found),
-        "charts": charts,
+        "caption": f"Landing and leaving by |mass|, in bins of {width:g} kDa; the species are "
+        "fitted to the events, not to the bins.",
         "tables": [
             {
                 "caption": "Species by mass; intervals from "
@@ -105,9 +108,7 @@ def _rows(species: Sequence[Mapping[str, Any]]) -> list[list[Any]]:
             for p, q in zip(low, high, strict=True)
         ]
         decimals = decimals_for(halves) if bounds else int(factor > 1)
-        columns.append(
-            [{"text": fixed(factor * s[key], decimals) + unit, "sort": s[key]} for s in species]
-        )
+        columns.append([fixed(factor * s[key], decimals) + unit for s in species])
         if bounds:
             columns.append(
                 [
@@ -119,61 +120,52 @@ def _rows(species: Sequence[Mapping[str, Any]]) -> list[list[Any]]:
     return [list(row) for row in zip(*columns, strict=True)]
 
 
-def _masses_chart(found: Mapping[str, Any]) -> dict[str, Any]:
-    histogram, curves = found["histogram"], found["curves"]
-    width = histogram["high_kda"][0] - histogram["low_kda"][0]
-    mass = curves["mass_kda"]
-    density = [width * d for d in curves["density"]]
-    reach = [width * 1.96 * se for se in curves["density_se"]]
-    edge = {"kind": "line", "color": "qcrb", "dash": True, "thin": True, "x": mass}
-    series: list[dict[str, Any]] = [
-        {"kind": "bars", "name": "events", "color": "plain", "opacity": 0.45,
-         "edges": [*histogram["low_kda"], histogram["high_kda"][-1]],
-         "counts": histogram["count"]},
-        {"kind": "line", "name": "kernel density, 95 %", "color": "qcrb", "x": mass,
-         "y": density, "thin": True},
-        {**edge, "y": [max(d - r, 0.0) for d, r in zip(density, reach, strict=True)]},
-        {**edge, "y": [d + r for d, r in zip(density, reach, strict=True)]},
-        {"kind": "line", "name": "species", "color": "sigma", "x": mass,
-         "y": [width * m for m in curves["model"]]},
-    ]  # fmt: skip
-    if min(curves["efficiency"]) < 1:
-        series.append(
-            {"kind": "line", "name": "corrected for what was missed", "color": "flag",
-             "dash": True, "x": mass, "y": [width * m for m in curves["model_corrected"]]}
-        )  # fmt: skip
-    return {
-        "id": "mixture",
-        "title": "Masses and species",
-        "caption": f"Landing and leaving by |mass|, in bins of {width:g} kDa; the species "
-        "are fitted to the events, not to the bins.",
-        "wide": True,
-        "spec": {
-            "height": 340,
-            "x": {"label": "|mass| [kDa]"},
-            "y": {"label": f"events per {width:g} kDa", "zero": True},
-            "series": series,
-        },
-    }
+def species_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
+    """Draw masses, species and the efficiency of their detection.
 
+    Parameters
+    ----------
+    found : mapping
+        What ``summary.json`` holds under ``distribution``.
 
-def _efficiency_chart(found: Mapping[str, Any]) -> dict[str, Any]:
-    curves = found["curves"]
-    return {
-        "id": "efficiency",
-        "title": "Detection efficiency",
-        "caption": "Chance that a particle exceeds the matched filter's threshold; points: the "
-        "species.",
-        "spec": {
-            "height": 240,
-            "x": {"label": "|mass| [kDa]"},
-            "y": {"label": "detected", "zero": True},
-            "series": [
-                {"kind": "line", "name": "P(snr > threshold)", "color": "crb",
-                 "x": curves["mass_kda"], "y": curves["efficiency"]},
-                {"kind": "points", "name": "species", "color": "sigma",
-                 "x": [s["mass_kda"] for s in found["species"]],
-                 "y": [s["efficiency"] for s in found["species"]]},
-            ],
-        },
-    }  # fmt: skip
+    Yields
+    ------
+    name : str
+        ``species``; nothing where there are none.
+    figure : Figure
+        One panel, or two where particles were missed.
+    """
+    if not found["species"]:
+        return
+    bars, curves = found["histogram"], found["curves"]
+    width = bars["high_kda"][0] - bars["low_kda"][0]
+    mass, efficiency = np.array(curves["mass_kda"]), np.array(curves["efficiency"])
+    density, error = (width * np.array(curves[key], float) for key in ("density", "density_se"))
+    missed = efficiency.min() < 1
+    figure = new_figure(9.6, 3.4)
+    panels = figure.subplots(1, 2, width_ratios=(2.2, 1)) if missed else [figure.add_subplot()]
+    panels[0].stairs(
+        bars["count"], [*bars["low_kda"], bars["high_kda"][-1]], fill=True, color=GREY, alpha=0.5,
+        label="events",
+    )  # fmt: skip
+    panels[0].fill_between(
+        mass,
+        np.maximum(density - 1.96 * error, 0),
+        density + 1.96 * error,
+        color=BLUE,
+        alpha=0.2,
+        lw=0,
+    )
+    panels[0].plot(mass, density, color=BLUE, lw=1, label="kernel density, 95 %")
+    model = width * np.array(curves["model"])
+    panels[0].plot(mass, model, color=VERMILLION, lw=1.6, label="species")
+    panels[0].set(xlabel="|mass| [kDa]", ylabel=f"events per {width:g} kDa")
+    if missed:
+        corrected = width * np.array(curves["model_corrected"])
+        panels[0].plot(mass, corrected, "--", color=PURPLE, label="corrected for what was missed")
+        panels[1].plot(mass, efficiency, color=INK)
+        at = [s["mass_kda"] for s in found["species"]]
+        panels[1].plot(at, [s["efficiency"] for s in found["species"]], "o", color=VERMILLION)
+        panels[1].set(xlabel="|mass| [kDa]", title="Chance of detection", ylim=(0, 1.05))
+    panels[0].legend()
+    yield "species", figure

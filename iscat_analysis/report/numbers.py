@@ -73,7 +73,7 @@ def fixed(value: float | None, decimals: int) -> str:
     """
     if value is None or not math.isfinite(value):
         return "—"
-    return f"{value:.{decimals}f}".replace("-", "−")
+    return f"{value:z.{decimals}f}".replace("-", "−")
 
 
 def percent(value: float) -> str:

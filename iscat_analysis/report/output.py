@@ -1,4 +1,4 @@
-"""An output folder that appears whole or not at all, and never eats what it did not write.
+"""An output folder that appears whole or not at all, and never replaces files of other programs.
 
 The folder is filled under a hidden name beside its own and renamed when it is complete.  One
 process at a time may do so: it holds a lock that the system releases however the process ends.
@@ -52,8 +52,8 @@ def check_output(
     overwrite : bool
         Whether an earlier result there may be replaced.
     known : collection of str
-        Names that an earlier result consists of; a folder that holds anything else is never
-        replaced, so that ``--out ~ --overwrite`` costs nobody their home.
+        Names that an earlier result consists of.  A folder that holds anything else is never
+        replaced, so that ``--out ~ --overwrite`` does not delete a home folder.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def check_output(
         if not target.exists():
             return
         if not target.is_dir():
-            raise DataError(f"{folder}: is a file, not a folder; choose another --out")
+            raise DataError(f"{folder}: is a file, not a folder; choose another `out`")
         entries = sorted(entry.name for entry in target.iterdir() if entry.name not in _LITTER)
     except OSError as error:
         raise DataError(f"{folder}: cannot be read ({error.strerror})") from None
@@ -74,12 +74,12 @@ def check_output(
     if foreign:
         raise DataError(
             f"{folder}: holds {foreign[0]!r}, which is not part of a result, and is left alone; "
-            "choose another --out"
+            "choose another `out`"
         )
     if entries and not overwrite:
         raise DataError(
-            f"{folder}: holds an earlier result; add --overwrite to replace it, or choose "
-            "another --out"
+            f"{folder}: holds an earlier result; pass `overwrite` to replace it, or choose "
+            "another `out`"
         )
 
 
@@ -116,7 +116,7 @@ def claim_output(
         held = _acquire(lock, folder)
     except OSError as error:
         raise DataError(
-            f"{folder}: cannot be made ({error.strerror}); choose another --out"
+            f"{folder}: cannot be made ({error.strerror}); choose another `out`"
         ) from None
     try:
         if held is not None:
@@ -125,7 +125,7 @@ def claim_output(
         yield
     finally:
         if held is not None:
-            lock.unlink(missing_ok=True)  # while it is held, so that nobody waits for a dead name
+            lock.unlink(missing_ok=True)  # before it is released: no other run waits for this file
             os.close(held)
 
 
@@ -162,7 +162,7 @@ def atomic_folder(
                 building.mkdir(0o700)
             except OSError as error:
                 raise DataError(
-                    f"{folder}: cannot be made ({error.strerror}); choose another --out"
+                    f"{folder}: cannot be made ({error.strerror}); choose another `out`"
                 ) from None
             yield building
             _like_an_ordinary_folder(building)
@@ -175,7 +175,7 @@ def atomic_folder(
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder of ours; an interrupt meanwhile does not stop halfway."""
+    """Remove a folder that this module made, completely even if an interrupt arrives meanwhile."""
     try:
         shutil.rmtree(folder, ignore_errors=True)
     finally:
@@ -184,25 +184,25 @@ def _remove(folder: Path) -> None:
 
 
 def _resolved(folder: Path) -> Path:
-    """Find the real place: ``new/..`` is the folder it names, whether ``new`` exists or not."""
+    """Resolve links and ``..``; the folders on the way need not exist."""
     try:
         return folder.resolve()
     except (OSError, RuntimeError) as error:  # RuntimeError: links in a circle, before 3.13
-        raise DataError(f"{folder}: cannot be found ({error}); choose another --out") from None
+        raise DataError(f"{folder}: cannot be found ({error}); choose another `out`") from None
 
 
 def _short(target: Path) -> str:
-    """Name of the target, or a number in its place where hidden names would become too long."""
+    """Give the target's name, or its hash where names with a prefix would become too long."""
     raw = os.fsencode(target.name)
     return target.name if len(raw) <= _LONGEST_NAME else hashlib.sha256(raw).hexdigest()
 
 
 def _hidden(kind: str, target: Path) -> Path:
-    """Name a folder beside the target before there is one, so that an interrupt leaves none."""
+    """Choose the name of a hidden folder beside the target, without making the folder."""
     return target.with_name(f"{kind}{secrets.token_hex(4)}.{_short(target)}")
 
 
-if sys.platform == "win32":  # no lock there: two runs into one folder race for the last rename
+if sys.platform == "win32":  # without locks, of two runs into one folder the last to end wins
 
     def _acquire(lock: Path, folder: Path) -> int | None:
         del lock, folder
@@ -225,7 +225,7 @@ else:
                 who = f" (process {owner})" if owner else ""
                 raise DataError(
                     f"{folder}: another run{who} is about to write there; wait for it, or choose "
-                    "another --out"
+                    "another `out`"
                 ) from None
             except OSError as error:
                 os.close(handle)
@@ -236,8 +236,8 @@ else:
                 os.ftruncate(handle, 0)
                 os.write(handle, str(os.getpid()).encode())
                 return handle
-            os.close(handle)  # its last owner removed it between our two steps
-        raise DataError(f"{folder}: other runs keep writing there; choose another --out")
+            os.close(handle)  # another run removed the file between opening and locking it
+        raise DataError(f"{folder}: other runs keep writing there; choose another `out`")
 
     def _is_still(lock: Path, handle: int) -> bool:
         try:
@@ -261,7 +261,7 @@ def _recover(target: Path) -> None:
 
 
 def _like_an_ordinary_folder(folder: Path) -> None:
-    """Give a folder that only its owner may read the mode `mkdir` would."""
+    """Give a folder that only its owner may read the permissions of an ordinary new folder."""
     probe = folder / ".mode"
     probe.mkdir()
     folder.chmod(probe.stat().st_mode)
@@ -269,7 +269,7 @@ def _like_an_ordinary_folder(folder: Path) -> None:
 
 
 def _swap(building: Path, target: Path) -> None:
-    """Put a complete folder in place; an interrupt at any point loses neither result."""
+    """Put a complete folder in place; if it is interrupted, one of both results is in place."""
     if not target.exists():
         building.rename(target)
         return

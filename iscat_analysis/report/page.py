@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
+from itertools import chain
+from pathlib import Path
 from typing import Any
 
 import jinja2
-from markupsafe import Markup
 
 from iscat_analysis.records import Analysis
 from iscat_analysis.report.context import report_context
-from iscat_analysis.report.distribution import distribution_section
+from iscat_analysis.report.distribution import distribution_section, species_figure
+from iscat_analysis.report.event_figures import corner_figures
+from iscat_analysis.report.figures import page_figures
+from iscat_analysis.report.headline import caution, is_uncalibrated
+from iscat_analysis.report.style import publish
+from iscat_analysis.report.tables import event_table
 from iscat_analysis.schemas import jsonable
-
-_UNSAFE_IN_SCRIPT = {
-    "<": "\\u003c",
-    ">": "\\u003e",
-    "&": "\\u0026",
-    "\u2028": "\\u2028",
-    "\u2029": "\\u2029",
-}
 
 
 def render_page(template: str, context: Mapping[str, Any]) -> str:
@@ -32,13 +29,11 @@ def render_page(template: str, context: Mapping[str, Any]) -> str:
     Parameters
     ----------
     template : str
-        ``"document.html"`` for a page of sections (facts, charts, tables, notes, code), whose
+        ``"document.html"`` for a page of sections (facts, figures, tables, notes, code), whose
         first lines say what each may hold; ``"report.html"`` for the report of an analysis.
     context : mapping
         ``title`` and, for a document, ``sections``.  Optional: ``kicker`` (the name at the left of
         the bar), ``subtitle``, ``footer``, ``nav`` ((id, label) pairs; by default the sections).
-        Charts are specifications for ``charts.js``, whose first lines describe them; NaN is
-        allowed and is drawn as a gap.
 
     Returns
     -------
@@ -57,40 +52,57 @@ def render_page(template: str, context: Mapping[str, Any]) -> str:
         lstrip_blocks=True,
         undefined=_AskableUndefined,
     )
-    environment.filters["embed"] = _embed
     environment.filters["cell"] = _cell
-    sections = context.get("sections", ())
     defaults = {
         "kicker": "iscat-analysis",
         "subtitle": None,
         "footer": "iscat-analysis",
-        "nav": [(part["id"], part["title"]) for part in sections],
+        "nav": [(part["id"], part["title"]) for part in context.get("sections", ())],
     }
     return environment.get_template(template).render({**defaults, **context})
 
 
-def render_report(analysis: Analysis, *, figures: Mapping[str, int] | None = None) -> str:
-    """Make the report page of one analysis.
+def render_report(analysis: Analysis, *, folder: Path | None = None) -> str:
+    """Make the report page of one analysis, and write its figures.
 
     Parameters
     ----------
     analysis : Analysis
         What was found.
-    figures : mapping, optional
-        How many figures of each kind lie beside the page, as `write_figures` returns it.
+    folder : Path, optional
+        Where each figure goes as PNG and SVG; without it they are in the page only.
 
     Returns
     -------
     str
         HTML.
     """
-    context = report_context(analysis, figures or {})
-    found = analysis.summary.get("distribution")
+    table = event_table(analysis)
+    found = analysis.summary.get("distribution") if caution(table) is None else None
     species = distribution_section(jsonable(found)) if found else None
-    if species is not None:
-        names = [name for name, _ in context["nav"]]
-        context["nav"].insert(names.index("distributions") + 1, (species["id"], species["title"]))
-    return render_page("report.html", {**context, "species": species})
+    if species is not None and is_uncalibrated(analysis):
+        species["lead"] = f"On the model's own scale, which is not a mass. {species['lead']}"
+    drawn = chain(
+        page_figures(analysis, table),
+        species_figure(jsonable(found)) if found else (),
+        corner_figures(analysis),
+    )
+    context = report_context(analysis, table, publish(drawn, folder))
+    nav = [
+        ("summary", "Summary"),
+        ("distributions", "Distributions" if len(table) else "Field"),
+        *([(species["id"], species["title"])] if species else []),
+        *([("precision", "Precision"), ("events", "Events")] if len(table) else []),
+        *(
+            [("posterior", "Posterior")]
+            if context["posterior_rows"] or context["refused_rows"]
+            else []
+        ),
+        ("diagnostics", "Diagnostics"),
+        ("configuration", "Configuration"),
+        ("provenance", "Provenance"),
+    ]
+    return render_page("report.html", {**context, "species": species, "nav": nav})
 
 
 class _AskableUndefined(jinja2.StrictUndefined):
@@ -98,14 +110,6 @@ class _AskableUndefined(jinja2.StrictUndefined):
 
     def __bool__(self) -> bool:  # type: ignore[override]
         return False
-
-
-def _embed(value: Any) -> Markup:
-    """JSON that may stand inside a script element."""
-    text = json.dumps(jsonable(value), separators=(",", ":"), ensure_ascii=False, allow_nan=False)
-    for character, escaped in _UNSAFE_IN_SCRIPT.items():
-        text = text.replace(character, escaped)
-    return Markup(text)  # every character that could end the element is escaped
 
 
 def _cell(value: Any) -> str:

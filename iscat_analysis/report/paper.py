@@ -5,31 +5,27 @@ Everything arrives as tables; nothing is computed here.
 
 from __future__ import annotations
 
-import base64
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
+from markupsafe import Markup
+from matplotlib.figure import Figure
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.report.output import atomic_folder
 from iscat_analysis.report.page import render_page
 from iscat_analysis.report.paper_figures import (
-    CONVENTIONS,
     PANELS,
     QUANTITY_LABELS,
     WAYS,
-    curves_of,
     images_figure,
-    limits_of,
     panel_figure,
     table_figure,
 )
-from iscat_analysis.report.style import STYLE, save_figure
+from iscat_analysis.report.style import publish
 
 PAPER_FILES = frozenset(
     {"comparison.html", "comparison.csv"}
@@ -79,41 +75,31 @@ def write_paper(
     DataError
         The folder may not or cannot be written.
     """
-    with (
-        atomic_folder(folder, overwrite, known=PAPER_FILES) as building,
-        mpl.rc_context(STYLE),
-    ):
-        gallery = images_figure(images, field_nm)
-        save_figure(gallery, building / "fig_2a")
+    with atomic_folder(folder, overwrite, known=PAPER_FILES) as building:
         _images_table(images, field_nm).to_csv(
             building / "fig_2a.csv", index=False, float_format="%.5g", lineterminator="\n"
         )
         for panel in PANELS:
-            rows = curves[curves["panel"] == panel]
-            save_figure(panel_figure(panel, rows, quantum), building / f"fig_{panel}")
-            rows.to_csv(
+            curves[curves["panel"] == panel].to_csv(
                 building / f"fig_{panel}.csv",
                 index=False, float_format="%.9g", lineterminator="\n",
             )  # fmt: skip
-        save_figure(table_figure(table), building / "table_1")
         for name in ("table_1.csv", "comparison.csv"):
             table.to_csv(building / name, index=False, float_format="%.9g", lineterminator="\n")
-        picture = io.BytesIO()
-        gallery.savefig(picture, format="png", dpi=110)
+        drawn = publish(_figures(curves, images, table, quantum, field_nm), building)
         page = render_page(
-            "comparison.html",
+            "document.html",
             {
                 "kicker": "iscat bounds",
                 "title": "Dong et al. (2021), printed and exact",
                 "subtitle": "Fundamental bounds on the precision of iSCAT, COBRI and dark-field "
                 "microscopy, J. Phys. D 54, 394002: each number and each curve as its authors "
                 "computed it, and as it comes out without the slips.",
-                "sections": _sections(curves, table, quantum),
+                "sections": _sections(table, drawn),
                 "nav": [
                     ("table-1", "Table 1"),
                     *((f"figure-{n}", f"Figure {n}") for n in (2, 3, 4)),
                 ],
-                "picture": base64.b64encode(picture.getvalue()).decode("ascii"),
                 "footer": "30 nm gold, 517.5 nm, NA 1.3, oil and glass 1.5, water 1.33; "
                 "field of 4 × 4 µm.",
             },
@@ -134,11 +120,20 @@ def _images_table(images: Mapping[tuple[str, float], FloatArray], field_nm: floa
     return pd.concat(parts, ignore_index=True)
 
 
-def _sections(
+def _figures(
     curves: pd.DataFrame,
+    images: Mapping[tuple[str, float], FloatArray],
     table: pd.DataFrame,
     quantum: Mapping[tuple[str, str], FloatArray],
-) -> list[dict[str, Any]]:
+    field_nm: float,
+) -> Iterator[tuple[str, Figure]]:
+    yield "table_1", table_figure(table)
+    yield "fig_2a", images_figure(images, field_nm)
+    for panel in PANELS:
+        yield f"fig_{panel}", panel_figure(panel, curves[curves["panel"] == panel], quantum)
+
+
+def _sections(table: pd.DataFrame, drawn: Mapping[str, Markup]) -> list[dict[str, Any]]:
     exact = table.set_index("quantity")["exact"]
     columns = [{"label": "Quantum bound of one photon"}] + [
         {"label": label, "numeric": True} for label in WAYS.values()
@@ -162,23 +157,31 @@ def _sections(
                 {"label": "z, COBRI", "value": f"{exact['z_cobri']:.1f}", "unit": "nm",
                  "note": "printed: 114"},
             ],
+            "charts": [
+                {"id": "chart-1", "title": "Five ways to compute Table 1", "svg": drawn["table_1"],
+                 "wide": True}
+            ],
             "tables": [{"columns": columns, "rows": rows, "caption": "Table 1, five ways"}],
             "notes": list(_NOTES),
         }
     ]  # fmt: skip
-    sections.append(
-        {"id": "figure-2", "title": "Figure 2a: images", "lead": _LEADS["2a"], "picture": True}
-    )
-    for panel, spec in PANELS.items():
-        section: dict[str, Any] = {
-            "id": {"3": "figure-3", "4a": "figure-4"}.get(panel, f"panel-{panel}"),
-            "title": spec.title.replace("Fig. ", "Figure "),
-            "charts": [
-                _chart(panel, convention, curves[curves["panel"] == panel], quantum)
-                for convention in CONVENTIONS
-            ],
-        }
-        sections.append(section | ({"lead": _LEADS[panel]} if panel in _LEADS else {}))
+    for panel, title in {
+        "2a": "Fig. 2a: images",
+        **{p: s.title for p, s in PANELS.items()},
+    }.items():
+        names = {"2a": "figure-2", "3": "figure-3", "4a": "figure-4"}
+        title = title.replace("Fig. ", "Figure ")
+        sections.append(
+            {
+                "id": names.get(panel, f"panel-{panel}"),
+                "title": title,
+                "lead": _LEADS.get(panel),
+                "charts": [
+                    {"id": f"chart-{panel}", "title": title.partition(": ")[2].capitalize(),
+                     "svg": drawn[f"fig_{panel}"], "wide": True}
+                ],
+            }
+        )  # fmt: skip
     return sections
 
 
@@ -195,60 +198,11 @@ _LEADS = {
     "to 1 µm. Each row has its own grey scale.",
     "2b": "Particle at height z, focus 1 µm above the coverslip for every z. Left as the authors "
     "computed it, here and below: per scattered photon on the field at z = focus = 0, refocusing "
-    "while they differentiate. Right with the stage held, per collected photon. Dashed lines are "
-    "the quantum bounds of the same convention.",
+    "while they differentiate. Exact: the stage held, per collected photon. Solid curves are "
+    "exact, dashed ones the authors'; dotted lines are quantum bounds. The lower panel shows how "
+    "far the two are apart.",
     "3": "Particle at 5 nm. Mass with everything else known, and for iSCAT with z unknown as well: "
     "in focus the image cannot tell height from mass.",
     "4a": "A weaker reference turns an interferometer into a dark-field microscope. β is the "
     "amplitude of the reference that passes.",
 }
-
-
-def _chart(
-    panel: str,
-    convention: str,
-    rows: pd.DataFrame,
-    quantum: Mapping[tuple[str, str], FloatArray],
-) -> dict[str, Any]:
-    spec = PANELS[panel]
-    series: list[dict[str, Any]] = [
-        {"kind": "line", "name": c.name, "color": c.theme, "x": c.x,
-         "y": [float(f"{v:.6g}") for v in c.y], "dash": c.dashed}
-        for c in curves_of(panel, rows, convention)
-    ]  # fmt: skip
-    series += [
-        {
-            "kind": "rule",
-            "name": limit.name,
-            "color": limit.theme,
-            "axis": "y",
-            "value": limit.value,
-        }
-        for limit in limits_of(panel, quantum, convention)
-    ]
-    y: dict[str, Any] = {"label": spec.y_label, "scale": "log" if spec.log else "linear"}
-    y["domain"] = _shared_domain(panel, rows, quantum)
-    return {
-        "id": f"chart-{panel}-{convention}",
-        "title": CONVENTIONS[convention],
-        "caption": None,
-        "spec": {"x": {"label": spec.x_label}, "y": y, "height": 330, "series": series},
-        "wide": False,
-    }
-
-
-def _shared_domain(
-    panel: str, rows: pd.DataFrame, quantum: Mapping[tuple[str, str], FloatArray]
-) -> Sequence[float]:
-    """Return one y range for both conventions."""
-    values = [c.y for convention in CONVENTIONS for c in curves_of(panel, rows, convention)]
-    values += [
-        np.array([limit.value])
-        for convention in CONVENTIONS
-        for limit in limits_of(panel, quantum, convention)
-    ]
-    every = np.concatenate(values)
-    low, high = float(np.nanmin(every)), float(np.nanmax(every))
-    if PANELS[panel].log:
-        return [low / 1.1, high * 1.1]
-    return [low - 0.05 * (high - low), high + 0.05 * (high - low)]

@@ -1,4 +1,4 @@
-"""Figures of Dong et al. (2021), each drawn twice: in the authors' convention, and exactly.
+"""Figures of Dong et al. (2021), in the authors' convention and exactly.
 
 Everything arrives as tables; nothing is computed here.
 """
@@ -7,21 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from iscat_analysis.records import FloatArray
+from iscat_analysis.report.event_figures import HALO
 from iscat_analysis.report.style import BLUE, GREY, INK, VERMILLION, log_y, new_figure
 
 SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "dark field"}
 SCHEME_COLORS = {"iscat": BLUE, "cobri": VERMILLION, "darkfield": INK}
-SCHEME_THEME = {"iscat": "qcrb", "cobri": "sigma", "darkfield": "ink"}
 SHADES = ("#1B1D21", "#0072B2", "#009E73", "#D55E00", "#B5578C")
-SHADE_THEME = ("ink", "qcrb", "ok", "sigma", "flag")
-CONVENTIONS = {"dong2021": "Authors' convention", "exact": "Exact"}
 
 
 @dataclass(frozen=True)
@@ -95,18 +95,17 @@ class Curve:
         Its legend.
     x, y : ndarray, shape (n,)
         Its points.
-    color, theme : str
-        Its colour in print, and the name of that in a page's theme.
-    dashed : bool
-        How it is drawn.
+    color : str
+        Its colour.
+    joint : bool
+        Whether another parameter is unknown as well.
     """
 
     name: str
     x: FloatArray
     y: FloatArray
     color: str
-    theme: str
-    dashed: bool
+    joint: bool
 
 
 @dataclass(frozen=True)
@@ -119,14 +118,13 @@ class Limit:
         Its legend.
     value : float
         Where it lies.
-    color, theme : str
-        As in `Curve`.
+    color : str
+        Its colour.
     """
 
     name: str
     value: float
     color: str
-    theme: str
 
 
 def curves_of(panel: str, rows: pd.DataFrame, convention: str) -> list[Curve]:
@@ -139,7 +137,7 @@ def curves_of(panel: str, rows: pd.DataFrame, convention: str) -> list[Curve]:
     rows : pandas.DataFrame
         Its curves, as in `write_paper`.
     convention : str
-        A key of `CONVENTIONS`.
+        ``"dong2021"`` or ``"exact"``.
 
     Returns
     -------
@@ -157,15 +155,15 @@ def curves_of(panel: str, rows: pd.DataFrame, convention: str) -> list[Curve]:
         if joint and first != "iscat":
             continue  # as in D21; the CSV has all three
         if spec.by_attenuation and first == 0:
-            name, color, theme = "dark field", GREY, "plain"
+            name, color = "dark field", GREY
         elif spec.by_attenuation:
-            name, color, theme = f"β = {first:g}", SHADES[number], SHADE_THEME[number]
+            name, color = f"β = {first:g}", SHADES[number]
         else:
-            name, color, theme = SCHEMES[first], SCHEME_COLORS[first], SCHEME_THEME[first]
+            name, color = SCHEMES[first], SCHEME_COLORS[first]
         found.append(
             Curve(
                 f"{name}, with z unknown" if joint else name,
-                group["x"].to_numpy(float), group["value"].to_numpy(float), color, theme, joint,
+                group["x"].to_numpy(float), group["value"].to_numpy(float), color, joint,
             )
         )  # fmt: skip
     return found
@@ -183,7 +181,7 @@ def limits_of(
     quantum : mapping
         As in `write_paper`.
     convention : str
-        A key of `CONVENTIONS`.
+        ``"dong2021"`` or ``"exact"``.
 
     Returns
     -------
@@ -199,18 +197,17 @@ def limits_of(
             Limit(
                 f"quantum bound, {SCHEMES[s]}", float(quantum[convention, s][2]),
                 GREY if spec.by_attenuation else SCHEME_COLORS[s],
-                "plain" if spec.by_attenuation else SCHEME_THEME[s],
             )
             for s in schemes
         ]  # fmt: skip
     value = float(quantum[convention, "iscat"][spec.bound])
-    return [Limit("quantum bound", value, GREY, "plain")]
+    return [Limit("quantum bound", value, GREY)]
 
 
 def panel_figure(
     panel: str, rows: pd.DataFrame, quantum: Mapping[tuple[str, str], FloatArray]
 ) -> Figure:
-    """Draw a panel, both conventions side by side.
+    """Draw a panel, both conventions over each other, and below it how far they are apart.
 
     Parameters
     ----------
@@ -224,26 +221,35 @@ def panel_figure(
     Returns
     -------
     Figure
-        With one y axis for both.
+        Solid: exact; dashed: the authors' convention.  The lower panel shows exact over authors'
+        where the axis is logarithmic, and the difference elsewhere.
     """
     spec = PANELS[panel]
-    figure = new_figure(9.2, 3.9)
-    both = figure.subplots(1, 2, sharey=True, sharex=True)
-    for axes, (convention, title) in zip(both, CONVENTIONS.items(), strict=True):
-        for c in curves_of(panel, rows, convention):
-            dash = (4, 2) if c.dashed else (None, None)
-            axes.plot(c.x, c.y, color=c.color, lw=1.4, label=c.name, dashes=dash)
+    figure = new_figure(8.2, 4.8)
+    top, low = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
+    for authors, exact in zip(
+        curves_of(panel, rows, "dong2021"), curves_of(panel, rows, "exact"), strict=True
+    ):
+        look: dict[str, Any] = {"color": exact.color, "alpha": 0.55 if exact.joint else 1.0}
+        top.plot(exact.x, exact.y, lw=1.6, label=exact.name, **look)
+        top.plot(authors.x, authors.y, "--", lw=1.1, **look)
+        apart = exact.y / authors.y if spec.log else exact.y - authors.y
+        low.plot(exact.x, apart, lw=1.3, **look)
+    for convention, dots in (("exact", (1.5, 2)), ("dong2021", (1.5, 6))):
         for limit in limits_of(panel, quantum, convention):
-            axes.axhline(limit.value, color=limit.color, lw=1.1, dashes=(1.5, 2), label=limit.name)
-        axes.set_title(title)
-        axes.set_xlabel(spec.x_label)
-        axes.margins(x=0.01)
+            label = limit.name if convention == "exact" else None
+            top.axhline(limit.value, color=limit.color, lw=1.1, dashes=dots, label=label)
+    handles, labels = top.get_legend_handles_labels()
+    handles += [Line2D([], [], color=GREY), Line2D([], [], color=GREY, ls="--")]
+    labels += ["exact", "authors' convention"]
     if spec.log:
-        log_y(both[0])
-    both[0].set_ylabel(spec.y_label)
-    handles, labels = both[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)))
-    figure.suptitle(spec.title, x=0.01, ha="left", fontsize=11, fontweight="bold")
+        log_y(top)
+    low.axhline(1.0 if spec.log else 0.0, color=GREY, lw=0.8)
+    low.set(xlabel=spec.x_label, ylabel="exact / authors'" if spec.log else "exact − authors'")
+    top.set_ylabel(spec.y_label)
+    top.margins(x=0.01)
+    figure.align_ylabels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4)
     return figure
 
 
@@ -288,8 +294,9 @@ def images_figure(images: Mapping[tuple[str, float], FloatArray], field_nm: floa
         bar.outline.set_visible(False)
     grid[-1, 0].plot([-half + 0.3, -half + 1.3], [-half + 0.35] * 2, color="white", lw=2.5)
     grid[-1, 0].text(
-        -half + 0.8, -half + 0.5, "1 µm", color="white", ha="center", va="bottom", fontsize=8
-    )
+        -half + 0.8, -half + 0.5, "1 µm", color="white", ha="center", va="bottom", fontsize=8,
+        path_effects=HALO,
+    )  # fmt: skip
     return figure
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, PosteriorResult, Status
-from iscat_analysis.report import figures
+from iscat_analysis.records import Analysis, EventView, PosteriorResult, Status
+from iscat_analysis.report import event_figures, figures
+from iscat_analysis.report.headline import main_quantity
 from iscat_analysis.report.style import STYLE
 from iscat_analysis.report.tables import event_table
 
@@ -40,13 +41,12 @@ def draw(analysis: Analysis, kind: str) -> Figure:
         No such kind of figure.
     """
     table = event_table(analysis)
-    free = FREE_PARAMETERS[analysis.mode]
-    main = "mass_kda" if "mass_kda" in free else "z_nm"
+    main = main_quantity(analysis).column
     kinds: Mapping[str, Callable[[], Figure]] = {
-        "overview": lambda: figures._overview(analysis, table),
-        "histogram": lambda: figures._histogram(table, main),
-        "precision": lambda: figures._precision(table, free),
-        "power": lambda: figures._power(analysis),
+        "overview": lambda: figures.overview(analysis, table),
+        "histogram": lambda: figures.histogram(analysis, table),
+        "precision": lambda: figures.precision(analysis, table),
+        "power": lambda: figures.power(analysis),
     }
     if kind not in kinds:
         raise ValueError(f"kind = {kind!r}: choose one of {', '.join(kinds)}")
@@ -76,7 +76,7 @@ def draw_event(analysis: Analysis, event: int) -> Figure:
         There is no such event.
     """
     view = view_of(analysis, event)
-    return _shown(lambda: figures._triptych(view, analysis))
+    return _shown(lambda: event_figures.triptych(view, analysis))
 
 
 def draw_corner(analysis: Analysis, event: int) -> Figure:
@@ -100,7 +100,7 @@ def draw_corner(analysis: Analysis, event: int) -> Figure:
         There is no such event, it was not sampled, or its chain did not converge.
     """
     posterior = posterior_of(analysis, event)
-    return _shown(lambda: figures._corner(posterior, event))
+    return _shown(lambda: event_figures.corner(posterior, event))
 
 
 def view_of(analysis: Analysis, event: int) -> EventView:

@@ -1,10 +1,15 @@
-"""How figures for print look: Matplotlib's own objects, no global state."""
+"""How figures look, in files and inside a page."""
 
 from __future__ import annotations
 
+import io
+import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -14,9 +19,22 @@ DPI = 140
 """Resolution of the PNG files."""
 
 VERMILLION, BLUE, PURPLE, GREY, INK = "#D55E00", "#0072B2", "#CC79A7", "#8A8F96", "#1B1D21"
+GRID = "#E7E4DD"
+
+_THEME = {
+    INK: "ink",
+    BLUE: "qcrb",
+    VERMILLION: "sigma",
+    PURPLE: "flag",
+    GREY: "plain",
+    GRID: "grid",
+}
+"""Variables of ``style.css`` that take the place of these colours inside a page."""
 
 STYLE: Any = {
     "font.size": 9,
+    "text.color": INK,
+    "axes.facecolor": "none",
     "axes.titlesize": 10,
     "axes.titlelocation": "left",
     "axes.spines.top": False,
@@ -31,9 +49,11 @@ STYLE: Any = {
 }
 """Settings of Matplotlib to draw and save under."""
 
+_NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+
 
 def new_figure(width: float, height: float, *, constrained: bool = True) -> Figure:
-    """Make a figure of its own, which no window shows.
+    """Make a figure that no window shows.
 
     Parameters
     ----------
@@ -52,19 +72,50 @@ def new_figure(width: float, height: float, *, constrained: bool = True) -> Figu
     return figure
 
 
-def save_figure(figure: Figure, stem: Path) -> None:
-    """Write a figure as PNG and SVG, the same at any time.
+def publish(figures: Iterable[tuple[str, Figure]], folder: Path | None = None) -> dict[str, Markup]:
+    """Write figures as PNG and SVG files, and as SVG for a page.
+
+    Equal figures give equal files at any time.
 
     Parameters
     ----------
-    figure : Figure
-        What to write.
-    stem : Path
-        Of the two files.
+    figures : iterable of (str, Figure)
+        Each with the name of its files; a generator draws under the style of this package.
+    folder : Path, optional
+        An existing folder; nothing is written without it.
+
+    Returns
+    -------
+    dict of str to Markup
+        Each figure as an SVG element whose colours follow the theme of the page.
     """
-    figure.savefig(stem.with_suffix(".png"), dpi=DPI, pil_kwargs={"compress_level": 3})
-    figure.set_layout_engine("none")  # everything has its place
-    figure.savefig(stem.with_suffix(".svg"), metadata={"Date": None})
+    inline = {}
+    with mpl.rc_context(STYLE):
+        for name, figure in figures:
+            if (engine := figure.get_layout_engine()) is not None:
+                engine.execute(figure)
+                figure.set_layout_engine("none")  # laid out once, not again for each file
+            if folder is not None:
+                path = folder / f"{name}.png"
+                figure.savefig(path, dpi=DPI, pil_kwargs={"compress_level": 3})
+            buffer = io.StringIO()
+            figure.savefig(buffer, format="svg", metadata=_NO_METADATA)
+            if folder is not None:
+                (folder / f"{name}.svg").write_text(buffer.getvalue(), encoding="utf-8")
+            inline[name] = _inline(buffer.getvalue(), name)
+    return inline
+
+
+def _inline(svg: str, name: str) -> Markup:
+    """Fit an SVG file of Matplotlib's into a page that holds others."""
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", svg, count=1, flags=re.DOTALL)
+    svg = re.sub(r' (xmlns|xmlns:xlink|width|height|version)="[^"]*"', "", svg, count=5)
+    svg = svg.replace("fill: #ffffff", "fill: none", 1)  # the ground of the figure
+    for color, variable in _THEME.items():
+        svg = svg.replace(color.lower(), f"var(--{variable})")
+    svg = re.sub(r'( id="|"#|url\(#)', rf"\g<1>{name}-", svg)
+    return Markup(svg)  # Matplotlib escapes every text
 
 
 def log_y(axes: Axes) -> None:

@@ -19,7 +19,7 @@ from pydantic import BaseModel
 
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.schemas.bounds import Bounds, Comparison
-from iscat_analysis.schemas.calibration import Calibration, Camera
+from iscat_analysis.schemas.calibration import Calibration, Camera, Optics
 from iscat_analysis.schemas.fit import Fit, Simulate, Summary
 from iscat_analysis.schemas.study import Benchmark
 
@@ -30,6 +30,7 @@ _DOCUMENTS: Mapping[str, type[BaseModel]] = {
     "camera": Camera,
     "comparison": Comparison,
     "fit": Fit,
+    "optics": Optics,
     "simulate": Simulate,
     "summary": Summary,
 }
@@ -53,8 +54,9 @@ def schema(name: str) -> dict[str, Any]:
     ----------
     name : str
         ``"fit"``, ``"simulate"`` or ``"bounds"`` for what the command prints with ``--json``, and
-        ``"comparison"`` for ``iscat bounds --preset``; ``"summary"``, ``"benchmark"``, ``"camera"``
-        or ``"calibration"`` for the file of that name and what is printed beside it.
+        ``"comparison"`` for ``iscat bounds --preset``; ``"summary"``, ``"benchmark"``,
+        ``"camera"``, ``"optics"`` or ``"calibration"`` for the file of that name and what is
+        printed beside it.
 
     Returns
     -------

@@ -120,3 +120,72 @@ class Calibration(Document):
     notes: list[str] = key("What the user should know, one line each")
     histogram: Histogram = maybe("In the file: sizes of the contrasts")
     out: str = maybe("The folder that was written; not in the file")
+
+
+class OpticsParameter(Closed):
+    """A parameter of the optics."""
+
+    parameter: str = key("Its key in [optics], or the name of an aberration")
+    value: float = key("Its value")
+    sigma: Number = key("Its standard error, null where it was not measured")
+    crb: Number = key("Its Cramér–Rao bound, null where it was not measured")
+    configured: float = key("What the configuration says")
+    state: Literal["measured", "held", "dropped", "given"] = key(
+        "measured; held, because the pictures do not determine it; dropped, because it improves "
+        "nothing; or given, because it was not asked for"
+    )
+
+
+class HeldOut(Closed):
+    """How pictures that were not fitted agree with a microscope."""
+
+    p_values: list[float] = key("Of each picture")
+    chi2_reduced: list[float] = key("Of each picture")
+    uniform_p: float = key("Chance that uniform p-values look less uniform")
+
+
+class Twin(Closed):
+    """Another microscope that makes the same pictures."""
+
+    settings: dict[str, float | bool | str] = key("Its parameters")
+    gap: float = key("Log-likelihood by which it is worse")
+
+
+class OpticsPictures(Closed):
+    """What the page shows."""
+
+    measured: list[list[float]] = key("Average contrast of the particles")
+    model: list[list[float]] = key("The same, by the microscope that was found")
+    residual: list[list[float]] = key("Their difference in standard deviations")
+    pixel_nm: float = key("Pixel side [nm]")
+    radius_nm: list[float] = key("Distance from the particle [nm]")
+    radial: list[float] = key("Average contrast on rings")
+    radial_se: list[float] = key("Its standard error")
+    radial_model: list[float] = key("The same, by the microscope that was found")
+    wavefront_nm: list[list[Number]] = key("Aberrations over the pupil [nm], null outside")
+    transmission: list[list[Number]] = key("Amplitude that the mask passes, null outside")
+    na: float = key("Radius of the pupil")
+
+
+class Optics(Document):
+    """What iscat calibrate optics prints and writes as optics.json."""
+
+    accepted: bool = key("Whether the result may be used")
+    refusals: list[str] = key("Why it may not, one line each")
+    parameters: list[OpticsParameter] = key("Every parameter")
+    names: list[str] = key("The measured ones, in the order of covariance")
+    covariance: list[list[float]] = key("Of the measured parameters")
+    correlation: list[list[float]] = key("Of the measured parameters")
+    settings: dict[str, float | bool | str] = key("Keys of [optics]; aberrations by name [nm]")
+    held: dict[str, str] = key("Parameters that the pictures do not determine, and why")
+    dropped: list[str] = key("Aberrations that improve nothing")
+    undecided: list[str] = key("Discrete properties that the pictures do not tell")
+    twin: Twin | None = key("A second microscope that is as likely")
+    held_out: HeldOut = key("Pictures that were not fitted, in the measured microscope")
+    held_out_as_configured: HeldOut = key("The same in the configured microscope")
+    particles: Count = key("Pictures that were used")
+    contaminated: Count = key("Pictures left out because something else happened in them")
+    source: dict[str, str] = key("Movie, its hash, and the program's version")
+    pictures: OpticsPictures = maybe("In the file: what the page shows")
+    notes: list[str] = key("What the user should know, one line each")
+    out: str = maybe("The folder that was written; not in the file")

@@ -45,8 +45,8 @@ class Event(Closed):
     y_nm: Number = key("y_px times the pixel size [nm]")
     z_nm: Number = key("Height above the coverslip [nm]")
     mass_kda: Number = key(
-        "Mass [kDa]; negative for a particle that leaves; on the model's scale where the summary's "
-        "mass_calibrated is false"
+        "Mass [kDa]; negative for a particle that leaves; on the model's own scale, which is no "
+        "mass, unless mass_scale is calibration"
     )
     contrast: Number = key("Signed peak contrast of the fitted model; null in dark field")
     sigma_x_nm: Positive = key(_SIGMA.format("nm"))

@@ -117,7 +117,10 @@ def calibrate_posterior(
         frame = setting.level_e() + setting.signal_e(truth)
         likelihood = setting.likelihood(setting.windows(frame, random, gain=gain))
         start = setting.start(truth, random)
-        fit = fit_particle(likelihood, start, setting.mode, (float(lower[2]), float(upper[2])))
+        fit = fit_particle(
+            likelihood, start, setting.mode, (float(lower[2]), float(upper[2])),
+            level=setting.level,
+        )  # fmt: skip
         prior = Box(
             free=fit.box.free,
             lower=np.array([*lower[:3], min(amplitudes), fit.box.lower[4]]),

@@ -49,6 +49,9 @@ class Setting:
         x, y, z [nm], mass [kDa], in the frame of the region.
     read_variance_e2 : float
         Read-noise variance of a frame [e²].
+    level : bool
+        Whether fits and bounds count the level of the light among what is unknown, as they do where
+        ``background.method = "sliding"``.
     """
 
     config: Config
@@ -57,6 +60,7 @@ class Setting:
     experiment: Experiment
     truth: FloatArray
     read_variance_e2: float
+    level: bool = False
 
     @property
     def mode(self) -> str:
@@ -76,7 +80,7 @@ class Setting:
     @property
     def bounds(self) -> EventBounds:
         """Bounds over the free parameters, for all frames."""
-        return self.experiment.bounds(self.free)
+        return self.experiment.bounds(self.free, level=self.level)
 
     def level_e(self) -> float:
         """Return the expected background per pixel and frame [e]."""
@@ -210,6 +214,7 @@ class Setting:
             "n_before": at.n_before,
             "n_after": at.n_after,
             "read_noise_e": math.sqrt(self.read_variance_e2),
+            "level_fitted": self.level,
             "n_scattered": {"camera": e.on_camera, "collected": e.collected},
         }
 
@@ -260,6 +265,8 @@ def make_setting(
         _check_place(config, side * pixel_nm / 2)
     asked = z_nm if z_nm is not None else config.bounds.z_nm
     height = config.particle.height_nm if asked is None else asked
+    counted = config.optics.scheme != "darkfield" and config.bounds.n_before > 0
+    level = config.background.method == "sliding" and counted
     config = _changed(config, {"background": _background(config)})
     if scene is None:
         scene = make_scene(config, (side, side))
@@ -283,6 +290,7 @@ def make_setting(
         experiment=experiment,
         truth=np.array([at.x_nm + centre, at.y_nm + centre, height, experiment.mass_kda]),
         read_variance_e2=float(read) ** 2 if not isinstance(read, str) else 0.0,
+        level=level,
     )
 
 

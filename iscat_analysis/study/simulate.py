@@ -94,13 +94,12 @@ def write_stack(
     """
     if config.camera.pixel_size_nm is None:
         raise ConfigError(
-            "camera.pixel_size_nm is needed to simulate: add it, as in "
-            "--set camera.pixel_size_nm=84.4"
+            "camera.pixel_size_nm is needed to simulate: add it, as in camera.pixel_size_nm = 84.4"
         )
     truth_path = path.with_suffix(".truth.csv")
     if not overwrite and (path.exists() or truth_path.exists()):
         found = path if path.exists() else truth_path
-        raise DataError(f"{found}: exists already; give another name, or --overwrite")
+        raise DataError(f"{found}: exists already; give another name, or pass `overwrite`")
     movie = Movie(config, config.simulation.seed if seed is None else seed)
     shape = (config.simulation.frames, *config.simulation.shape)
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")

@@ -16,7 +16,7 @@ from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.records import PARAMETERS, FloatArray, Progress, Status, silent
 from iscat_analysis.report import atomic_folder, check_output
-from iscat_analysis.report.benchmark import BENCHMARK_NAMES, draw_benchmark, render_benchmark
+from iscat_analysis.report.benchmark import BENCHMARK_NAMES, render_benchmark
 from iscat_analysis.schemas import to_json
 from iscat_analysis.study.baselines import Baselines
 from iscat_analysis.study.calibration import RANKS, Calibration, calibrate_posterior
@@ -198,8 +198,9 @@ def write_benchmark(study: Mapping[str, Any], folder: Path, *, overwrite: bool =
         text = to_json("benchmark", study)
         (building / "benchmark.json").write_text(text + "\n", encoding="utf-8")
         (building / "config.toml").write_text(study["config"], encoding="utf-8")
-        (building / "benchmark.html").write_text(render_benchmark(study), encoding="utf-8")
-        draw_benchmark(study, building / "figures")
+        (building / "figures").mkdir()
+        page = render_benchmark(study, folder=building / "figures")
+        (building / "benchmark.html").write_text(page, encoding="utf-8")
     return folder
 
 

@@ -38,7 +38,7 @@ class Trials:
     estimate, sigma : ndarray, shape (n, 4)
         What was found, and its stated standard deviation.
     status : ndarray of str, shape (n,)
-        Verdict of each fit; `Status.POOR_FIT` only where nothing else was flagged.
+        Verdict of each fit.
     flags : tuple of frozenset of str
         Every flag of each fit.
     p_value, chi2_reduced, gap : ndarray, shape (n,)
@@ -116,6 +116,7 @@ def run_trials(
     chunk: int = CHUNK,
     truths: FloatArray | None = None,
     baselines: Baselines | None = None,
+    correct_bias: bool = True,
     advance: Callable[[int], None] | None = None,
 ) -> Trials:
     """Draw and fit.
@@ -134,6 +135,8 @@ def run_trials(
         A particle for each trial, in place of the setting's.
     baselines : Baselines, optional
         Also run the estimators that labs use.
+    correct_bias : bool
+        As in `fit_particle`; False shows what the bare maximum of the likelihood does.
     advance : callable, optional
         Told how many more trials are done.
 
@@ -157,7 +160,10 @@ def run_trials(
             likelihood = setting.likelihood(setting.draw(truth[i], random))
             start = setting.start(truth[i], random)
             begun = time.thread_time()
-            fit = fit_particle(likelihood, start, setting.mode, setting.config.fit.z_range_nm)
+            fit = fit_particle(
+                likelihood, start, setting.mode, setting.config.fit.z_range_nm,
+                level=setting.level, correct_bias=correct_bias,
+            )  # fmt: skip
             spent += time.thread_time() - begun
             fits[i] = fit
             estimate[i] = fit.x_nm, fit.y_nm, fit.z_nm, fit.mass_kda

@@ -154,6 +154,21 @@ def test_counts_below_the_offset(refused: Run, movie: Path) -> None:
 # ---- frames ----------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("options", [GOOD, ["--set", "camera.pixel_size_nm=84.4"]])
+def test_ratios_of_frames(refused: Run, tmp_path: Path, options: list[str]) -> None:
+    counts = _counts("f4")
+    path = _save(tmp_path / "movie.tif", counts / counts[:12].mean(axis=0))
+    line = refused(path, options=options)
+    assert "movie.tif: frame 0 is ratiometric" in line
+    assert "raw counts" in line
+
+
+def test_heights_at_one_time(refused: Run, tmp_path: Path) -> None:
+    path = tmp_path / "movie.tif"
+    _save(path, _counts().reshape(1, FRAMES, 1, SIDE, SIDE), metadata={"axes": "TZCYX"})
+    assert "Z (height) of length 24 and T (time) of length 1" in refused(path)
+
+
 @pytest.mark.parametrize("span", ["0:24", "0:25", "0:4000"])
 def test_fewer_frames_than_the_background_wants(span: str, refused: Run, movie: Path) -> None:
     line = refused(movie, "--background", span)
@@ -227,7 +242,7 @@ def test_impossible_settings(setting: str, expected: str, refused: Run, movie: P
 
 
 def test_gold_where_its_table_ends(refused: Run, movie: Path) -> None:
-    settings = ["--set", "particle.kind=gold", "--set", "optics.wavelength_nm=5000"]
+    settings = ["--set", "particle.kind=gold", "--set", "optics.wavelength_nm=2500"]
     line = refused(movie, *settings, "--set", "fit.roi_nm=3000", status=USAGE)
     assert "gold" in line
 

@@ -21,11 +21,12 @@ from typing import Any, get_args
 import numpy as np
 import pandas as pd
 import pytest
+from report_factory import summary_of
 
 from iscat_analysis.config import Mode as ConfigMode
 from iscat_analysis.config import load_config
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.records import EVENT_COLUMNS
+from iscat_analysis.records import EVENT_COLUMNS, Status
 from iscat_cli import main, main_fit
 from iscat_cli.app import COMMANDS
 from iscat_cli.options import Mode
@@ -41,9 +42,13 @@ def _row(event: int, status: str = "ok", flags: str = "") -> dict[str, Any]:
     return row
 
 
-def _analysis(*rows: dict[str, Any], mode: str = "mass") -> SimpleNamespace:
+def _analysis(
+    *rows: dict[str, Any], mode: str = "mass", mass_scale: str = "calibration"
+) -> SimpleNamespace:
     table = pd.DataFrame(list(rows), columns=list(EVENT_COLUMNS))
-    return SimpleNamespace(table=table, mode=mode, summary={"count": np.int64(len(rows))})
+    summary = summary_of(table, mode, "iscat") | {"count": np.int64(len(rows))}
+    summary["mass_scale"] = mass_scale
+    return SimpleNamespace(table=table, mode=mode, scheme="iscat", summary=summary)
 
 
 @pytest.fixture
@@ -122,14 +127,38 @@ def test_the_table_is_short_and_plain(library, capsys) -> None:
     library(_returning(_analysis(_row(0), _row(1, "at_bound", "at_bound"))))
     assert main_fit(["movie.tif"]) == 0
     captured = capsys.readouterr()
-    heading, first, second, last = captured.out.splitlines()
+    warned, heading, first, second, last = captured.out.splitlines()
+    assert warned.startswith("1 of 2 rows are flagged, so no median is given")
     assert "\x1b" not in captured.out
     assert all(word in heading for word in ("event", "x ± σ", "CRB mass", "QCRB mass", "status"))
     for cell in ("3456.8 ± 1.2", "480 ± 12", "11.5", "5.1", "ok"):
         assert cell in first
     assert "at_bound" in second
     assert last == "2 events: 1 ok, 1 at_bound; results in movie.iscat"
-    assert "1 at_bound: A parameter lies on its bound" in captured.err
+    assert f"1 at_bound: {Status.AT_BOUND.advice}" in captured.err
+
+
+def test_every_remark_is_explained(library, capsys) -> None:
+    """A status hides no other: what is said beside it is counted and explained too."""
+    both = _row(0, "poor_fit", "poor_fit;saturated")
+    library(_returning(_analysis(both, _row(1, "saturated", "saturated"))))
+    assert main_fit(["movie.tif"]) == 0
+    told = capsys.readouterr().err
+    assert f"1 poor_fit: {Status.POOR_FIT.advice}" in told
+    assert f"2 saturated: {Status.SATURATED.advice}" in told
+
+
+def test_without_calibration_contrasts_are_printed(library, capsys) -> None:
+    """A contrast of −0.0149 for 480.4 kDa: the spread keeps its share, and no kDa is printed."""
+    row = _row(0) | {"contrast": -0.0149}
+    library(_returning(_analysis(row, mass_scale="absolute model")))
+    assert main_fit(["movie.tif"]) == 0
+    warned, heading, first, last = capsys.readouterr().out.splitlines()
+    assert "iscat calibrate mass" in warned
+    assert "contrast ± σ" in heading
+    assert "kDa" not in heading
+    assert "-0.01490 ± 0.00037" in first
+    assert last == "1 event: 1 ok; results in movie.iscat"
 
 
 def test_joint_shows_the_bounds_of_height_too(library, capsys) -> None:
@@ -143,7 +172,7 @@ def test_a_long_table_is_cut(library, capsys) -> None:
     main_fit(["movie.tif"])
     out = capsys.readouterr().out.splitlines()
     assert len(out) == 23
-    assert out[-2] == "… and 280 more"
+    assert out[-2] == "… and 280 more in movie.iscat/fits.csv"
 
 
 def test_no_events_is_a_result(library, capsys) -> None:
@@ -286,7 +315,9 @@ def test_simulate_makes_one_call(monkeypatch, capsys, tmp_path) -> None:
 
     def write_stack(config: Any, path: Path, **options: Any) -> pd.DataFrame:
         calls.append((config, path, options))
-        return pd.DataFrame({"x_px": [1.5, np.nan]})
+        row = dict.fromkeys(("x_px", "y_px", "x_nm", "y_nm", "z_nm", "mass_kda"), 1.5)
+        row |= {"event": 0, "frame": 3, "leave": None, "contrast": np.nan}
+        return pd.DataFrame([row, row | {"event": 1}])
 
     stand_in = SimpleNamespace(write_stack=write_stack)
     monkeypatch.setitem(sys.modules, "iscat_analysis.study.simulate", stand_in)
@@ -301,7 +332,9 @@ def test_simulate_makes_one_call(monkeypatch, capsys, tmp_path) -> None:
     assert options["overwrite"] is False
     assert "2 particles in m.tif, their truth in m.truth.csv" in capsys.readouterr().out
     main([*arguments, "--json"])
-    assert json.loads(capsys.readouterr().out)["events"] == [{"x_px": 1.5}, {"x_px": None}]
+    first, second = json.loads(capsys.readouterr().out)["events"]
+    assert first["x_px"] == 1.5
+    assert second["contrast"] is None
 
 
 def test_bounds_prints_tables_or_json(capsys) -> None:

@@ -8,6 +8,10 @@ import sys
 import time
 
 import pytest
+import typer
+
+from iscat_analysis.errors import ConfigError
+from iscat_cli.console import Messages, failures
 
 SECONDS = 2.0
 LOADED = 3.0  # more, for a machine that does other things as well
@@ -62,6 +66,40 @@ def test_compiled_code_does_not_hold_the_program(where: str, number: signal.Sign
     assert "interrupted" in err
     assert len(err.splitlines()) == 1
     assert seconds < SECONDS + LOADED
+
+
+def test_an_interrupt_that_meets_compiled_code_is_an_interrupt(capsys) -> None:
+    """Numba turns an exception that a signal raises inside its dispatcher into a SystemError."""
+    with pytest.raises(typer.Exit) as ended, failures(Messages("iscat fit"), debug=False):
+        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+    assert ended.value.exit_code == 130
+    assert capsys.readouterr().err == "iscat fit: error: interrupted\n"
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        (
+            "`scan` = z: write it as `scan` = z=0:2000:50",
+            "--scan z: write it as --scan z=0:2000:50",
+        ),
+        ("pass `overwrite`, or choose another `out`", "pass --overwrite, or choose another --out"),
+        ("`standards_kda` = 66,66: names a mass twice", "--standards 66,66: names a mass twice"),
+        ("give background.frames = [0, 200]", "give --background 0:200"),
+        ('choose fit.mode = "joint"', "choose --mode joint"),
+        (
+            "set it, as in camera.gain_e_per_adu = 1.5",
+            "set it, as in --set camera.gain_e_per_adu=1.5",
+        ),
+        ("use `conditional` or `a b`", "use `conditional` or `a b`"),
+    ],
+)
+def test_commands_name_options_where_the_library_names_arguments(
+    said: str, shown: str, capsys
+) -> None:
+    with pytest.raises(typer.Exit), failures(Messages("iscat fit"), debug=False):
+        raise ConfigError(said)
+    assert capsys.readouterr().err == f"iscat fit: error: {shown}\n"
 
 
 @pytest.mark.parametrize(

@@ -56,16 +56,16 @@ def test_scan_syntax(text: str, values: list[float]) -> None:
 @pytest.mark.parametrize(
     ("text", "remedy"),
     [
-        ("z", "as in --scan z=0:2000:50"),
+        ("z", "as in `scan` = z=0:2000:50"),
         ("height=0:1:1", "NAME one of z, focus, attenuation, na, pixel, fov, photons"),
         ("z=0:1", "needs three numbers"),
-        ("z=a:b:c", "as in --scan z=0:2000:50"),
+        ("z=a:b:c", "as in `scan` = z=0:2000:50"),
         ("z=0:100:-10", "change its sign"),
         ("z=0:100:0", "change its sign"),
         ("z=0:nan:1", "finite"),
         ("z=0:1e9:1", "take a larger step"),
         ("z=1,2:3", "needs three numbers"),
-        ("z=", "as in --scan z=0:2000:50"),
+        ("z=", "as in `scan` = z=0:2000:50"),
     ],
 )
 def test_bad_scan_syntax_gets_one_line(text: str, remedy: str) -> None:
@@ -155,7 +155,7 @@ def test_a_small_well_asks_for_attenuation_and_read_noise_against_it() -> None:
 @pytest.mark.parametrize(
     ("axis", "target", "mode", "message"),
     [
-        ("focus", "z", "mass", "not free in mode mass: choose --mode joint"),
+        ("focus", "z", "mass", 'not free in mode mass: choose fit.mode = "joint"'),
         ("focus", "colour", "joint", "choose one of x, y, z, mass"),
         ("na", "mass", "joint", "choose focus or attenuation"),
     ],

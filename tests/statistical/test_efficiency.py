@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from microscopes import setting
+from microscopes import PHOTONS, setting
 from scipy.stats import binom
 
 from iscat_analysis.records import PARAMETERS, FloatArray
@@ -113,6 +113,52 @@ def test_bound_is_reached_under_other_conditions(sections: dict[str, dict[str, o
         k = PARAMETERS.index(name)
         pull = error / trials.sigma[trials.usable, k]
         assert abs(_distance_from_bound(pull, 1.0)) < STANDARD_ERRORS, name
+
+
+# ---- faint particles ----------------------------------------------------------------------------
+
+FAINT_TRIALS = 1200
+SECOND_ORDER = 2.5
+"""Excess of a position's spread over its bound, times SNR²: what the bound, which knows the first
+order alone, leaves out."""
+
+
+@cache
+def _faint(snr: float) -> tuple[Setting, Trials, FloatArray]:
+    """Trials at a signal-to-noise ratio, and the masses at which the likelihood was largest."""
+    bright = setting("iscat", "mass")
+    ratio = bright.truth[3] * math.sqrt(bright.bounds.fisher[3, 3])
+    experiment = setting("iscat", "mass", PHOTONS * (snr / ratio) ** 2)
+    trials = run_trials(experiment, FAINT_TRIALS, seed=SEED, stream=60)
+    bare = run_trials(experiment, FAINT_TRIALS, seed=SEED, stream=60, correct_bias=False)
+    return experiment, trials, bare.estimate[:, 3]
+
+
+@pytest.mark.parametrize("snr", [3.0, 5.0, 10.0])
+def test_faint_masses_are_unbiased(snr: float) -> None:
+    experiment, trials, bare = _faint(snr)
+    mass, crb = experiment.truth[3], experiment.bounds.crb_joint[3]
+    kept = trials.usable
+    error = trials.estimate[kept, 3] - mass
+    standard_error = float(np.std(error)) / math.sqrt(error.size)
+    assert abs(np.mean(error)) < STANDARD_ERRORS * standard_error + BIAS_SHARE * crb
+    assert abs(_distance_from_bound(error, crb)) < STANDARD_ERRORS
+    # control: the bare maximum is too large by 1/SNR standard deviations
+    excess = (np.mean(bare[kept]) - mass) / crb
+    assert abs(excess - 1 / snr) < STANDARD_ERRORS * standard_error / crb + 1 / snr**2
+    if snr < 10:
+        assert excess * crb > STANDARD_ERRORS * standard_error + BIAS_SHARE * crb
+
+
+@pytest.mark.parametrize("snr", [3.0, 5.0, 10.0])
+def test_faint_positions_approach_their_bound(snr: float) -> None:
+    experiment, trials, _ = _faint(snr)
+    for k in (0, 1):
+        error = (trials.estimate - trials.truth)[trials.usable, k]
+        ratio = float(np.std(error)) / experiment.bounds.crb_joint[k]
+        margin = STANDARD_ERRORS * spread_error(error)
+        assert 1 - margin < ratio < 1 + SECOND_ORDER / snr**2 + margin
+        assert abs(np.mean(error)) < STANDARD_ERRORS * np.std(error) / math.sqrt(error.size)
 
 
 # ---- negative controls: what must not pass ------------------------------------------------------

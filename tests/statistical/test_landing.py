@@ -15,7 +15,6 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import conditional
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.bias import unbiased
 from iscat_analysis.pipeline.chunks import FRAME_COLUMN
 from iscat_analysis.pipeline.landing import analyse_landings, make_landing_scene
 from iscat_analysis.records import Candidate
@@ -236,8 +235,8 @@ def biases() -> tuple[np.ndarray, np.ndarray]:
         after = rng.poisson(WINDOW * LEVEL_E * (1 + signal)).astype(float)
         likelihood = conditional(scene.model, grid, before, after, 1.0)
         fit = fit_particle(likelihood, start, "mass", (0.0, 1000.0), level=True)
-        plain.append(fit.mass_kda / mass - 1)
-        corrected.append(unbiased(likelihood, fit).mass_kda / mass - 1)
+        plain.append(fit.theta[3] / scene.model.scale.amplitude(mass) - 1)
+        corrected.append(fit.mass_kda / mass - 1)
     return np.array(plain), np.array(corrected)
 
 

@@ -25,7 +25,9 @@ def _fit(experiment: Setting, frame: FloatArray, trial: int, gain: float = 1.0) 
     random = trial_generator(SEED, 1, trial)
     likelihood = experiment.likelihood(experiment.windows(frame, random, gain=gain))
     start = experiment.start(experiment.truth, random)
-    return fit_particle(likelihood, start, experiment.mode, experiment.config.fit.z_range_nm)
+    return fit_particle(
+        likelihood, start, experiment.mode, experiment.config.fit.z_range_nm, level=False
+    )
 
 
 def _good_frame(experiment: Setting) -> FloatArray:
@@ -64,7 +66,7 @@ def test_each_test_is_uniform_on_good_data() -> None:
         random = trial_generator(SEED, 2, trial)
         likelihood = experiment.likelihood(experiment.draw(experiment.truth, random))
         start = experiment.start(experiment.truth, random)
-        fit = fit_particle(likelihood, start, "joint", (0.0, 1000.0))
+        fit = fit_particle(likelihood, start, "joint", (0.0, 1000.0), level=False)
         at = likelihood, fit.theta
         found.append([scatter(*at, fit.box.free)[1], structure(*at, fit.box.free), outlier(*at)])
     for column in np.transpose(found):

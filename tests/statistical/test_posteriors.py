@@ -61,7 +61,9 @@ def _sampled(experiment: Setting, truth: FloatArray, trial: int) -> tuple[Poster
     random = trial_generator(SEED, 3, trial)
     likelihood = experiment.likelihood(experiment.draw(truth, random))
     start = experiment.start(truth, random)
-    fit = fit_particle(likelihood, start, experiment.mode, experiment.config.fit.z_range_nm)
+    fit = fit_particle(
+        likelihood, start, experiment.mode, experiment.config.fit.z_range_nm, level=False
+    )
     return sample_posterior(likelihood, fit, walkers=32, steps=1000, seed=trial), fit
 
 
@@ -72,7 +74,11 @@ def test_a_height_between_two_fringes_has_two_peaks() -> None:
         random = trial_generator(SEED, 3, trial)
         likelihood = experiment.likelihood(experiment.draw(experiment.truth, random))
         fit = fit_particle(
-            likelihood, experiment.start(experiment.truth, random), "localize", (0.0, 1000.0)
+            likelihood,
+            experiment.start(experiment.truth, random),
+            "localize",
+            (0.0, 1000.0),
+            level=False,
         )
         if fit.alternatives and fit.alternatives[0].log_likelihood_gap < 1:
             break

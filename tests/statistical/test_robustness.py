@@ -28,7 +28,9 @@ def _data(experiment: Setting, truth: FloatArray, trial: int) -> tuple[Likelihoo
 
 
 def _fit(experiment: Setting, likelihood: Likelihood, start: Candidate) -> FitResult:
-    return fit_particle(likelihood, start, experiment.mode, experiment.config.fit.z_range_nm)
+    return fit_particle(
+        likelihood, start, experiment.mode, experiment.config.fit.z_range_nm, level=False
+    )
 
 
 @pytest.mark.parametrize("scheme", ["iscat", "cobri", "darkfield"])

@@ -7,11 +7,12 @@ import math
 
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 from microscopes import configuration, setting
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
-from iscat_analysis.report.benchmark import BENCHMARK_NAMES, render_benchmark
+from iscat_analysis.report.benchmark import BENCHMARK_NAMES, benchmark_figures, render_benchmark
 from iscat_analysis.study import (
     Baselines,
     gaussian_posterior,
@@ -250,10 +251,13 @@ def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
 
 
 def test_page_shows_how_sure_each_spread_is(study: dict[str, dict[str, object]]) -> None:
-    page = render_benchmark(study)
-    low, high = study["curves"]["z"]["joint"]["z_nm"]["spread_ci95"][0]
-    assert json.dumps(low) in page
-    assert json.dumps(high) in page
+    """The bars of the figure end where the intervals do."""
+    ends = np.array(study["curves"]["z"]["joint"]["z_nm"]["spread_ci95"])  # type: ignore[index]
+    panel = dict(benchmark_figures(study))["heights_joint"].axes[2]
+    (bars,) = (c for c in panel.collections if isinstance(c, LineCollection))
+    drawn = np.array([segment[:, 1] for segment in bars.get_segments()])
+    np.testing.assert_allclose(drawn, ends, rtol=1e-12)
+    assert 'id="joint-heights"' in render_benchmark(study)
 
 
 def test_page_of_a_study_without_usable_fits(study: dict[str, dict[str, object]]) -> None:

@@ -147,12 +147,12 @@ def test_the_configuration_wins_and_says_so() -> None:
 
 @pytest.mark.parametrize("size_nm", [6.5e6, 6500.0, 0.0844])
 def test_a_pixel_size_that_no_microscope_has_is_refused(size_nm: float) -> None:
-    with pytest.raises(DataError, match=r"ome metadata.*sample plane.*--set camera\.pixel_size_nm"):
+    with pytest.raises(DataError, match=r"ome metadata.*sample plane.*as in camera\.pixel_size"):
         resolve_metadata(parse_config({}), StackMetadata(size_nm, source="ome"))
 
 
 def test_a_pixel_size_is_needed() -> None:
-    with pytest.raises(DataError, match=r"set camera\.pixel_size_nm.*--set") as error:
+    with pytest.raises(DataError, match=r"set camera\.pixel_size_nm, as in camera") as error:
         resolve_metadata(parse_config({}), StackMetadata())
     assert error.value.exit_status == 1
 

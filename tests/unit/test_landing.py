@@ -333,7 +333,7 @@ def test_a_moving_pattern_is_named(shift: int, named: bool) -> None:
     ("frames", "setting", "words"),
     [
         (30, "background.window_frames=40", ["30 frames", "80", "background.window_frames"]),
-        (30, "detection.polarity=both", ["30 frames", "--background 0:N"]),
+        (30, "detection.polarity=both", ["30 frames", "background.frames = [0, N]"]),
     ],
 )
 def test_a_movie_shorter_than_its_windows(
@@ -638,7 +638,7 @@ def test_injected_particles_are_recovered(movie: Path) -> None:
 
 def test_injection_needs_sliding_windows(movie: Path) -> None:
     config = _config("background.frames=[0, 60]", "posterior.enabled=false")
-    with open_stack(movie) as stack, pytest.raises(ConfigError, match="--inject"):
+    with open_stack(movie) as stack, pytest.raises(ConfigError, match="`inject` = "):
         analyse(stack, config, inject=8)
 
 

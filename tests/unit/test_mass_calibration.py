@@ -213,7 +213,7 @@ def test_a_wrong_sign_is_one_clear_line() -> None:
 
 @pytest.mark.parametrize("standards", [(66.0,), (66.0, -146.0), (66.0, math.nan), (66.0, 66.0)])
 def test_impossible_standards_are_refused(standards: tuple[float, ...]) -> None:
-    with pytest.raises(ConfigError, match="standards_kda = "):
+    with pytest.raises(ConfigError, match="`standards_kda` = "):
         calibrate_mass(events(np.random.default_rng(7)), standards)
 
 

@@ -148,7 +148,7 @@ def test_small_read_noise_has_an_upper_limit() -> None:
 def test_a_flat_needs_its_offset() -> None:
     rng = np.random.default_rng(3)
     flat = record(np.full(SHAPE, 2e4), 100, rng, power=0.0, read_e=0.0)
-    with pytest.raises(DataError, match=r"give a dark \(--dark\), the offset \(--offset\)"):
+    with pytest.raises(DataError, match=r"give a dark \(`dark`\), the offset \(`offset_adu`\)"):
         measure_camera([flat])
     found = measure_camera([flat], offset_adu=OFFSET)
     assert abs(pull(found.gain_e_per_adu, GAIN)) < 4
@@ -195,7 +195,7 @@ def test_maps_show_pixels_that_differ() -> None:
     assert abs(np.median(right) / 5 - 1) < 0.05
     assert values.min() > 0
     assert set(found.maps) == {"gain_e_per_adu", "offset_adu", "read_noise_e"}
-    with pytest.raises(DataError, match="--maps needs 100 frames"):
+    with pytest.raises(DataError, match="`maps` needs 100 frames"):
         measure_camera([Movie(movie.counts[:50])], dark=dark, maps=True)
 
 

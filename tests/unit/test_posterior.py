@@ -34,7 +34,7 @@ def _case(
     rng = np.random.default_rng(2)
     before, after = (rng.poisson(2e6 * s).astype(float) for s in (1 + 0 * signal, 1 + signal))
     likelihood = models.conditional(model, GRID, before, after, 1.0)
-    fit = fit_particle(likelihood, Candidate(X, Y, z_nm, mass, 10.0), mode, z_range)
+    fit = fit_particle(likelihood, Candidate(X, Y, z_nm, mass, 10.0), mode, z_range, level=False)
     return likelihood, fit
 
 

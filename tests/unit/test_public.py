@@ -225,7 +225,7 @@ def test_nothing_found_is_a_result(movie, config) -> None:
 def test_saving_is_the_command_lines(result, movie, config, tmp_path) -> None:
     folder = result.save(str(tmp_path / "kept"))
     assert (folder / "report.html").is_file()
-    with pytest.raises(ia.DataError, match="--overwrite"):
+    with pytest.raises(ia.DataError, match="pass `overwrite`"):
         result.save(folder)
     result.save(folder, overwrite=True)
     with pytest.raises(ia.DataError):

@@ -300,7 +300,7 @@ def test_nothing_is_overwritten_or_left_half_done(tmp_path: Path) -> None:
     path = tmp_path / "movie.tif"
     write_stack(config, path)
     before = path.read_bytes()
-    with pytest.raises(DataError, match="--overwrite"):
+    with pytest.raises(DataError, match="pass `overwrite`"):
         write_stack(config, path, seed=2)
     assert path.read_bytes() == before
     write_stack(config, path, seed=2, overwrite=True)

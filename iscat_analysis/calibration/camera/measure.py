@@ -167,7 +167,7 @@ def _checked(light: Sequence[FrameSource], dark: FrameSource | None, maps: bool)
     frames = sum(stack.shape[0] for stack in light)
     if maps and light and frames < LEAST_FRAMES_FOR_MAPS:
         raise DataError(
-            f"--maps needs {LEAST_FRAMES_FOR_MAPS} frames or more, not {frames}: with fewer the "
+            f"`maps` needs {LEAST_FRAMES_FOR_MAPS} frames or more, not {frames}: with fewer the "
             "gain of one pixel is all noise"
         )
 

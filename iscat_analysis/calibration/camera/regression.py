@@ -206,13 +206,13 @@ def _ratio(
     if offset is None:
         raise DataError(
             "the pixels are too alike in brightness for variance against mean, and the offset is "
-            "not known: give a dark (--dark), the offset (--offset), or a second level"
+            "not known: give a dark (`dark`), the offset (`offset_adu`), or a second level"
         )
     light = mean - offset.value
     if light.mean() <= 0:
         raise DataError(
             f"the offset of {offset.value:g} counts is not below the frames' mean of "
-            f"{mean.mean():g}; correct --offset"
+            f"{mean.mean():g}; correct `offset_adu`"
         )
     ratio = float(variance.sum() / light.sum())
     scatter = float(np.sum((variance - ratio * light) ** 2))

@@ -137,5 +137,6 @@ class CameraCalibration:
                 continue
             low, high = estimate.ci95
             value = f'"{maps[key]}"' if maps and key in maps else f"{estimate.value:.6g}"
-            lines.append(f"{key} = {value}  # 95 %: {low:.6g} to {high:.6g}")
+            interval = f"95 %: {low:.6g} to {high:.6g}" if low < high else "as given"
+            lines.append(f"{key} = {value}  # {interval}")
         return "\n".join(lines) + "\n"

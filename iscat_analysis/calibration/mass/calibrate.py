@@ -77,7 +77,7 @@ def calibrate_mass(
         raise DataError(
             f"{name}: only {lands.sum()} of {signed.size} events are {landing}, which landing "
             f"should be: the contrast has the wrong sign; if your particles land {other}, say "
-            f"landing = {other}"
+            f"`landing` = {other}"
         )
     size, size_errors = np.abs(signed[lands]), errors[lands]
     if size.size < LEAST_EVENTS:
@@ -135,14 +135,16 @@ def _standards(
     shown = ",".join(f"{m:g}" for m in values)
     if values.size < 2 or not np.isfinite(values).all() or (values <= 0).any():
         raise ConfigError(
-            f"standards_kda = {shown}: a line needs two or more positive masses in kDa, as in "
+            f"`standards_kda` = {shown}: a line needs two or more positive masses in kDa, as in "
             "66,146,480"
         )
     if np.unique(values).size < values.size:
-        raise ConfigError(f"standards_kda = {shown}: names a mass twice")
+        raise ConfigError(f"`standards_kda` = {shown}: names a mass twice")
     se = STANDARD_ERROR * values if errors is None else np.asarray(errors, dtype=np.float64)
     if se.shape != values.shape or not np.isfinite(se).all() or (se < 0).any():
-        raise ConfigError(f"standards_kda = {shown}: needs one error, not negative, for each mass")
+        raise ConfigError(
+            f"`standards_kda` = {shown}: needs one error, not negative, for each mass"
+        )
     order = np.argsort(values)
     return values[order], se[order]
 

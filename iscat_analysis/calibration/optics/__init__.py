@@ -1,0 +1,60 @@
+"""The microscope, from pictures of particles that it made.
+
+`starts` finds a microscope that resembles the average picture; `estimate` maximises the joint
+likelihood over the microscope and every particle; `measure` decides what the pictures can tell and
+whether the result describes pictures that were not fitted; `result` hands it on.
+"""
+
+from __future__ import annotations
+
+from iscat_analysis.calibration.optics.estimate import (
+    Estimate,
+    Settings,
+    Sight,
+    maximise,
+    optics_limits,
+)
+from iscat_analysis.calibration.optics.measure import (
+    HELD_OUT_P,
+    LEAST_SIGHTS,
+    Judgement,
+    Measured,
+    Twin,
+    judge,
+    measure_microscope,
+)
+from iscat_analysis.calibration.optics.pictures import Pictures, make_pictures
+from iscat_analysis.calibration.optics.result import OpticsCalibration, make_result
+from iscat_analysis.calibration.optics.settings import (
+    FREE,
+    build_microscope,
+    free_groups,
+    is_term,
+    settings_of,
+    with_settings,
+)
+
+__all__ = [
+    "FREE",
+    "HELD_OUT_P",
+    "LEAST_SIGHTS",
+    "Estimate",
+    "Judgement",
+    "Measured",
+    "OpticsCalibration",
+    "Pictures",
+    "Settings",
+    "Sight",
+    "Twin",
+    "build_microscope",
+    "free_groups",
+    "is_term",
+    "judge",
+    "make_pictures",
+    "make_result",
+    "maximise",
+    "measure_microscope",
+    "optics_limits",
+    "settings_of",
+    "with_settings",
+]

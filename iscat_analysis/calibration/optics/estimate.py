@@ -1,0 +1,507 @@
+"""One microscope, many particles: the maximum of their joint likelihood.
+
+Every sight of a particle has unknowns of its own (place, mass, background level) and shares those
+of the microscope with all others.  The information matrix is an arrow; its private blocks are
+eliminated sight by sight (their Schur complement), so that the cost grows linearly with the
+sights.  Fisher scoring with Levenberg's damping; a step is taken only if the likelihood rises.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from iscat_analysis._kernels.scoring import CONDITIONAL
+from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.records import FloatArray, Mapper
+
+PRIOR_RANGE = {
+    "focus_nm": 1000.0,
+    "na": 0.05,
+    "reference_phase_deg": 180.0,
+    "mask_na": 0.3,
+    "attenuation": 0.5,
+}
+"""How far a parameter may plausibly lie from the configured one; what the data leave wider than
+this, they do not tell."""
+
+TERM_RANGE_NM = 100.0
+"""The same for every aberration [nm]."""
+
+PRIVATE = 4
+"""Unknowns of one sight: x, y [nm], mass [kDa] and the logarithm of the background level."""
+
+_LARGEST_STEP = {
+    "focus_nm": 120.0,
+    "na": 0.02,
+    "reference_phase_deg": 40.0,
+    "mask_na": 0.1,
+    "attenuation": 0.1,
+}
+_TERM_STEP_NM = 25.0
+_PLACE_STEP_NM = 60.0
+_ROAM_NM = 300.0  # along x and y, from the centre of a picture
+_DAMPING = (1e-3, 1e8)  # first, and where the search gives up
+_LOWEST_NA = 0.3
+_NA_ROOM = 2e-3  # below the index of the oil
+_MASK_NA = 0.02  # smallest mask, and the narrowest ring around it
+
+
+class Microscope(Protocol):
+    """What the estimator asks of a forward model."""
+
+    def image(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
+    ) -> FloatArray:
+        """Signal of one particle."""
+
+    def gradient(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Signal, and its derivatives with respect to x, y, z and mass."""
+
+    def optics_gradient(
+        self,
+        grid: PixelGrid,
+        x_nm: float,
+        y_nm: float,
+        z_nm: float,
+        mass_kda: float,
+        names: Sequence[str],
+    ) -> tuple[FloatArray, FloatArray]:
+        """Signal, and its derivatives with respect to the named parameters of the optics."""
+
+
+Settings = Mapping[str, Any]
+"""Values of ``[optics]`` by key, each aberration under its own name (``z5``…)."""
+
+Build = Callable[[Settings], Microscope]
+"""Makes the microscope of some settings."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The picture of one particle: counts of a region, and where the search begins.
+
+    Attributes
+    ----------
+    grid : PixelGrid
+        The region's pixels.
+    kind : int
+        Noise model of `data`: CONDITIONAL or POISSON of `iscat_analysis.likelihood`.
+    data : ndarray, shape (4, ny, nx)
+        As in `Likelihood.data`.
+    x_nm, y_nm : float
+        Place from which the search starts [nm].
+    z_nm : float
+        Height of the particle [nm].
+    mass_kda : float
+        Signed mass from which the search starts, 0 where unknown [kDa].
+    level : float
+        Logarithm of the background level from which the search starts.
+    focus_offset_nm : float
+        Known focus of this picture relative to the first of a scan [nm].
+    frame : int
+        First frame of the new state.
+    snr : float
+        Signal-to-noise ratio with which it was found.
+    neighbours : tuple of (int, float)
+        Other particles whose rings reach into the picture: their number, and the share of their
+        contrast that is new after the step.
+    rings : ndarray, shape (ny, nx), or float
+        Factor of the expected light that was put into `data` for them.
+    baseline : float
+        What they add to the log-likelihood where there is no particle.
+    """
+
+    grid: PixelGrid
+    kind: int
+    data: FloatArray
+    x_nm: float
+    y_nm: float
+    z_nm: float
+    mass_kda: float = 0.0
+    level: float = 0.0
+    focus_offset_nm: float = 0.0
+    frame: int = 0
+    snr: float = 0.0
+    neighbours: tuple[tuple[int, float], ...] = ()
+    rings: FloatArray | float = 1.0
+    baseline: float = 0.0
+
+    @property
+    def private(self) -> FloatArray:
+        """Start of the sight's own unknowns, shape (4,)."""
+        return np.array([self.x_nm, self.y_nm, self.mass_kda, self.level])
+
+    def among(self, contrast: FloatArray) -> Sight:
+        """Return the sight with the contrast of its neighbours in its expectation."""
+        rings = 1 + contrast
+        data = self.data.copy()
+        # a factor of the odds, or of the expected counts with and without the particle
+        columns = [2] if self.kind == CONDITIONAL else [1, 2]
+        data[columns] *= rings / self.rings
+        bare = data.copy()
+        bare[columns] /= rings
+        if self.kind == CONDITIONAL:
+            terms = data[0] * np.log(rings) - data[1] * (np.log1p(data[2]) - np.log1p(bare[2]))
+            baseline = float(np.sum(data[3] * terms))
+        else:
+            now, then = data[1] + data[3], bare[1] + bare[3]
+            used = (data[2] > 0) & (then > 0)
+            ratio = np.where(used, now / np.where(used, then, 1.0), 1.0)
+            baseline = float(np.sum(np.where(used, data[0] * np.log(ratio) - now + then, 0.0)))
+        return replace(self, data=data, rings=rings, baseline=baseline)
+
+    def moved(self, private: FloatArray) -> Sight:
+        """Return the same pictures with another start."""
+        x, y, mass, level = (float(v) for v in private)
+        return replace(self, x_nm=x, y_nm=y, mass_kda=mass, level=level)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A maximum of the joint likelihood.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Parameters of the optics that were free.
+    values : mapping
+        All parameters of the optics.
+    sights : tuple of Sight
+        The sights, each with its own unknowns at their estimates.
+    information : ndarray, shape (n, n)
+        Fisher information about the free parameters with every private unknown eliminated.
+    scatter : ndarray, shape (n, n)
+        Covariance of the score as the residuals of the pixels have it; equal to `information` where
+        the noise is the camera's.
+    log_likelihood : float
+        Relative to no particle.
+    converged : bool
+        Whether the last step promised less than the tolerance.
+    passes : int
+        Evaluations of all pictures.
+    """
+
+    names: tuple[str, ...]
+    values: Settings
+    sights: tuple[Sight, ...]
+    information: FloatArray
+    scatter: FloatArray
+    log_likelihood: float
+    converged: bool
+    passes: int
+
+    @property
+    def bound(self) -> FloatArray:
+        """Cramér–Rao bound of the covariance: the inverse information, shape (n, n)."""
+        scale = np.array([prior_range(name) for name in self.names])
+        scaled = self.information * np.outer(scale, scale)
+        return np.asarray(np.linalg.pinv(scaled, hermitian=True) * np.outer(scale, scale))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the estimates from the residuals themselves, shape (n, n).
+
+        Notes
+        -----
+        H. White, Econometrica 50, 1 (1982): right where the noise is not quite that of the model.
+        """
+        return np.asarray(self.bound @ self.scatter @ self.bound)
+
+
+def prior_range(name: str) -> float:
+    """Plausible distance of a parameter from the configured value, in its unit."""
+    return PRIOR_RANGE.get(name, TERM_RANGE_NM)
+
+
+def maximise(
+    sights: Sequence[Sight],
+    build: Build,
+    start: Settings,
+    names: Sequence[str],
+    *,
+    limits: Mapping[str, tuple[float, float]] | None = None,
+    tolerance: float = 1e-2,
+    passes: int = 40,
+    mapper: Mapper = map,
+) -> Estimate:
+    """Maximise the joint likelihood over the microscope and all particles.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        The pictures.
+    build : callable
+        Makes the microscope.
+    start : mapping
+        Parameters of the optics, the free ones among them.
+    names : sequence of str
+        The free ones; none: only the particles are fitted.
+    limits : mapping of str to (float, float), optional
+        Bounds of free parameters beyond which no microscope exists.
+    tolerance : float
+        Expected gain in log-likelihood of the last step.
+    passes : int
+        Evaluations of all pictures at most.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    Estimate
+        The maximum that this start leads to.
+    """
+    names = tuple(names)
+    values = dict(start)
+    walls = _walls(sights)
+    private = np.clip([sight.private for sight in sights], *walls)
+    at = _Point.evaluate(sights, build, values, names, private, mapper)
+    damping, used, converged = _DAMPING[0], 1, False
+    while used < passes and damping < _DAMPING[1]:
+        if at.gain(names) < tolerance:
+            converged = True
+            break
+        shared, own = at.step(names, damping)
+        trial_values = _limited(values, names, shared, limits or {})
+        moved = np.clip(private + own, *walls)
+        trial = _Point.evaluate(sights, build, trial_values, names, moved, mapper)
+        used += 1
+        if trial.value > at.value:
+            values, private, at = trial_values, moved, trial
+            damping = max(damping / 8, 1e-9)
+        else:
+            damping = max(8 * damping, 1e-3)
+    return Estimate(
+        names=names,
+        values=values,
+        sights=tuple(s.moved(p) for s, p in zip(sights, private, strict=True)),
+        information=at.reduced(0.0)[0],
+        scatter=at.scatter(),
+        log_likelihood=at.value,
+        converged=converged,
+        passes=used,
+    )
+
+
+def _walls(sights: Sequence[Sight]) -> FloatArray:
+    """Bounds of what is a sight's own, shape (2, n, 4): a particle stays in its picture."""
+    centres = np.array([(s.grid.x_nm.mean(), s.grid.y_nm.mean()) for s in sights])
+    walls = np.full((2, len(sights), PRIVATE), np.inf)
+    walls[0] = -np.inf
+    walls[0, :, :2], walls[1, :, :2] = centres - _ROAM_NM, centres + _ROAM_NM
+    return walls
+
+
+def _limited(
+    values: Settings,
+    names: Sequence[str],
+    step: FloatArray,
+    limits: Mapping[str, tuple[float, float]],
+) -> dict[str, Any]:
+    """Take a step and stay inside the limits."""
+    out = dict(values)
+    for name, move in zip(names, step, strict=True):
+        low, high = limits.get(name, (-math.inf, math.inf))
+        out[name] = float(min(max(values[name] + move, low), high))
+    if "mask_na" in names:
+        out["mask_na"] = min(out["mask_na"], out["na"] - _MASK_NA)
+    return out
+
+
+def optics_limits(n_immersion: float, n_glass: float) -> dict[str, tuple[float, float]]:
+    """Bounds of the parameters of a microscope that can exist.
+
+    Parameters
+    ----------
+    n_immersion, n_glass : float
+        Refractive indices; the numerical aperture stays below both.
+
+    Returns
+    -------
+    dict of str to (float, float)
+        By name.
+    """
+    top = min(n_immersion, n_glass) - _NA_ROOM
+    return {
+        "na": (_LOWEST_NA, top),
+        "mask_na": (_MASK_NA, top - _MASK_NA),
+        "attenuation": (0.005, 1.0),
+    }
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Likelihood, score and information of all sights at one set of parameters."""
+
+    value: float
+    score: FloatArray  # (n, k + 4)
+    fisher: FloatArray  # (n, k + 4, k + 4)
+    squares: FloatArray  # the same, with squared residuals in place of their expectation
+
+    @classmethod
+    def evaluate(
+        cls,
+        sights: Sequence[Sight],
+        build: Build,
+        values: Settings,
+        names: tuple[str, ...],
+        private: FloatArray,
+        mapper: Mapper,
+    ) -> _Point:
+        models: dict[float, Microscope] = {}
+        for offset in {sight.focus_offset_nm for sight in sights}:
+            shifted = dict(values)
+            if offset:
+                shifted["focus_nm"] = shifted["focus_nm"] + offset
+            models[offset] = build(shifted)
+
+        def one(index: int) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+            sight = sights[index]
+            return _scores(sight, models[sight.focus_offset_nm], names, private[index])
+
+        found = list(mapper(one, range(len(sights))))
+        value = math.fsum(each[0] for each in found)
+        return cls(
+            value if math.isfinite(value) else -math.inf,
+            *(np.array([each[part] for each in found]) for part in (1, 2, 3)),
+        )
+
+    def scatter(self) -> FloatArray:
+        """Covariance of the reduced score from the residuals, shape (k, k)."""
+        k = self.score.shape[1] - PRIVATE
+        gains = np.einsum("eij,ejk->eik", self.fisher[:, :k, k:], self.reduced(0.0)[2])
+        reduce = np.concatenate([np.broadcast_to(np.eye(k), (len(gains), k, k)), -gains], axis=2)
+        return np.asarray(np.einsum("eia,eab,ejb->ij", reduce, self.squares, reduce))
+
+    def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Information and score of the shared parameters, and the private blocks inverted."""
+        k = self.score.shape[1] - PRIVATE
+        cross, block = self.fisher[:, :k, k:], self.fisher[:, k:, k:]
+        ridge = damping * np.einsum("eii->ei", block)
+        inverse = np.linalg.inv(block + ridge[:, :, None] * np.eye(PRIVATE))
+        gains = np.einsum("eij,ejk->eik", cross, inverse)
+        information = (self.fisher[:, :k, :k] - gains @ cross.transpose(0, 2, 1)).sum(axis=0)
+        score = (self.score[:, :k] - np.einsum("eij,ej->ei", gains, self.score[:, k:])).sum(axis=0)
+        return information, score, inverse
+
+    def gain(self, names: tuple[str, ...]) -> float:
+        """Gain in log-likelihood that the undamped step promises."""
+        k = len(names)
+        information, score, inverse = self.reduced(0.0)
+        own = self.score[:, k:]
+        total = 0.5 * float(np.einsum("ei,eij,ej->", own, inverse, own))
+        return total + 0.5 * float(score @ _solve(information, score, names, 1e-9))
+
+    def step(self, names: tuple[str, ...], damping: float) -> tuple[FloatArray, FloatArray]:
+        """Damped step of the shared parameters and of every private one."""
+        k = len(names)
+        information, score, inverse = self.reduced(damping)
+        shared = _solve(information, score, names, damping)
+        largest = np.array([_LARGEST_STEP.get(name, _TERM_STEP_NM) for name in names])
+        if k:
+            shared = shared / max(1.0, float(np.max(np.abs(shared) / largest)))
+        rest = self.score[:, k:] - np.einsum("eij,i->ej", self.fisher[:, :k, k:], shared)
+        own = np.einsum("eij,ej->ei", inverse, rest)
+        own[:, :2] = np.clip(own[:, :2], -_PLACE_STEP_NM, _PLACE_STEP_NM)
+        own[:, 3] = np.clip(own[:, 3], -0.5, 0.5)
+        return shared, own
+
+
+def _solve(
+    information: FloatArray, score: FloatArray, names: tuple[str, ...], damping: float
+) -> FloatArray:
+    """Solve the damped normal equations in units of the prior ranges.
+
+    What is added to the diagonal, one part in 10⁴ of what a direction worth knowing has, keeps
+    directions of which the pictures say nothing at rest.
+    """
+    if not names:
+        return np.empty(0)
+    scale = np.array([prior_range(name) for name in names])
+    scaled = information * np.outer(scale, scale)
+    ridge = damping * np.maximum(np.diag(scaled), 0.0) + 1e-4
+    return np.asarray(scale * np.linalg.solve(scaled + np.diag(ridge), scale * score))
+
+
+def _scores(
+    sight: Sight, model: Microscope, names: tuple[str, ...], private: FloatArray
+) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+    """Log-likelihood, score, expected information and its observed squares, shared ones first."""
+    x, y, mass, level = (float(v) for v in private)
+    place = (sight.grid, x, y, sight.z_nm, mass)
+    k = len(names)
+    if names:
+        signal, shared = model.optics_gradient(*place, names)
+    signal, own = model.gradient(*place)
+    rows = np.empty((k + PRIVATE, signal.size))
+    if names:
+        rows[:k] = shared.reshape(k, -1)
+    rows[k : k + 2] = own[:2].reshape(2, -1)
+    rows[k + 2] = own[3].ravel()
+    value, residual, weight, of_signal, of_level = pixel_terms(
+        sight.kind, sight.data, signal, level
+    )
+    rows[:-1] *= of_signal.ravel()
+    rows[-1] = of_level.ravel()
+    weighted = rows * weight.ravel()
+    scored = rows * residual.ravel()
+    return value + sight.baseline, scored.sum(axis=1), weighted @ rows.T, scored @ scored.T
+
+
+def pixel_terms(
+    kind: int, data: FloatArray, signal: FloatArray, level: float
+) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Log-likelihood of a region and what its derivatives are made of.
+
+    Each pixel's law has one natural coordinate η: the logarithm of the odds of a count to come
+    after the step (CONDITIONAL), or the expected counts (POISSON).
+
+    Parameters
+    ----------
+    kind : int
+        CONDITIONAL or POISSON.
+    data : ndarray, shape (4, ny, nx)
+        As in `Likelihood.data`; zeros where masked.
+    signal : ndarray, shape (ny, nx)
+        Contrast.
+    level : float
+        Logarithm of the background level.
+
+    Returns
+    -------
+    value : float
+        Log-likelihood relative to no particle.
+    score, information, by_signal, by_level : ndarray, shape (ny, nx)
+        Derivative with respect to η and its expected information; ∂η/∂signal and ∂η/∂level.
+    """
+    c0, c1, c2, c3 = data
+    bright, nothing = 1 + signal, np.zeros(signal.shape)
+    if kind == CONDITIONAL:
+        used = c3 > 0
+        if np.any(bright[used] <= 0):
+            return -math.inf, nothing, nothing, nothing, nothing
+        safe, odds = np.where(used, bright, 1.0), np.where(used, c2, 1.0)
+        shift = np.log(safe) + level
+        eta = np.log(odds) + shift
+        p = 1 / (1 + np.exp(-eta))
+        terms = c0 * shift - c1 * (np.logaddexp(0.0, eta) - np.log1p(odds))
+        score = np.where(used, c3 * (c0 - c1 * p), 0.0)
+        information = np.where(used, c3 * c1 * p * (1 - p), 0.0)
+        return float(np.sum(c3 * terms)), score, information, 1 / safe, np.ones(signal.shape)
+    used = c2 > 0
+    gain = math.exp(level)
+    expected = gain * (c1 + c2 * signal)
+    rate = expected + c3
+    if np.any(rate[used] <= 0):
+        return -math.inf, nothing, nothing, nothing, nothing
+    rate = np.where(used, rate, 1.0)
+    empty = np.where(used, c1 + c3, 1.0)
+    value = float(np.sum(np.where(used, c0 * np.log(rate / empty) - rate + empty, 0.0)))
+    score = np.where(used, c0 / rate - 1, 0.0)
+    return value, score, np.where(used, 1 / rate, 0.0), gain * c2, expected

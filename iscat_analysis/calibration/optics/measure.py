@@ -1,0 +1,548 @@
+"""From pictures of particles to the microscope that made them, and a verdict on it.
+
+Two thirds of the pictures are fitted and a third decides: how many aberrations are worth having,
+and whether the result describes pictures that it has not seen.  Directions in the space of
+parameters that the pictures do not determine within the plausible range are named and held at the
+configured values.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import kstest
+
+from iscat_analysis.calibration.optics.estimate import (
+    Build,
+    Estimate,
+    Settings,
+    Sight,
+    maximise,
+    prior_range,
+)
+from iscat_analysis.calibration.optics.settings import (
+    FREE,
+    HIGHER,
+    PRIMARY,
+    SECONDARY,
+    is_term,
+)
+from iscat_analysis.calibration.optics.starts import (
+    FOCUS_RANGE_NM,
+    FOCUS_STEP_NM,
+    Start,
+    average_sights,
+    search_starts,
+    with_masses,
+)
+from iscat_analysis.records import FloatArray, Mapper
+
+LEAST_SIGHTS = 12
+"""Pictures without which nothing is calibrated: eight to fit and four to judge."""
+
+HELD_OUT = 3
+"""One picture in so many is not fitted."""
+
+TWIN_GAP = math.log(1000.0)
+"""Log-likelihood by which a twin must be worse to be ruled out: odds of 1000."""
+
+HELD_OUT_P = 1e-3
+"""Below this chance the p-values of pictures that were not fitted are not uniform."""
+
+CONTAMINATED_P = 1e-4
+"""A single picture with a smaller p-value, where most are fine, shows more than one particle."""
+
+_STARTS = 2  # microscopes that are refined on the average picture, per state
+_PLACE = ("x_nm", "y_nm")
+_ROUGH = 1.0  # gain in log-likelihood that ends a search on the average picture
+_ROUGH_PASSES = 25
+_OTHERS_PASSES = 8
+_MASKS_NA = (0.35, 0.65)
+_MASK_TRANSMITS = 0.3  # where no attenuation is configured
+_CONTAMINATED_SHARE = 0.25  # more than this is the model's fault
+_TRIAL_PASSES = 12  # of a second microscope on all pictures
+_CLOSE = 0.01  # states whose average is explained this much worse are tried on all pictures
+
+Judge = Callable[[Sight, Settings], tuple[float, float]]
+"""Goodness of fit of a sight in a microscope: reduced χ² and p-value."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """How the pictures that were not fitted agree with the microscope.
+
+    Attributes
+    ----------
+    p_values, chi2_reduced : ndarray, shape (n,)
+        Of each picture, its own unknowns fitted.
+    uniform_p : float
+        Chance that uniform p-values look less uniform (Kolmogorov and Smirnov).
+    """
+
+    p_values: FloatArray
+    chi2_reduced: FloatArray
+    uniform_p: float
+
+    @property
+    def good(self) -> bool:
+        """Whether they agree."""
+        return bool(self.uniform_p >= HELD_OUT_P)
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A second microscope that makes the same pictures.
+
+    Attributes
+    ----------
+    settings : mapping
+        Its parameters.
+    gap : float
+        Log-likelihood by which it is worse.
+    """
+
+    settings: Settings
+    gap: float
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What the pictures say about the microscope.
+
+    Attributes
+    ----------
+    settings : mapping
+        Every parameter: measured, or as configured.
+    estimate : Estimate
+        The joint fit of all pictures.
+    held : mapping of str to str
+        Parameters that the pictures do not determine, held as configured, and why.
+    dropped : tuple of str
+        Aberrations that do not improve the pictures that were not fitted; 0.
+    undecided : tuple of str
+        Discrete properties that the pictures do not tell, taken as configured.
+    judgement : Judgement
+        On the pictures that were not fitted.
+    configured : Judgement
+        The same with the configured microscope.
+    held_out : tuple of Sight
+        The pictures that were not fitted.
+    twin : Twin or None
+        Another microscope that is as likely.
+    contaminated : int
+        Pictures left out because something else happened in them.
+    refusals : tuple of str
+        Why the result must not be used; empty if it may.
+    """
+
+    settings: Settings
+    estimate: Estimate
+    held: Mapping[str, str]
+    dropped: tuple[str, ...]
+    undecided: tuple[str, ...]
+    judgement: Judgement
+    configured: Judgement
+    held_out: tuple[Sight, ...]
+    twin: Twin | None
+    contaminated: int
+    refusals: tuple[str, ...]
+
+
+def judge(
+    sights: Sequence[Sight], settings: Settings, judge_one: Judge, mapper: Mapper = map
+) -> Judgement:
+    """Judge fitted pictures one by one and all together.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        With their own unknowns fitted.
+    settings : mapping
+        The microscope.
+    judge_one : callable
+        Goodness of fit of one.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    Judgement
+        See there.
+    """
+    found = np.array(list(mapper(lambda sight: judge_one(sight, settings), sights)))
+    p_values = found[:, 1]
+    return Judgement(p_values, found[:, 0], float(kstest(p_values, "uniform").pvalue))
+
+
+def measure_microscope(
+    sights: Sequence[Sight],
+    configured: Settings,
+    build: Build,
+    judge_one: Judge,
+    *,
+    free: Sequence[str],
+    limits: Mapping[str, tuple[float, float]],
+    side: int = 0,
+    landing: int = 0,
+    others: Sequence[Sight] = (),
+    build_wide: Build | None = None,
+    mapper: Mapper = map,
+) -> Measured:
+    """Measure the microscope from pictures of particles.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        At least `LEAST_SIGHTS`, of one shape.
+    configured : mapping
+        Every parameter as configured.
+    build : callable
+        Makes the microscope.
+    judge_one : callable
+        Goodness of fit of one sight.
+    free : sequence of str
+        Keys of `FREE`.
+    limits : mapping of str to (float, float)
+        Bounds of a microscope that can exist.
+    side : int
+        Sign of the focus that was configured, which decides between twins; 0 where none was.
+    landing : int
+        1 where more particles land than leave, so that most masses are positive; 0 where that is
+        not known, and the reference phase is taken within 90° of the configured one.
+    others : sequence of Sight
+        Every particle that `Sight.neighbours` counts, these sights among them.
+    build_wide : callable, optional
+        Makes the microscope as far as rings matter; needed where there are neighbours.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    Measured
+        Parameters, errors and verdict.
+    """
+    search = _Search(
+        configured, build, judge_one, tuple(free), limits, side, landing, mapper,
+        tuple(others), build_wide,
+    )  # fmt: skip
+    return search.run(sorted(sights, key=lambda sight: -sight.snr))
+
+
+def _fitted(sights: Sequence[Sight]) -> list[Sight]:
+    """Give the pictures that are fitted."""
+    return [sight for i, sight in enumerate(sights) if i % HELD_OUT != 1]
+
+
+def _held_out(sights: Sequence[Sight]) -> list[Sight]:
+    """Give the pictures that are not."""
+    return list(sights[1::HELD_OUT])
+
+
+def _same_state(one: Estimate, other: Estimate) -> bool:
+    """Whether two microscopes have the same polarisation, and both a mask or none."""
+    return bool(
+        one.values["polarization"] == other.values["polarization"]
+        and (one.values["mask_na"] > 0) == (other.values["mask_na"] > 0)
+    )
+
+
+@dataclass
+class _Search:
+    """One measurement of the microscope; its steps in order of `run`."""
+
+    configured: Settings
+    build: Build
+    judge_one: Judge
+    free: tuple[str, ...]
+    limits: Mapping[str, tuple[float, float]]
+    side: int
+    landing: int
+    mapper: Mapper = map
+    others: tuple[Sight, ...] = ()
+    build_wide: Build | None = None
+
+    def run(self, sights: Sequence[Sight]) -> Measured:
+        best, held_out = self._best_state(*average_sights(sights))
+        best, held_out = self._cleared(best, held_out)
+        best, held = self._identified(best)
+        before = len(best.sights) + len(held_out)
+        best, held_out = self._uncontaminated(best, held_out)
+        contaminated = before - len(best.sights) - len(held_out)
+        best, dropped = self._worthwhile(best, held_out)
+        best, undecided = self._analyzer(best)
+        best, twin = self._twin(best)
+        best, held_out = self._cleared(best, held_out)
+        best = self._signed(best)
+        held_out = self._own(held_out, best.values)
+        judgement = judge(held_out, best.values, self.judge_one, self.mapper)
+        nominal = with_masses(held_out, self.build, self.configured)
+        configured = judge(
+            self._own(nominal, self.configured), self.configured, self.judge_one, self.mapper
+        )
+        final = self._fit((*best.sights, *held_out), best.values, best.names)
+        refusals = self._refusals(final, judgement, twin)
+        return Measured(
+            settings=final.values, estimate=final, held=held, dropped=dropped,
+            undecided=undecided, judgement=judgement, configured=configured, held_out=held_out,
+            twin=twin, contaminated=contaminated, refusals=refusals,
+        )  # fmt: skip
+
+    def _fit(
+        self, sights: Sequence[Sight], start: Settings, names: Sequence[str], passes: int = 40
+    ) -> Estimate:
+        return maximise(
+            sights, self.build, start, names, limits=self.limits, passes=passes, mapper=self.mapper
+        )
+
+    def _cleared(
+        self, best: Estimate, held_out: Sequence[Sight]
+    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        """Put the rings of all neighbours into what is expected of every picture."""
+        if not self.others or self.build_wide is None:
+            return best, tuple(held_out)
+        wide = self.build_wide(best.values)
+        others = with_masses(self.others, self.build, best.values)
+        others = self._fit(others, best.values, (), _OTHERS_PASSES).sights
+
+        def clear(sight: Sight) -> Sight:
+            contrast = np.zeros(sight.grid.shape)
+            for number, share in sight.neighbours:
+                other = others[number]
+                place = (other.x_nm, other.y_nm, other.z_nm, other.mass_kda)
+                contrast += share * wide.image(sight.grid, *place)
+            return sight.among(contrast)
+
+        others = self._fit(
+            tuple(self.mapper(clear, others)), best.values, (), _OTHERS_PASSES
+        ).sights
+        fitted = tuple(self.mapper(clear, best.sights))
+        judged = tuple(self.mapper(clear, held_out))
+        judged = self._own(judged, best.values) if judged else ()
+        return self._fit(fitted, best.values, best.names), judged
+
+    def _own(self, sights: Sequence[Sight], settings: Settings) -> tuple[Sight, ...]:
+        """Fit what is a sight's own."""
+        return self._fit(sights, settings, ()).sights
+
+    def _names(self, settings: Settings, terms: Sequence[str]) -> tuple[str, ...]:
+        """Give the continuous parameters that are free in a state, with some of the aberrations."""
+        names = [
+            name
+            for group in self.free
+            for name in FREE[group]
+            if (not is_term(name) or name in terms) and (group != "mask" or settings["mask_na"] > 0)
+        ]
+        return tuple(names)
+
+    def _best_state(
+        self, averages: Sequence[Sight], placed: Sequence[Sight]
+    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        """Try every state on the average picture, the best ones on the pictures to be fitted.
+
+        The pictures that are not fitted come back with their places and masses.
+        """
+
+        def begin(state: list[dict[str, Any]]) -> tuple[Start, ...]:
+            starts = search_starts(averages, self.build, state, most=_STARTS)
+            return starts if "phase" in self.free else tuple(map(self._phased, starts))
+
+        def refine(start: Start) -> Estimate:
+            there = [
+                replace(a, x_nm=start.x_nm, y_nm=start.y_nm, mass_kda=start.mass_kda)
+                for a in averages
+            ]
+            names = self._names(start.values, PRIMARY + SECONDARY)
+            return maximise(
+                there, self.build, start.values, names,
+                limits=self.limits, tolerance=_ROUGH, passes=_ROUGH_PASSES,
+            )  # fmt: skip
+
+        states = self._states()
+        begun = [start for starts in self.mapper(begin, states) for start in starts]
+        refined = list(self.mapper(refine, begun))
+        refined.sort(key=lambda e: -e.log_likelihood)
+        top = refined[0].log_likelihood
+        joint: list[tuple[float, Estimate, tuple[Sight, ...]]] = []
+        tried: list[Estimate] = []
+        for rough in refined:
+            far = top - rough.log_likelihood > max(_CLOSE * top, 2 * TWIN_GAP)
+            same = any(_same_state(rough, other) for other in tried)
+            if far or same:
+                continue
+            x_nm, y_nm = (np.median([getattr(a, k) for a in rough.sights]) for k in _PLACE)
+            sights = with_masses(
+                [replace(s, x_nm=s.x_nm + float(x_nm), y_nm=s.y_nm + float(y_nm)) for s in placed],
+                self.build,
+                rough.values,
+            )
+            names = self._names(rough.values, FREE["zernike"])
+            passes = _TRIAL_PASSES if tried else 40
+            tried.append(rough)
+            fit = self._fit(_fitted(sights), rough.values, names, passes)
+            judged = self._fit(_held_out(sights), fit.values, ())
+            joint.append((judged.log_likelihood, fit, judged.sights))
+        _, best, held_out = max(joint, key=lambda each: each[0])
+        return best, held_out
+
+    def _states(self) -> list[list[dict[str, Any]]]:
+        """Give the settings to start from, those of one discrete state together."""
+        now = dict(self.configured)
+        lights = ["linear", "circular"] if "polarization" in self.free else [now["polarization"]]
+        masks: list[list[dict[str, Any]]] = [[{}]]
+        if "mask" in self.free:
+            dims = now["attenuation"] if now["attenuation"] < 0.9 else _MASK_TRANSMITS
+            edges = sorted({*_MASKS_NA, *([now["mask_na"]] if now["mask_na"] else [])})
+            masks = [
+                [{"mask_na": 0.0, "attenuation": now["attenuation"]}],
+                [{"mask_na": edge, "attenuation": dims} for edge in edges],
+            ]
+        foci = [now["focus_nm"]]
+        if "focus" in self.free:
+            steps = math.ceil(FOCUS_RANGE_NM / FOCUS_STEP_NM)
+            foci = [now["focus_nm"] + FOCUS_STEP_NM * i for i in range(-steps, steps + 1)]
+        return [
+            [
+                {**now, **mask, "polarization": light, "focus_nm": focus}
+                for mask in kind
+                for focus in foci
+            ]
+            for light in lights
+            for kind in masks
+        ]
+
+    def _phased(self, start: Start) -> Start:
+        """Put the configured reference phase back."""
+        phase = self.configured["reference_phase_deg"]
+        flipped = math.cos(math.radians(start.values["reference_phase_deg"] - phase)) < 0
+        mass = -start.mass_kda if flipped else start.mass_kda
+        return replace(start, values={**start.values, "reference_phase_deg": phase}, mass_kda=mass)
+
+    def _identified(self, best: Estimate) -> tuple[Estimate, dict[str, str]]:
+        """Hold what the pictures do not determine within the plausible range."""
+        held: dict[str, str] = {}
+        while best.names:
+            scale = np.array([prior_range(name) for name in best.names])
+            values, vectors = np.linalg.eigh(best.information * np.outer(scale, scale))
+            if values[0] >= 1:
+                break
+            weakest = np.abs(vectors[:, 0])
+            name = best.names[int(np.argmax(weakest))]
+            mixed = [n for n, w in zip(best.names, weakest, strict=True) if w > 0.3 and n != name]
+            held[name] = "not told apart from " + ", ".join(mixed) if mixed else "not visible"
+            kept = tuple(n for n in best.names if n != name)
+            settings = {**best.values, name: self.configured[name]}
+            best = self._fit(best.sights, settings, kept)
+        return best, held
+
+    def _uncontaminated(
+        self, best: Estimate, held_out: Sequence[Sight]
+    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        """Leave out the few pictures in which something else happened, if the others are fine."""
+        good = [
+            judge(sights, best.values, self.judge_one, self.mapper).p_values > CONTAMINATED_P
+            for sights in (best.sights, held_out)
+        ]
+        bad = sum(int(np.sum(~g)) for g in good)
+        if not bad or bad > _CONTAMINATED_SHARE * (len(best.sights) + len(held_out)):
+            return best, tuple(held_out)
+        kept = [s for s, ok in zip(best.sights, good[0], strict=True) if ok]
+        rest = tuple(s for s, ok in zip(held_out, good[1], strict=True) if ok)
+        return self._fit(kept, best.values, best.names), rest
+
+    def _worthwhile(
+        self, best: Estimate, held_out: Sequence[Sight]
+    ) -> tuple[Estimate, tuple[str, ...]]:
+        """Keep as many aberrations as improve the pictures that were not fitted."""
+        terms = tuple(n for n in best.names if is_term(n))
+        ladder = [
+            tuple(n for n in terms if n in some)
+            for some in ((), PRIMARY, PRIMARY + SECONDARY, PRIMARY + SECONDARY + HIGHER)
+        ]
+        rungs = list(dict.fromkeys([*ladder, terms]))
+        tried: list[tuple[float, Estimate]] = []
+        for rung in rungs:
+            names = tuple(n for n in best.names if not is_term(n) or n in rung)
+            start = {**best.values, **{n: 0.0 for n in terms if n not in rung}}
+            fit = best if rung == terms else self._fit(best.sights, start, names, passes=12)
+            tried.append((self._fit(held_out, fit.values, ()).log_likelihood, fit))
+        _, chosen = max(tried, key=lambda pair: pair[0])
+        return chosen, tuple(n for n in terms if n not in chosen.names)
+
+    def _analyzer(self, best: Estimate) -> tuple[Estimate, tuple[str, ...]]:
+        """Ask whether there is an analyser, which only strong particles tell."""
+        if "polarization" not in self.free:
+            return best, ()
+        was = bool(best.values["analyzer"])
+        other = self._fit(best.sights, {**best.values, "analyzer": not was}, best.names, passes=8)
+        gap = best.log_likelihood - other.log_likelihood
+        if abs(gap) < TWIN_GAP:
+            return best, ("analyzer",)
+        return (best if gap > 0 else other), ()
+
+    def _twin(self, best: Estimate) -> tuple[Estimate, Twin | None]:
+        """Look for the microscope on the other side of focus that makes the same pictures."""
+        if not {"focus_nm", "reference_phase_deg"} <= set(best.names):
+            return best, None
+        z = best.sights[0].z_nm
+        mirrored = dict(best.values)
+        mirrored["focus_nm"] = 2 * z - best.values["focus_nm"]
+        mirrored["reference_phase_deg"] = -best.values["reference_phase_deg"]
+        for name in best.names:
+            if is_term(name) and name not in ("z7", "z8", "z9", "z10"):
+                mirrored[name] = -best.values[name]
+        turned = [replace(s, mass_kda=-s.mass_kda) for s in best.sights]
+        other = self._fit(turned, mirrored, best.names, _TRIAL_PASSES)
+        other, _ = self._cleared(other, ())  # each among the rings that it makes itself
+        gap = best.log_likelihood - other.log_likelihood
+        apart = abs(other.values["focus_nm"] - best.values["focus_nm"])
+        if abs(gap) >= TWIN_GAP or apart < 1.0:
+            return (best if gap > -TWIN_GAP else other), None
+        wanted = self.side or (1 if self.configured["focus_nm"] > 0 else -1)
+        if (other.values["focus_nm"] > 0) == (wanted > 0) != (best.values["focus_nm"] > 0):
+            best, other, gap = other, best, -gap
+        return best, Twin(other.values, gap)
+
+    def _signed(self, best: Estimate) -> Estimate:
+        """Choose between a phase and its opposite, which a particle that leaves has."""
+        if "reference_phase_deg" not in best.names:
+            return best
+        masses = np.array([s.mass_kda for s in best.sights])
+        phase = best.values["reference_phase_deg"]
+        if self.landing and abs(np.sign(masses).sum()) > 3 * math.sqrt(masses.size):
+            flip = np.sign(masses).sum() * self.landing < 0
+        else:
+            flip = math.cos(math.radians(phase - self.configured["reference_phase_deg"])) < 0
+        phase = (phase + 180 * flip + 180) % 360 - 180
+        turned = tuple(
+            replace(s, mass_kda=-s.mass_kda if flip else s.mass_kda) for s in best.sights
+        )
+        return replace(best, values={**best.values, "reference_phase_deg": phase}, sights=turned)
+
+    def _refusals(
+        self, final: Estimate, judgement: Judgement, twin: Twin | None
+    ) -> tuple[str, ...]:
+        reasons = []
+        if not final.names:
+            reasons.append("the pictures determine none of the parameters")
+        if not final.converged:
+            reasons.append("the search did not converge")
+        for name in final.names:
+            low, high = self.limits.get(name, (-math.inf, math.inf))
+            if final.values[name] in (low, high):
+                reasons.append(f"{name} = {final.values[name]:g} lies at its limit")
+        if not judgement.good:
+            reasons.append(
+                f"of {judgement.p_values.size} pictures that were not fitted the p-values are not "
+                f"uniform (p = {judgement.uniform_p:.1g}, mean reduced chi2 = "
+                f"{float(np.mean(judgement.chi2_reduced)):.3f})"
+            )
+        if twin is not None and not self.side:
+            reasons.append(
+                "a focus on the other side explains the pictures as well, and optics.focus_nm does "
+                "not say which side it is"
+            )
+        return tuple(reasons)

@@ -1,0 +1,266 @@
+"""What a calibration of the optics hands on: values with errors, and what could not be known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.calibration.optics.measure import Judgement, Measured
+from iscat_analysis.calibration.optics.pictures import Pictures
+from iscat_analysis.calibration.optics.settings import is_term, with_settings
+from iscat_analysis.config import Config
+from iscat_analysis.records import FloatArray
+
+COLUMNS = ("parameter", "value", "sigma", "crb", "configured", "state")
+"""Columns of `OpticsCalibration.parameters`."""
+
+
+@dataclass(frozen=True, eq=False)
+class OpticsCalibration:
+    """A microscope as a movie shows it.
+
+    Attributes
+    ----------
+    config : Config
+        The configuration with the measured optics; as it was given where the result is refused.
+    parameters : pandas.DataFrame
+        One row per parameter, columns `COLUMNS`: its value, standard error, Cramér–Rao bound, the
+        configured value, and ``"measured"``, ``"held"`` (not determined, as configured),
+        ``"dropped"`` (an aberration that improves nothing, 0) or ``"given"`` (not asked for).
+    names : tuple of str
+        The measured parameters, in the order of `covariance`.
+    covariance : ndarray, shape (n, n)
+        Of the measured parameters.
+    measured : Measured
+        Fits, verdicts and pictures in full.
+    pictures : Pictures
+        What a report shows.
+    sights : int
+        Pictures used, those that were not fitted included.
+    source : mapping of str to str
+        Where the pictures came from.
+    notes : tuple of str
+        What the user should know, one sentence each.
+    """
+
+    config: Config
+    parameters: pd.DataFrame
+    names: tuple[str, ...]
+    covariance: FloatArray
+    measured: Measured
+    pictures: Pictures
+    sights: int
+    source: Mapping[str, str]
+    notes: tuple[str, ...]
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the measured optics may be used."""
+        return not self.measured.refusals
+
+    def value(self, name: str) -> float:
+        """Value of a continuous parameter, in its unit."""
+        return float(self.measured.settings[name])
+
+    def sigma(self, name: str) -> float:
+        """Give the standard error of a parameter, NaN where it was not measured."""
+        row = self.parameters.set_index("parameter").loc[name]
+        return float(row["sigma"])
+
+    def headline(self) -> str:
+        """Say in one line what was found."""
+        judged, before = self.measured.judgement, self.measured.configured
+        parts = []
+        for name, unit in (("focus_nm", "nm"), ("na", ""), ("reference_phase_deg", "deg")):
+            if name in self.names:
+                label = {"focus_nm": "focus", "na": "NA", "reference_phase_deg": "phase"}[name]
+                parts.append(with_error(label, self.value(name), self.sigma(name), unit))
+        terms = [n for n in self.names if is_term(n)]
+        if terms:
+            rms = float(np.sqrt(sum(self.value(n) ** 2 for n in terms)))
+            parts.append(f"aberrations {rms:.1f} nm rms")
+        if self.value("mask_na"):
+            parts.append(f"mask of NA {self.value('mask_na'):.3f}")
+        parts.append(f"{self.measured.settings['polarization']} polarisation")
+        return (
+            f"{', '.join(parts)} from {self.sights} particles; reduced chi2 of those that were not "
+            f"fitted {np.mean(judged.chi2_reduced):.3f} ({np.mean(before.chi2_reduced):.3g} as "
+            "configured)"
+        )
+
+    def to_toml(self) -> str:
+        """Write what ``[optics] file`` reads.
+
+        Returns
+        -------
+        str
+            Tables ``[optics]``, ``[uncertainty]`` (standard errors), ``[covariance]`` and
+            ``[provenance]``.
+        """
+        optics = self.config.optics
+        lines = ["# Optics measured by `iscat calibrate optics`", "", "[optics]"]
+        keys = ("polarization", "polarization_deg", "analyzer", "na", "attenuation", "mask_na",
+                "focus_nm", "reference_phase_deg")  # fmt: skip
+        for key in keys:
+            value = getattr(optics, key)
+            said = {True: "true", False: "false"}.get(value) if isinstance(value, bool) else None
+            text = said or (f'"{value}"' if isinstance(value, str) else f"{value:.9g}")
+            lines.append(f"{key} = {text}")
+        terms = ", ".join(f"{n} = {v:.9g}" for n, v in optics.aberrations_nm.items())
+        lines += [f"aberrations_nm = {{ {terms} }}", "", "[uncertainty]"]
+        lines += [f"{name} = {self.sigma(name):.6g}" for name in self.names]
+        quoted = ", ".join(f'"{name}"' for name in self.names)
+        lines += ["", "[covariance]", f"names = [{quoted}]", "matrix = ["]
+        lines += [f"  [{', '.join(f'{v:.9g}' for v in row)}]," for row in self.covariance]
+        lines += ["]", "", "[provenance]"]
+        lines += [f"{key} = {_quoted(text)}" for key, text in self.source.items()]
+        return "\n".join([*lines, f"particles = {self.sights}", ""])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give what ``optics.json`` holds.
+
+        Returns
+        -------
+        dict
+            Nested plain values.
+        """
+        found = self.measured
+        twin, shown = found.twin, vars(self.pictures)
+        return {
+            "accepted": self.accepted,
+            "refusals": list(found.refusals),
+            "parameters": self.parameters.replace({np.nan: None}).to_dict("records"),
+            "names": list(self.names),
+            "covariance": self.covariance.tolist(),
+            "correlation": correlation(self.covariance).tolist(),
+            "settings": dict(found.settings),
+            "held": dict(found.held),
+            "dropped": list(found.dropped),
+            "undecided": list(found.undecided),
+            "twin": None if twin is None else {"settings": dict(twin.settings), "gap": twin.gap},
+            "held_out": _judged(found.judgement),
+            "held_out_as_configured": _judged(found.configured),
+            "particles": self.sights,
+            "contaminated": found.contaminated,
+            "source": dict(self.source),
+            "pictures": {k: v.tolist() if hasattr(v, "tolist") else v for k, v in shown.items()},
+            "notes": list(self.notes),
+        }
+
+
+def make_result(
+    config: Config,
+    configured: Mapping[str, Any],
+    measured: Measured,
+    pictures: Pictures,
+    source: Mapping[str, str],
+) -> OpticsCalibration:
+    """Put a result together.
+
+    Parameters
+    ----------
+    config : Config
+        As it was given.
+    configured : mapping
+        The parameters in it.
+    measured : Measured
+        What the pictures say.
+    pictures : Pictures
+        What a report shows.
+    source : mapping of str to str
+        Where the pictures came from.
+
+    Returns
+    -------
+    OpticsCalibration
+        See there.
+    """
+    estimate = measured.estimate
+    covariance, bound = estimate.covariance, estimate.bound
+    rows = []
+    for name, value in measured.settings.items():
+        if isinstance(value, str | bool) or name == "polarization_deg":
+            continue
+        state = "given"
+        sigma = crb = float("nan")
+        if name in estimate.names:
+            k = estimate.names.index(name)
+            sigma, crb = float(np.sqrt(covariance[k, k])), float(np.sqrt(bound[k, k]))
+            state = "measured"
+        elif name in measured.held:
+            state = "held"
+        elif name in measured.dropped:
+            state = "dropped"
+        rows.append((name, float(value), sigma, crb, float(configured[name]), state))
+    return OpticsCalibration(
+        config=with_settings(config, measured.settings) if not measured.refusals else config,
+        parameters=pd.DataFrame(rows, columns=list(COLUMNS)),
+        names=estimate.names,
+        covariance=covariance,
+        measured=measured,
+        pictures=pictures,
+        sights=len(estimate.sights),
+        source=source,
+        notes=_notes(measured),
+    )
+
+
+def _notes(measured: Measured) -> tuple[str, ...]:
+    """Say in words what could not be known."""
+    notes = []
+    for name, why in measured.held.items():
+        notes.append(f"{name} is {why} in these pictures and was held as configured")
+    for name in measured.undecided:
+        notes.append(
+            f"the pictures do not tell {name} = true from false; it stays as configured "
+            "(particles of higher contrast would tell)"
+        )
+    if measured.dropped:
+        notes.append(
+            f"{', '.join(measured.dropped)} did not improve pictures that were not fitted and are 0"
+        )
+    if measured.contaminated:
+        notes.append(
+            f"{measured.contaminated} pictures were left out, because something else happened in "
+            "them"
+        )
+    twin = measured.twin
+    if twin is not None:
+        notes.append(
+            f"a twin with focus {twin.settings['focus_nm']:.1f} nm, reference phase "
+            f"{twin.settings['reference_phase_deg']:.1f} deg and the even aberrations reversed "
+            "makes the same pictures (log-likelihood "
+            f"{abs(twin.gap):.1f} {'lower' if twin.gap >= 0 else 'higher'}); the configured side "
+            "of focus was taken. A scan of the focus, particles at several heights or an NA above "
+            "the sample's index would tell them apart"
+        )
+    return tuple(notes)
+
+
+def _judged(judgement: Judgement) -> dict[str, Any]:
+    return {
+        "p_values": judgement.p_values.tolist(),
+        "chi2_reduced": judgement.chi2_reduced.tolist(),
+        "uniform_p": judgement.uniform_p,
+    }
+
+
+def correlation(covariance: FloatArray) -> FloatArray:
+    """Correlation matrix of a covariance, shape (n, n)."""
+    sigma = np.sqrt(np.diag(covariance))
+    return np.asarray(covariance / np.outer(sigma, sigma)) if sigma.size else covariance
+
+
+def with_error(label: str, value: float, sigma: float, unit: str) -> str:
+    """Write a value with as many digits as its error deserves."""
+    digits = max(0, 1 - int(np.floor(np.log10(sigma)))) if sigma > 0 else 3
+    return f"{label} {value:.{digits}f} ± {sigma:.{digits}f} {unit}".rstrip()
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'

@@ -1,0 +1,130 @@
+"""Parameters of the optics by name, and the sections of a configuration that hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from iscat_analysis.calibration.optics.estimate import Settings
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.forward import ForwardModel, forward_model
+
+PRIMARY = ("z5", "z6", "z7", "z8", "z11")
+"""Astigmatism, coma, spherical aberration."""
+
+SECONDARY = ("z9", "z10")
+"""Trefoil."""
+
+HIGHER = ("z22",)
+"""Secondary spherical aberration."""
+
+FREE = {
+    "focus": ("focus_nm",),
+    "na": ("na",),
+    "phase": ("reference_phase_deg",),
+    "mask": ("mask_na", "attenuation"),
+    "zernike": (*PRIMARY, *SECONDARY, *HIGHER),
+    "polarization": (),
+}
+"""What ``--free`` may name, and the continuous parameters that each stands for; the state of
+polarisation is chosen among a few."""
+
+
+def free_groups(text: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Read which groups of parameters are free.
+
+    Parameters
+    ----------
+    text : str or sequence of str, optional
+        Keys of `FREE`, as one text with commas between them or one by one; default all.
+
+    Returns
+    -------
+    tuple of str
+        In the order of `FREE`.
+
+    Raises
+    ------
+    ConfigError
+        A name is none of them, or there is none.
+    """
+    if text is None:
+        return tuple(FREE)
+    given = text.split(",") if isinstance(text, str) else list(text)
+    names = {name.strip() for name in given if name.strip()}
+    unknown = sorted(names - set(FREE))
+    if unknown or not names:
+        raise ConfigError(
+            f"--free {','.join(given)}: {unknown[0] if unknown else 'nothing'!r} cannot be set "
+            f"free; give some of {', '.join(FREE)}"
+        )
+    return tuple(name for name in FREE if name in names)
+
+
+def settings_of(config: Config) -> dict[str, Any]:
+    """Parameters that a calibration may change, as configured.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration.
+
+    Returns
+    -------
+    dict
+        Every key of ``[optics]`` concerned and every aberration of `FREE`, 0 where absent.
+    """
+    optics = config.optics
+    keys = ("focus_nm", "na", "reference_phase_deg", "mask_na", "attenuation",
+            "polarization", "polarization_deg", "analyzer")  # fmt: skip
+    terms = dict.fromkeys(FREE["zernike"], 0.0) | dict(optics.aberrations_nm)
+    return {key: getattr(optics, key) for key in keys} | terms
+
+
+def with_settings(config: Config, settings: Settings) -> Config:
+    """Put parameters into a configuration.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration.
+    settings : mapping
+        From `settings_of`, changed.
+
+    Returns
+    -------
+    Config
+        With these optics; aberrations of exactly 0 are left out.
+    """
+    plain = {key: value for key, value in settings.items() if not is_term(key)}
+    terms = {key: value for key, value in settings.items() if is_term(key) and value}
+    optics = config.optics.model_copy(update={**plain, "aberrations_nm": terms})
+    return config.model_copy(update={"optics": optics})
+
+
+def is_term(name: str) -> bool:
+    """Whether a name is that of an aberration."""
+    return name[0] == "z" and name[1:].isdigit()
+
+
+def build_microscope(config: Config, reach_nm: float, settings: Settings) -> ForwardModel:
+    """Make the forward model of a configuration with other optics and the model's own mass scale.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration; its ``[calibration]`` is set aside, because the line through the
+        standards holds for the optics with which it was measured.
+    reach_nm : float
+        As in `forward_model` [nm].
+    settings : mapping
+        Parameters of the optics.
+
+    Returns
+    -------
+    ForwardModel
+        Ready to evaluate.
+    """
+    changed = with_settings(config, settings).model_copy(update={"calibration": None})
+    return forward_model(changed, reach_nm, z_max_nm=config.particle.height_nm)

@@ -1,0 +1,277 @@
+"""Where the search for the microscope begins: every focus, on the average of all pictures.
+
+The pictures are registered on each other, with the sign of each, and averaged; no model takes part
+in that.  For one focus the contrast of a weak particle is linear in the cosine and the sine of the
+reference phase, so that the phase and the amplitude that fit the average best follow from a 2 × 2
+system at every shift of the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import fft, ndimage
+
+from iscat_analysis._kernels.scoring import CONDITIONAL
+from iscat_analysis.calibration.optics.estimate import Build, Sight, pixel_terms
+from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.records import FloatArray
+
+FOCUS_RANGE_NM = 1000.0
+"""How far from the configured focus the search goes."""
+
+FOCUS_STEP_NM = 80.0
+"""Step of the search over focus; a quarter of the depth of field at NA 1.2."""
+
+_FOCI = 7  # of a scan, whose averages are searched
+_ROUNDS = 3  # of registration
+_SHIFT_PX = 4.0  # a picture's first centre is off by no more
+
+
+@dataclass(frozen=True)
+class Start:
+    """A microscope that resembles the average picture.
+
+    Attributes
+    ----------
+    values : mapping
+        Parameters of the optics.
+    x_nm, y_nm, mass_kda : float
+        The particle of the average picture in it [nm, kDa].
+    explained : float
+        χ² of the average that it explains.
+    """
+
+    values: Mapping[str, Any]
+    x_nm: float
+    y_nm: float
+    mass_kda: float
+    explained: float
+
+
+def average_sights(sights: Sequence[Sight]) -> tuple[tuple[Sight, ...], tuple[Sight, ...]]:
+    """Average the pictures of each focus, registered on each other, with the sign of each.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        The brightest first; all of the same shape and pixel.
+
+    Returns
+    -------
+    averages : tuple of Sight
+        One for each of at most `_FOCI` foci, on a grid centred at 0, with the counts of a movie
+        that would show the average contrast with its noise; of the sign and size of the brightest.
+    sights : tuple of Sight
+        With the places at which the average's centre lies in them.
+    """
+    placed = list(sights)
+    averages = {}
+    for offset in sorted({sight.focus_offset_nm for sight in sights}):
+        members = [i for i, sight in enumerate(sights) if sight.focus_offset_nm == offset]
+        averages[offset], group = _average([sights[i] for i in members])
+        for i, sight in zip(members, group, strict=True):
+            placed[i] = sight
+    offsets = list(averages)
+    chosen = np.unique(np.linspace(0, len(offsets) - 1, min(_FOCI, len(offsets))).round())
+    return tuple(averages[offsets[int(i)]] for i in chosen), tuple(placed)
+
+
+def _average(sights: Sequence[Sight]) -> tuple[Sight, list[Sight]]:
+    """Average pictures of one focus; their places are those of the average's centre."""
+    contrasts, variances = zip(*(contrast_of(sight) for sight in sights), strict=True)
+    pixel = sights[0].grid.pixel_nm
+    shifts = np.array([
+        (
+            (sight.y_nm - float(np.mean(sight.grid.y_nm))) / pixel,
+            (sight.x_nm - float(np.mean(sight.grid.x_nm))) / pixel,
+        )
+        for sight in sights
+    ])  # fmt: skip
+    template = ndimage.shift(contrasts[0], -shifts[0], order=3, mode="nearest")
+    variance = np.full(template.shape, float(np.median(variances[0])))
+    for _ in range(_ROUNDS if len(sights) > 1 else 0):
+        total, weight = np.zeros_like(template), np.zeros_like(template)
+        for index, (contrast, noise) in enumerate(zip(contrasts, variances, strict=True)):
+            shifts[index] = _register(contrast, template, shifts[index])
+            moved = ndimage.shift(contrast, -shifts[index], order=3, mode="nearest")
+            noise = float(np.median(noise))
+            scale = float(np.vdot(moved, template) / np.vdot(template, template))
+            total += scale * moved / noise
+            weight += scale**2 / noise
+        template, variance = total / weight, 1 / weight
+    data = np.zeros((4, *template.shape))
+    counts = 2 / variance
+    data[0], data[2], data[3] = counts * (1 + template), 1.0, 1.0
+    data[1] = counts + data[0]
+    grid = PixelGrid.centred(template.shape[0], pixel)
+    average = Sight(
+        grid, CONDITIONAL, data, 0.0, 0.0, sights[0].z_nm,
+        focus_offset_nm=sights[0].focus_offset_nm,
+    )  # fmt: skip
+    placed = [
+        replace(
+            sight,
+            x_nm=float(np.mean(sight.grid.x_nm) + dx * pixel),
+            y_nm=float(np.mean(sight.grid.y_nm) + dy * pixel),
+        )
+        for sight, (dy, dx) in zip(sights, shifts, strict=True)
+    ]
+    return average, placed
+
+
+def contrast_of(sight: Sight) -> tuple[FloatArray, FloatArray]:
+    """Measured contrast of a sight and the variance of its noise.
+
+    Parameters
+    ----------
+    sight : Sight
+        The picture.
+
+    Returns
+    -------
+    contrast, variance : ndarray, shape (ny, nx)
+        The contrast without its mean; masked pixels hold 0 and a variance of 10⁶.
+    """
+    _, _, information, by_signal, _ = pixel_terms(
+        sight.kind, sight.data, np.zeros(sight.grid.shape), 0.0
+    )
+    information = information * by_signal**2
+    c0, c1, c2, c3 = sight.data
+    with np.errstate(divide="ignore", invalid="ignore"):
+        conditional = sight.kind == CONDITIONAL
+        contrast = c0 / ((c1 - c0) * c2) - 1 if conditional else (c0 - c3 - c1) / c2
+    used = (information > 0) & np.isfinite(contrast)
+    level = float(np.average(contrast[used], weights=information[used]))
+    variance = 1 / np.where(used, information, 1e-6)
+    return np.where(used, contrast - level, 0.0), variance
+
+
+def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> FloatArray:
+    """Shift of a picture from a template: where the correlation is largest, of either sign."""
+    correlation = fft.irfft2(fft.rfft2(contrast) * np.conj(fft.rfft2(template)), s=contrast.shape)
+    reach = math.ceil(_SHIFT_PX)
+    around = np.abs(np.roll(correlation, (reach, reach), (0, 1)))
+    offset = np.rint(shift).astype(int)
+    around = np.roll(around, tuple(-offset), (0, 1))[: 2 * reach + 1, : 2 * reach + 1]
+    row, column = np.unravel_index(int(np.argmax(around)), around.shape)
+    out = np.array([row - reach, column - reach], dtype=float) + offset
+    for axis, (line, index) in enumerate(((around[:, column], row), (around[row], column))):
+        if 0 < index < line.size - 1:
+            low, mid, high = line[index - 1 : index + 2]
+            bend = low - 2 * mid + high
+            out[axis] += 0.5 * (low - high) / bend if bend < 0 else 0.0
+    return np.asarray(out)
+
+
+def with_masses(
+    sights: Sequence[Sight], build: Build, settings: Mapping[str, Any]
+) -> tuple[Sight, ...]:
+    """Give every sight the mass that fits it best where it stands, weak particles assumed.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        Placed.
+    build : callable
+        Makes the microscope.
+    settings : mapping
+        Its parameters.
+
+    Returns
+    -------
+    tuple of Sight
+        With signed masses.
+    """
+    models: dict[float, Any] = {}
+    out = []
+    for sight in sights:
+        offset = sight.focus_offset_nm
+        if offset not in models:
+            models[offset] = build({**settings, "focus_nm": settings["focus_nm"] + offset})
+        place = (sight.grid, sight.x_nm, sight.y_nm, sight.z_nm, 0.0)
+        picture = models[offset].gradient(*place)[1][3]
+        contrast, variance = contrast_of(sight)
+        weight = 1 / variance
+        picture = picture - np.average(picture, weights=weight)
+        mass = float(np.sum(weight * picture * contrast) / np.sum(weight * picture**2))
+        out.append(replace(sight, mass_kda=mass))
+    return tuple(out)
+
+
+def search_starts(
+    averages: Sequence[Sight],
+    build: Build,
+    candidates: Sequence[Mapping[str, Any]],
+    *,
+    most: int,
+) -> tuple[Start, ...]:
+    """Rank microscopes by how much of the average pictures they explain.
+
+    Parameters
+    ----------
+    averages : sequence of Sight
+        From `average_sights`.
+    build : callable
+        Makes the microscope.
+    candidates : sequence of mapping
+        Parameters of the optics to try; their reference phase is set here.
+    most : int
+        Starts that are returned at most.
+
+    Returns
+    -------
+    tuple of Start
+        The best first; of neighbouring foci only the better one.
+    """
+    pixel, shape = averages[0].grid.pixel_nm, averages[0].grid.shape
+    spectra = []
+    for average in averages:
+        contrast, variance = contrast_of(average)
+        spectra.append((fft.rfft2(contrast), float(np.median(variance))))
+    reach = math.ceil(_SHIFT_PX / 2)
+    here = np.arange(-reach, reach + 1)
+    found = []
+    for values in candidates:
+        gram, overlaps = np.zeros((2, 2)), np.zeros((2, here.size, here.size))
+        for average, (spectrum, noise) in zip(averages, spectra, strict=True):
+            focus = values["focus_nm"] + average.focus_offset_nm
+            pictures = []
+            for phase in (0.0, 90.0):
+                model = build({**values, "focus_nm": focus, "reference_phase_deg": phase})
+                picture = model.gradient(average.grid, 0.0, 0.0, average.z_nm, 0.0)[1][3]
+                pictures.append(picture - picture.mean())
+            gram += np.einsum("iyx,jyx->ij", pictures, pictures) / noise
+            for k, picture in enumerate(pictures):
+                match = fft.irfft2(spectrum * np.conj(fft.rfft2(picture)), s=shape)
+                overlaps[k] += match[np.ix_(here, here)] / noise
+        solved = np.einsum("ij,jyx->iyx", np.linalg.pinv(gram), overlaps)
+        explained = np.einsum("iyx,iyx->yx", solved, overlaps)
+        row, column = np.unravel_index(int(np.argmax(explained)), explained.shape)
+        cosine, sine = solved[:, row, column]
+        found.append(
+            Start(
+                {**values, "reference_phase_deg": math.degrees(math.atan2(sine, cosine))},
+                x_nm=float(here[column]) * pixel,
+                y_nm=float(here[row]) * pixel,
+                mass_kda=math.hypot(cosine, sine),
+                explained=float(explained[row, column]),
+            )
+        )
+    found.sort(key=lambda start: -start.explained)
+    kept: list[Start] = []
+    for start in found:
+        near = any(
+            abs(start.values["focus_nm"] - other.values["focus_nm"]) < 1.5 * FOCUS_STEP_NM
+            and all(start.values.get(k) == other.values.get(k) for k in ("polarization", "mask_na"))
+            for other in kept
+        )
+        if not near:
+            kept.append(start)
+        if len(kept) == most:
+            break
+    return tuple(kept)

@@ -1,0 +1,97 @@
+"""From counts before and after to a likelihood: which noise model suits what is known of them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from iscat_analysis.inference.checks import BoolArray, FloatArray, mask_of, pixels_of
+from iscat_analysis.inference.likelihood import Likelihood, conditional, poisson
+from iscat_analysis.movie.background import smooth_background
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+
+KNOWN, MEAN, MEDIAN = 0.0, 1.0, math.pi / 2
+"""Variance of a background over that of the mean of its frames."""
+
+
+def counts_likelihood(
+    model: ForwardModel,
+    grid: PixelGrid,
+    before_e: ArrayLike,
+    after_e: ArrayLike,
+    power_ratio: float,
+    *,
+    background: float,
+    use_conditional: bool,
+    scale_e: float | None = None,
+    others: FloatArray | None = None,
+    read_variance_before_e2: ArrayLike = 0.0,
+    read_variance_after_e2: ArrayLike = 0.0,
+    masked: BoolArray | None = None,
+) -> Likelihood:
+    """Likelihood of a region's counts.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Gives the signal.
+    grid : PixelGrid
+        The region's pixels.
+    before_e, after_e : array_like, shape (ny, nx)
+        Photoelectrons summed before and after [e].
+    power_ratio : float
+        Light after over light before.
+    background : float
+        `KNOWN`, `MEAN` or `MEDIAN`: what the background before is.
+    use_conditional : bool
+        Divide the background out exactly; for interferometric images and a background of counts.
+    scale_e : float, optional
+        Dark field: photoelectrons per pixel for unit signal, summed over the frames after.
+    others : ndarray, shape (ny, nx), optional
+        Signal of other particles, which is part of this one's background.
+    read_variance_before_e2, read_variance_after_e2 : array_like
+        Read-noise variance of the sums [e²].
+    masked : ndarray of bool, shape (ny, nx), optional
+        Pixels to leave out.
+
+    Returns
+    -------
+    Likelihood
+        Conditional where asked for, Poisson otherwise.
+
+    Raises
+    ------
+    DataError
+        An array does not fit the grid, or an unmasked pixel holds no finite number.
+    """
+    signal = np.zeros(grid.shape) if others is None else others
+    if use_conditional:
+        return conditional(
+            model, grid, before_e, after_e, power_ratio * (1 + signal),
+            read_variance_before_e2=read_variance_before_e2,
+            read_variance_after_e2=read_variance_after_e2,
+            masked=masked,
+        )  # fmt: skip
+    masked = mask_of("masked", masked, grid.shape)
+    before = pixels_of("before_e", before_e, grid.shape, masked, scalar=True)
+    read_before, read_after = (
+        pixels_of(name, value, grid.shape, masked, scalar=True, least=0.0)
+        for name, value in (
+            ("read_variance_before_e2", read_variance_before_e2),
+            ("read_variance_after_e2", read_variance_after_e2),
+        )
+    )
+    steady = smooth_background(before, read_before, masked) if background else before
+    # The expected variance is that of the smooth background; the excess is that over the own one.
+    extra = read_after + power_ratio**2 * (background * steady + read_before)
+    extra = extra + power_ratio * (steady - before)
+    level = power_ratio * before
+    if scale_e is not None:
+        return poisson(
+            model, grid, after_e, level + scale_e * signal, scale_e,
+            extra_variance_e2=extra, masked=masked,
+        )  # fmt: skip
+    level = level * (1 + signal)
+    return poisson(model, grid, after_e, level, level, extra_variance_e2=extra, masked=masked)

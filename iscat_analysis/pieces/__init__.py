@@ -1,0 +1,27 @@
+"""The pieces: what a physicist calls with arrays, without a movie, a folder or a file.
+
+Each takes the microscope, the particle and the camera as `Optics`, `Particle` and `Camera`, the
+same sections that a configuration file has, and arrays otherwise:
+
+`psf`
+    images of a particle, for arrays of positions, heights or masses;
+`fit_rois`
+    fits of many regions, counts before and after, into one table;
+`log_likelihood`
+    the log-likelihood of one region and its gradient, for any sampler or optimiser;
+`crb`, `qcrb`
+    what no estimate can beat, given the camera or given the light, for arrays of set-ups.
+
+Lengths are nm, masses kDa, counts photoelectrons; images have axes (y, x), and pixel (0, 0) of a
+region has its centre at (0, 0) nm.
+"""
+
+from __future__ import annotations
+
+from iscat_analysis.config import CameraConfig as Camera
+from iscat_analysis.pieces.images import psf
+from iscat_analysis.pieces.likelihoods import LogLikelihood, log_likelihood
+from iscat_analysis.pieces.limits import crb, qcrb
+from iscat_analysis.pieces.regions import fit_rois
+
+__all__ = ["Camera", "LogLikelihood", "crb", "fit_rois", "log_likelihood", "psf", "qcrb"]

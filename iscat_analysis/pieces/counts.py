@@ -1,0 +1,209 @@
+"""Counts of regions before and after, checked once, and the likelihood of each."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import BoolArray, real_array
+from iscat_analysis.inference.counts import KNOWN, MEAN, counts_likelihood
+from iscat_analysis.inference.fit import window_nm
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.pieces.setups import darkfield_photons, number_in
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Regions of one size under one microscope; build it with `gather`.
+
+    Attributes
+    ----------
+    config : Config
+        Microscope, particle and camera.
+    model : ForwardModel
+        Reaches over a region from wherever a fit may move.
+    grid : PixelGrid
+        Of every region.
+    before, after : ndarray, shape (n, y, x)
+        Photoelectrons [e].
+    ratio : ndarray, shape (n,)
+        Light after over light before.
+    level : bool
+        Whether a common level is fitted.
+    n_before, n_after : int
+        Frames.
+    masked, saturated : ndarray of bool, shape (n, y, x)
+        Pixels to leave out, and the saturated ones among them.
+    """
+
+    config: Config
+    model: ForwardModel
+    grid: PixelGrid
+    before: FloatArray
+    after: FloatArray
+    ratio: FloatArray
+    level: bool
+    n_before: int
+    n_after: int
+    masked: BoolArray
+    saturated: BoolArray
+
+    def likelihood(self, index: int) -> Likelihood:
+        """Likelihood of one region.
+
+        Parameters
+        ----------
+        index : int
+            Which.
+
+        Returns
+        -------
+        Likelihood
+            Conditional where the background is measured and interferes, Poisson otherwise.
+        """
+        read = float(self.config.camera.read_noise_e) ** 2
+        ratio = float(self.ratio[index])
+        return counts_likelihood(
+            self.model, self.grid, self.before[index], self.after[index], ratio,
+            background=MEAN if self.n_before else KNOWN,
+            use_conditional=bool(self.model.rho) and self.n_before > 0,
+            scale_e=None if self.model.rho else self._scale_e(ratio),
+            read_variance_before_e2=self.n_before * read,
+            read_variance_after_e2=self.n_after * read,
+            masked=self.masked[index],
+        )  # fmt: skip
+
+    def collected(self, index: int, z_nm: float, mass_kda: float) -> float:
+        """Scattered photons that the pupil collected in the frames after.
+
+        Parameters
+        ----------
+        index : int
+            Which region.
+        z_nm, mass_kda : float
+            Its particle.
+
+        Returns
+        -------
+        float
+            Photoelectrons.
+        """
+        area = self.model.collected_area_nm2(z_nm, mass_kda) / self.grid.pixel_nm**2
+        ratio = float(self.ratio[index])
+        if not self.model.rho:
+            return self._scale_e(ratio) * area
+        used = ~self.masked[index]
+        return ratio * float(self.before[index][used].mean()) * area
+
+    def _scale_e(self, ratio: float) -> float:
+        """Photoelectrons per pixel for unit signal in dark field."""
+        photons = darkfield_photons(self.config.particle)
+        per_frame = self.model.photons_per_intensity(photons, self.grid.pixel_nm)
+        return per_frame * ratio * max(self.n_before, 1)
+
+
+def gather(
+    config: Config,
+    before: ArrayLike,
+    after: ArrayLike,
+    *,
+    n_before: int,
+    n_after: int,
+    power_ratio: ArrayLike | None,
+    level: bool | None,
+    masked: ArrayLike | None,
+    saturated: ArrayLike | None = None,
+) -> Counts:
+    """Check counts and what is said of them.
+
+    Parameters
+    ----------
+    config : Config
+        From `config_of`.
+    before, after, n_before, n_after, power_ratio, level, masked, saturated
+        As in `fit_rois`.
+
+    Returns
+    -------
+    Counts
+        Ready to be fitted.
+
+    Raises
+    ------
+    ConfigError, DataError
+        As in `fit_rois`.
+    """
+    frames_before = int(number_in("n_before", n_before, least=0, whole=True))
+    frames_after = int(number_in("n_after", n_after, least=1, whole=True))
+    events = real_array("after", after)
+    if events.ndim != 3 or min(events.shape[1:], default=0) < 5:
+        raise DataError(
+            f"after: has shape {events.shape}; give regions of at least 5 x 5 pixels as (n, y, x)"
+        )
+    background = real_array("before", before)
+    if background.shape != events.shape:
+        known = not frames_before and background.shape in ((), events.shape[1:])
+        if not known:
+            also = "" if frames_before else ", an image (y, x) or a number"
+            raise DataError(
+                f"before: has shape {background.shape}; give {events.shape} as after has{also}"
+            )
+        background = np.array(np.broadcast_to(background, events.shape))
+    burnt = _mask_of("saturated", saturated, events.shape)
+    out = _mask_of("masked", masked, events.shape) | burnt
+    for name, array in (("before", background), ("after", events)):
+        wrong = int(np.count_nonzero(~np.isfinite(array) & ~out))
+        if wrong:
+            raise DataError(f"{name}: is not finite in {wrong} pixels; mask them with masked=…")
+    frames = frames_after / max(frames_before, 1)
+    ratio = real_array("power_ratio", frames if power_ratio is None else power_ratio)
+    if ratio.shape not in ((), events.shape[:1]):
+        raise DataError(
+            f"power_ratio: has shape {ratio.shape}; give one number or {events.shape[0]}"
+        )
+    bad = ~(np.isfinite(ratio) & (ratio > 0))
+    if bad.any():
+        raise DataError(
+            f"power_ratio = {ratio[bad].flat[0]:g}: give the light after over that before, above 0"
+        )
+    if level not in (None, True, False):
+        raise ConfigError(f"level = {level!r}: give True, False or None")
+    pixel_nm = float(config.camera.pixel_size_nm or 0.0)
+    rows, columns = events.shape[1:]
+    reach = math.hypot(rows + 2, columns + 2) * pixel_nm + window_nm(pixel_nm)
+    model = forward_model(config, reach)
+    if level is None:
+        level = frames_before > 0 and power_ratio is None and bool(model.rho)
+    return Counts(
+        config=config,
+        model=model,
+        grid=PixelGrid.region((0, rows), (0, columns), pixel_nm),
+        before=background,
+        after=events,
+        ratio=np.array(np.broadcast_to(ratio, events.shape[:1])),
+        level=bool(level),
+        n_before=frames_before,
+        n_after=frames_after,
+        masked=out,
+        saturated=burnt,
+    )
+
+
+def _mask_of(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
+    """Give a mask for every region, from one for each or one for all."""
+    if value is None:
+        return np.zeros(shape, dtype=np.bool_)
+    array = np.asarray(value)
+    if array.dtype != np.bool_:
+        raise DataError(f"{name}: holds {array.dtype}; give True where a pixel must not be used")
+    if array.shape not in (shape, shape[1:]):
+        raise DataError(f"{name}: has shape {array.shape}; give {shape} or {shape[1:]}")
+    return np.array(np.broadcast_to(array, shape))

@@ -1,0 +1,306 @@
+"""Bounds for arrays of set-ups."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from iscat_analysis.bounds import event_bounds, quantum_information
+from iscat_analysis.bounds.experiment import expected_likelihood
+from iscat_analysis.config import Calibration, CameraConfig, Config, Optics, Particle
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.pieces.setups import config_of, darkfield_photons, number_in, together
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
+
+FloatArray = NDArray[np.float64]
+
+
+def crb(
+    optics: Optics,
+    particle: Particle,
+    camera: CameraConfig,
+    *,
+    photons_per_pixel: ArrayLike,
+    n_after: ArrayLike = 1,
+    n_before: ArrayLike = 0,
+    mode: str = "mass",
+    joint: bool = True,
+    level: bool = False,
+    pixels: int = 33,
+    x_nm: ArrayLike = 0.0,
+    y_nm: ArrayLike = 0.0,
+    z_nm: ArrayLike | None = None,
+    mass_kda: ArrayLike | None = None,
+    focus_nm: ArrayLike | None = None,
+    calibration: Calibration | None = None,
+) -> dict[str, FloatArray]:
+    """Cramér–Rao bounds: the smallest spread of any unbiased estimate from such frames.
+
+    Parameters
+    ----------
+    optics : Optics
+        The microscope.
+    particle : Particle
+        Its material; its height sets the focus.
+    camera : Camera
+        Pixel size, samples per pixel and read noise.
+    photons_per_pixel : array_like
+        Background per pixel and frame [e]; in dark field it may be 0.
+    n_after : array_like
+        Frames with the particle.
+    n_before : array_like
+        Frames of background; 0 where the background is known.
+    mode : {"mass", "localize", "joint"}
+        Which parameters are free.
+    joint : bool
+        Whether all free parameters are unknown at once; False gives each with the others known.
+    level : bool
+        Whether the level of the light is unknown too.
+    pixels : int
+        Side of the square region [pixels].
+    x_nm, y_nm : array_like
+        Particle, from the centre of the region [nm].
+    z_nm : array_like, optional
+        Height above the coverslip [nm]; default ``particle.height_nm``.
+    mass_kda : array_like, optional
+        Mass [kDa]; default that of `particle`.
+    focus_nm : array_like, optional
+        Focus [nm]; default ``optics.focus_nm``.
+    calibration : Calibration, optional
+        Contrast against mass, in place of the model's absolute scale.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Standard deviations [nm, kDa] of the free parameters, by name, each of the shape of the
+        broadcast arguments; NaN where the image does not tell.
+
+    Raises
+    ------
+    ConfigError
+        An argument is missing or impossible.
+    DataError
+        An argument does not hold real numbers.
+
+    Notes
+    -----
+    The inverse of the Fisher matrix of the likelihood that `fit_rois` maximises.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import iscat_analysis as ia
+    >>> optics, camera = ia.Optics(na=1.42, focus_nm=-500), ia.Camera(pixel_size_nm=84.4)
+    >>> gold = ia.Particle(kind="gold", diameter_nm=20)
+    >>> bounds = ia.crb(optics, gold, camera, photons_per_pixel=1e4, n_after=100, mode="joint",
+    ...                 z_nm=np.array([[50.0], [100.0]]), mass_kda=[10_000, 50_000, 90_000])
+    >>> bounds["z_nm"].shape
+    (2, 3)
+    """
+    config = config_of(optics, particle, camera, mode=mode, calibration=calibration)
+    side = int(number_in("pixels", pixels, least=2, whole=True))
+    setups = _Setups(
+        config, side, x_nm=x_nm, y_nm=y_nm, z_nm=z_nm, mass_kda=mass_kda, focus_nm=focus_nm,
+        photons_per_pixel=photons_per_pixel, n_after=n_after, n_before=n_before,
+    )  # fmt: skip
+    free = FREE_PARAMETERS[mode]
+    index = [PARAMETERS.index(name) for name in free]
+    read_noise_e = float(config.camera.read_noise_e)
+    out = np.full((len(free), *setups.shape), np.nan)
+    for place in np.ndindex(setups.shape):
+        at = setups.at(place)
+        likelihood = expected_likelihood(
+            at.model, setups.grid, at.theta, at.level_e, at.scale_e,
+            n_before=int(at.n_before), n_after=int(at.n_after), read_noise_e=read_noise_e,
+        )  # fmt: skip
+        bounds = event_bounds(likelihood, at.theta, free, at.collected, level=level)
+        out[(slice(None), *place)] = (bounds.crb_joint if joint else bounds.crb_single)[index]
+    return dict(zip(free, out, strict=True))
+
+
+def qcrb(
+    optics: Optics,
+    particle: Particle,
+    camera: CameraConfig,
+    *,
+    photons_per_pixel: ArrayLike,
+    n_after: ArrayLike = 1,
+    mode: str = "mass",
+    joint: bool = False,
+    z_nm: ArrayLike | None = None,
+    mass_kda: ArrayLike | None = None,
+    focus_nm: ArrayLike | None = None,
+    calibration: Calibration | None = None,
+) -> dict[str, FloatArray]:
+    """Quantum Cramér–Rao bounds: what no measurement of the collected light can beat.
+
+    Parameters
+    ----------
+    optics : Optics
+        The microscope.
+    particle : Particle
+        Its material; its height sets the focus.
+    camera : Camera
+        Its pixel size turns photons per pixel into light.
+    photons_per_pixel : array_like
+        Background per pixel and frame [e]; in dark field without influence.
+    n_after : array_like
+        Frames with the particle.
+    mode : {"mass", "localize", "joint"}
+        Which parameters are free.
+    joint : bool
+        Whether all free parameters are unknown at once; by default each with the others known,
+        since height and mass cannot both be measured so well.
+    z_nm : array_like, optional
+        Height above the coverslip [nm]; default ``particle.height_nm``.
+    mass_kda : array_like, optional
+        Mass [kDa]; default that of `particle`.
+    focus_nm : array_like, optional
+        Focus [nm]; default ``optics.focus_nm``.
+    calibration : Calibration, optional
+        Contrast against mass, in place of the model's absolute scale.
+
+    Returns
+    -------
+    dict of str to ndarray
+        As `crb` gives it.
+
+    Raises
+    ------
+    ConfigError
+        An argument is missing or impossible.
+    DataError
+        An argument does not hold real numbers.
+
+    Examples
+    --------
+    >>> import iscat_analysis as ia
+    >>> optics, camera = ia.Optics(na=1.42), ia.Camera(pixel_size_nm=84.4)
+    >>> limit = ia.qcrb(optics, ia.Particle(mass_kda=480), camera, photons_per_pixel=[1e4, 4e4])
+    >>> float(limit["x_nm"][0] / limit["x_nm"][1])
+    2.0
+    """
+    config = config_of(optics, particle, camera, mode=mode, calibration=calibration)
+    setups = _Setups(
+        config, 2, x_nm=0.0, y_nm=0.0, z_nm=z_nm, mass_kda=mass_kda, focus_nm=focus_nm,
+        photons_per_pixel=photons_per_pixel, n_after=n_after, n_before=0,
+    )  # fmt: skip
+    free = FREE_PARAMETERS[mode]
+    index = [PARAMETERS.index(name) for name in free]
+    out = np.full((len(free), *setups.shape), np.nan)
+    for place in np.ndindex(setups.shape):
+        at = setups.at(place)
+        information = quantum_information(at.model, float(at.theta[2])).real[np.ix_(index, index)]
+        scale = 1 / np.sqrt(np.diag(information))
+        bound = scale
+        if joint:
+            inverse = np.linalg.inv(information * np.outer(scale, scale))
+            bound = scale * np.sqrt(np.diag(inverse))
+        step = abs(at.theta[3] * at.model.scale.slope(float(at.theta[3])))  # mass per unit of ln a
+        units = np.where(np.array(index) == PARAMETERS.index("mass_kda"), step, 1.0)
+        out[(slice(None), *place)] = bound * units / math.sqrt(at.collected)
+    return dict(zip(free, out, strict=True))
+
+
+@dataclass(frozen=True)
+class _At:
+    """One set-up: the model, where the particle is, and how much light there is."""
+
+    model: ForwardModel
+    theta: FloatArray
+    level_e: float
+    scale_e: float
+    n_before: float
+    n_after: float
+    collected: float
+
+
+class _Setups:
+    """Broadcast set-ups; models are shared between those of one focus."""
+
+    def __init__(
+        self,
+        config: Config,
+        pixels: int,
+        *,
+        x_nm: ArrayLike,
+        y_nm: ArrayLike,
+        z_nm: ArrayLike | None,
+        mass_kda: ArrayLike | None,
+        focus_nm: ArrayLike | None,
+        photons_per_pixel: ArrayLike,
+        n_after: ArrayLike,
+        n_before: ArrayLike,
+    ) -> None:
+        self._config = config
+        self._pixel_nm = float(config.camera.pixel_size_nm or 0.0)
+        self.grid = PixelGrid.centred(pixels, self._pixel_nm)
+        self._dark = config.optics.scheme == "darkfield"
+        # a calibration was measured at the focus of `optics`, whatever focus is asked about
+        nominal = forward_model(config, self._pixel_nm)
+        self._scale = nominal.scale
+        self._all = together(
+            {
+                "x_nm": x_nm,
+                "y_nm": y_nm,
+                "z_nm": config.particle.height_nm if z_nm is None else z_nm,
+                "mass_kda": nominal.material.mass_kda if mass_kda is None else mass_kda,
+                "focus_nm": config.optics.focus_nm if focus_nm is None else focus_nm,
+                "photons_per_pixel": photons_per_pixel,
+                "n_after": n_after,
+                "n_before": n_before,
+            },
+            least={"z_nm": 0.0, "photons_per_pixel": 0.0, "n_after": 1.0, "n_before": 0.0},
+        )
+        for name in ("n_after", "n_before"):
+            broken = self._all[name] != np.round(self._all[name])
+            if broken.any():
+                raise ConfigError(
+                    f"{name} = {self._all[name][broken].flat[0]:g}: give whole frames"
+                )
+        if not self._dark and np.any(self._all["photons_per_pixel"] == 0):
+            raise ConfigError(
+                "photons_per_pixel = 0: without background there is no interference; give the "
+                'photoelectrons per pixel and frame, or Optics(scheme="darkfield")'
+            )
+        half = pixels * self._pixel_nm / 2
+        for name in ("x_nm", "y_nm"):
+            outside = np.abs(self._all[name]) > half
+            if outside.any():
+                raise ConfigError(
+                    f"{name} = {self._all[name][outside].flat[0]:g} lies outside the region of "
+                    f"±{half:g} nm: move the particle, or enlarge pixels = {pixels}"
+                )
+        self.shape = self._all["x_nm"].shape
+        far = [half + float(np.abs(self._all[name]).max(initial=0.0)) for name in ("x_nm", "y_nm")]
+        self._reach_nm = math.hypot(*far) * 1.0001
+        highest = float(self._all["z_nm"].max(initial=0.0))
+        self._highest_nm = max(highest, config.particle.height_nm)
+        self._models: dict[float, ForwardModel] = {}
+
+    def at(self, place: tuple[int, ...]) -> _At:
+        """Give the set-up at an index."""
+        now = {name: float(values[place]) for name, values in self._all.items()}
+        model = self._model(now["focus_nm"])
+        amplitude = model.scale.amplitude(now["mass_kda"])
+        theta = np.array([now["x_nm"], now["y_nm"], now["z_nm"], amplitude, 0.0])
+        level_e = scale_e = now["photons_per_pixel"]
+        if self._dark:
+            photons = darkfield_photons(self._config.particle)
+            scale_e = model.photons_per_intensity(photons, self._pixel_nm)
+        area = model.collected_area_nm2(now["z_nm"], now["mass_kda"]) / self._pixel_nm**2
+        collected = now["n_after"] * scale_e * area
+        return _At(model, theta, level_e, scale_e, now["n_before"], now["n_after"], collected)
+
+    def _model(self, focus_nm: float) -> ForwardModel:
+        if focus_nm not in self._models:
+            optics = self._config.optics.model_copy(update={"focus_nm": focus_nm})
+            config = self._config.model_copy(update={"optics": optics, "calibration": None})
+            like = next(iter(self._models.values()), None)
+            model = forward_model(config, self._reach_nm, z_max_nm=self._highest_nm, like=like)
+            self._models[focus_nm] = replace(model, scale=self._scale)
+        return self._models[focus_nm]

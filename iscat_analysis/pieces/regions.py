@@ -1,0 +1,297 @@
+"""Fits of many regions of interest, into one table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from iscat_analysis.bounds import event_bounds
+from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import real_array
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood, compile_kernels
+from iscat_analysis.pieces.counts import Counts, gather
+from iscat_analysis.pieces.setups import config_of, number_in
+from iscat_analysis.records import (
+    EVENT_COLUMNS,
+    FREE_PARAMETERS,
+    PARAMETERS,
+    Candidate,
+    FitResult,
+    Status,
+    verdict,
+)
+from iscat_analysis.search.templates import Templates, make_templates, signal_to_noise
+
+FloatArray = NDArray[np.float64]
+
+SATURATION_NM = 500.0
+"""Saturated pixels nearer than this spoil a fit."""
+
+_FEWEST = 0.5  # share of a region's pixels that must be usable
+_MARGIN = 0.15  # of the region's side at each edge, where a particle is not looked for
+
+
+def fit_rois(
+    before: ArrayLike,
+    after: ArrayLike,
+    optics: Optics,
+    particle: Particle,
+    camera: CameraConfig,
+    *,
+    n_after: int,
+    n_before: int,
+    mode: str = "mass",
+    power_ratio: ArrayLike | None = None,
+    level: bool | None = None,
+    z_range_nm: tuple[float, float] = (0.0, 1000.0),
+    masked: ArrayLike | None = None,
+    saturated: ArrayLike | None = None,
+    corners_px: ArrayLike | None = None,
+    calibration: Calibration | None = None,
+    workers: int = 1,
+) -> pd.DataFrame:
+    """Fit one particle in each of many regions.
+
+    Parameters
+    ----------
+    before : array_like, shape (n, y, x)
+        Photoelectrons summed over the frames before [e].  With ``n_before=0`` the background is
+        known, and this is its expectation for one frame: an array, an image (y, x) or a number.
+    after : array_like, shape (n, y, x)
+        Photoelectrons summed over the frames with the particle [e].
+    optics : Optics
+        The microscope.
+    particle : Particle
+        Its material, and the height or mass that a mode holds fixed.
+    camera : Camera
+        Pixel size, samples per pixel and read noise.
+    n_after, n_before : int
+        Frames in the sums; ``n_before=0`` where the background is known.
+    mode : {"mass", "localize", "joint"}
+        Which parameters are free: x, y and mass; x, y and z; all four.
+    power_ratio : array_like, optional
+        Light after over light before, one number or one for each region, where it is known from a
+        larger field; default the ratio of the frames, with `level` fitted.
+    level : bool, optional
+        Whether a common level of the light is fitted as a nuisance; default where the background
+        is measured, interferes, and no `power_ratio` is given.
+    z_range_nm : (float, float)
+        Heights that are searched where z is free [nm].
+    masked, saturated : array_like of bool, shape (n, y, x) or (y, x), optional
+        Pixels to leave out; saturated ones near a particle are remarked on.
+    corners_px : array_like, shape (n, 2), optional
+        Row and column of each region's first pixel in the full frame, added to the positions.
+    calibration : Calibration, optional
+        Contrast against mass, in place of the model's absolute scale.
+    workers : int
+        Threads; without influence on the result.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row for each region, in their order, with the columns of ``fits.csv``.  `frame` is
+        empty: sums do not say when.  A region without half of its pixels is ``not_converged`` and
+        has no estimate.
+
+    Raises
+    ------
+    ConfigError
+        An argument is missing or impossible.
+    DataError
+        An array has another shape, holds no real numbers, or is not finite in an unmasked pixel.
+
+    Notes
+    -----
+    The same likelihood, estimator, bounds and remarks as `fit_movie` and `iscat-fit`; what they do
+    beyond it is to find the regions and to take neighbours into account.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import iscat_analysis as ia
+    >>> optics, camera = ia.Optics(na=1.42, focus_nm=-500), ia.Camera(pixel_size_nm=84.4)
+    >>> protein, line = ia.Particle(mass_kda=480), ia.Calibration(gradient_per_kda=-3.1e-5)
+    >>> light = 200 * 1e4 * (1 + ia.psf(optics, protein, camera, calibration=line))
+    >>> counts = np.random.default_rng(1).poisson([np.full_like(light, 200 * 1e4), light])
+    >>> table = ia.fit_rois(counts[:1], counts[1:], optics, protein, camera, calibration=line,
+    ...                     n_before=200, n_after=200)
+    >>> abs(table.mass_kda[0] - 480) < 4 * table.sigma_mass_kda[0]
+    np.True_
+    """
+    if mode == "track":
+        raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
+    config = config_of(
+        optics, particle, camera, mode=mode, z_range_nm=z_range_nm, calibration=calibration
+    )
+    counts = gather(
+        config, before, after, n_before=n_before, n_after=n_after, power_ratio=power_ratio,
+        level=level, masked=masked, saturated=saturated,
+    )  # fmt: skip
+    count = len(counts.after)
+    corners = np.zeros((count, 2)) if corners_px is None else real_array("corners_px", corners_px)
+    if corners.shape != (count, 2) or not np.all(np.isfinite(corners)):
+        raise DataError(f"corners_px: has shape {corners.shape}; give {(count, 2)} finite numbers")
+    threads = int(number_in("workers", workers, least=1, whole=True))
+    templates = make_templates(
+        counts.model, config.detection,
+        pixel_nm=counts.grid.pixel_nm,
+        roi_nm=min(counts.grid.shape) * counts.grid.pixel_nm,
+        z_range_nm=config.fit.z_range_nm if "z_nm" in FREE_PARAMETERS[mode] else None,
+        field_px=counts.grid.shape,
+    )  # fmt: skip
+    compile_kernels(counts.model)
+    with ThreadPoolExecutor(threads) as pool:
+        rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
+    return table_from(rows)
+
+
+def table_from(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
+    """Make a table of rows.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        With the keys `EVENT_COLUMNS`.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns `EVENT_COLUMNS`; a frame that is not known is empty.
+    """
+    table = pd.DataFrame(list(rows), columns=list(EVENT_COLUMNS))
+    known = bool(table["frame"].notna().all())
+    kinds = dict.fromkeys(("event", "n_before", "n_after"), "int64")
+    kinds["frame"] = "int64" if known else "Int64"
+    texts = ("status", "flags")
+    numbers = [name for name in EVENT_COLUMNS if name not in kinds and name not in texts]
+    return table.astype({**kinds, **dict.fromkeys(numbers, "float64")})
+
+
+def row_of(
+    likelihood: Likelihood,
+    fit: FitResult,
+    collected: float,
+    *,
+    event: int,
+    frame: int | None,
+    n_before: int,
+    n_after: int,
+) -> dict[str, Any]:
+    """Put a fit and its bounds into a row of the table.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        The one that was maximised.
+    fit : FitResult
+        Its estimate, in the full frame.
+    collected : float
+        Scattered photons that the pupil collected in the frames after.
+    event : int
+        Number of the row.
+    frame : int or None
+        First frame of the new state, where it is known.
+    n_before, n_after : int
+        Frames.
+
+    Returns
+    -------
+    dict
+        With the keys `EVENT_COLUMNS`.
+    """
+    model, pixel_nm = likelihood.model, likelihood.grid.pixel_nm
+    bounds = event_bounds(
+        likelihood, fit.estimate, fit.free, collected, level=bool(fit.box.free[LEVEL])
+    )
+    row: dict[str, Any] = {
+        "event": event,
+        "frame": frame,
+        "n_before": n_before,
+        "n_after": n_after,
+        "x_px": fit.x_nm / pixel_nm,
+        "y_px": fit.y_nm / pixel_nm,
+        "x_nm": fit.x_nm,
+        "y_nm": fit.y_nm,
+        "z_nm": fit.z_nm,
+        "mass_kda": fit.mass_kda,
+        "contrast": fit.contrast if model.rho else np.nan,
+        "n_scattered": collected,
+        "snr": math.sqrt(2 * max(fit.log_likelihood, 0.0)),
+        "chi2_reduced": fit.chi2_reduced,
+        "p_value": fit.p_value,
+        "status": str(fit.status),
+        "flags": ";".join(str(flag) for flag in fit.flags),
+    }
+    for k, name in enumerate(PARAMETERS):
+        row[f"sigma_{name}"] = fit.sigma[k]
+        row[f"crb_{name}"] = bounds.crb_joint[k]
+        row[f"qcrb_{name}"] = bounds.qcrb[k]
+    return row
+
+
+def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -> dict[str, Any]:
+    """Fit one region."""
+    likelihood = counts.likelihood(index)
+    config, model, pixel_nm = counts.config, counts.model, counts.grid.pixel_nm
+    saturated = counts.saturated[index]
+    if likelihood.n_pixels < _FEWEST * saturated.size:
+        flags = [Status.NOT_CONVERGED, *([Status.SATURATED] if saturated.any() else [])]
+        status, noticed = verdict(flags)
+        return {
+            "event": index,
+            "n_before": counts.n_before,
+            "n_after": counts.n_after,
+            "status": str(status),
+            "flags": ";".join(str(flag) for flag in noticed),
+        }
+    start = _start(likelihood, templates)
+    free = FREE_PARAMETERS[config.fit.mode]
+    if "mass_kda" not in free:
+        start = replace(start, mass_kda=model.material.mass_kda)
+    if "z_nm" not in free:
+        start = replace(start, z_nm=config.particle.height_nm)
+    fit = fit_particle(
+        likelihood, start, config.fit.mode, config.fit.z_range_nm, level=counts.level
+    )
+    rows, columns = np.nonzero(saturated)
+    away = np.hypot(columns * pixel_nm - fit.x_nm, rows * pixel_nm - fit.y_nm)
+    if np.any(away < SATURATION_NM):
+        status, noticed = verdict([*fit.flags, Status.SATURATED])
+        fit = replace(fit, status=status, flags=noticed)
+    fit = replace(fit, x_nm=fit.x_nm + corner[1] * pixel_nm, y_nm=fit.y_nm + corner[0] * pixel_nm)
+    collected = counts.collected(index, fit.z_nm, fit.mass_kda)
+    return row_of(
+        likelihood, fit, collected,
+        event=index, frame=None, n_before=counts.n_before, n_after=counts.n_after,
+    )  # fmt: skip
+
+
+def _start(likelihood: Likelihood, templates: Templates) -> Candidate:
+    """Where the matched filter is largest, away from the edges of the region."""
+    snr, strength = signal_to_noise(likelihood, templates)
+    ranked = np.abs(snr) if templates.two_sided else snr
+    rows, columns = likelihood.grid.shape
+    inner = np.full(ranked.shape, -np.inf)
+    top, left = (int(_MARGIN * size) for size in (rows, columns))
+    inside = (slice(None), slice(top, rows - top), slice(left, columns - left))
+    inner[inside] = ranked[inside]
+    k, row, column = (int(i) for i in np.unravel_index(np.argmax(inner), inner.shape))
+    amplitude = float(strength[k, row, column])
+    if templates.quadratic:
+        amplitude = math.sqrt(max(amplitude, 0.0))
+    return Candidate(
+        x_px=float(column),
+        y_px=float(row),
+        z_nm=float(templates.z_nm[k]),
+        mass_kda=float(likelihood.model.scale.mass(np.asarray(amplitude))),
+        snr=float(snr[k, row, column]),
+    )

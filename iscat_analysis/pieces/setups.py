@@ -1,0 +1,182 @@
+"""What the pieces are given: microscope, particle and camera, and arrays that go together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from iscat_analysis.config import Calibration, CameraConfig, Config, Fit, Optics, Particle
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.checks import real_array
+from iscat_analysis.records import FREE_PARAMETERS
+
+FloatArray = NDArray[np.float64]
+
+
+def config_of(
+    optics: Optics,
+    particle: Particle,
+    camera: CameraConfig,
+    *,
+    mode: str = "joint",
+    z_range_nm: tuple[float, float] | None = None,
+    calibration: Calibration | None = None,
+) -> Config:
+    """Put microscope, particle and camera together.
+
+    Parameters
+    ----------
+    optics, particle, camera
+        The sections of a configuration.
+    mode : str
+        Key of `FREE_PARAMETERS`.
+    z_range_nm : (float, float), optional
+        Heights that are searched [nm].
+    calibration : Calibration, optional
+        Contrast against mass.
+
+    Returns
+    -------
+    Config
+        Whose other sections are at their defaults.
+
+    Raises
+    ------
+    ConfigError
+        An argument is of another kind, or a number that the pieces need is missing.
+    """
+    for name, value, kind, example in (
+        ("optics", optics, Optics, "Optics(na=1.42)"),
+        ("particle", particle, Particle, "Particle(mass_kda=480)"),
+        ("camera", camera, CameraConfig, "Camera(pixel_size_nm=84.4)"),
+    ):
+        if not isinstance(value, kind):
+            raise ConfigError(
+                f"{name}: is {type(value).__name__}; give what iscat_analysis.{example} returns"
+            )
+    if calibration is not None and not isinstance(calibration, Calibration):
+        raise ConfigError(
+            f"calibration: is {type(calibration).__name__}; give what "
+            "iscat_analysis.Calibration(gradient_per_kda=-3.1e-5) returns, or None"
+        )
+    if camera.pixel_size_nm is None:
+        raise ConfigError("camera.pixel_size_nm is needed: Camera(pixel_size_nm=84.4)")
+    if isinstance(camera.read_noise_e, str):
+        raise ConfigError(
+            f"camera.read_noise_e = {camera.read_noise_e!r} is a map: give one number [e]"
+        )
+    if mode not in FREE_PARAMETERS:
+        raise ConfigError(f"mode = {mode!r}: choose one of {', '.join(FREE_PARAMETERS)}")
+    fit = {"mode": mode} if z_range_nm is None else {"mode": mode, "z_range_nm": z_range_nm}
+    return Config(
+        optics=optics, particle=particle, camera=camera, calibration=calibration,
+        fit=Fit(**fit),
+    )  # fmt: skip
+
+
+def number_in(
+    name: str, value: Any, *, least: float, whole: bool = False, above: bool = False
+) -> float:
+    """Check a single number.
+
+    Parameters
+    ----------
+    name : str
+        What messages call it.
+    value : Any
+        The number.
+    least : float
+        Smallest that is possible.
+    whole : bool
+        Whether it counts something.
+    above : bool
+        Whether it must exceed `least`.
+
+    Returns
+    -------
+    float
+        The number.
+
+    Raises
+    ------
+    ConfigError
+        It is not such a number.
+    """
+    array = real_array(name, value)
+    kind = "whole number" if whole else "number"
+    limit = f"above {least:g}" if above else f"of at least {least:g}"
+    number = float(array) if array.ndim == 0 else math.nan
+    good = math.isfinite(number) and (number > least if above else number >= least)
+    if not good or (whole and number != round(number)):
+        raise ConfigError(f"{name} = {value!r}: give one {kind} {limit}")
+    return number
+
+
+def together(
+    given: Mapping[str, ArrayLike], *, least: Mapping[str, float]
+) -> dict[str, FloatArray]:
+    """Broadcast arrays against one another.
+
+    Parameters
+    ----------
+    given : mapping of str to array_like
+        Arrays by name.
+    least : mapping of str to float
+        Smallest possible value of some of them.
+
+    Returns
+    -------
+    dict of str to ndarray
+        All of one shape, finite.
+
+    Raises
+    ------
+    ConfigError
+        The shapes do not go together, or a value is impossible.
+    """
+    arrays = {name: real_array(name, value) for name, value in given.items()}
+    for name, array in arrays.items():
+        bad = ~np.isfinite(array)
+        if name in least:
+            bad |= array < least[name]
+        if bad.any():
+            limit = f" of at least {least[name]:g}" if name in least else ""
+            raise ConfigError(f"{name} = {array[bad].flat[0]:g}: give finite numbers{limit}")
+    try:
+        same = np.broadcast_arrays(*arrays.values())
+    except ValueError:
+        shapes = ", ".join(f"{name} {a.shape}" for name, a in arrays.items() if a.ndim)
+        raise ConfigError(
+            f"shapes do not go together: {shapes}; see numpy's broadcasting"
+        ) from None
+    return dict(zip(arrays, same, strict=True))
+
+
+def darkfield_photons(particle: Particle) -> float:
+    """Give the scale of masses in dark field.
+
+    Parameters
+    ----------
+    particle : Particle
+        With ``photons_per_frame``.
+
+    Returns
+    -------
+    float
+        Scattered photons collected per frame from a particle of this mass.
+
+    Raises
+    ------
+    ConfigError
+        It is not given.
+    """
+    if particle.photons_per_frame is None:
+        raise ConfigError(
+            "particle.photons_per_frame is needed in dark field, where it is the scale of masses: "
+            "Particle(mass_kda=480, photons_per_frame=3000)"
+        )
+    return particle.photons_per_frame

@@ -1,0 +1,350 @@
+"""What an analysis says in a few words: the same on the page, on stdout and in a notebook.
+
+Every number here is taken over the rows whose status is ok.  Where more than a fifth of the rows
+is flagged, the rest is a selection rather than a sample, and no number is given.  Without a
+calibration the headline is the contrast, because the model's absolute scale is not a mass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.records import FREE_PARAMETERS, Analysis, FloatArray, Status
+from iscat_analysis.report.numbers import LABELS, UNITS, count, number, percent
+
+MOST_FLAGGED = 0.2
+"""Share of flagged rows above which no headline is given."""
+
+NOT_A_MASS = (
+    "Not calibrated: mass_kda is on the model's own absolute scale, and an uncalibrated absolute "
+    "scale is not a mass. What was measured are contrasts; `iscat calibrate mass` makes masses of "
+    "them."
+)
+"""What is said of masses without ``[calibration]``."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """The column that an analysis is about.
+
+    Attributes
+    ----------
+    column : str
+        Of the table.
+    label, unit : str
+        What it is called in print; the unit may be empty.
+    """
+
+    column: str
+    label: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class Precision:
+    """How near the fits of one parameter came to its bounds, over the rows that are ok.
+
+    Attributes
+    ----------
+    name : str
+        As in `PARAMETERS`.
+    events : int
+        Rows with a usable σ and CRB.
+    sigma, crb, qcrb : float
+        Medians [nm or kDa]; NaN where there is none.
+    over_crb : float
+        Median of σ/CRB.
+    information : float
+        Median of (QCRB/CRB)², the share of the light's information that the measurement uses.
+    """
+
+    name: str
+    events: int
+    sigma: float
+    crb: float
+    qcrb: float
+    over_crb: float
+    information: float
+
+
+def counted(table: pd.DataFrame) -> pd.DataFrame:
+    """Leave out the rows that stay in the table but are no events: side lobes of others.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        With a column ``status``.
+
+    Returns
+    -------
+    pandas.DataFrame
+        The rows that count as events.
+    """
+    return table[table["status"] != "sidelobe"]
+
+
+def is_uncalibrated(analysis: Analysis) -> bool:
+    """Tell whether masses were fitted on the model's own scale.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+
+    Returns
+    -------
+    bool
+        False also where the mass was not fitted.
+    """
+    fitted = "mass_kda" in FREE_PARAMETERS[analysis.mode]
+    return fitted and analysis.summary.get("mass_scale") != "calibration"
+
+
+def main_quantity(analysis: Analysis) -> Quantity:
+    """Choose what the headline is about.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+
+    Returns
+    -------
+    Quantity
+        The mass where it is calibrated; otherwise the contrast, or in dark field, which has none,
+        the number of scattered photons; the height where the mass was not fitted.
+    """
+    if "mass_kda" not in FREE_PARAMETERS[analysis.mode]:
+        return Quantity("z_nm", "height", "nm")
+    if not is_uncalibrated(analysis):
+        return Quantity("mass_kda", "mass", "kDa")
+    if analysis.scheme == "darkfield":
+        return Quantity("n_scattered", "number of scattered photons", "")
+    return Quantity("contrast", "contrast", "")
+
+
+def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
+    """Put contrasts where the masses are: right for a scale that is proportional to the mass.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Columns `EVENT_COLUMNS`; without calibration the model's contrast is proportional to the
+        mass.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A copy in which ``mass_kda`` and its σ and bounds are contrasts.
+    """
+    per_kda = (table["contrast"] / table["mass_kda"]).abs()
+    columns = [f"{kind}_mass_kda" for kind in ("sigma", "crb", "qcrb")]
+    scaled = {name: table[name] * per_kda for name in columns}
+    return table.assign(**scaled, mass_kda=table["contrast"])
+
+
+def label_of(analysis: Analysis, name: str) -> str:
+    """Say what a parameter is called in tables and figures.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    name : str
+        As in `PARAMETERS`.
+
+    Returns
+    -------
+    str
+        ``"mass, model scale"`` where the mass is not calibrated.
+    """
+    return "mass, model scale" if name == "mass_kda" and is_uncalibrated(analysis) else LABELS[name]
+
+
+def caution(table: pd.DataFrame) -> str | None:
+    """Say that too many rows are flagged for a headline.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        With a column ``status``.
+
+    Returns
+    -------
+    str or None
+        One sentence with the commonest reason and its remedy; None where `MOST_FLAGGED` or fewer
+        are flagged.
+    """
+    table = counted(table)
+    flagged = table["status"][table["status"] != Status.OK.value]
+    if len(flagged) <= MOST_FLAGGED * len(table):
+        return None
+    commonest = Status(flagged.mode().iloc[0])
+    return (
+        f"{len(flagged)} of {count(len(table), 'row')} are flagged, so no median is given: the "
+        f"rest is no fair sample. The commonest reason is {commonest.value}. {commonest.advice}"
+    )
+
+
+def precision_of(table: pd.DataFrame, name: str) -> Precision:
+    """Set the spread of one parameter beside its bounds.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Columns `EVENT_COLUMNS`.
+    name : str
+        As in `PARAMETERS`.
+
+    Returns
+    -------
+    Precision
+        Over the rows whose status is ok; NaN where nothing is known.
+    """
+    good = table[table["status"] == Status.OK.value]
+    sigma, crb, qcrb = (good[f"{kind}_{name}"].to_numpy(float) for kind in ("sigma", "crb", "qcrb"))
+    usable = np.isfinite(sigma) & np.isfinite(crb) & (crb > 0)
+    sigma, crb, qcrb = sigma[usable], crb[usable], qcrb[usable]
+    return Precision(
+        name,
+        int(usable.sum()),
+        quantiles(sigma)[1],
+        quantiles(crb)[1],
+        quantiles(qcrb)[1],
+        quantiles(sigma / crb)[1],
+        quantiles((qcrb / crb) ** 2)[1],
+    )
+
+
+def quantiles(values: FloatArray) -> tuple[float, float, float]:
+    """Give the quartiles of what is finite.
+
+    Parameters
+    ----------
+    values : ndarray
+        Any shape.
+
+    Returns
+    -------
+    tuple of three floats
+        25, 50 and 75 %; NaN where nothing is finite.
+    """
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return math.nan, math.nan, math.nan
+    low, middle, high = np.quantile(finite, [0.25, 0.5, 0.75])
+    return float(low), float(middle), float(high)
+
+
+def sizes(analysis: Analysis, table: pd.DataFrame) -> FloatArray:
+    """Give the magnitudes of the main quantity over the rows that are ok.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    table : pandas.DataFrame
+        Its table.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Finite; particles that leave count by their magnitude.
+    """
+    good = table["status"] == Status.OK.value
+    values = np.abs(table[main_quantity(analysis).column][good].to_numpy(float))
+    return np.asarray(values[np.isfinite(values)])
+
+
+def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
+    """Say in two or three sentences what was found.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    table : pandas.DataFrame
+        Its table.
+
+    Returns
+    -------
+    list of str
+        A warning first where one is due.
+    """
+    table = counted(table)
+    if table.empty:
+        return [
+            "Nothing was found in this movie that stands out from its noise. If particles can be "
+            "seen by eye, look at the field image and the laser power below, then at "
+            "detection.polarity, detection.false_alarms_per_movie and the two frame ranges."
+        ]
+    warned = [NOT_A_MASS] if is_uncalibrated(analysis) else []
+    if (flagged := caution(table)) is not None:
+        return [flagged, *warned]
+    good = int((table["status"] == Status.OK.value).sum())
+    kind = "fitted position" if analysis.mode == "track" else "event"
+    text = f"{count(len(table), kind)}, {good if good < len(table) else 'all'} of them ok."
+    if len(table) == 1:
+        text = f"One {kind}, and it is ok."
+    main, values = main_quantity(analysis), sizes(analysis, table)
+    if values.size > 1:
+        low, middle, high = quantiles(values)
+        text += (
+            f" Median {main.label} {_with_unit(middle, main)}, middle half {number(low)} to "
+            f"{_with_unit(high, main)}."
+        )
+    return [text, *_spread(analysis, table), *warned]
+
+
+def _with_unit(value: float, main: Quantity) -> str:
+    return f"{number(value)} {main.unit}".rstrip()
+
+
+def _spread(analysis: Analysis, table: pd.DataFrame) -> list[str]:
+    """Set the spread of the mass, or else of the height, beside the bounds."""
+    free = FREE_PARAMETERS[analysis.mode]
+    name = "mass_kda" if "mass_kda" in free else "z_nm"
+    p = precision_of(table, name)
+    if not p.events:
+        return []
+    text = f"The spread of {LABELS[name]} is {number(p.sigma)} {UNITS[name]}"
+    if is_uncalibrated(analysis):
+        text = "The spread of the contrast"
+        good = table[table["status"] == Status.OK.value]
+        relative = (good["sigma_mass_kda"] / good["mass_kda"].abs()).to_numpy(float)
+        text += f" is {percent(quantiles(relative)[1])} of it"
+    text += f", {number(p.over_crb)} times the Cramér–Rao bound"
+    if math.isfinite(p.information):
+        text += f"; {percent(p.information)} of the information in the light is used"
+    return [f"{text}."]
+
+
+def precision_rows(analysis: Analysis, precision: Sequence[Precision]) -> list[list[str]]:
+    """Write the table of precisions.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    precision : sequence of Precision
+        One of each free parameter.
+
+    Returns
+    -------
+    list of list of str
+        Parameter, σ, CRB, QCRB, σ over CRB, light used, rows.
+    """
+    return [
+        [
+            f"{label_of(analysis, p.name)} [{UNITS[p.name]}]",
+            *(number(value) for value in (p.sigma, p.crb, p.qcrb, p.over_crb)),
+            percent(p.information),
+            str(p.events),
+        ]
+        for p in precision
+    ]

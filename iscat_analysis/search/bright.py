@@ -1,0 +1,358 @@
+"""Bright steps of any shape: where the contrast changes by more than noise, whatever it looks like.
+
+No picture of a particle is needed.  At every boundary between blocks the squared contrast over its
+variance, less one, is averaged over a spot of the size of the diffraction limit; noise averages to
+zero there and a step does not.  It takes a step some three times brighter than a matched filter
+needs, and it finds it with a microscope of which nothing is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, maximum_filter
+
+from iscat_analysis.records import BoolArray, FloatArray, Mapper
+from iscat_analysis.search.sliding import STRIDES, Chunk, locate_step
+
+THRESHOLD = 7.0
+"""Excess of the smoothed energy over its noise; the noise of a movie of 10⁸ pixels stays below."""
+
+ALONE_NM = 3500.0
+"""Nothing else may happen nearer than this to a step while its frames are summed."""
+
+LEAST_FRAMES = 8
+"""Frames on either side without which a step is left out."""
+
+CONSTANT_P = 1e-3
+"""A step whose height changes before or after it, with less than this chance, is left out."""
+
+_SPOT = 1.0  # standard deviation of the spot over λ/NA
+_SHADOW_NM = 1500.0  # a weaker maximum nearer than this to a stronger one is part of it
+_OTHERS_NM = 1700.0  # side of the region around a neighbour
+_CORE_NM = 900.0  # radius that dates a step
+
+
+@dataclass(frozen=True)
+class BrightStep:
+    """One bright step, summed before and after.
+
+    Attributes
+    ----------
+    frame : int
+        First frame of the new state.
+    x_px, y_px : float
+        Centre of its energy, to about a pixel.
+    snr : float
+        Root of the χ² that its picture has in excess of noise.
+    rows, columns : (int, int)
+        Its region of the field, half-open.
+    before_e, after_e : ndarray, shape (ny, nx)
+        Summed photoelectrons [e].
+    frames_before, frames_after : (int, int)
+        Frames in each sum, half-open.
+    n_before, n_after : int
+        The good ones among them.
+    power_ratio : float
+        Power after over power before.
+    usable : ndarray of bool, shape (ny, nx)
+        Pixels that are neither defective nor saturated.
+    read_variance_e2 : ndarray, shape (ny, nx)
+        Of one frame [e²].
+    """
+
+    frame: int
+    x_px: float
+    y_px: float
+    snr: float
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+    before_e: FloatArray
+    after_e: FloatArray
+    frames_before: tuple[int, int]
+    frames_after: tuple[int, int]
+    n_before: int
+    n_after: int
+    power_ratio: float
+    usable: BoolArray
+    read_variance_e2: FloatArray
+
+
+@dataclass(frozen=True)
+class _Spot:
+    """A maximum of the energy."""
+
+    frame: int
+    row: int
+    column: int
+
+
+def find_bright_steps(
+    chunk: Chunk,
+    window: int,
+    *,
+    pixel_nm: float,
+    resolution_nm: float,
+    roi_px: int,
+    most: int,
+    mapper: Mapper = map,
+) -> tuple[tuple[BrightStep, ...], tuple[BrightStep, ...]]:
+    """Bright steps that stand alone, and all of them, brightest first.
+
+    Parameters
+    ----------
+    chunk : Chunk
+        The frames, with `STRIDES` blocks to a window.
+    window : int
+        Frames before a step, and after it, at most.
+    pixel_nm : float
+        Pixel side [nm].
+    resolution_nm : float
+        λ/NA, roughly [nm].
+    roi_px : int
+        Side of the region that is cut out.
+    most : int
+        Steps that are returned at most.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    alone : tuple of BrightStep
+        Each with nothing else within `ALONE_NM` in the frames summed.
+    others : tuple of BrightStep
+        Every step with nothing else at its own place, in the middle of its region: what the rings
+        in the pictures of the first come from.
+    """
+    spots = _spots(chunk, _SPOT * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, mapper)
+    cut = list(
+        mapper(
+            lambda s: _cut(chunk, s, spots, window, pixel_nm, roi_px, ALONE_NM), spots[: 4 * most]
+        )
+    )
+    alone = sorted((step for step in cut if step), key=lambda step: -step.snr)[:most]
+    small = max(5, round(_OTHERS_NM / pixel_nm))
+    rest = mapper(lambda s: _cut(chunk, s, spots, window, pixel_nm, small, _SHADOW_NM), spots)
+    return tuple(alone), tuple(step for step in rest if step)
+
+
+def _spots(chunk: Chunk, spot_px: float, shadow_px: float, mapper: Mapper) -> list[_Spot]:
+    """Maxima of the energy in time and space, brightest first."""
+    count = chunk.edges.size - 2
+    power = np.add.reduceat(chunk.power, chunk.edges[:-1])
+    frames = np.diff(chunk.edges)
+    read = chunk.camera.read_variance_e2(chunk.shape)
+    used = chunk.usable
+
+    def one(j: int) -> FloatArray:
+        low, middle, high = max(j + 1 - STRIDES, 0), j + 1, min(j + 1 + STRIDES, count + 1)
+        ratio = power[middle:high].sum() / max(power[low:middle].sum(), 1e-300)
+        before = chunk.blocks_e[low:middle].sum(axis=0)
+        after = chunk.blocks_e[middle:high].sum(axis=0)
+        if not 0 < ratio < 1e6:
+            return np.zeros(chunk.shape, dtype=np.float32)
+        lit = used & (before > 0) & (after > 0)
+        change = after - ratio * before
+        change -= before * (change[lit].sum() / before[lit].sum())
+        variance = after + ratio**2 * before
+        variance += read * (frames[middle:high].sum() + ratio**2 * frames[low:middle].sum())
+        return energy_of(change, variance, lit, spot_px)
+
+    energy = np.stack(list(mapper(one, range(count))))
+    return [
+        _Spot(chunk.first + int(chunk.edges[k + 1]), i, j) for k, i, j in _maxima(energy, shadow_px)
+    ]
+
+
+def energy_of(
+    change: FloatArray, variance: FloatArray, used: BoolArray, spot_px: float
+) -> FloatArray:
+    """Smoothed energy of a change of the image, in standard deviations of its noise.
+
+    Parameters
+    ----------
+    change, variance : ndarray, shape (y, x)
+        The change and the variance of its noise, in any unit and its square.
+    used : ndarray of bool, shape (y, x)
+        Pixels to use.
+    spot_px : float
+        Standard deviation of the smoothing [pixels].
+
+    Returns
+    -------
+    ndarray of float32, shape (y, x)
+        About 0 where there is only noise.
+    """
+    excess = np.where(used, change**2 / np.where(used, variance, 1.0) - 1, 0.0)
+    coverage = np.maximum(gaussian_filter(used.astype(float), spot_px), 1e-3)
+    noise = math.sqrt(2 / (4 * math.pi * spot_px**2))
+    return np.asarray(gaussian_filter(excess, spot_px) / coverage / noise, dtype=np.float32)
+
+
+def find_bright_places(
+    energy: FloatArray, *, pixel_nm: float, alone_nm: float, roi_px: int
+) -> list[tuple[int, int]]:
+    """Places where a single map of the energy has a maximum with no other near.
+
+    Parameters
+    ----------
+    energy : ndarray, shape (y, x)
+        From `energy_of`.
+    pixel_nm : float
+        Pixel side [nm].
+    alone_nm : float
+        Distance within which there is no other [nm].
+    roi_px : int
+        Side of the region that must lie inside the field.
+
+    Returns
+    -------
+    list of (int, int)
+        Row and column, brightest first.
+    """
+    found = [(i, j) for _, i, j in _maxima(energy[None], _SHADOW_NM / pixel_nm)]
+    room = roi_px // 2 + 1
+    return [
+        (i, j)
+        for i, j in found
+        if room <= i < energy.shape[0] - room
+        and room <= j < energy.shape[1] - room
+        and sum(math.hypot(i - k, j - m) * pixel_nm < alone_nm for k, m in found) <= 1
+    ]
+
+
+def _maxima(energy: FloatArray, shadow_px: float) -> list[tuple[int, int, int]]:
+    """Maxima of a stack of maps, brightest first, without what belongs to a brighter one."""
+    peaks = (energy > THRESHOLD) & (energy == maximum_filter(energy, size=(3, 5, 5)))
+    order = np.argsort(-energy[peaks], kind="stable")
+    taken: list[tuple[int, int, int]] = []
+    for k, i, j in np.argwhere(peaks)[order]:
+        if not any(
+            abs(k - kk) < 2 * STRIDES and math.hypot(i - ii, j - jj) < shadow_px
+            for kk, ii, jj in taken
+        ):
+            taken.append((int(k), int(i), int(j)))
+    return taken
+
+
+def _cut(
+    chunk: Chunk,
+    spot: _Spot,
+    spots: Sequence[_Spot],
+    window: int,
+    pixel_nm: float,
+    roi_px: int,
+    alone_nm: float,
+) -> BrightStep | None:
+    """Date a step and sum the frames around it in which nothing else happens; None if too few."""
+    low, high = max(chunk.first, spot.frame - window), min(chunk.stop, spot.frame + window)
+    margin = max(1, window // (2 * STRIDES)) + 1  # a spot's frame is known to half a block
+    for other in spots:
+        if other is spot or _distance(other, spot) * pixel_nm > alone_nm:
+            continue
+        if other.frame <= spot.frame:
+            low = max(low, other.frame + margin)
+        if other.frame >= spot.frame:
+            high = min(high, other.frame - margin)
+    row, column = spot.row, spot.column
+    step: BrightStep | None = None
+    frame = spot.frame
+    for gap in (0, None, None):  # roughly, then dated with its own picture and centred
+        rows, columns = _region(row, roi_px), _region(column, roi_px)
+        if min(rows[0], columns[0]) < 0 or rows[1] > chunk.shape[0] or columns[1] > chunk.shape[1]:
+            return None
+        patch = chunk.patch(low, high, rows, columns)
+        if gap is None and step is not None:
+            dated = locate_step(patch, _core(step, pixel_nm), (low + 1, high))
+            if dated.p_constant < CONSTANT_P:
+                return None
+            frame, gap = dated.frame, dated.gap
+        if min(frame - (gap or 0) - low, high - frame - (gap or 0)) < LEAST_FRAMES:
+            return None
+        before, n_before, power_before = patch.window(low, frame - (gap or 0))
+        after, n_after, power_after = patch.window(frame + (gap or 0), high)
+        if min(n_before, n_after) < LEAST_FRAMES:
+            return None
+        step = BrightStep(
+            frame=frame, x_px=column, y_px=row, snr=0.0, rows=rows, columns=columns,
+            before_e=before, after_e=after, frames_before=(low, frame - (gap or 0)),
+            frames_after=(frame + (gap or 0), high), n_before=n_before, n_after=n_after,
+            power_ratio=power_after / power_before, usable=patch.usable,
+            read_variance_e2=np.full(before.shape, np.square(patch.read_noise_e)),
+        )  # fmt: skip
+        y_px, x_px, snr = centre_of_energy(*measured_contrast(step), pixel_nm)
+        step = replace(step, y_px=y_px + rows[0], x_px=x_px + columns[0], snr=snr)
+        row, column = round(step.y_px), round(step.x_px)
+    return step
+
+
+def _distance(one: _Spot, other: _Spot) -> float:
+    return math.hypot(one.row - other.row, one.column - other.column)
+
+
+def _region(centre: int, side: int) -> tuple[int, int]:
+    first = centre - side // 2
+    return first, first + side
+
+
+def measured_contrast(step: BrightStep) -> tuple[FloatArray, FloatArray]:
+    """Contrast of a step, its common level taken off, and the variance of shot noise.
+
+    Parameters
+    ----------
+    step : BrightStep
+        The step.
+
+    Returns
+    -------
+    contrast, variance : ndarray, shape (ny, nx)
+        Where a pixel is not usable, 0 and a variance of 10⁶.
+    """
+    used = step.usable & (step.before_e > 0) & (step.after_e > 0)
+    before, after = np.where(used, step.before_e, 1.0), np.where(used, step.after_e, 1.0)
+    ratio = float(after[used].sum() / before[used].sum())
+    contrast = np.where(used, after / (ratio * before) - 1, 0.0)
+    return contrast, np.where(used, 1 / before + 1 / after, 1e6)
+
+
+def _core(step: BrightStep, pixel_nm: float) -> FloatArray:
+    """Give the smoothed contrast of a step around its centre, as the template that dates it."""
+    contrast, _ = measured_contrast(step)
+    y, x = np.mgrid[slice(*step.rows), slice(*step.columns)]
+    distance = np.hypot(y - step.y_px, x - step.x_px) * pixel_nm
+    return np.asarray(gaussian_filter(contrast, 0.7) * (distance < _CORE_NM))
+
+
+def centre_of_energy(
+    contrast: FloatArray, variance: FloatArray, pixel_nm: float
+) -> tuple[float, float, float]:
+    """Centre of a picture's energy, found in a shrinking neighbourhood.
+
+    Parameters
+    ----------
+    contrast, variance : ndarray, shape (ny, nx)
+        The picture, its level taken off, and the variance of its noise.
+    pixel_nm : float
+        Pixel side [nm].
+
+    Returns
+    -------
+    row, column : float
+        Where it lies, counted from the first pixel.
+    snr : float
+        Root of the χ² in excess of noise.
+    """
+    energy = np.maximum(gaussian_filter(contrast**2 / variance - 1, 0.7), 0.0)
+    y, x = np.mgrid[: contrast.shape[0], : contrast.shape[1]]
+    row, column = (contrast.shape[0] - 1) / 2, (contrast.shape[1] - 1) / 2
+    for reach_nm in (900.0, 700.0, 600.0, 500.0):
+        weight = energy * (np.hypot(y - row, x - column) * pixel_nm < reach_nm)
+        total = float(weight.sum())
+        if total <= 0:
+            break
+        row, column = float((weight * y).sum()) / total, float((weight * x).sum()) / total
+    excess = float(np.sum(contrast**2 / variance) - contrast.size)
+    return row, column, math.sqrt(max(excess, 0.0))

@@ -1,0 +1,132 @@
+"""The microscope is learned within its stated errors, or refused with the reason."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from calibrations import configuration, make_sights
+
+from iscat_analysis.calibration.optics import Measured, maximise, settings_of
+from iscat_analysis.calibration.optics.estimate import optics_limits
+from iscat_analysis.calibration.optics.measure import HELD_OUT_P, _Search, measure_microscope
+from iscat_analysis.config import Config
+from iscat_analysis.errors import DataError
+from iscat_analysis.pipeline.microscope import calibrate_sights, goodness
+
+SIGMAS = 4.0
+"""A parameter farther from the truth than this many standard errors is wrong: 6e-5 by chance."""
+
+ROUND = ("focus", "na", "phase", "zernike")
+
+
+def _measure(
+    changes: dict[str, Any],
+    count: int,
+    seed: int,
+    *,
+    free: tuple[str, ...] = ROUND,
+    config: Config | None = None,
+    **light: Any,
+) -> Measured:
+    config = configuration() if config is None else config
+    sights, _, build = make_sights(changes, count, seed=seed, config=config, **light)
+    return measure_microscope(
+        sights,
+        settings_of(config),
+        build,
+        lambda sight, settings: goodness(sight, build(settings)),
+        free=free,
+        limits=optics_limits(1.515, 1.515),
+        side=-1,
+        landing=1,
+    )
+
+
+def _pulls(found: Measured, changes: dict[str, Any], config: Config | None = None) -> np.ndarray:  # type: ignore[type-arg]
+    truth = {**settings_of(configuration() if config is None else config), **changes}
+    sigma = np.sqrt(np.diag(found.estimate.covariance))
+    names = found.estimate.names
+    return np.array([(found.settings[n] - truth[n]) / s for n, s in zip(names, sigma, strict=True)])
+
+
+MICROSCOPES = {
+    "spherical aberration": {"z11": 20.0},
+    "coma, another focus and phase": {"z7": 25.0, "focus_nm": -400.0, "reference_phase_deg": 15.0},
+}
+
+
+@pytest.mark.parametrize("name", MICROSCOPES)
+def test_parameters_lie_within_their_errors(name: str) -> None:
+    changes = MICROSCOPES[name]
+    found = _measure(changes, 24, seed=11)
+    assert not found.refusals
+    assert found.configured.uniform_p < HELD_OUT_P
+    assert np.abs(_pulls(found, changes)).max() < SIGMAS
+    assert {n for n in changes if n[0] != "z"} <= set(found.estimate.names)
+
+
+def test_circular_light_and_a_mask_are_recognised() -> None:
+    changes = {"polarization": "circular", "mask_na": 0.6}
+    found = _measure(changes, 18, seed=12, free=("focus", "phase", "mask", "polarization"))
+    assert not found.refusals
+    assert found.settings["polarization"] == "circular"
+    assert np.abs(_pulls(found, changes)).max() < SIGMAS
+
+
+def test_a_good_configuration_stays() -> None:
+    found = _measure({}, 24, seed=13)
+    assert found.configured.good
+    assert not found.refusals
+    assert np.abs(_pulls(found, {})).max() < SIGMAS
+
+
+def test_what_may_not_change_is_missed() -> None:
+    """Control: without the aberration that the pictures have, they are not described."""
+    found = _measure({"z11": 20.0}, 24, seed=14, free=("focus", "phase"))
+    assert found.refusals
+    assert "not fitted" in found.refusals[0]
+
+
+def test_weak_particles_below_the_critical_angle_have_a_twin() -> None:
+    config = configuration(na=1.2)
+    changes = {"z5": 8.0, "focus_nm": -350.0, "reference_phase_deg": 20.0}
+    weak = {"photons": 4e7, "masses_kda": (300.0, 600.0)}
+    found = _measure(changes, 18, 15, config=config, free=("focus", "phase", "zernike"), **weak)
+    assert found.twin is not None
+    assert found.settings["focus_nm"] < 0 < found.twin.settings["focus_nm"]
+    assert np.abs(_pulls(found, changes, config)).max() < SIGMAS
+
+
+def test_light_beyond_the_critical_angle_rules_the_twin_out() -> None:
+    found = _measure({"focus_nm": -350.0}, 18, seed=16, free=("focus", "phase", "zernike"))
+    assert found.twin is None
+
+
+def test_too_few_particles_are_refused_with_what_to_record() -> None:
+    sights, _, _ = make_sights({}, 8, seed=17, masses_kda=(300.0,))
+    with pytest.raises(DataError, match=r"8 bright particles.*12 are needed.*record more"):
+        calibrate_sights(
+            sights, (), configuration(), ROUND, {"movie": "faint.tif"}, given_focus=True
+        )
+
+
+def test_what_the_pictures_do_not_tell_is_held() -> None:
+    """Particles far below the noise do not tell an aperture to 0.05: it is named and held."""
+    _, truth, build = make_sights({}, 14, seed=18, photons=150.0)
+    configured = settings_of(configuration())
+    names = ("focus_nm", "na", "reference_phase_deg", "z11")
+    rough = maximise(truth, build, configured, names, passes=1)
+    search = _Search(configured, build, _never, ROUND, {}, -1, 1, map)
+    found, held = search._identified(rough)
+    assert held
+    for name in held:
+        assert found.values[name] == configured[name]
+        assert name not in found.names
+    bright = maximise(make_sights({}, 14, seed=18)[1], build, configured, names, passes=1)
+    assert not search._identified(bright)[1]
+
+
+def _never(_sight: Any, _settings: Any) -> tuple[float, float]:
+    raise AssertionError

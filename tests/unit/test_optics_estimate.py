@@ -1,0 +1,154 @@
+"""The joint estimator against plain differences, plain inverses, and known shifts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibrations import GRID, configuration, make_sights, microscope
+
+from iscat_analysis._kernels.scoring import CONDITIONAL, POISSON
+from iscat_analysis.calibration.optics import (
+    Sight,
+    free_groups,
+    maximise,
+    optics_limits,
+    settings_of,
+    with_settings,
+)
+from iscat_analysis.calibration.optics.estimate import _Point, pixel_terms
+from iscat_analysis.calibration.optics.starts import average_sights, search_starts
+from iscat_analysis.config import config_to_toml, parse_config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.likelihood import Likelihood
+
+NAMES = ("focus_nm", "na", "reference_phase_deg", "z7", "z11")
+
+
+@pytest.mark.parametrize("kind", [CONDITIONAL, POISSON])
+def test_pixel_terms_are_derivatives(kind: int) -> None:
+    random = np.random.default_rng(3)
+    signal = random.normal(0, 0.05, (6, 7))
+    data = np.ones((4, 6, 7))
+    data[0] = random.poisson(900, (6, 7))
+    if kind == CONDITIONAL:
+        data[1], data[2], data[3] = data[0] + random.poisson(1000, (6, 7)), 0.9, 0.97
+    else:
+        data[1], data[2], data[3] = 880.0, 880.0, 4.0
+    _, score, _, by_signal, by_level = pixel_terms(kind, data, signal, 0.02)
+
+    def value(change: np.ndarray, level: float) -> float:  # type: ignore[type-arg]
+        return pixel_terms(kind, data, signal + change, level)[0]
+
+    step = 1e-5
+    push = np.zeros(signal.shape)
+    push[2, 3] = step
+    slope = (value(push, 0.02) - value(-push, 0.02)) / (2 * step)
+    assert slope == pytest.approx(float((score * by_signal)[2, 3]), rel=1e-6)
+    nothing = np.zeros(signal.shape)
+    slope = (value(nothing, 0.02 + step) - value(nothing, 0.02 - step)) / (2 * step)
+    assert slope == pytest.approx(float((score * by_level).sum()), rel=1e-5)
+
+
+def test_value_is_that_of_the_likelihood_of_fits() -> None:
+    sights, _, build = make_sights({}, 2, seed=4)
+    settings = settings_of(configuration())
+    model = build(settings)
+    for sight in sights:
+        likelihood = Likelihood(model, sight.grid, sight.kind, sight.data)
+        theta = np.array([sight.x_nm, sight.y_nm, sight.z_nm, 5000.0, 0.01])
+        place = (sight.grid, sight.x_nm, sight.y_nm, sight.z_nm, 5000.0)
+        mine = pixel_terms(sight.kind, sight.data, model.gradient(*place)[0], 0.01)[0]
+        assert mine == pytest.approx(likelihood.values(theta[None])[0], rel=1e-9)
+
+
+def test_private_unknowns_are_eliminated_exactly() -> None:
+    """The reduced information is the inverse of the shared block of the whole inverse."""
+    sights, _, build = make_sights({"z11": 8.0}, 3, seed=5)
+    settings = settings_of(configuration())
+    private = np.array([sight.private for sight in sights])
+    private[:, 2] = 6000.0
+    at = _Point.evaluate(sights, build, settings, NAMES, private, map)
+    k, n = len(NAMES), len(sights)
+    whole = np.zeros((k + 4 * n, k + 4 * n))
+    whole[:k, :k] = at.fisher[:, :k, :k].sum(axis=0)
+    for e in range(n):
+        own = slice(k + 4 * e, k + 4 * (e + 1))
+        whole[:k, own] = at.fisher[e, :k, k:]
+        whole[own, :k] = at.fisher[e, k:, :k]
+        whole[own, own] = at.fisher[e, k:, k:]
+    scale = 1 / np.sqrt(np.diag(whole))
+    inverse = np.linalg.inv(whole * np.outer(scale, scale)) * np.outer(scale, scale)
+    reduced = np.linalg.inv(at.reduced(0.0)[0])
+    np.testing.assert_allclose(reduced, inverse[:k, :k], rtol=1e-6)
+
+
+def test_score_is_the_slope_of_the_joint_likelihood() -> None:
+    sights, _, build = make_sights({"z11": 8.0}, 2, seed=6)
+    settings = {**settings_of(configuration()), "z7": 3.0}
+    private = np.array([sight.private for sight in sights])
+    private[:, 2] = 6000.0
+
+    def at(name: str, change: float) -> _Point:
+        moved = {**settings, name: settings[name] + change}
+        return _Point.evaluate(sights, build, moved, NAMES, private, map)
+
+    middle = at("z7", 0.0)
+    for index, name in enumerate(NAMES):
+        step = {"na": 1e-5}.get(name, 1e-2)
+        slope = (at(name, step).value - at(name, -step).value) / (2 * step)
+        assert slope == pytest.approx(middle.score[:, index].sum(), rel=2e-4), name
+
+
+def test_the_average_of_shifted_pictures() -> None:
+    sights, truth, _ = make_sights({}, 6, seed=7)
+    jolted = [replace(s, x_nm=s.x_nm + 90.0, y_nm=s.y_nm - 60.0) for s in sights]
+    (average,), placed = average_sights(jolted)
+    assert average.grid.shape == GRID.shape
+    found = np.array([(s.x_nm, s.y_nm) for s in placed])
+    true = np.array([(s.x_nm, s.y_nm) for s in truth])
+    apart = found - true
+    assert np.ptp(apart, axis=0).max() < 15.0  # one shift is common to all
+
+
+def test_every_focus_is_tried() -> None:
+    """A start 600 nm from the truth is not needed: the coarse search finds its neighbourhood."""
+    sights, _, build = make_sights({"focus_nm": 310.0, "reference_phase_deg": 40.0}, 6, seed=8)
+    averages, _ = average_sights(sights)
+    now = settings_of(configuration())
+    candidates = [{**now, "focus_nm": f} for f in np.arange(-1000.0, 1000.0, 80.0)]
+    best = search_starts(averages, build, candidates, most=2)[0]
+    assert abs(best.values["focus_nm"] - 310.0) <= 80.0
+
+
+def test_free_groups() -> None:
+    assert free_groups("na, focus") == ("focus", "na")
+    assert "zernike" in free_groups(None)
+    with pytest.raises(ConfigError, match="phase, mask"):
+        free_groups("focus,zernikes")
+
+
+def test_settings_go_into_a_configuration_and_back() -> None:
+    config = configuration(na=1.3, aberrations_nm={"z11": 4.0, "z14": 2.0})
+    settings = settings_of(config)
+    assert settings["z14"] == 2.0
+    changed = with_settings(config, {**settings, "z11": 0.0, "z7": -5.0, "focus_nm": 12.0})
+    assert changed.optics.aberrations_nm == {"z7": -5.0, "z14": 2.0}
+    assert parse_config(_values(changed)).optics == changed.optics
+
+
+def _values(config):  # type: ignore[no-untyped-def]
+    import tomllib
+
+    return tomllib.loads(config_to_toml(config))
+
+
+def test_limits_hold() -> None:
+    """Pictures of a wider aperture than the limit allows end at it, not beyond."""
+    sights, truth, build = make_sights({"na": 1.44}, 4, seed=9)
+    limits = {**optics_limits(1.515, 1.515), "na": (1.3, 1.43)}
+    found = maximise(truth, build, settings_of(configuration()), ("na",), limits=limits, passes=15)
+    assert found.values["na"] == 1.43
+    assert isinstance(sights[0], Sight)
+    assert microscope(configuration(), {}) is not None
