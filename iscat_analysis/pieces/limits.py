@@ -119,7 +119,7 @@ def crb(
         )  # fmt: skip
         bounds = event_bounds(likelihood, at.theta, free, at.collected, level=level)
         out[(slice(None), *place)] = (bounds.crb_joint if joint else bounds.crb_single)[index]
-    return dict(zip(free, out, strict=True))
+    return {name: np.asarray(values) for name, values in zip(free, out, strict=True)}
 
 
 def qcrb(
@@ -203,7 +203,7 @@ def qcrb(
         step = abs(at.theta[3] * at.model.scale.slope(float(at.theta[3])))  # mass per unit of ln a
         units = np.where(np.array(index) == PARAMETERS.index("mass_kda"), step, 1.0)
         out[(slice(None), *place)] = bound * units / math.sqrt(at.collected)
-    return dict(zip(free, out, strict=True))
+    return {name: np.asarray(values) for name, values in zip(free, out, strict=True)}
 
 
 @dataclass(frozen=True)
