@@ -99,9 +99,9 @@ SEVERITY = (
     Status.TOO_CLOSE,
     Status.SATURATED,
 )
-"""What is remarked on a fit, worst first: perhaps no particle; no estimate; none inside the bounds; a
-model that does not describe the data; one of several heights; a mass shared with a neighbour; pixels
-left out."""
+"""What is remarked on a fit, worst first: perhaps no particle; no estimate; none inside the bounds;
+a model that does not describe the data; one of several heights; a mass shared with a neighbour;
+pixels left out."""
 
 
 def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
