@@ -66,6 +66,7 @@ class Status(StrEnum):
     POOR_FIT = "poor_fit"
     TOO_CLOSE = "too_close"
     SATURATED = "saturated"
+    SIDELOBE = "sidelobe"
 
     @property
     def advice(self) -> str:
@@ -83,11 +84,14 @@ _ADVICE = {
     Status.POOR_FIT: "The model does not describe the data: check focus, NA, gain and neighbours.",
     Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
     "treat the mass as shared between them.",
+    Status.SIDELOBE: "Not larger than what the model leaves over of a brighter particle beside it, "
+    "and not counted: check focus, NA and aberrations to tell whether it is a particle.",
     Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
 }
 
 
 SEVERITY = (
+    Status.SIDELOBE,
     Status.NOT_CONVERGED,
     Status.AT_BOUND,
     Status.POOR_FIT,
@@ -95,8 +99,9 @@ SEVERITY = (
     Status.TOO_CLOSE,
     Status.SATURATED,
 )
-"""What is remarked on a fit, worst first: no estimate; none inside the bounds; a model that does
-not describe the data; one of several heights; a mass shared with a neighbour; pixels left out."""
+"""What is remarked on a fit, worst first: perhaps no particle; no estimate; none inside the bounds;
+a model that does not describe the data; one of several heights; a mass shared with a neighbour;
+pixels left out."""
 
 
 def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
@@ -211,6 +216,8 @@ class Candidate:
         Linear estimate of the mass [kDa]; negative where the contrast has the other sign.
     snr : float
         Matched-filter signal over its noise.
+    beside : float
+        Height of the ratio elsewhere at its distance from a known particle; the largest of them.
     """
 
     x_px: float
@@ -218,6 +225,7 @@ class Candidate:
     z_nm: float
     mass_kda: float
     snr: float
+    beside: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,12 @@ from iscat_analysis.movie.background import measure_windows
 from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts, refuse_ratio
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pipeline.diagnosis import (
-    camera_warnings,
+    EXCESS_NOISE,
     drift_warning,
     examine_background,
+    judge_gain,
+    misfit_warning,
+    pixel_warnings,
 )
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.landing import analyse_landings, has_landings, inject_and_recover
@@ -308,7 +311,10 @@ def _measured_background(
         check=check,
         progress=progress,
     )
-    for text in camera_warnings(movie, camera, windows):
+    gain = judge_gain(movie, camera, windows)
+    if gain is not None and gain.message:
+        tell(gain.message)
+    for text in pixel_warnings(windows):
         tell(text)
     if not scene.additive:
         further["background"] = examine_background(movie, camera, windows)
@@ -322,7 +328,11 @@ def _measured_background(
                 scene, movie, camera, windows, check=check, pool=pool, progress=progress
             )
         else:
-            found = _bound_particles(scene, windows, clock, pool=pool, progress=progress)
+            noisy = gain is not None and gain.noise_ratio > EXCESS_NOISE
+            excess = (gain.message or "") if gain is not None and noisy else ""
+            found = _bound_particles(
+                scene, windows, clock, excess_noise=excess, tell=tell, pool=pool, progress=progress
+            )
     windows = found.windows
     image = field_likelihood(scene, windows).measured_signal()
     if scene.additive:
@@ -336,12 +346,19 @@ def _bound_particles(
     windows: Windows,
     clock: _Clock,
     *,
+    excess_noise: str,
+    tell: Notify,
     pool: ThreadPoolExecutor,
     progress: Progress,
 ) -> Found:
     """Find, fit and sample the particles that bound between the two windows."""
-    events, windows = fit_field(scene, windows, pool=pool, progress=progress)
+    events, windows = fit_field(
+        scene, windows, excess_noise=excess_noise, pool=pool, progress=progress
+    )
     clock.lap("fit")
+    cause = misfit_warning(scene.config, events)
+    if cause:
+        tell(cause)
     rows = [Row(number, event, windows) for number, event in enumerate(events)]
     interrupted = False
     if scene.config.samples_posterior:

@@ -17,6 +17,8 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera, check_counts
 from iscat_analysis.movie.drift import Trajectory, measure_drift
+from iscat_analysis.movie.metadata import diagnose_gain
+from iscat_analysis.pipeline.diagnosis import EXCESS_NOISE
 from iscat_analysis.pipeline.results import table_of
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import (
@@ -50,6 +52,7 @@ FRAME_COLUMN = "frame_ci95"
 _MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _PIECE_BYTES = 8 * 2**20
 _NOISE_FRAMES = 800  # on which the windows are chosen
+_GAIN_FRAMES = 64  # on which the gain is judged
 _SEAM_PX = 2.0  # two chunks' estimates of one step are nearer than this
 
 
@@ -80,7 +83,7 @@ class Reader:
         self, movie: Frames, camera: Camera, first: int, last: int, room_bytes: int
     ) -> None:
         self._movie = movie
-        self._camera = camera
+        self.camera = camera
         self.first, self.last = first, last
         self.shape = (movie.shape[1], movie.shape[2])
         self.frame_bytes = math.prod(self.shape) * movie.dtype.itemsize
@@ -137,13 +140,13 @@ class Reader:
             for run in _runs(lit[piece[0] - begin : piece[1] - begin]):
                 low, high = piece[0] + run.start, piece[0] + run.stop
                 frames = self._buffer[low - start : high - start]
-                check_counts(frames, low, self.name, camera=self._camera)
+                check_counts(frames, low, self.name, camera=self.camera)
 
         for _ in mapper(read, pieces):
             pass
         ahead = 1 if begin > start else 0  # the first new frame is compared with the last old one
         part = self._buffer[begin - ahead - start : end - start]
-        light, repeats = measure_frames(part, self._camera, mapper=mapper)
+        light, repeats = measure_frames(part, self.camera, mapper=mapper)
         lit = np.isfinite(light[ahead:])
         for _ in mapper(check, pieces):
             pass
@@ -160,18 +163,18 @@ class Reader:
                 "is zero or repeats the one before it; analyse the others with fit.frames = [A, B]"
             )
         return make_chunk(
-            span[0], counts, good, light, self._camera,
+            span[0], counts, good, light, self.camera,
             stride=stride, defects=find_defects, mapper=pool.map,
         )  # fmt: skip
 
-    def noise(self, longest: int, mapper: Mapper = map) -> NoiseCurve:
-        """Noise against averaging in the first frames."""
+    def opening(self, mapper: Mapper = map) -> NDArray[Any]:
+        """Good frames among the first, on which the noise is judged."""
         stop = min(self.last, self.first + _NOISE_FRAMES)
         counts, good, _ = self.counts(self.first, stop, mapper)
         used = counts if good.all() else counts[good]
         if len(used) < 2:
             raise DataError(f"{self.name}: has no two frames that differ; export it again")
-        return measure_noise(used, self._camera, longest, mapper=mapper)
+        return used
 
 
 def _runs(flags: BoolArray) -> Iterator[slice]:
@@ -181,8 +184,30 @@ def _runs(flags: BoolArray) -> Iterator[slice]:
         yield slice(int(start), int(stop))
 
 
-def choose_windows(reader: Reader, config: Config, mapper: Mapper = map) -> tuple[NoiseCurve, int]:
-    """Choose how many frames before and after a step are summed.
+@dataclass(frozen=True)
+class Noise:
+    """What the first frames say before anything is searched.
+
+    Attributes
+    ----------
+    curve : NoiseCurve
+        Noise against averaging.
+    window : int
+        Frames before, and as many after, each step.
+    gain_message : str
+        One line where the noise does not agree with the configured gain, else empty.
+    excess : str
+        What is known of noise beyond the expected, else empty.
+    """
+
+    curve: NoiseCurve
+    window: int
+    gain_message: str
+    excess: str
+
+
+def judge_noise(reader: Reader, config: Config, mapper: Mapper = map) -> Noise:
+    """Compare the noise with the camera's, and choose how many frames around a step are summed.
 
     Parameters
     ----------
@@ -195,10 +220,13 @@ def choose_windows(reader: Reader, config: Config, mapper: Mapper = map) -> tupl
 
     Returns
     -------
-    curve : NoiseCurve
-        Noise against averaging.
-    window : int
-        Frames before, and as many after, each step.
+    Noise
+        Window, noise curve, and what is to be said of the gain.
+
+    Raises
+    ------
+    DataError
+        The movie is shorter than two windows, or holds no two frames that differ.
     """
     frames = reader.last - reader.first
     given = config.background.window_frames
@@ -213,8 +241,24 @@ def choose_windows(reader: Reader, config: Config, mapper: Mapper = map) -> tupl
             + (", or lower background.window_frames" if given else "")
             + "; or give the frames before the particles bind as background.frames = [0, N]"
         )
-    curve = reader.noise(min(given or longest_window(frames), _NOISE_FRAMES // 4), mapper)
-    return curve, given or choose_window(curve, frames)
+    opening = reader.opening(mapper)
+    longest = min(given or longest_window(frames), _NOISE_FRAMES // 4)
+    curve = measure_noise(opening, reader.camera, longest, mapper=mapper)
+    window = given or choose_window(curve, frames)
+    message, ratio = "", 1.0
+    try:
+        gain = diagnose_gain(opening[:_GAIN_FRAMES], reader.camera)
+        message, ratio = gain.message or "", gain.noise_ratio
+    except DataError:  # too dark to tell
+        pass
+    excess = message if ratio > EXCESS_NOISE else ""
+    if not excess and curve.at(window) > EXCESS_NOISE:
+        excess = (
+            f"between averages of {window} frames the noise variance is {curve.at(window):.2g} "
+            "times that of the light; look at the laser, set background.drift_correction = true, "
+            "or lower background.window_frames"
+        )
+    return Noise(curve, window, message, excess)
 
 
 def counts_budget(config: Config) -> int:
@@ -295,10 +339,10 @@ class Done:
     saturated: BoolArray
     strongest: FloatArray
     ends_e: FloatArray  # mean images of its first and last quarter
-    gain_message: str = ""
     sampled: int = field(default=0)
     stopped: bool = False  # in the middle of its chains
     trajectory: Trajectory | None = None  # of the pattern, in all frames that were read
+    cause: str = ""  # what the model probably has wrong
 
 
 class Merged:
@@ -314,14 +358,14 @@ class Merged:
         self._done: list[Done] = []
         self._strongest = np.zeros((2, *shape))
         self.sampled = 0
-        self.gain_message = ""
+        self.cause = ""
 
     def add(self, done: Done) -> None:
         """Take one more."""
         stronger = done.strongest[0] > self._strongest[0]
         self._strongest = np.where(stronger, done.strongest, self._strongest)
         self.sampled += done.sampled
-        self.gain_message = self.gain_message or done.gain_message
+        self.cause = self.cause or done.cause
         # the images are merged; holding them for every chunk would grow with the movie
         small = np.empty((2, 0, 0))
         kept = done.views if sum(len(d.views) for d in self._done) < 2 * VIEWS else ()

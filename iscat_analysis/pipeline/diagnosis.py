@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.inference.cause import likely_cause
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import follow_pattern
-from iscat_analysis.movie.metadata import diagnose_gain
-from iscat_analysis.records import Windows
+from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain
+from iscat_analysis.pipeline.field import Event
+from iscat_analysis.records import Status, Windows
 from iscat_analysis.search.sliding import measure_noise
 
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""
 
+_BRIGHTEST = 8  # isolated particles on which the model is judged
+_DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
 _GAIN_FRAMES = 64  # on which the gain is judged
 _NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
 _LONGEST = 100  # average of the noise curve
@@ -27,8 +32,12 @@ _SMALLEST_PX = 32  # side of a field in which a pattern is followed
 _SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
 
 
-def camera_warnings(movie: Stack, camera: Camera, windows: Windows) -> Iterator[str]:
-    """Say what the background frames reveal about the camera.
+EXCESS_NOISE = 1.4
+"""Noise variance over the expected from which a thousand candidates are taken for noise."""
+
+
+def judge_gain(movie: Stack, camera: Camera, windows: Windows) -> GainDiagnosis | None:
+    """Compare the noise of the background frames with the gain.
 
     Parameters
     ----------
@@ -39,20 +48,32 @@ def camera_warnings(movie: Stack, camera: Camera, windows: Windows) -> Iterator[
     windows : Windows
         The background.
 
+    Returns
+    -------
+    GainDiagnosis or None
+        None where there is no shot noise to look at.
+    """
+    if windows.n_before < 2 or not _is_lit(windows):
+        return None
+    try:
+        return diagnose_gain(_first(movie, windows, _GAIN_FRAMES), camera, masked=windows.masked)
+    except DataError:  # too dark to tell
+        return None
+
+
+def pixel_warnings(windows: Windows) -> Iterator[str]:
+    """Say which pixels are left out.
+
+    Parameters
+    ----------
+    windows : Windows
+        The background.
+
     Yields
     ------
     str
         One line each.
     """
-    if windows.n_before >= 2 and _is_lit(windows):  # else there is no shot noise to look at
-        try:
-            message = diagnose_gain(
-                _first(movie, windows, _GAIN_FRAMES), camera, masked=windows.masked
-            ).message
-        except DataError:
-            message = None  # too dark to tell
-        if message:
-            yield message
     defects = int(np.sum(windows.masked & ~windows.saturated))
     if defects:
         yield f"{defects} dead or hot pixels are left out"
@@ -134,6 +155,30 @@ def drift_warning(name: str, background: dict[str, Any]) -> str | None:
         "background and the frames after it; its edges look like particles: take background frames "
         "nearer to them (background.frames), or fewer frames (fit.frames)"
     )
+
+
+def misfit_warning(config: Config, events: Sequence[Event]) -> str:
+    """Say what is probably wrong with the model, where it misses the brightest particles.
+
+    Parameters
+    ----------
+    config : Config
+        The microscope as it is configured.
+    events : sequence of Event
+        Fitted particles.
+
+    Returns
+    -------
+    str
+        One line; empty where most of the brightest are described, or nothing stands out.
+    """
+    alone = [e for e in events if not _DISTURBED.intersection(e.fit.flags)]
+    brightest = sorted(alone, key=lambda e: -e.snr)[:_BRIGHTEST]
+    missed = [e for e in brightest if Status.POOR_FIT in e.fit.flags]
+    if 2 * len(missed) <= len(brightest):
+        return ""
+    cause = likely_cause(config, [(e.likelihood, e.fit.theta, e.fit.box.free) for e in missed])
+    return cause.message if cause else ""
 
 
 def _first(movie: Stack, windows: Windows, most: int) -> NDArray[Any]:

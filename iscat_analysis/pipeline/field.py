@@ -38,7 +38,8 @@ from iscat_analysis.records import (
     silent,
     verdict,
 )
-from iscat_analysis.search.templates import find_particles
+from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, LISTED, is_dwarfed
+from iscat_analysis.search.templates import LARGEST_IMAGE, find_particles
 
 MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""
@@ -75,6 +76,7 @@ def fit_field(
     windows: Windows,
     *,
     starts: Sequence[Candidate] = (),
+    excess_noise: str = "",
     pool: ThreadPoolExecutor,
     progress: Progress = silent,
 ) -> tuple[tuple[Event, ...], Windows]:
@@ -88,6 +90,9 @@ def fit_field(
         Sums before and after.
     starts : sequence of Candidate
         Particles known beforehand, fitted first.
+    excess_noise : str
+        What is known of noise beyond the expected; with it a search that a thousand places pass is
+        given up.
     pool : ThreadPoolExecutor
         Runs the fits; the result does not depend on its size.
     progress : Progress
@@ -101,11 +106,11 @@ def fit_field(
         With the laser power estimated anew.
     """
     events: list[Event] = []
-    fresh = list(starts)
+    fresh, doubtful = list(starts), list[Candidate]()
     for number in range(MAX_ROUNDS):
         progress("detect", number, MAX_ROUNDS)
         if number or not fresh:
-            fresh = _search(scene, windows, events)
+            fresh, doubtful = _search(scene, windows, events, excess_noise)
         if not fresh and (number or not starts):
             break
         events = _fit_all(scene, windows, [*(e.candidate for e in events), *fresh], events, pool)
@@ -117,7 +122,11 @@ def fit_field(
     kept = [e for e in events if e.snr > scene.templates.threshold and _wanted(scene, e)]
     if 0 < len(kept) < len(events):  # what is dropped must leave its neighbours' background too
         kept = _fit_all(scene, windows, [e.candidate for e in kept], kept, pool)
-    events = _judged(scene, windows, kept)
+    lobes: list[Event] = []
+    if doubtful and not starts:
+        lobes = _fit_all(scene, windows, doubtful, kept, pool, first=len(kept))
+        lobes = [e for e in lobes if e.snr > scene.templates.threshold and _wanted(scene, e)]
+    events = _judged(scene, windows, kept, lobes)
     progress("detect", MAX_ROUNDS, MAX_ROUNDS)
     return tuple(sorted(events, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
 
@@ -163,7 +172,10 @@ def _add_signal(scene: Scene, event: Event, region: Region, total: FloatArray) -
     total[inside] += scene.wide.image(grid, fit.x_nm, fit.y_nm, fit.z_nm, fit.mass_kda)
 
 
-def _search(scene: Scene, windows: Windows, events: Sequence[Event]) -> list[Candidate]:
+def _search(
+    scene: Scene, windows: Windows, events: Sequence[Event], excess_noise: str
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Find new particles, and what may be but the side lobe of a known one."""
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
     explained = total_signal(scene, shape, events)
     found = find_particles(
@@ -172,25 +184,36 @@ def _search(scene: Scene, windows: Windows, events: Sequence[Event]) -> list[Can
         search_both(scene.config.detection),
         roi_px=scene.roi_px,
         explained=explained,
+        excess_noise=excess_noise,
+        known=[(e.candidate.x_px, e.candidate.y_px) for e in events],
     )
     near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na) / scene.pixel_nm
-    return [c for c in found if all(_is_new(c, event, scene.roi_px, near) for event in events)]
+    fresh: list[Candidate] = []
+    doubtful: list[Candidate] = []
+    for candidate in found:
+        size = max(
+            (_misfit(candidate, event, scene, near) for event in events),
+            default=0.0,
+        )
+        size = max(size, EXCEEDS * candidate.beside)
+        if abs(candidate.snr) > size:
+            fresh.append(candidate)
+        elif abs(candidate.snr) > LISTED * size:
+            doubtful.append(candidate)
+    return fresh, doubtful
 
 
-def _is_new(candidate: Candidate, event: Event, roi_px: int, near_px: float) -> bool:
-    """Whether a peak is another particle than a fitted one, and not what its fit left over.
-
-    A second particle explains most of the χ² in excess around the first; the residue of a model
-    that does not suit the first is spread over many peaks.
-    """
+def _misfit(candidate: Candidate, event: Event, scene: Scene, near_px: float) -> float:
+    """Signal-to-noise ratio that a candidate must exceed not to be what a fit left over."""
     here = event.candidate
     distance = math.hypot(candidate.x_px - here.x_px, candidate.y_px - here.y_px)
     if distance <= near_px:
-        return False
-    if distance > 2 * roi_px or Status.POOR_FIT not in event.fit.flags:
-        return True
-    excess = (event.fit.chi2_reduced - 1) * event.likelihood.n_pixels
-    return candidate.snr**2 > 0.5 * excess
+        return math.inf
+    # in dark field a wrong level of the background reaches farther than the region
+    reach = (2 if scene.additive else 0.75) * scene.roi_px
+    if distance > reach or Status.POOR_FIT not in event.fit.flags:
+        return 0.0
+    return math.sqrt(EXPLAINS * max(event.fit.chi2_reduced - 1, 0.0) * event.likelihood.n_pixels)
 
 
 def _fit_all(
@@ -199,8 +222,13 @@ def _fit_all(
     candidates: Sequence[Candidate],
     events: Sequence[Event],
     pool: ThreadPoolExecutor,
+    *,
+    first: int = 0,
 ) -> list[Event]:
-    """Fit every candidate with the current `events` but itself in its background."""
+    """Fit candidates with the current `events` but itself in its background.
+
+    Candidate i is event ``first + i``, where there is one of that number.
+    """
     height = scene.config.particle.height_nm
     nominal = scene.model.material.mass_kda
     free = FREE_PARAMETERS[scene.mode]
@@ -214,7 +242,7 @@ def _fit_all(
         region = _region(scene, windows, start)
         others = np.zeros(region.shape)
         for number, event in enumerate(events):
-            if number != index:
+            if number != first + index:
                 _add_signal(scene, event, region, others)
         likelihood = region_likelihood(scene, windows, region, others)
         if likelihood.n_pixels < 0.5 * others.size:
@@ -264,15 +292,29 @@ def _without_doubles(events: Sequence[Event], scene: Scene) -> list[Event]:
     return kept
 
 
-def _judged(scene: Scene, windows: Windows, events: Sequence[Event]) -> list[Event]:
-    """Add the verdicts that need the neighbourhood: saturation and crowding."""
+def _judged(
+    scene: Scene, windows: Windows, events: Sequence[Event], lobes: Sequence[Event]
+) -> list[Event]:
+    """Add the verdicts that need the neighbourhood: saturation, crowding, side lobes."""
     judged = []
     limit = scene.config.detection.min_separation_nm
-    for event in events:
+    for number, event in enumerate((*events, *lobes)):
         x, y = event.fit.x_nm, event.fit.y_nm
         crowded = any(
             other is not event and math.hypot(other.fit.x_nm - x, other.fit.y_nm - y) < limit
             for other in events
+        )
+        brightest = max(
+            (
+                other.snr
+                for other in events
+                if math.hypot(other.fit.x_nm - x, other.fit.y_nm - y)
+                < LARGEST_IMAGE * scene.roi_px * scene.pixel_nm
+            ),
+            default=0.0,
+        )
+        lobe = number >= len(events) or is_dwarfed(
+            event.snr, event.fit.chi2_reduced, event.likelihood.n_pixels, brightest
         )
         rows, columns = np.nonzero(windows.saturated[event.region.slices])
         dx = (columns + event.region.columns[0]) * scene.pixel_nm - x
@@ -280,6 +322,7 @@ def _judged(scene: Scene, windows: Windows, events: Sequence[Event]) -> list[Eve
         burnt = bool(np.any(np.hypot(dx, dy) < _SATURATION_NM))
         status, flags = verdict([
             *event.fit.flags,
+            *([Status.SIDELOBE] if lobe else []),
             *([Status.SATURATED] if burnt else []),
             *([Status.TOO_CLOSE] if crowded else []),
         ])  # fmt: skip

@@ -23,9 +23,9 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Mover, Trajectory
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.chunks import FRAME_COLUMN, Frames
-from iscat_analysis.pipeline.neighbours import LARGEST_IMAGE
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import FloatArray, Status
+from iscat_analysis.search.templates import LARGEST_IMAGE
 
 STAY = 3
 """Windows between landing and leaving."""

@@ -26,7 +26,6 @@ from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
-from iscat_analysis.movie.metadata import diagnose_gain
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.pipeline.chunks import (
     FRAME_COLUMN,
@@ -35,29 +34,26 @@ from iscat_analysis.pipeline.chunks import (
     Frames,
     Merged,
     Reader,
-    choose_windows,
     counts_budget,
+    judge_noise,
     plan_chunks,
 )
-from iscat_analysis.pipeline.diagnosis import DRIFT_PX
+from iscat_analysis.pipeline.diagnosis import DRIFT_PX, misfit_warning
 from iscat_analysis.pipeline.injection import InjectedMovie, draw_particles, recovery
-from iscat_analysis.pipeline.neighbours import LARGEST_IMAGE
 from iscat_analysis.pipeline.pattern import follow
 from iscat_analysis.pipeline.results import Row, table_of, view_of
 from iscat_analysis.pipeline.resume import Store
 from iscat_analysis.pipeline.scene import Scene, reported_steps, search_both
 from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
-from iscat_analysis.records import EventView, FloatArray, Progress, Windows
+from iscat_analysis.records import EventView, FloatArray, Progress, Status, Windows
 from iscat_analysis.search.sliding import STRIDES, Chunk
-from iscat_analysis.search.templates import make_templates
+from iscat_analysis.search.templates import LARGEST_IMAGE, make_templates
 
 POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""
 
 JUMP = 0.1
 """Relative change of the light from one frame to the next that is reported."""
-
-_GAIN_FRAMES = 64
 
 Tell = Callable[[str], None]
 
@@ -172,7 +168,10 @@ def analyse_landings(
         )
     reader = Reader(movie, camera, first, last, counts_budget(config))
     with ThreadPoolExecutor(config.compute.workers) as pool:
-        curve, window = choose_windows(reader, config, pool.map)
+        noise = judge_noise(reader, config, pool.map)
+    curve, window = noise.curve, noise.window
+    if noise.gain_message:
+        tell(noise.gain_message)
     stride = max(1, window // STRIDES)
     count = max(math.ceil((last - first) / stride) - 1, 1)
     posterior = config.samples_posterior
@@ -191,7 +190,7 @@ def analyse_landings(
                 if done is None:
                     chunk = reader.chunk(span, stride, pool)
                     budget = POSTERIORS - merged.sampled if posterior else 0
-                    done = _analyse_chunk(scene, chunk, core, window, pool, budget)
+                    done = _analyse_chunk(scene, chunk, core, window, pool, budget, noise.excess)
                     store.save(number, done)
                 merged.add(done)
                 progress("landing", core[1] - first, last - first)
@@ -206,21 +205,21 @@ def analyse_landings(
     wanted = config.background.drift_correction
     for text in frame_warnings(movie.name, merged, light, first, window, corrected=wanted):
         tell(text)
+    if merged.cause:
+        tell(f"{movie.name}: {merged.cause}")
     if not config.background.power_normalization:
         tell(
             "background.power_normalization = false has no effect on a landing movie: each frame "
             "is weighed by its own light"
         )
-    message = merged.gain_message
-    if message:
-        tell(message)
-    found = table["mass_kda"] < 0
+    counted = table[table["status"] != Status.SIDELOBE]
+    left = counted["mass_kda"] < 0
     summary = {
         "window_frames": window,
         "stride_frames": stride,
         "boundaries_searched": count,
-        "landings": int((~found).sum()),
-        "leavings": int(found.sum()),
+        "landings": int((~left).sum()),
+        "leavings": int(left.sum()),
         "shot_noise_limited_frames": curve.shot_limited,
         "noise_frames": list(curve.frames),
         "noise_variance_over_shot": list(curve.variance_over_shot),
@@ -297,7 +296,7 @@ def inject_and_recover(
         raise KeyboardInterrupt
     return recovery(
         particles,
-        again.table,
+        again.table[again.table["status"] != Status.SIDELOBE],
         frames[1],
         result.scene.roi_px / 2,
         window,
@@ -382,10 +381,11 @@ def _analyse_chunk(
     window: int,
     pool: ThreadPoolExecutor,
     posteriors: int,
+    excess_noise: str,
 ) -> Done:
     wanted = scene.config.background.drift_correction
     trajectory = follow(chunk, pool.map) if wanted else None
-    fitter = ChunkFitter(scene, chunk, window, pool, trajectory)
+    fitter = ChunkFitter(scene, chunk, window, pool, trajectory, excess_noise=excess_noise)
     seam = max(2, window // STRIDES)
     steps = fitter.run((core[0] - seam, core[1] + seam))
     rows = list(pool.map(_row, range(len(steps)), steps))
@@ -415,10 +415,6 @@ def _analyse_chunk(
     table[FRAME_COLUMN] = [s.step.at.half_width for s in steps]
     inside = slice(core[0] - chunk.first, core[1] - chunk.first)
     light = np.where(chunk.good, chunk.power, np.nan) * float(chunk.mean_e.mean())
-    message = ""
-    used = chunk.counts[chunk.good][:_GAIN_FRAMES] if core[0] == chunk.first else chunk.counts[:0]
-    if len(used) >= 2:
-        message = diagnose_gain(used, chunk.camera, masked=~chunk.usable).message or ""
     return Done(
         core=core,
         table=table,
@@ -429,10 +425,10 @@ def _analyse_chunk(
         saturated=chunk.saturated,
         strongest=fitter.strongest,
         ends_e=_ends(chunk, inside),
-        gain_message=message,
         sampled=sampled,
         stopped=stopped,
         trajectory=trajectory,
+        cause=misfit_warning(scene.config, [s.event for s in steps]),
     )
 
 

@@ -24,9 +24,7 @@ from iscat_analysis.pipeline.pattern import MovingPattern
 from iscat_analysis.pipeline.scene import Region, Scene
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.search.sliding import Chunk, StepFrame
-
-LARGEST_IMAGE = 3.5
-"""Regions from the centre to the edge of a strong particle's image; the rings go on, faintly."""
+from iscat_analysis.search.templates import LARGEST_IMAGE
 
 _FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is enough
 WHOLE = (slice(None), slice(None))
@@ -57,6 +55,8 @@ class Step:
         Latest estimate.
     snr : float
         √(2 Δℓ) of it against no particle, with the neighbours in place.
+    excess : float
+        χ² that its best fit left above the expected; 0 where that may be noise.
     """
 
     sign: int
@@ -67,6 +67,7 @@ class Step:
     slopes: FloatArray = field(default_factory=lambda: np.empty((5, 0, 0)))
     theta: FloatArray | None = None
     snr: float = math.inf
+    excess: float = 0.0
 
 
 class Neighbours:

@@ -177,7 +177,7 @@ def summary_of(
         "emission": scene.model.optics.emission,
         "convention": scene.model.optics.convention,
         "mass_scale": "calibration" if scene.config.calibration else "absolute model",
-        "events": len(table),
+        "events": int((table["status"] != Status.SIDELOBE).sum()),
         "status": dict(sorted(Counter(table["status"]).items())),
         "frames_before": list(windows.frames_before),
         "frames_after": list(windows.frames_after),

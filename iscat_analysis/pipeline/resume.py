@@ -88,8 +88,8 @@ class Store:
                     saturated=data["saturated"],
                     strongest=data["strongest"],
                     ends_e=data["ends_e"],
-                    gain_message=str(data["gain_message"]),
                     trajectory=_trajectory(data["trajectory"]),
+                    cause=str(data["cause"]),
                 )
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
             return None  # never finished, or cut short
@@ -119,8 +119,8 @@ class Store:
                     saturated=done.saturated,
                     strongest=done.strongest,
                     ends_e=done.ends_e,
-                    gain_message=np.array(done.gain_message),
                     trajectory=_columns(done.trajectory),
+                    cause=np.array(done.cause),
                 )
             building.replace(path)
         except OSError:

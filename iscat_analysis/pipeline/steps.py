@@ -19,7 +19,6 @@ from iscat_analysis.inference.fit import POOR_FIT_P, fit_particle, search_box, s
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pipeline.field import Event
 from iscat_analysis.pipeline.neighbours import (
-    LARGEST_IMAGE,
     Neighbours,
     Step,
     distance_px,
@@ -37,6 +36,14 @@ from iscat_analysis.records import (
     Windows,
     verdict,
 )
+from iscat_analysis.search.residue import (
+    EXCEEDS,
+    EXPLAINS,
+    LISTED,
+    chi2_excess,
+    is_dwarfed,
+    size_on_ring,
+)
 from iscat_analysis.search.sliding import (
     STRIDES,
     Chunk,
@@ -48,6 +55,7 @@ from iscat_analysis.search.sliding import (
     make_filter,
     sliding_maps,
 )
+from iscat_analysis.search.templates import LARGEST_IMAGE, refuse_flood
 
 ROUNDS = 6
 """Searches at most; each takes what was found so far off the contrast."""
@@ -103,6 +111,9 @@ class ChunkFitter:
         Runs the fits; the result does not depend on its size.
     trajectory : Trajectory, optional
         Of the fixed pattern, whose motion is then divided out.
+    excess_noise : str
+        What is known of noise beyond the expected; with it a search that a thousand places pass is
+        given up.
 
     Attributes
     ----------
@@ -120,7 +131,10 @@ class ChunkFitter:
         window: int,
         pool: ThreadPoolExecutor,
         trajectory: Trajectory | None = None,
+        *,
+        excess_noise: str = "",
     ) -> None:
+        self._excess_noise = excess_noise
         pattern = MovingPattern(chunk, trajectory, pool.map) if trajectory else None
         chunk = pattern.chunk if pattern else chunk
         self._scene = scene
@@ -134,6 +148,7 @@ class ChunkFitter:
         self._tasks = TaskBuilder(scene, chunk, window, self._neighbours, pattern)
         self._stride = int(chunk.edges[1] - chunk.edges[0])
         self._maps: tuple[MapArray, FloatArray] | None = None
+        self._doubtful: list[Peak] = []
         self._near: list[list[Step]] = []  # steps that each of the maps knows of
         self.strongest = np.zeros((2, *chunk.shape))
         self.rounds = 0
@@ -181,14 +196,20 @@ class ChunkFitter:
             steps = credible
         if not steps:
             return []
-        seen, _ = self._neighbours.of(steps)
+        lobes = [self._begin(peak) for peak in self._doubtful]
+        everything = steps + lobes
+        seen = [[k for k in near if k < len(steps)] for near in self._neighbours.of(everything)[0]]
         # steps of the other polarity are fitted too: their rings have the one that is reported
         sign = reported_steps(self._scene)
         own = [
-            i for i, s in enumerate(steps) if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
+            i
+            for i, s in enumerate(everything)
+            if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
         ]
-        found = self._pool.map(lambda i: self._finish(i, steps, seen), own)
-        fitted = [f for f in found if f is not None]
+        found = self._pool.map(
+            lambda i: self._finish(i, everything, seen, lobe=i >= len(steps)), own
+        )
+        fitted = self._without_dwarfs([f for f in found if f is not None])
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
 
     # ---- search ----------------------------------------------------------------------------
@@ -229,15 +250,47 @@ class ChunkFitter:
             frames = np.maximum(effective[where], 1e-9)
             self.strongest = np.stack([np.abs(best), best / np.sqrt(frames * matched.norm)])
         peaks = find_steps(chunk, matched, snr, effective, scene.templates.threshold)
+        refuse_flood(
+            len(peaks), self._excess_noise, frames=f" in frames {chunk.first}:{chunk.stop}"
+        )
         fresh: list[Peak] = []
+        doubtful: list[Peak] = []
         taller: list[Peak] = []
         for peak in peaks:
             # one that waits casts its shadow too, or its rings would be taken for particles
             waits = any(self._shadows(p, peak) for p in taller)
             taller.append(peak)
-            if not waits and not any(self._is_residue(step, peak) for step in steps):
+            if waits or any(self._is_residue(step, peak) for step in steps):
+                continue
+            size = max((self._misfit(step, peak, steps, snr) for step in steps), default=0.0)
+            if abs(peak.snr) > size:
                 fresh.append(peak)
+            elif abs(peak.snr) > LISTED * size:
+                doubtful.append(peak)
+        self._doubtful = doubtful
         return [self._begin(peak) for peak in fresh]
+
+    def _misfit(self, step: Step, peak: Peak, steps: Sequence[Step], snr: MapArray) -> float:
+        """Signal-to-noise ratio that a peak must exceed not to be what the fit of a step left."""
+        if not self._meet(step, peak):
+            return 0.0
+        x0, y0 = step.start.x_px, step.start.y_px
+        distance = math.hypot(peak.x_px - x0, peak.y_px - y0)
+        if distance > LARGEST_IMAGE * self._roi_px:
+            return 0.0
+        # a window that holds the step only in part sees that part of the misfit
+        part = max(1 - abs(step.at.frame - peak.frame) / self._window, 0.0)
+        whole = part * math.sqrt(EXPLAINS * step.excess) if distance < self._roi_px / 2 else 0.0
+        others = [
+            (s.start.x_px, s.start.y_px) for s in steps if s is not step and self._meet(s, peak)
+        ]
+        j = round((peak.frame - self._chunk.first) / self._stride) - 1
+        beside = size_on_ring(snr[j], (x0, y0), (peak.x_px, peak.y_px), others)
+        return max(whole, EXCEEDS * beside)
+
+    def _meet(self, step: Step, peak: Peak) -> bool:
+        """Whether a step is seen at the boundary of a peak."""
+        return abs(step.at.frame - peak.frame) <= (self._strides + 1) * self._stride
 
     def _shadows(self, one: Peak, peak: Peak) -> bool:
         """Whether a peak may be nothing but the side lobe of a stronger one."""
@@ -246,7 +299,7 @@ class ChunkFitter:
         if apart > reach + self._stride:
             return False
         dx, dy = abs(one.x_px - peak.x_px), abs(one.y_px - peak.y_px)
-        if apart < reach and math.hypot(dx, dy) < self._roi_px / 6:
+        if apart < reach and math.hypot(dx, dy) < self._roi_px / 3:
             return True
         far = max(dx, dy) >= self._roi_px
         if far and max(dx, dy) >= LARGEST_IMAGE * self._roi_px:
@@ -255,7 +308,7 @@ class ChunkFitter:
 
     def _is_residue(self, step: Step, peak: Peak) -> bool:
         """Whether a peak may be what a fitted step left over: the model is never quite right."""
-        if abs(step.at.frame - peak.frame) > (self._strides + 1) * self._stride:
+        if not self._meet(step, peak):
             return False
         start = step.start
         distance = math.hypot(start.x_px - peak.x_px, start.y_px - peak.y_px)
@@ -311,7 +364,14 @@ class ChunkFitter:
             )
             snr = math.sqrt(2 * max(best.log_likelihood, 0.0))
             return self._neighbours.drawn(
-                replace(step, at=task.at, start=moved, theta=best.theta, snr=snr)
+                replace(
+                    step,
+                    at=task.at,
+                    start=moved,
+                    theta=best.theta,
+                    snr=snr,
+                    excess=chi2_excess(likelihood.residuals(best.theta)),
+                )
             )
 
         improved = list(steps)
@@ -325,7 +385,7 @@ class ChunkFitter:
         return "mass" if "mass_kda" in FREE_PARAMETERS[self._scene.mode] else "localize"
 
     def _finish(
-        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]]
+        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]], *, lobe: bool
     ) -> FittedStep | None:
         """Fit a step for good and judge it."""
         scene, step = self._scene, steps[index]
@@ -340,7 +400,7 @@ class ChunkFitter:
         fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=True)
         if fit.mass_kda <= 0 and "mass_kda" in fit.free:
             return None
-        fit = _judged(scene, fit, task)
+        fit = _judged(scene, fit, task, lobe=lobe)
         pixel = scene.pixel_nm
         fit = replace(fit, x_nm=fit.x_nm - x_px * pixel, y_nm=fit.y_nm - y_px * pixel)
         local = Region(
@@ -352,6 +412,28 @@ class ChunkFitter:
             return None
         step = replace(step, at=task.at)
         return FittedStep(step, event, task.region, task.windows, task.n_before, task.n_after)
+
+    def _without_dwarfs(self, fitted: Sequence[FittedStep]) -> list[FittedStep]:
+        """Flag what explains less than it leaves over, beside a step that is far brighter."""
+        flagged = []
+        for one in fitted:
+            fit = one.event.fit
+            brightest = max(
+                (
+                    other.event.snr
+                    for other in fitted
+                    if _apart(other.step, one.step) < self._window
+                    and distance_px(other.step, one.step) < LARGEST_IMAGE * self._roi_px
+                ),
+                default=0.0,
+            )
+            if Status.SIDELOBE not in fit.flags and is_dwarfed(
+                one.event.snr, fit.chi2_reduced, one.event.likelihood.n_pixels, brightest
+            ):
+                status, flags = verdict([Status.SIDELOBE, *fit.flags])
+                fit = replace(fit, status=status, flags=flags)
+            flagged.append(replace(one, event=replace(one.event, fit=fit)))
+        return flagged
 
     def _credible(self, steps: Sequence[Step]) -> list[Step]:
         """Leave out what the others explain, and the weaker of two steps that describe one."""
@@ -367,13 +449,14 @@ class ChunkFitter:
         return kept
 
 
-def _judged(scene: Scene, fit: FitResult, task: Task) -> FitResult:
+def _judged(scene: Scene, fit: FitResult, task: Task, *, lobe: bool) -> FitResult:
     """Add the verdicts that need the neighbourhood."""
     rows, columns = np.nonzero(task.windows.saturated)
     dx = (columns + task.region.columns[0]) * scene.pixel_nm - fit.x_nm
     dy = (rows + task.region.rows[0]) * scene.pixel_nm - fit.y_nm
     status, flags = verdict([
         *fit.flags,
+        *([Status.SIDELOBE] if lobe else []),
         *([Status.SATURATED] if np.any(np.hypot(dx, dy) < _SATURATION_NM) else []),
         *([Status.TOO_CLOSE] if task.crowded else []),
         *([Status.POOR_FIT] if task.at.p_constant < POOR_FIT_P else []),

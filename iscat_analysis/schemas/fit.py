@@ -200,7 +200,7 @@ class Distribution(Document):
 class Summary(Document):
     """What iscat fit writes into its output folder as summary.json."""
 
-    events: Count = key("How many events there are")
+    events: Count = key("How many events there are, side lobes left out")
     mode: Mode = key("What was free")
     scheme: Scheme = key("Optical scheme")
     emission: Emission = key("Emission model")

@@ -10,6 +10,7 @@ Geometry, 2007), in the plane, or in the plane and along z where the height is f
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,9 +19,11 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import maximum_filter
 
 from iscat_analysis.config import Detection
+from iscat_analysis.errors import DataError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
+from iscat_analysis.search.residue import size_on_ring
 
 HEIGHTS_PER_FRINGE = 8
 """Templates per interference fringe where z is free: half-way between two the match loses 4 %."""
@@ -31,6 +34,13 @@ unless it reaches this share of it."""
 
 FAR_LOBE = 0.05
 """The same beyond the region, where the rings go on: 3 % of the peak at 3 µm."""
+
+
+LARGEST_IMAGE = 3.5
+"""Regions from the centre to the edge of a strong particle's image; the rings go on, faintly."""
+
+FLOOD = 1000
+"""Candidates beyond which a search is given up where there is more noise than expected."""
 
 
 @dataclass(frozen=True)
@@ -168,6 +178,8 @@ def find_particles(
     *,
     roi_px: float,
     explained: FloatArray | None = None,
+    known: Sequence[tuple[float, float]] = (),
+    excess_noise: str = "",
 ) -> tuple[Candidate, ...]:
     """Peaks of the matched filter above the threshold, strongest first.
 
@@ -186,11 +198,20 @@ def find_particles(
         Side of the fitted region [pixels].
     explained : ndarray, shape (y, x), optional
         Signal of particles already known.
+    known : sequence of (float, float)
+        Where those are, (x, y) [pixels].
+    excess_noise : str
+        What is known of noise beyond the expected.
 
     Returns
     -------
     tuple of Candidate
         With sub-pixel positions.
+
+    Raises
+    ------
+    DataError
+        There is such noise, and it passes the threshold at a thousand places.
     """
     snr, strength = signal_to_noise(likelihood, templates, explained)
     ranked = np.abs(snr) if templates.two_sided else snr
@@ -203,6 +224,7 @@ def find_particles(
     best = ranked.max(axis=0)
     peaks = (best == maximum_filter(best, size=3)) & (best > templates.threshold)
     rows, columns = np.nonzero(peaks)
+    refuse_flood(rows.size, excess_noise)
     found: list[Candidate] = []
     strongest_first = np.argsort(-best[rows, columns])
     for row, column in zip(rows[strongest_first], columns[strongest_first], strict=True):
@@ -228,9 +250,45 @@ def find_particles(
                 z_nm=float(templates.z_nm[k]),
                 mass_kda=_mass(likelihood.model, templates, float(strength[k, row, column])),
                 snr=float(snr[k, row, column]),
+                beside=_beside(best, (float(column + dx), float(row + dy)), known, roi_px),
             )
         )
     return tuple(found)
+
+
+def _beside(
+    best: FloatArray,
+    place: tuple[float, float],
+    known: Sequence[tuple[float, float]],
+    roi_px: float,
+) -> float:
+    """Size of what known particles left over, at a candidate's distance from each."""
+    reach = LARGEST_IMAGE * roi_px
+    near = [k for k in known if math.hypot(k[0] - place[0], k[1] - place[1]) < reach]
+    return max(
+        (size_on_ring(best, k, place, [o for o in near if o is not k]) for k in near), default=0.0
+    )
+
+
+def refuse_flood(candidates: int, excess_noise: str, frames: str = "") -> None:
+    """Give up a search in which noise passes the threshold; many particles are no reason to.
+
+    Parameters
+    ----------
+    candidates : int
+        Places above the threshold.
+    excess_noise : str
+        What is known of noise beyond the expected; empty where there is none.
+    frames : str
+        Of which they are, for the message.
+
+    Raises
+    ------
+    DataError
+        There is such noise, and there are more than `FLOOD` places.
+    """
+    if excess_noise and candidates > FLOOD:
+        raise DataError(f"{candidates} places{frames} pass the detection threshold: {excess_noise}")
 
 
 def _correlate(image: FloatArray, kernels: FloatArray) -> FloatArray:

@@ -27,8 +27,8 @@ SHOT_LIMITED = 1.2
 """Noise variance over shot noise up to which averaging is called shot-noise limited."""
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
-_ROWS = 16  # on which the noise is measured
 _NORMAL_QUARTILE = 0.6744897501960817
+_ROWS = 16  # on which the noise is measured
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,10 @@ class NoiseCurve:
                 break
             limit = n
         return limit
+
+    def at(self, length: int) -> float:
+        """Noise variance over shot noise of averages of a length."""
+        return float(np.interp(length, self.frames, self.variance_over_shot))
 
     @property
     def best(self) -> int:

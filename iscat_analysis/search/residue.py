@@ -1,0 +1,128 @@
+"""What the model leaves over of a bright particle, and how large a particle beside it must be.
+
+A model that is not quite right leaves rings around every bright particle, which the matched filter
+takes for more.  How large they are is measured on the particle itself:
+
+- around it, at the distance of the candidate: a second particle fills a small part of that ring, a
+  misfit rises as high on much of it;
+- in its fitted region: a second particle explains most of the χ² in excess, a peak of a misfit a
+  small share.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+EXCEEDS = 1.5
+"""Times the height of its ring that a particle must have."""
+
+EXPLAINS = 0.5
+"""Share of the χ² in excess that a particle inside the fitted region must explain."""
+
+DWARFS = 3.0
+"""Times the signal-to-noise ratio of an event from which on another one near it dwarfs it."""
+
+LISTED = 0.7
+"""Share of what a particle must have from which a candidate is listed, as a side lobe."""
+
+_EXCESS_SIGMAS = 3.0  # of χ²'s own scatter, below which an excess may be noise
+_RING_PX = 2.0  # on either side of the candidate's distance
+_SECTOR_PX = 4.0  # of the ring, along it
+_HEIGHT = 0.8  # share of the ring that is lower than what counts as its height
+_PATCH_PX = 5.0  # around the candidate, which is its own
+
+
+def is_dwarfed(snr: float, chi2_reduced: float, n_pixels: int, brightest: float) -> bool:
+    """Whether a fit explains less than it leaves over, beside a particle that is far brighter.
+
+    Parameters
+    ----------
+    snr : float
+        Of the fitted event.
+    chi2_reduced : float
+        Of its fit.
+    n_pixels : int
+        In its region.
+    brightest : float
+        Largest signal-to-noise ratio of the events that reach there.
+
+    Returns
+    -------
+    bool
+        Whether it is no more than a side lobe, as far as the model can tell.
+    """
+    excess = (chi2_reduced - 1) * n_pixels
+    noise = _EXCESS_SIGMAS * math.sqrt(2 * n_pixels)
+    return excess > noise and snr**2 < EXPLAINS * excess and brightest > DWARFS * snr
+
+
+def chi2_excess(residuals: NDArray[Any]) -> float:
+    """Measure what a fit left over.
+
+    Parameters
+    ----------
+    residuals : ndarray
+        Data minus model in standard deviations; NaN where masked.
+
+    Returns
+    -------
+    float
+        χ² above its expectation; 0 where that may be noise.
+    """
+    n = int(np.count_nonzero(np.isfinite(residuals)))
+    excess = float(np.nansum(residuals**2)) - n
+    return excess if excess > _EXCESS_SIGMAS * math.sqrt(2 * n) else 0.0
+
+
+def size_on_ring(
+    snr: NDArray[Any],
+    centre: tuple[float, float],
+    place: tuple[float, float],
+    others: Iterable[tuple[float, float]] = (),
+) -> float:
+    """Give how high the map rises at a candidate's distance from a particle, beside its own peak.
+
+    A fifth of the ring may be higher: so much is left for particles that are not known yet.
+
+    Parameters
+    ----------
+    snr : ndarray, shape (y, x)
+        Signal-to-noise ratio after all that is known has been taken off.
+    centre, place : (float, float)
+        The particle and the candidate, (x, y) [pixels].
+    others : iterable of (float, float)
+        Further known particles: what lies nearer to one of them is what is left of that one.
+
+    Returns
+    -------
+    float
+        The signal-to-noise ratio that four fifths of the ring do not exceed.
+    """
+    (x0, y0), (xc, yc) = centre, place
+    distance = max(math.hypot(xc - x0, yc - y0), _RING_PX)
+    far = distance + _RING_PX
+    (top, bottom), (left, right) = (
+        (max(math.floor(c - far), 0), max(min(math.ceil(c + far) + 1, n), 0))
+        for c, n in zip((y0, x0), snr.shape, strict=True)
+    )
+    y, x = np.mgrid[top:bottom, left:right]
+    away = np.hypot(y - y0, x - x0)
+    ring = np.abs(away - distance) < _RING_PX
+    ring &= np.hypot(y - yc, x - xc) > _PATCH_PX
+    y, x, away = y[ring], x[ring], away[ring]
+    own = np.ones(away.shape, dtype=np.bool_)
+    for xo, yo in others:
+        own &= np.hypot(y - yo, x - xo) > away
+    y, x = y[own], x[own]
+    if not y.size:
+        return 0.0
+    sectors = max(8, round(2 * math.pi * distance / _SECTOR_PX))
+    sector = ((np.arctan2(y - y0, x - x0) / (2 * math.pi) + 0.5) * sectors).astype(int) % sectors
+    highest = np.full(sectors, -1.0)
+    np.maximum.at(highest, sector, np.abs(snr[y, x]))
+    return float(np.quantile(highest[highest >= 0], _HEIGHT))

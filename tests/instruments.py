@@ -1,0 +1,238 @@
+"""Movies seen through microscopes that the configuration does not describe.
+
+The picture of a dipole is a sum over the whole pupil, ray by ray and azimuth by azimuth, with
+scipy's Bessel functions: nothing here is taken from the package, so that a movie made with it knows
+nothing of the model that is fitted.  Pictures are scaled to a peak contrast per kDa, as a mass
+calibration would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter
+from scipy.special import jv
+
+FloatArray = NDArray[np.float64]
+
+PEAK_PER_KDA = 3.1e-5
+_AZIMUTHS = 64
+_FARTHEST_NM = 26_000.0
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """One microscope; lengths in nm, aberrations by Noll's index as rms of the wavefront."""
+
+    wavelength_nm: float = 525.0
+    na: float = 1.42
+    n_immersion: float = 1.515
+    n_glass: float = 1.515
+    n_sample: float = 1.33
+    focus_nm: float = -300.0
+    height_nm: float = 5.0
+    emission: str = "dong2021"
+    circular: bool = False
+    analyzer: bool = False
+    mask_na: float = 0.0
+    attenuation: float = 1.0
+    reference_phase_deg: float = 0.0
+    aberrations_nm: Mapping[int, float] = field(default_factory=dict)
+
+
+def _zernike(j: int, rho: FloatArray, phi: FloatArray) -> FloatArray:
+    """Noll's polynomials of rms 1, less their value at the centre."""
+    forms = {
+        5: np.sqrt(6) * rho**2 * np.sin(2 * phi),
+        6: np.sqrt(6) * rho**2 * np.cos(2 * phi),
+        7: np.sqrt(8) * (3 * rho**3 - 2 * rho) * np.sin(phi),
+        8: np.sqrt(8) * (3 * rho**3 - 2 * rho) * np.cos(phi),
+        9: np.sqrt(8) * rho**3 * np.sin(3 * phi),
+        10: np.sqrt(8) * rho**3 * np.cos(3 * phi),
+        11: np.sqrt(5) * (6 * rho**4 - 6 * rho**2),
+    }
+    return forms[j]
+
+
+class Pictures:
+    """Contrast of a particle through one microscope.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        The microscope.
+    """
+
+    def __init__(self, instrument: Instrument) -> None:
+        m = instrument
+        k = 2 * np.pi / m.wavelength_nm
+        alpha = np.arcsin(m.na / m.n_immersion)
+        x, w = np.polynomial.legendre.leggauss(160)
+        critical = np.arcsin(min(m.n_sample, m.na) / m.n_immersion)
+        # θ = θ_c ∓ u² smooths the root at the critical angle
+        below, above = np.sqrt(critical), np.sqrt(max(alpha - critical, 0.0))
+        u1, u2 = below * (x + 1) / 2, above * (x + 1) / 2
+        theta = np.concatenate([critical - u1**2, critical + u2**2])
+        weight = np.concatenate([below * w * u1, above * w * u2])
+        sin, cos = np.sin(theta), np.cos(theta)
+        cos_s = np.sqrt(1 - (m.n_immersion * sin / m.n_sample) ** 2 + 0j)
+        cos_g = np.sqrt(1 - (m.n_immersion * sin / m.n_glass) ** 2 + 0j)
+        up = m.n_glass * cos_g if m.emission == "reciprocal" else m.n_sample * cos_s
+        t_p = 2 * up / (m.n_glass * cos_s + m.n_sample * cos_g)
+        t_s = 2 * up / (m.n_glass * cos_g + m.n_sample * cos_s)
+        oil = m.height_nm - m.focus_nm - m.height_nm * m.n_immersion / m.n_sample
+        path = m.n_sample * m.height_nm * (cos_s + 1) + m.n_immersion * oil * (cos - 1)
+        phi = 2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+        rho = m.n_immersion * sin / m.na
+        wave = sum(
+            (a * _zernike(j, rho[:, None], phi[None]) for j, a in m.aberrations_nm.items()),
+            start=np.zeros((theta.size, _AZIMUTHS)),
+        )
+        jones = np.array([1.0, 1j]) / np.sqrt(2) if m.circular else np.array([1.0, 0.0j])
+        along = jones[0] * np.cos(phi) + jones[1] * np.sin(phi)
+        across = -jones[0] * np.sin(phi) + jones[1] * np.cos(phi)
+        radial = (t_p * cos_s)[:, None] * along
+        turning = t_s[:, None] * across
+        vector = np.stack([
+            radial * np.cos(phi) - turning * np.sin(phi),
+            radial * np.sin(phi) + turning * np.cos(phi),
+        ])  # fmt: skip
+        if m.analyzer:
+            vector = np.stack([np.einsum("c,ctp->tp", np.conj(jones), vector)])
+            reference = np.array([1.0 + 0j])
+        else:
+            reference = jones
+        passes = np.where(m.n_immersion * sin < m.mask_na, m.attenuation, 1.0)
+        pupil = vector * np.exp(1j * k * (path[:, None] + wave)) * (passes * np.sqrt(cos))[:, None]
+        harmonics = np.fft.fft(pupil, axis=2) / _AZIMUTHS
+        self._orders = [h if h <= 8 else h - _AZIMUTHS for h in (*range(9), *range(56, 64))]
+        r = np.arange(0.0, _FARTHEST_NM, 12.0)
+        argument = k * m.n_immersion * sin * r[:, None]
+        tables = []
+        for h in self._orders:
+            bessel = jv(h, argument) * (weight * sin)
+            tables.append(1j**h * np.einsum("rt,ct->rc", bessel, harmonics[:, :, h]))
+        # amplitude of the dipole: −i; the reference's own phase is added to it
+        phase = np.exp(1j * np.deg2rad(m.reference_phase_deg))
+        self._reference = reference * phase
+        self._spline = CubicSpline(r, -1j * np.array(tables), axis=1)
+        near = np.linspace(-900.0, 900.0, 181)
+        linear, _ = self._terms(near[None, :], near[:, None])
+        top = linear.flat[np.argmax(np.abs(linear))]
+        self.sign = float(np.sign(top))
+        self._per_kda = PEAK_PER_KDA / abs(top)
+
+    def _terms(self, dx_nm: FloatArray, dy_nm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        r, phi = np.hypot(dx_nm, dy_nm), np.arctan2(dy_nm, dx_nm)
+        parts = self._spline(r)
+        e = sum(parts[n] * np.exp(1j * h * phi)[..., None] for n, h in enumerate(self._orders))
+        linear = 2 * np.real(e @ np.conj(self._reference))
+        return linear, np.sum(np.abs(e) ** 2, axis=-1)
+
+    def contrast(self, dx_nm: FloatArray, dy_nm: FloatArray, mass_kda: float) -> FloatArray:
+        """Contrast of a particle at camera minus particle coordinates that broadcast."""
+        linear, square = self._terms(dx_nm, dy_nm)
+        amplitude = mass_kda * self._per_kda
+        return amplitude * linear + amplitude**2 * square
+
+
+@dataclass(frozen=True)
+class Landings:
+    """Particles that land and stay."""
+
+    frame: NDArray[np.int64]
+    x_px: FloatArray
+    y_px: FloatArray
+    mass_kda: FloatArray
+
+
+class InstrumentMovie:
+    """A landing movie in memory, with Poisson noise.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        Through which it is seen.
+    shape : (int, int, int)
+        Frames, rows, columns.
+    landings : Landings
+        What lands.
+    seed : int
+        Of the noise and the background.
+    level_e : float
+        Photoelectrons per pixel and frame.
+    pixel_nm, gain_e_per_adu : float
+        Of the camera.
+    """
+
+    name = "movie"
+
+    def __init__(
+        self,
+        instrument: Instrument,
+        shape: tuple[int, int, int],
+        landings: Landings,
+        *,
+        seed: int,
+        level_e: float = 1e5,
+        pixel_nm: float = 84.0,
+        gain_e_per_adu: float = 4.0,
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        frames, rows, columns = shape
+        y, x = np.arange(rows) * pixel_nm, np.arange(columns) * pixel_nm
+        pictures = Pictures(instrument)
+        rough = gaussian_filter(rng.standard_normal((rows, columns)), 3.0, mode="wrap")
+        light = level_e * (1 + 0.05 * rough / rough.std())
+        order = np.argsort(landings.frame)
+        counts = np.empty(shape, dtype=np.uint16)
+        expected = light.copy()
+        pending = [int(i) for i in order]
+        for t in range(frames):
+            while pending and landings.frame[pending[0]] <= t:
+                i = pending.pop(0)
+                expected *= 1 + pictures.contrast(
+                    (x - landings.x_px[i] * pixel_nm)[None, :],
+                    (y - landings.y_px[i] * pixel_nm)[:, None],
+                    float(landings.mass_kda[i]),
+                )
+            power = 1 + 0.01 * rng.standard_normal()
+            noisy = power * expected + np.sqrt(power * expected) * rng.standard_normal(
+                (rows, columns)
+            )
+            counts[t] = np.floor(noisy / gain_e_per_adu + rng.random((rows, columns)))
+        self.counts = counts
+        self.shape = shape
+        self.dtype = counts.dtype
+
+    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
+        """Frames [start, stop)."""
+        return self.counts[start:stop]
+
+
+def draw_landings(
+    shape: tuple[int, int, int],
+    count: int,
+    *,
+    seed: int,
+    masses: tuple[float, ...] = (92.0, 205.0, 430.0),
+    margin_px: float = 8.0,
+    first: int = 60,
+    frame: int | None = None,
+    apart_px: float = 0.0,
+) -> Landings:
+    """Particles anywhere, at any time or all in one frame; as many of each mass."""
+    rng = np.random.default_rng(seed)
+    frames, rows, columns = shape
+    places: list[tuple[float, float]] = []
+    while len(places) < count:
+        x, y = (float(rng.uniform(margin_px, n - 1 - margin_px)) for n in (columns, rows))
+        if all(np.hypot(x - a, y - b) >= apart_px for a, b in places):
+            places.append((x, y))
+    when = rng.integers(first, frames - first, count) if frame is None else np.full(count, frame)
+    x_px, y_px = np.array(places).T
+    return Landings(when, x_px, y_px, rng.permutation(np.resize(masses, count)))
