@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config, config_to_toml
-from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import compile_kernels
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.movie import Stack, open_stack
@@ -35,6 +35,8 @@ from iscat_analysis.pipeline.diagnosis import (
 )
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.landing import analyse_landings, has_landings, inject_and_recover
+from iscat_analysis.pipeline.learning import learn_optics
+from iscat_analysis.pipeline.ranges import frame_ranges
 from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
 from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
 from iscat_analysis.pipeline.scene import Scene, field_likelihood, make_scene
@@ -200,6 +202,10 @@ def analyse(
     digest = hashing.submit(movie.sha256)
     hashing.shutdown(wait=False)
     further: dict[str, Any] = {}
+    config, learned = learn_optics(movie, config, camera, tell=tell)
+    if learned:
+        further["optics"] = learned
+    clock.lap("optics")
     if has_landings(config):
         result = analyse_landings(
             movie,
@@ -270,48 +276,6 @@ def analyse(
         provenance=provenance,
         warnings=tuple(warnings),
     )
-
-
-def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, tuple[int, int]]:
-    """Which frames are background and which are fitted.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    config : Config
-        ``background.frames``, ``background.method`` and ``fit.frames``.
-
-    Returns
-    -------
-    before : (int, int) or None
-        None where the background is known.
-    after : (int, int)
-        Half-open.
-
-    Raises
-    ------
-    ConfigError
-        The background frames are not given.
-    DataError
-        The background leaves no frame to fit.
-    """
-    before = config.background.frames
-    if config.background.method == "known":
-        before = None
-    elif before is None:
-        raise ConfigError(
-            "which frames come before the particles? give them as "
-            'background.frames = [0, 200], or a known level with background.method = "known"'
-        )
-    start = before[1] if before else 0
-    after = config.fit.frames or (start, movie.shape[0])
-    if after[1] <= after[0]:
-        raise DataError(
-            f"{movie.name}: has {movie.shape[0]} frames and the background takes "
-            f"{start} of them, so none is left to fit; change background.frames"
-        )
-    return before, after
 
 
 def _measured_background(

@@ -36,9 +36,9 @@ from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.pipeline import frame_ranges
 from iscat_analysis.pipeline.chunks import Reader, counts_budget, judge_noise, plan_chunks
 from iscat_analysis.pipeline.landing import has_landings
+from iscat_analysis.pipeline.ranges import frame_ranges
 from iscat_analysis.records import Mapper, Progress, Windows, silent
 from iscat_analysis.search.bright import (
     ALONE_NM,
@@ -209,7 +209,7 @@ def calibrate_sights(
             "brighter ones (20 nm gold, or protein of 400 kDa and more), or more photons per frame"
         )
     configured = settings_of(config)
-    build = microscopes(config, max(_reach_nm(sight) for sight in sights))
+    build = microscopes(config, max(reach_nm(sight) for sight in sights))
     optics = config.optics
     measured = measure_microscope(
         sights,
@@ -575,6 +575,17 @@ def _region(row: int, column: int, side: int) -> tuple[tuple[int, int], tuple[in
     return (first, first + side), (left, left + side)
 
 
-def _reach_nm(sight: Sight) -> float:
-    """Largest distance from a particle that may move inside its picture."""
+def reach_nm(sight: Sight) -> float:
+    """Distance from a particle, which may move in its picture, to the farthest pixel.
+
+    Parameters
+    ----------
+    sight : Sight
+        The picture.
+
+    Returns
+    -------
+    float
+        Distance [nm].
+    """
     return sight.grid.diagonal_nm / 2 + _SHIFT_NM

@@ -1,0 +1,160 @@
+"""Test the configured optics on the brightest particles before a movie is analysed.
+
+Where they do not, the optics are learned from these particles, and the analysis goes on with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from iscat_analysis.calibration.optics import (
+    FREE,
+    LEAST_SIGHTS,
+    OpticsCalibration,
+    Sight,
+    maximise,
+    settings_of,
+)
+from iscat_analysis.calibration.optics.starts import average_sights, with_masses
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.movie import Stack
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.optics.forward import forward_model
+from iscat_analysis.pipeline.landing import has_landings
+from iscat_analysis.pipeline.microscope import (
+    bound_sights,
+    calibrate_sights,
+    goodness,
+    landing_sights,
+    microscopes,
+    reach_nm,
+)
+
+REJECTED_P = 1e-3
+"""Half of the brightest particles must fit worse than this before the optics are doubted: a few
+that are not alone do not suffice."""
+
+_TESTED = 24
+
+
+def learn_optics(
+    movie: Stack, config: Config, camera: Camera, *, tell: Callable[[str], None]
+) -> tuple[Config, dict[str, Any]]:
+    """Test the configured optics on the brightest particles, and learn them where they fail.
+
+    Parameters
+    ----------
+    movie : Stack
+        A landing movie, or one with background frames.
+    config : Config
+        Resolved; ``optics.calibrate`` says what is wanted.
+    camera : Camera
+        Counts → photoelectrons.
+    tell : callable
+        Told in one line what was found, unless the configured optics are fine.
+
+    Returns
+    -------
+    config : Config
+        With the learned optics and ``calibrate = "never"``, so that it repeats the analysis; or as
+        it was.
+    summary : dict
+        What ``summary.json`` says of it; empty where nothing was tested.
+    """
+    optics = config.optics
+    suited = optics.scheme != "darkfield" and optics.convention == "exact"
+    measured = config.background.method in ("sliding", "fixed", "median")
+    if (
+        optics.calibrate == "never"
+        or (optics.calibrate == "auto" and optics.file is not None)
+        or not suited
+        or not measured
+        or config.fit.mode == "track"
+    ):
+        return config, {}
+    try:
+        with ThreadPoolExecutor(config.compute.workers) as pool:
+            find = landing_sights if has_landings(config) else _bound
+            sights, others = find(movie, config, camera, pool)
+            median = _median_p(sights, config) if len(sights) >= LEAST_SIGHTS else 1.0
+            if optics.calibrate == "auto" and median >= REJECTED_P:
+                return config, {"tested": len(sights), "median_p": median, "calibrated": False}
+            found = calibrate_sights(
+                sights,
+                others,
+                config,
+                tuple(FREE),
+                {"movie": movie.name},
+                given_focus="focus_nm" in optics.model_fields_set,
+                mapper=pool.map,
+            )
+    except DataError as error:
+        if optics.calibrate == "always":
+            tell(f"the optics stay as configured: {error}")
+        return config, {"calibrated": False, "reason": str(error)}
+    summary = {"tested": len(sights), "median_p": median, **_told(found)}
+    learned, why = _usable(found, config)
+    if learned is None:
+        tell(
+            f"the configured optics do not describe the brightest {len(sights)} particles (median "
+            f"p-value {median:.1g}), and they cannot be learned from them: {why}; the analysis "
+            "goes on as configured"
+        )
+        return config, summary | {"calibrated": False, "reason": why}
+    tell(f"optics learned from the movie, instead of the configured ones: {found.headline()}")
+    for note in found.notes:
+        tell(note)
+    return learned, summary | {"calibrated": True}
+
+
+def _bound(
+    movie: Stack, config: Config, camera: Camera, _pool: ThreadPoolExecutor
+) -> tuple[list[Sight], list[Sight]]:
+    return bound_sights(movie, config, camera)
+
+
+def _median_p(sights: list[Sight], config: Config) -> float:
+    """Median p-value of the brightest particles in the configured microscope."""
+    settings = settings_of(config)
+    build = microscopes(config, max(map(reach_nm, sights)))
+    tested = with_masses(average_sights(sights[:_TESTED])[1], build, settings)
+    fitted = maximise(tested, build, settings, ()).sights
+    model = build(settings)
+    return float(np.median([goodness(sight, model)[1] for sight in fitted]))
+
+
+def _told(found: OpticsCalibration) -> dict[str, Any]:
+    """Give what the summary says of a calibration."""
+    told = found.to_dict()
+    return {
+        key: told[key]
+        for key in ("accepted", "refusals", "parameters", "names", "covariance", "notes")
+    }
+
+
+def _usable(found: OpticsCalibration, config: Config) -> tuple[Config | None, str]:
+    """Give the configuration with the learned optics, or why there is none.
+
+    A line between contrast and mass fixes the sign of the contrast, and with it the reference phase
+    of two that differ by half a turn.
+    """
+    if not found.accepted:
+        return None, "; ".join(found.measured.refusals)
+    phase = found.config.optics.reference_phase_deg
+    reason = ""
+    for turned in (phase, (phase + 360) % 360 - 180):
+        update = {"reference_phase_deg": turned, "calibrate": "never"}
+        optics = found.config.optics.model_copy(update=update)
+        learned = config.model_copy(update={"optics": optics})
+        try:
+            forward_model(learned, 1000.0)
+        except ConfigError as error:
+            reason = str(error)
+        else:
+            return learned, ""
+    return None, reason
