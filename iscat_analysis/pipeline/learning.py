@@ -90,7 +90,6 @@ def learn_optics(
                 config,
                 tuple(FREE),
                 {"movie": movie.name},
-                given_focus="focus_nm" in optics.model_fields_set,
                 mapper=pool.map,
             )
     except DataError as error:

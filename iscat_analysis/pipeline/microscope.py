@@ -112,7 +112,6 @@ def calibrate_movie(
         The configuration cannot be calibrated.
     """
     groups = free_groups(free)
-    given_focus = "focus_nm" in config.optics.model_fields_set
     config, notes = resolve_metadata(config, movie.metadata)
     for note in notes:
         if notify is not None:
@@ -136,9 +135,7 @@ def calibrate_movie(
             else "landing movie" if has_landings(config) else "frames before and after",
             "version": version("iscat-analysis"),
         }  # fmt: skip
-        return calibrate_sights(
-            sights, others, config, groups, source, given_focus=given_focus, mapper=pool.map
-        )
+        return calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
 
 
 def refuse_uncalibratable(config: Config) -> None:
@@ -170,7 +167,6 @@ def calibrate_sights(
     groups: Sequence[str],
     source: Mapping[str, str],
     *,
-    given_focus: bool,
     mapper: Mapper = map,
 ) -> OpticsCalibration:
     """Measure the optics from pictures.
@@ -187,8 +183,6 @@ def calibrate_sights(
         From `free_groups`.
     source : mapping of str to str
         Where the pictures came from.
-    given_focus : bool
-        Whether the user configured the focus, and with it the side of it.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -218,7 +212,7 @@ def calibrate_sights(
         lambda sight, settings: goodness(sight, build(settings)),
         free=groups,
         limits=optics_limits(optics.n_immersion, optics.n_glass),
-        side=int(math.copysign(1, optics.focus_nm)) if given_focus and optics.focus_nm else 0,
+        side=int(math.copysign(1, optics.focus_nm)) if optics.focus_nm else 0,
         landing=1,
         others=others,
         build_wide=microscopes(config, RINGS_NM + sights[0].grid.diagonal_nm),

@@ -107,9 +107,7 @@ def test_light_beyond_the_critical_angle_rules_the_twin_out() -> None:
 def test_too_few_particles_are_refused_with_what_to_record() -> None:
     sights, _, _ = make_sights({}, 8, seed=17, masses_kda=(300.0,))
     with pytest.raises(DataError, match=r"8 bright particles.*12 are needed.*record more"):
-        calibrate_sights(
-            sights, (), configuration(), ROUND, {"movie": "faint.tif"}, given_focus=True
-        )
+        calibrate_sights(sights, (), configuration(), ROUND, {"movie": "faint.tif"})
 
 
 def test_what_the_pictures_do_not_tell_is_held() -> None:
