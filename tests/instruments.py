@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 
 PEAK_PER_KDA = 3.1e-5
 _AZIMUTHS = 64
-_FARTHEST_NM = 26_000.0
+_FARTHEST_NM = 20_000.0
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Pictures:
         m = instrument
         k = 2 * np.pi / m.wavelength_nm
         alpha = np.arcsin(m.na / m.n_immersion)
-        x, w = np.polynomial.legendre.leggauss(160)
+        x, w = np.polynomial.legendre.leggauss(110)
         critical = np.arcsin(min(m.n_sample, m.na) / m.n_immersion)
         # θ = θ_c ∓ u² smooths the root at the critical angle
         below, above = np.sqrt(critical), np.sqrt(max(alpha - critical, 0.0))
@@ -110,11 +110,12 @@ class Pictures:
         pupil = vector * np.exp(1j * k * (path[:, None] + wave)) * (passes * np.sqrt(cos))[:, None]
         harmonics = np.fft.fft(pupil, axis=2) / _AZIMUTHS
         self._orders = [h if h <= 8 else h - _AZIMUTHS for h in (*range(9), *range(56, 64))]
-        r = np.arange(0.0, _FARTHEST_NM, 12.0)
+        r = np.arange(0.0, _FARTHEST_NM, 15.0)
         argument = k * m.n_immersion * sin * r[:, None]
         tables = []
+        whole = [jv(h, argument) * (weight * sin) for h in range(9)]
         for h in self._orders:
-            bessel = jv(h, argument) * (weight * sin)
+            bessel = whole[abs(h)] * (-1 if h < 0 and h % 2 else 1)
             tables.append(1j**h * np.einsum("rt,ct->rc", bessel, harmonics[:, :, h]))
         # amplitude of the dipole: −i; the reference's own phase is added to it
         phase = np.exp(1j * np.deg2rad(m.reference_phase_deg))
