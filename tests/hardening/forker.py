@@ -29,16 +29,21 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from markupsafe import Markup
+
 from iscat_analysis import report
 from iscat_analysis.pipeline import chunks
+from iscat_analysis.report import page
 from iscat_cli import main
 
-_write_figures = report.write_figures
+_PAGES = (report, page)
+_publish = report.publish
 
 
 def _run(order: dict[str, Any]) -> int:
     os.chdir(order["cwd"])
-    report.write_figures = _write_figures if order.get("figures") else _sketch_figures
+    for module in _PAGES:
+        module.publish = _publish if order.get("figures") else _sketch_figures
     if "limit" in order:
         resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
     if "memory_share" in order:
@@ -51,13 +56,12 @@ def _run(order: dict[str, Any]) -> int:
     return status
 
 
-def _sketch_figures(analysis: Any, folder: pathlib.Path, **options: Any) -> dict[str, int]:
-    del analysis, options
-    folder.mkdir()
-    for number in range(10):
-        (folder / f"{number}.svg").write_bytes(b"<svg/>\n" * 150)
+def _sketch_figures(figures: Any, folder: pathlib.Path | None = None) -> dict[str, Markup]:
+    names = [name for name, _ in figures]
+    for name in names if folder is not None else ():
+        (folder / f"{name}.svg").write_bytes(b"<svg/>\n" * 150)
         time.sleep(0.01)  # a moment to be killed in
-    return {}
+    return dict.fromkeys(names, Markup("<svg/>"))
 
 
 def _die_while_renaming(word: str, number: int) -> None:
