@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.config import Config, parse_config
+from iscat_analysis.config import Config, config_to_toml, parse_config
 from iscat_analysis.movie.background import start_power
 from iscat_analysis.records import Windows
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study.simulate import Movie, write_stack
 
 Array = NDArray[np.float64]
 
@@ -123,3 +124,28 @@ def blank(windows: Windows, rng: np.random.Generator) -> Windows:
         before_e=rng.poisson(level, shape).astype(float),
         after_e=rng.poisson(windows.power_ratio * level, shape).astype(float),
     )
+
+
+OPTICS_TRUTH = {"focus_nm": -420.0, "reference_phase_deg": 10.0}
+"""Optics of `write_bright_landings`, which its configuration does not know."""
+
+
+def write_bright_landings(movie: Path, setup: Path) -> None:
+    """Sixteen particles land 3.7 µm apart, each at a frame of its own."""
+    events = [
+        {"frame": 40 + 5 * i, "x_px": 22.3 + 44 * (i % 4), "y_px": 21.6 + 44 * (i // 4),
+         "mass_kda": 4500.0}
+        for i in range(16)
+    ]  # fmt: skip
+    nominal = {
+        "optics": {"wavelength_nm": 525.0, "na": 1.42, "attenuation": 0.1, "focus_nm": -300.0},
+        "camera": {"pixel_size_nm": PIXEL_NM},
+        "particle": {"kind": "protein", "height_nm": 5.0},
+    }
+    simulation = {
+        "shape": [176, 176], "frames": 160, "photons_per_pixel": 2e4, "seed": 3,
+        "background": "speckle", "events": events,
+    }  # fmt: skip
+    true = {**nominal, "optics": nominal["optics"] | OPTICS_TRUTH, "simulation": simulation}
+    write_stack(parse_config(true), movie)
+    setup.write_text(config_to_toml(parse_config(nominal)), encoding="utf-8")

@@ -155,9 +155,11 @@ class Likelihood:
         points = vector_of("thetas", thetas, (-1, 5))
         inside = self.supports(points)
         out = np.full(len(points), -np.inf)
+        if not inside.any():
+            return out
         if inside.all():
             value_batch(self._table(points[:, 2]), *self._arguments, points, out)
-        elif inside.any():
+        else:
             known = np.empty(int(inside.sum()))
             value_batch(self._table(points[inside, 2]), *self._arguments, points[inside], known)
             out[inside] = known

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+from scenes import write_bright_landings
 
 from iscat_analysis.config import Config, config_to_toml, load_config
 from iscat_analysis.records import EVENT_COLUMNS
@@ -98,6 +99,9 @@ def test_every_example_runs(
     if "movie.tif" in arguments and "simulate" not in arguments:
         assert main(["simulate", "--config", "setup.toml", "--out", "movie.tif"]) == 0
         arguments = [a.replace("0:200", "0:30") for a in arguments]
+    if "landing.tif" in arguments:
+        write_bright_landings(Path("landing.tif"), Path("landing.toml"))
+        arguments += ["--free", "focus,phase"]
     if "simulate" in arguments:
         arguments += [f"--set={change}" for change in SMALL]
     if "benchmark" in arguments:

@@ -4,49 +4,25 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
+from scenes import OPTICS_TRUTH, write_bright_landings
 
-from iscat_analysis.config import config_to_toml, load_config, parse_config
-from iscat_analysis.study.simulate import write_stack
+from iscat_analysis.config import load_config
 from iscat_cli import main
 
 Captured = pytest.CaptureFixture[str]
 
 FREE = ["--free", "focus,phase"]
-TRUTH = {"focus_nm": -420.0, "reference_phase_deg": 10.0}
-SIDE, FRAMES = 176, 160
 SIGMAS = 4.0
-
-
-def _values(**sections: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "optics": {"wavelength_nm": 525.0, "na": 1.42, "attenuation": 0.1, "focus_nm": -300.0}
-        | sections.pop("optics", {}),
-        "camera": {"pixel_size_nm": 84.4},
-        "particle": {"kind": "protein", "height_nm": 5.0},
-        **sections,
-    }
 
 
 @pytest.fixture(scope="module")
 def movie(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Sixteen particles land 3.7 µm apart, each at a frame of its own."""
     folder = tmp_path_factory.mktemp("optics")
-    events = [
-        {"frame": 40 + 5 * i, "x_px": 22.3 + 44 * (i % 4), "y_px": 21.6 + 44 * (i // 4),
-         "mass_kda": 4500.0}
-        for i in range(16)
-    ]  # fmt: skip
-    simulation = {
-        "shape": [SIDE, SIDE], "frames": FRAMES, "photons_per_pixel": 2e4, "seed": 3,
-        "background": "speckle", "events": events,
-    }  # fmt: skip
-    write_stack(parse_config(_values(optics=TRUTH, simulation=simulation)), folder / "movie.tif")
-    (folder / "setup.toml").write_text(config_to_toml(parse_config(_values())), encoding="utf-8")
+    write_bright_landings(folder / "movie.tif", folder / "setup.toml")
     return folder / "movie.tif"
 
 
@@ -58,7 +34,7 @@ def test_a_landing_movie_tells_its_optics(movie: Path, tmp_path: Path, capsys: C
     assert printed["accepted"]
     assert printed["particles"] >= 12
     found = {row["parameter"]: row for row in printed["parameters"]}
-    for name, true in TRUTH.items():
+    for name, true in OPTICS_TRUTH.items():
         assert found[name]["state"] == "measured"
         assert abs(found[name]["value"] - true) < SIGMAS * found[name]["sigma"]
         assert found[name]["sigma"] == pytest.approx(found[name]["crb"], rel=0.2)
@@ -78,7 +54,7 @@ def test_a_movie_with_background_frames(movie: Path, tmp_path: Path, capsys: Cap
     given += ["--set", "background.frames=[0,38]", "--set", "fit.frames=[120,160]"]
     assert main(given) == 0
     found = {r["parameter"]: r for r in json.loads(capsys.readouterr().out)["parameters"]}
-    for name, true in TRUTH.items():
+    for name, true in OPTICS_TRUTH.items():
         assert abs(found[name]["value"] - true) < SIGMAS * found[name]["sigma"]
 
 

@@ -178,7 +178,7 @@ def test_every_mode_and_scheme_makes_a_page(mode: str, scheme: str) -> None:
     assert f"mode {mode}" in page
     assert len(payload(page)) == 21
     assert ">nan" not in page
-    for status in Status:
+    for status in set(Status) - {Status.SIDELOBE}:  # side lobes are no events
         assert status.value in page
 
 
