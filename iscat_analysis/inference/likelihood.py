@@ -499,10 +499,10 @@ class Likelihood:
         )
 
     def _table(self, heights_nm: FloatArray) -> AxialTable:
-        """Profiles along z, or at the one height that is asked for."""
-        first = float(heights_nm[0])
-        single = bool(np.all(heights_nm == first))
-        return self.model.height_table(first) if single else self.model.axial_table
+        """Profiles along z, or at the particle's fixed height where no other is asked for."""
+        fixed = self.model.height_nm
+        at_it = bool(np.all(heights_nm == fixed))
+        return self.model.height_table(fixed) if at_it else self.model.axial_table
 
     @property
     def _arguments(self) -> tuple[Lens, Pixels, int, FloatArray]:
