@@ -250,13 +250,39 @@ def _judged(judgement: Judgement) -> dict[str, Any]:
 
 
 def correlation(covariance: FloatArray) -> FloatArray:
-    """Correlation matrix of a covariance, shape (n, n)."""
+    """Give the correlation matrix of a covariance.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (n, n)
+        The covariance.
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+        Correlations.
+    """
     sigma = np.sqrt(np.diag(covariance))
     return np.asarray(covariance / np.outer(sigma, sigma)) if sigma.size else covariance
 
 
 def with_error(label: str, value: float, sigma: float, unit: str) -> str:
-    """Write a value with as many digits as its error deserves."""
+    """Write a value with as many digits as its error deserves.
+
+    Parameters
+    ----------
+    label : str
+        What it is.
+    value, sigma : float
+        The value and its standard error.
+    unit : str
+        Unit of both.
+
+    Returns
+    -------
+    str
+        As in ``focus -371.4 ± 2.0 nm``.
+    """
     digits = max(0, 1 - int(np.floor(np.log10(sigma)))) if sigma > 0 else 3
     return f"{label} {value:.{digits}f} ± {sigma:.{digits}f} {unit}".rstrip()
 

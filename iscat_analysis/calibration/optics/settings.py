@@ -104,7 +104,18 @@ def with_settings(config: Config, settings: Settings) -> Config:
 
 
 def is_term(name: str) -> bool:
-    """Whether a name is that of an aberration."""
+    """Tell whether a name is that of an aberration.
+
+    Parameters
+    ----------
+    name : str
+        A key of the settings.
+
+    Returns
+    -------
+    bool
+        True for ``z5`` and the like.
+    """
     return name[0] == "z" and name[1:].isdigit()
 
 
