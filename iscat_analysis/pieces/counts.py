@@ -128,7 +128,13 @@ def gather(
     ----------
     config : Config
         From `config_of`.
-    before, after, n_before, n_after, power_ratio, level, masked, saturated
+    before, after : array_like, shape (n, y, x)
+        As in `fit_rois`.
+    n_before, n_after : int
+        As in `fit_rois`.
+    power_ratio, masked, saturated : array_like, optional
+        As in `fit_rois`.
+    level : bool, optional
         As in `fit_rois`.
 
     Returns

@@ -216,7 +216,18 @@ class Estimate:
 
 
 def prior_range(name: str) -> float:
-    """Plausible distance of a parameter from the configured value, in its unit."""
+    """Give the plausible distance of a parameter from the configured value.
+
+    Parameters
+    ----------
+    name : str
+        The parameter.
+
+    Returns
+    -------
+    float
+        In its unit.
+    """
     return PRIOR_RANGE.get(name, TERM_RANGE_NM)
 
 
