@@ -153,7 +153,18 @@ def harmonics(waves: ComplexArray, weight: FloatArray) -> ComplexArray:
 
 
 def critical_angle(optics: Optics) -> float | None:
-    """Angle in the oil at which light grazes the sample, where the pupil comes near it [rad]."""
+    """Return the angle in the oil at which light grazes the sample.
+
+    Parameters
+    ----------
+    optics : Optics
+        The microscope.
+
+    Returns
+    -------
+    float or None
+        The angle [rad]; None where the pupil does not come near it.
+    """
     near = NEAR_CRITICAL * optics.n_sample < optics.na and optics.n_sample < optics.n_immersion
     return math.asin(optics.n_sample / optics.n_immersion) if near else None
 

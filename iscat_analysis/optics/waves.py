@@ -400,7 +400,7 @@ def radial_field(
 
     Parameters
     ----------
-    source, axial, psi, circular, analyzer
+    source, axial : ndarray, complex
         As in `RadialField`.
     transverse : ndarray, shape (n,)
         Transverse wavenumbers [rad/nm].
@@ -408,6 +408,10 @@ def radial_field(
         The largest of them [rad/nm].
     reach_nm : float
         Largest distance wanted [nm].
+    psi : float
+        As in `RadialField`.
+    circular, analyzer : bool
+        As in `RadialField`.
     like : RadialField or None
         One whose Bessel table is taken over where it is the same.
 

@@ -132,9 +132,11 @@ def gather(
         As in `fit_rois`.
     n_before, n_after : int
         As in `fit_rois`.
-    power_ratio, masked, saturated : array_like, optional
+    power_ratio : array_like, optional
         As in `fit_rois`.
     level : bool, optional
+        As in `fit_rois`.
+    masked, saturated : array_like, optional
         As in `fit_rois`.
 
     Returns

@@ -30,8 +30,12 @@ def config_of(
 
     Parameters
     ----------
-    optics, particle, camera
-        The sections of a configuration.
+    optics : Optics
+        The microscope.
+    particle : Particle
+        What is seen.
+    camera : CameraConfig
+        What records it.
     mode : str
         Key of `FREE_PARAMETERS`.
     z_range_nm : (float, float), optional
