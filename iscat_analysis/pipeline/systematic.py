@@ -9,15 +9,17 @@ shrink when events are averaged.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from iscat_analysis.bounds import imitation, joint_information, mass_drift
 from iscat_analysis.calibration.mass import line_sigma_kda
 from iscat_analysis.config import Config
-from iscat_analysis.inference.response import optics_response, peak_response
-from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.inference.likelihood import LEVEL, asimov_conditional, asimov_poisson
+from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Status
 
 _AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
@@ -87,7 +89,7 @@ def _of_the_line(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray
 
 
 def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
-    """Give what the measured optics may be wrong by: D Σ Dᵀ of `inference.response`."""
+    """Give what the measured optics may be wrong by: D Σ Dᵀ of `bounds.shared`."""
     errors, pixel = config.optics.covariance, config.camera.pixel_size_nm
     suited = config.optics.scheme != "darkfield" and config.optics.convention == "exact"
     if errors is None or not errors.names or pixel is None or not suited:
@@ -117,16 +119,13 @@ def _shifts(
     errors = config.optics.covariance
     names = errors.names if errors is not None else ()
     free = [name in FREE_PARAMETERS[config.fit.mode] for name in PARAMETERS]
-    before, after = (float(table[f"n_{when}"].median()) for when in ("before", "after"))
     amplitude = np.array([model.scale.amplitude(m) for m in table["mass_kda"].astype(float)])
     nodes = _amplitude_nodes(amplitude, (table["status"] == Status.OK.value).to_numpy())
-
-    def at(z_nm: float, amplitudes: FloatArray) -> FloatArray:
-        return optics_response(
-            model, grid, z_nm, amplitudes, names, free=free,
-            level=config.background.method == "sliding", odds=after / before if before else 0.0,
-        )  # fmt: skip
-
+    respond = _Response(
+        replace(model, scale=MassScale()), grid, names, tuple(free),
+        level=config.background.method == "sliding",
+        frames=(int(table["n_before"].median()), int(table["n_after"].median())),
+    )  # fmt: skip
     by_amplitude = _lagrange(nodes, np.clip(amplitude, nodes.min(), nodes.max()))
     heights, by_height = _height_weights(
         table["z_nm"].to_numpy(dtype=float), model.z_range_nm, model.fringe_nm
@@ -134,39 +133,77 @@ def _shifts(
     shifts = np.zeros((len(table), len(PARAMETERS), len(names)))
     for height, weight in zip(heights, by_height.T, strict=True):
         near = weight != 0
-        found = np.einsum("en,nik->eik", by_amplitude[near], at(float(height), nodes))
+        found = np.einsum("en,nik->eik", by_amplitude[near], respond.at(float(height), nodes))
         shifts[near] += weight[near, None, None] * found
     if free[3]:
-        shifts[:, 3] = _mass_shifts(config, model, amplitude, shifts[:, 3], at)
+        shifts[:, 3] *= amplitude[:, None]
+        if model.scale.calibration is not None:
+            peak = np.array([mass_drift(model, a, names) / a for a in nodes])
+            drift = amplitude[:, None] * (by_amplitude @ peak)
+            shifts[:, 3] = _calibrated(config, model, respond, amplitude, shifts[:, 3], drift)
     return shifts
 
 
-def _mass_shifts(
+@dataclass(frozen=True)
+class _Response:
+    """How the estimates of a particle at the centre of a region move with the optics."""
+
+    model: ForwardModel  # with masses that are amplitudes
+    grid: PixelGrid
+    names: tuple[str, ...]
+    free: tuple[bool, ...]
+    level: bool
+    frames: tuple[int, int]
+
+    def at(self, z_nm: float, amplitudes: FloatArray) -> FloatArray:
+        """D of (x, y, z [nm], ln a) per unit of each parameter, shape (amplitudes, 4, k)."""
+        count, (before, after) = len(self.names), self.frames
+        kept = np.flatnonzero([*self.free, self.level])
+        chosen = np.concatenate([np.arange(count), count + kept])
+        out = np.zeros((len(amplitudes), LEVEL + 1, count))
+        for index, amplitude in enumerate(amplitudes):
+            theta = np.array([*self._centre, z_nm, amplitude, 0.0])
+            expected = (
+                asimov_conditional(self.model, self.grid, theta, 1.0, before, after)
+                if before
+                else asimov_poisson(self.model, self.grid, theta, 1.0, 1.0)
+            )
+            whole = joint_information(expected, theta, self.names)
+            out[index, kept] = imitation(whole[np.ix_(chosen, chosen)], count)
+            out[index, 3] /= amplitude
+        return out[:, :4]
+
+    @property
+    def _centre(self) -> tuple[float, float]:
+        return float(np.mean(self.grid.x_nm)), float(np.mean(self.grid.y_nm))
+
+
+def _calibrated(
     config: Config,
     model: ForwardModel,
+    respond: _Response,
     amplitude: FloatArray,
-    relative: FloatArray,
-    at: Callable[[float, FloatArray], FloatArray],
+    moves: FloatArray,
+    drift: FloatArray,
 ) -> FloatArray:
-    """Turn relative shifts of the amplitude (n, k) into shifts of the mass [kDa].
+    """Turn shifts of the amplitude (n, k) into those of a mass that a line ties to the contrast.
 
-    On the model's own scale the amplitude is the mass.  A calibration is about the peak contrast
-    C = L a + Q a², which moves less, because L moves too.  Where the optics come from a file, the
-    standards were fitted with the same: line and contrasts are off by the same factor, that of a
-    faint particle, and only what bright ones have beyond it remains.
+    The peak contrast C = L a + Q a² moves less than the amplitude, because L moves too: `drift`.
+    Where the optics come from a file, the standards were fitted with the same: line and contrasts
+    are off by the same factor, that of a faint particle, and only what bright ones have beyond it
+    remains.
     """
-    line, a = config.calibration, amplitude[:, None]
-    if line is None:
-        return np.asarray(a * relative)
-    names = config.optics.covariance.names if config.optics.covariance is not None else ()
-    linear, quadratic = model.scale.linear, model.scale.quadratic
-    by_linear, by_quadratic = peak_response(model, names)
-    contrast = linear * a + quadratic * a**2
-    change = (linear * a + 2 * quadratic * a**2) * relative + by_linear * a + by_quadratic * a**2
+    scale, names = model.scale, respond.names
+    gradient = float(scale.slope(0.0))
+    slope = np.array([scale.slope(float(a)) for a in amplitude])
+    shifts = slope[:, None] * moves + drift
     if config.optics.file is not None:
-        faint = np.array([1e-6 / linear])
-        change = change - contrast * (at(model.height_nm, faint)[0, 3] + by_linear / linear)
-    return np.asarray(change / line.gradient_per_kda)
+        faint = 1e-6 * np.abs(amplitude).max()
+        relative = respond.at(model.height_nm, np.array([faint]))[0, 3]
+        relative = relative + mass_drift(model, faint, names) / (faint * gradient)
+        contrast = scale.linear * amplitude + scale.quadratic * amplitude**2
+        shifts -= (contrast * gradient / scale.linear)[:, None] * relative
+    return np.asarray(shifts)
 
 
 def _amplitude_nodes(amplitude: FloatArray, good: NDArray[np.bool_]) -> FloatArray:
@@ -195,7 +232,8 @@ def _height_weights(
     cubic = _lagrange(np.arange(4.0), place - first)
     np.put_along_axis(weights, first[:, None] + np.arange(4), cubic, axis=1)
     used = np.flatnonzero(np.any(weights != 0, axis=0))
-    return low + (high - low) / count * used, weights[:, used]
+    heights = np.asarray(low + (high - low) / count * used, dtype=np.float64)
+    return heights, weights[:, used]
 
 
 def _lagrange(nodes: FloatArray, points: FloatArray) -> FloatArray:
