@@ -708,18 +708,17 @@ def _wave(
 def _mass_scale(model: ForwardModel, line: Calibration) -> MassScale:
     if not model.rho:
         raise ConfigError("[calibration] relates contrast to mass; dark field has no contrast")
-    if isinstance(model.wave, MeasuredField):
-        weak, cause = 1e-6 / model.wave.gain, "the picture that was measured"
-    else:
-        weak = 1e-6 / math.sqrt(model.collected_area_nm2(model.height_nm, 1.0))
-        cause = f"optics.focus_nm = {model.optics.focus_nm:g}"
+    measured = isinstance(model.wave, MeasuredField)
+    area = 0.0 if measured else model.collected_area_nm2(model.height_nm, 1.0)
+    weak = 1e-6 / (peak_per_amplitude(model) if measured else math.sqrt(area))
     linear, quadratic = model.wave.peak(model.height_nm, weak, model.rho)
     linear, quadratic = linear / weak, quadratic / weak**2
     if linear * line.gradient_per_kda < 0:
         seen = "bright" if linear > 0 else "dark"
+        cause = "optics.template" if measured else f"optics.focus_nm = {model.optics.focus_nm:g}"
         raise ConfigError(
             f"calibration.gradient_per_kda = {line.gradient_per_kda:g} has the wrong sign: with "
-            f"optics.focus_nm = {model.optics.focus_nm:g} the model's particles are {seen}; "
-            "change the sign or the focus"
+            f"{cause} the model's particles are {seen}; change the sign"
+            f"{'' if measured else ' or the focus'}"
         )
     return MassScale(line, linear, quadratic)

@@ -16,6 +16,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ FloatArray = NDArray[np.float64]
 
 _KEPT = 4  # lattices at hand, one for each number of orders
 _SLOW = 1e-3  # a rate [rad/nm] for tables along z, where nothing changes
+_STORED = ("contrast", "sigma", "step_nm", "pixel_nm", "roi_nm", "peak_se", "sights")
 _SAME_PIXEL = 1e-3  # relative difference of pixel sizes that is rounding
 
 
@@ -65,7 +67,8 @@ class Template:
     def to_bytes(self) -> bytes:
         """Give the content of an ``.npz`` file, the same bytes for the same template."""
         out = io.BytesIO()
-        np.savez(out, **{name: np.asarray(value) for name, value in vars(self).items()})
+        values: dict[str, Any] = {k: np.asarray(getattr(self, k)) for k in _STORED}
+        np.savez(out, **values)
         return out.getvalue()
 
     @classmethod
@@ -141,16 +144,14 @@ def sha256_of(content: bytes) -> str:
 def _parsed(name: str, content: bytes) -> Template:
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-            values = {key: stored[key] for key in Template.__dataclass_fields__}
+            values: dict[str, Any] = {key: stored[key] for key in _STORED}
     except (KeyError, ValueError, OSError):
         raise ConfigError(
             f"{name}: is no template of `iscat calibrate optics --measured`"
         ) from None
-    arrays = {key: np.asarray(values.pop(key), dtype=float) for key in ("contrast", "sigma")}
-    return Template(
-        **arrays, **{key: float(v) for key, v in values.items() if key != "sights"},
-        sights=int(values["sights"]),
-    )  # fmt: skip
+    for key in _STORED[2:-1]:
+        values[key] = float(values[key])
+    return Template(**values | {"sights": int(values["sights"])})
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +214,7 @@ class MeasuredField:
         return lru_cache(_KEPT)(with_orders)
 
     def _coefficients(self) -> FloatArray:
-        """Samples of Re e on the lattice of the reach, less the smoothing of its window."""
+        """Sample Re e on the lattice of the reach, and undo the smoothing of its window."""
         side = 2 * (self.half + FILTER) + 1
         samples = np.zeros((side, side))
         known = self.template.contrast.T * (self.gain / 2)

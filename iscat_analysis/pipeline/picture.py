@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 
@@ -89,6 +90,32 @@ class MeasuredPicture:
             f"{judged.p_values.size} that were held out {np.mean(judged.chi2_reduced):.3f} "
             f"(p-values uniform: p = {judged.uniform_p:.2g})"
         )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give what ``template.json`` holds.
+
+        Returns
+        -------
+        dict
+            Nested plain values.
+        """
+        found, judged = self.template, self.judgement
+        return {
+            "accepted": self.accepted,
+            "refusals": list(self.refusals),
+            "particles": found.sights,
+            "contaminated": self.contaminated,
+            "determined": self.fit.effective,
+            "peak_se": found.peak_se,
+            "pixel_nm": found.pixel_nm,
+            "roi_nm": found.roi_nm,
+            "held_out": {
+                "p_values": judged.p_values.tolist(),
+                "chi2_reduced": judged.chi2_reduced.tolist(),
+                "uniform_p": judged.uniform_p,
+            },
+            "source": dict(self.source),
+        }
 
     def to_toml(self, template: str, checksum: str) -> str:
         """Write what ``[optics] file`` reads.
@@ -218,9 +245,7 @@ def _judged(
 
     first = fit([s for i, s in enumerate(sights) if i % _HELD_OUT != 1])
     held = fitted_with(sights[1::_HELD_OUT], first)
-    kept = [
-        (some, judged(some, first).p_values > _CONTAMINATED_P) for some in (first.sights, held)
-    ]
+    kept = [(some, judged(some, first).p_values > _CONTAMINATED_P) for some in (first.sights, held)]
     bad = sum(int(np.sum(~good)) for _, good in kept)
     contaminated = 0
     if 0 < bad <= _CONTAMINATED_SHARE * len(sights):

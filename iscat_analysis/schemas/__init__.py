@@ -19,7 +19,7 @@ from pydantic import BaseModel
 
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.schemas.bounds import Bounds, Comparison
-from iscat_analysis.schemas.calibration import Calibration, Camera, Optics
+from iscat_analysis.schemas.calibration import Calibration, Camera, Optics, Template
 from iscat_analysis.schemas.fit import Fit, Simulate, Summary
 from iscat_analysis.schemas.study import Benchmark
 
@@ -33,6 +33,7 @@ _DOCUMENTS: Mapping[str, type[BaseModel]] = {
     "optics": Optics,
     "simulate": Simulate,
     "summary": Summary,
+    "template": Template,
 }
 
 
@@ -55,8 +56,8 @@ def schema(name: str) -> dict[str, Any]:
     name : str
         ``"fit"``, ``"simulate"`` or ``"bounds"`` for what the command prints with ``--json``, and
         ``"comparison"`` for ``iscat bounds --preset``; ``"summary"``, ``"benchmark"``,
-        ``"camera"``, ``"optics"`` or ``"calibration"`` for the file of that name and what is
-        printed beside it.
+        ``"camera"``, ``"optics"``, ``"template"`` or ``"calibration"`` for the file of that
+        name and what is printed beside it.
 
     Returns
     -------

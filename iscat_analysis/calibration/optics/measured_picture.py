@@ -145,8 +145,9 @@ def fit_picture(
     offsets, weights = nominal.samples
     blur = (offsets * pixel, weights)
     coefficients, scale = np.zeros(2 * waves.qx.size - 1), peak_per_amplitude(nominal)
-    template, covariance, effective, used = None, np.zeros((0, 0)), 0.0, 0
-    for used in range(1, _ROUNDS + 1):
+    used, moved = 0, math.inf
+    while used < _ROUNDS and moved > _SETTLED:
+        used += 1
         found = _solve(own, nominal, waves, coefficients, scale, blur, level, mapper)
         before, (coefficients, covariance, effective) = coefficients, found
         coefficients, shift, size = _gauge(waves, coefficients, side / 2, step_nm, own)
@@ -160,11 +161,7 @@ def fit_picture(
         )
         model = with_template(nominal, template)
         own = list(mapper(lambda s, m=model: fit_own(s, m, level=level), own))
-        noise = float(np.trace(covariance))
-        if np.sum((coefficients - before) ** 2) < _SETTLED**2 * noise:
-            break
-    if template is None:  # there is at least one round
-        raise AssertionError
+        moved = float(np.linalg.norm(coefficients - before) / np.sqrt(np.trace(covariance)))
     return PictureFit(template, tuple(own), effective, used)
 
 
@@ -235,9 +232,7 @@ def place_sights(sights: Sequence[Sight], nominal: ForwardModel) -> list[Sight]:
     return out
 
 
-def _seen(
-    sight: Sight, nominal: ForwardModel, signal: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _seen(sight: Sight, nominal: ForwardModel, signal: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Measured signal of a picture and its information, 0 where masked; the model takes no part."""
     likelihood = Likelihood(nominal, sight.grid, sight.kind, sight.data)
     return np.nan_to_num(likelihood.measured_signal()), likelihood.signal_information(signal)
@@ -332,7 +327,7 @@ def _template(
 ) -> Template:
     """Sample the picture on its lattice; beyond what was seen it fades."""
     count = math.ceil((side_nm / 2 + _FADE_NM) / step_nm)
-    axis = step_nm * np.arange(-count, count + 1)
+    axis = np.asarray(step_nm * np.arange(-count, count + 1), dtype=np.float64)
     beyond = np.clip((np.abs(axis) - side_nm / 2) / _FADE_NM, 0, 1)
     fade = np.cos(math.pi / 2 * beyond) ** 2
     basis = waves.on(axis, axis, None)
