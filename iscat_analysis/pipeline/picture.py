@@ -41,6 +41,7 @@ HELD_OUT_P = 1e-3
 _HELD_OUT = 3  # every third picture is held out
 _CONTAMINATED_P = 1e-4  # something else happened in a picture with a smaller p-value
 _CONTAMINATED_SHARE = 0.25  # more than this is the template's fault
+_NEW = 0.02  # share of a neighbour's contrast that is new in a picture and disturbs it
 _CLEAR_NM = 600.0  # from the edge of a picture to the nearest other particle
 
 
@@ -272,7 +273,7 @@ def _alone(sights: Sequence[Sight], others: Sequence[Sight]) -> list[Sight]:
     def is_alone(sight: Sight) -> bool:
         room = sight.grid.pixel_nm * max(sight.grid.shape) / 2 + _CLEAR_NM
         x, y = float(np.mean(sight.grid.x_nm)), float(np.mean(sight.grid.y_nm))
-        near = (others[number] for number, _ in sight.neighbours)
+        near = (others[number] for number, share in sight.neighbours if abs(share) > _NEW)
         return all(max(abs(o.x_nm - x), abs(o.y_nm - y)) > room for o in near)
 
     return [sight for sight in sights if is_alone(sight)]

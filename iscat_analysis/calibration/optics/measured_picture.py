@@ -7,8 +7,9 @@ contrasts of either sign, the counts before and after with their own weights, th
 of every picture, and a band limit in place of smoothing kernels: no light leaves the glass with a
 wave vector beyond 2π n/λ, so that plane waves up to there say all that any microscope can show.
 
-The picture is linear in the amplitudes of these waves.  Their prior is white, with the variance
-that makes the pictures most probable (D. J. C. MacKay, Neural Comput. 4, 415, 1992).
+The picture is linear in the amplitudes of these waves.  Their prior knows that rings fade with
+the distance, as the picture of the round before had them, and its variance is the one that makes
+the pictures most probable (D. J. C. MacKay, Neural Comput. 4, 415, 1992).
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ _SETTLED = 0.1  # change of the picture, over its noise, at which rounds end
 _FADE_NM = 250.0  # beyond the pictures the template fades to nothing
 _ROOM_NM = 250.0  # between periodic images, beside what fades
 _ROAM_NM = 400.0  # along x and y, in the fit of one picture
+_RING_NM = 150.0  # width of the rings on which the prior is told
+_LEAST = 1e-4  # of its variance, relative to that of the centre
 _FINE = 8  # points per step of the lattice, where the peak is looked for
 _EVIDENCE = 30  # steps of the variance of the prior
 
@@ -145,10 +148,11 @@ def fit_picture(
     offsets, weights = nominal.samples
     blur = (offsets * pixel, weights)
     coefficients, scale = np.zeros(2 * waves.qx.size - 1), peak_per_amplitude(nominal)
+    prior = np.eye(coefficients.size)
     used, moved = 0, math.inf
     while used < _ROUNDS and moved > _SETTLED:
         used += 1
-        found = _solve(own, nominal, waves, coefficients, scale, blur, level, mapper)
+        found = _solve(own, nominal, waves, coefficients, prior, scale, blur, level, mapper)
         before, (coefficients, covariance, effective) = coefficients, found
         coefficients, shift, size = _gauge(waves, coefficients, side / 2, step_nm, own)
         own = [
@@ -156,6 +160,7 @@ def fit_picture(
             for s in own
         ]
         covariance = covariance / size**2
+        prior = _prior(waves, coefficients, covariance, step_nm)
         template = _template(
             waves, coefficients, covariance, own, roi_nm=roi_nm, side_nm=side, step_nm=step_nm
         )
@@ -243,6 +248,7 @@ def _solve(
     nominal: ForwardModel,
     waves: _Waves,
     coefficients: FloatArray,
+    prior: FloatArray,
     scale: float,
     blur: tuple[FloatArray, FloatArray],
     level: bool,
@@ -278,8 +284,9 @@ def _solve(
     found = list(mapper(one, sights))
     information = np.sum([each[0] for each in found], axis=0)
     pull = np.sum([each[1] for each in found], axis=0) + information @ coefficients
-    values, vectors = np.linalg.eigh(information)
+    values, vectors = np.linalg.eigh(prior.T @ information @ prior)
     values = np.maximum(values, 0.0)
+    vectors = prior @ vectors
     turned = vectors.T @ pull
     ridge = 1e-3 * float(values[-1])
     effective = 0.0
@@ -290,6 +297,24 @@ def _solve(
     solved = turned / (values + ridge)
     covariance = (vectors / (values + ridge)) @ vectors.T
     return vectors @ solved, covariance, effective
+
+
+def _prior(
+    waves: _Waves, coefficients: FloatArray, covariance: FloatArray, step_nm: float
+) -> FloatArray:
+    """Root of the covariance of a picture whose variance fades with the distance, shape (k, k)."""
+    side = 2 * math.pi / float(np.min(np.abs(waves.qx[waves.qx != 0])))
+    points = 2 * math.ceil(side / step_nm / 2)
+    axis = (np.arange(points) - points // 2) * (side / points)
+    basis = waves.on(axis, axis, None)
+    noise = np.einsum("pi,ij,pj->p", basis, covariance, basis, optimize=True)
+    energy = (basis @ coefficients) ** 2 - noise
+    ring = np.rint(np.hypot(axis[:, None], axis).ravel() / _RING_NM).astype(int)
+    mean = np.bincount(ring, energy) / np.maximum(np.bincount(ring), 1)
+    fading = np.maximum.accumulate(np.maximum(mean, _LEAST * mean.max())[::-1])[::-1]
+    spread = np.sqrt(fading / fading[0])[ring]
+    back = basis.T * np.where(np.arange(coefficients.size) == 0, 1.0, 2.0)[:, None] / ring.size
+    return np.asarray((back * spread) @ basis)
 
 
 def _gauge(
