@@ -150,7 +150,7 @@ def signal_derivatives(
     y_nm: float,
     amplitude: float,
 ) -> FloatArray:
-    """Derivatives of the signal from lattices.
+    """Combine lattices to derivatives of the signal.
 
     Parameters
     ----------

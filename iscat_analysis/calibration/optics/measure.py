@@ -51,7 +51,9 @@ CONTAMINATED_P = 1e-4
 """A single picture with a smaller p-value, where most are fine, shows more than one particle."""
 
 _PLACE = ("x_nm", "y_nm")
-_OTHERS_PASSES = 8
+_OTHERS_PASSES = 6
+_RUNG_PASSES = 12
+_TOO_FEW = 20.0  # log-likelihood that fewer aberrations lose where still fewer cannot be better
 _CONTAMINATED_SHARE = 0.25  # more than this is the model's fault
 _TRIAL_PASSES = 12  # of a second microscope on all pictures
 _CLOSE = 0.01  # states whose average is explained this much worse are tried on all pictures
@@ -300,6 +302,7 @@ class _Search:
         others = self._fit(
             tuple(self.mapper(clear, others)), best.values, (), _OTHERS_PASSES
         ).sights
+        self.others = others  # where they are is known the next time
         fitted = tuple(self.mapper(clear, best.sights))
         judged = tuple(self.mapper(clear, held_out))
         judged = self._own(judged, best.values) if judged else ()
@@ -383,11 +386,13 @@ class _Search:
         ]
         rungs = list(dict.fromkeys([*ladder, terms]))
         tried: list[tuple[float, Estimate]] = []
-        for rung in rungs:
+        for rung in reversed(rungs):  # the most first; fewer than too few are not tried
             names = tuple(n for n in best.names if not is_term(n) or n in rung)
             start = {**best.values, **{n: 0.0 for n in terms if n not in rung}}
-            fit = best if rung == terms else self._fit(best.sights, start, names, passes=12)
+            fit = best if rung == terms else self._fit(best.sights, start, names, _RUNG_PASSES)
             tried.append((self._fit(held_out, fit.values, ()).log_likelihood, fit))
+            if tried[-1][0] < tried[0][0] - _TOO_FEW:
+                break
         _, chosen = max(tried, key=lambda pair: pair[0])
         return chosen, tuple(n for n in terms if n not in chosen.names)
 

@@ -27,6 +27,7 @@ _FIRST_PASSES, _MORE_PASSES = 6, 14  # of all starts, and of those that lead the
 _LEADERS = 2  # beside the best of every state
 _ROUGH = 1.0  # gain in log-likelihood that ends a search
 _HOPELESS = 0.03  # share of the log-likelihood by which a state lags that is given up
+_WORTH_A_MASK = 1.01  # times what the same light explains without one
 _MASKS_NA = (0.35, 0.65)
 _FINER_MASKS_NA = (0.35, 0.5, 0.65, 0.8, 1.0)
 _MASK_TRANSMITS = 0.3  # where no attenuation is configured
@@ -90,11 +91,8 @@ class StateSearch:
         list of Estimate
             Fits of the average pictures, the most likely first.
         """
-        begun = [
-            start
-            for starts in self.mapper(lambda state: self._begin(averages, state), self.states())
-            for start in starts
-        ]
+        found = list(self.mapper(lambda state: self._begin(averages, state), self.states()))
+        begun = [start for starts in found for start in starts if self._promising(start, found)]
         refined = self._refine(averages, begun)
         hidden = self._hidden_masks(averages, refined)
         refined += self._refine(averages, hidden) if hidden else []
@@ -140,6 +138,19 @@ class StateSearch:
     ) -> tuple[Start, ...]:
         starts = search_starts(averages, self.build, candidates, most=most)
         return starts if "phase" in self.free else tuple(map(self._phased, starts))
+
+    def _promising(self, start: Start, found: Sequence[Sequence[Start]]) -> bool:
+        """Whether a mask that is not configured explains more than the same light without one."""
+        if not start.values["mask_na"] or self.configured["mask_na"]:
+            return True
+        light = start.values["polarization"]
+        plain = [
+            other.explained
+            for others in found
+            for other in others
+            if other.values["polarization"] == light and not other.values["mask_na"]
+        ]
+        return start.explained > _WORTH_A_MASK * max(plain)
 
     def _phased(self, start: Start) -> Start:
         """Put the configured reference phase back."""
