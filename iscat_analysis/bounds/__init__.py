@@ -1,7 +1,8 @@
 """Bounds: what no unbiased estimator can beat, given the camera or given the light itself.
 
 `quantum` holds what the collected light knows, `classical` what the camera can learn of it, and
-`experiment` plans a measurement from a configuration; `scan` varies one thing, `planning` turns the
+`experiment` plans a measurement from a configuration; `shared` says what an uncertain microscope
+leaves in every particle; `scan` varies one thing, `planning` turns the
 question round, and `paper` reproduces Dong et al. (2021).
 """
 
@@ -39,6 +40,14 @@ from iscat_analysis.bounds.quantum import (
     z_nm_phase_free,
 )
 from iscat_analysis.bounds.scan import AXES, Axis, Scan, changed, parse_scan, scan
+from iscat_analysis.bounds.shared import (
+    displacement,
+    eliminated,
+    imitation,
+    joint_information,
+    mass_drift,
+    shared_sigma,
+)
 
 __all__ = [
     "AXES",
@@ -56,10 +65,15 @@ __all__ = [
     "bounds_report",
     "budget",
     "changed",
+    "displacement",
     "effort",
+    "eliminated",
     "event_bounds",
+    "imitation",
     "incompatible_pairs",
     "information_fraction",
+    "joint_information",
+    "mass_drift",
     "optimize",
     "parse_scan",
     "parse_target",
@@ -69,6 +83,7 @@ __all__ = [
     "report_of",
     "reproduce",
     "scan",
+    "shared_sigma",
     "warnings_of",
     "z_nm_phase_free",
 ]
