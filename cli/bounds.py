@@ -42,6 +42,7 @@ Along the focus, with a figure; the best focus for the mass; what 5 kDa takes:
 KINDS = {
     "crb_single": "CRB single",
     "crb_joint": "CRB joint",
+    "holevo": "Holevo",
     "qcrb": "QCRB",
     "qcrb_dong2021": "QCRB (Dong 2021)",
 }
@@ -191,7 +192,8 @@ def _print(report: Mapping[str, Any]) -> None:
             print_result(report["target"]["note"])
     else:
         print_result(_bounds_table("per photon", report["per_photon"]))
-        print_result(_bounds_table("for these photons", report["actual"]))
+        at_once = {name: report["holevo"][name] for name in report["at"]["free"]}
+        print_result(_bounds_table("for these photons", {**report["actual"], "holevo": at_once}))
         print_result(_information(report))
     for line in report["unidentifiable"]:
         print_result(f"unidentifiable: {line}")
@@ -297,7 +299,7 @@ def _bounds_table(title: str, values: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def _information(report: Mapping[str, Any]) -> Table:
-    found = table("information used", "of the light's")
+    found = table("information used", "of the light's", "jointly, of what can be had")
     found.add_column("no single measurement is best for it and", no_wrap=True)
     rivals = [pair.split("–") for pair in report["incompatible"]]
     for name, share in report["information_fraction"].items():
@@ -305,10 +307,14 @@ def _information(report: Mapping[str, Any]) -> Table:
         others = [a if b == alias else b for a, b in rivals if alias in (a, b)]
         found.add_row(
             name,
-            "–" if share is None or not math.isfinite(share) else f"{100 * share:.1f} %",
+            *(_percent(value) for value in (share, report["information_fraction_joint"].get(name))),
             ", ".join(other.replace("_rel", "_kda") for other in others) or "–",
         )
     return found
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None or not math.isfinite(share) else f"{100 * share:.1f} %"
 
 
 def _scan_table(scanned: Mapping[str, Any], free: list[str]) -> Table:

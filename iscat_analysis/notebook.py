@@ -7,6 +7,7 @@ configuration are given as a mapping.
 from __future__ import annotations
 
 import html
+import math
 import textwrap
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -454,9 +455,11 @@ class Result:
         counts = table["status"].value_counts()
         facts.append(("status", ", ".join(f"{n} {s}" for s, n in counts.items()) or "no events"))
         for name in FREE_PARAMETERS[self.mode] if caution(table) is None else ():
-            p = precision_of(table, name)
+            p = precision_of(self.analysis, table, name)
             if p.events:
-                text = f"σ {number(p.sigma)}, CRB {number(p.crb)}, QCRB {number(p.qcrb)}"
+                text = f"σ {number(p.sigma)}, CRB {number(p.crb)}"
+                text += f", Holevo {number(p.holevo)}" if math.isfinite(p.holevo) else ""
+                text += f", QCRB {number(p.qcrb)}"
                 facts.append((label_of(self.analysis, name), f"{text} {UNITS[name]} (medians)"))
         return facts + [("warning", text) for text in self.warnings]
 

@@ -89,6 +89,17 @@ class BoundsPlanned(Document):
     qcrb_dong2021: Planned = key("Quantum, with the mode weight of Dong et al. (2021)")
 
 
+class Holevo(Closed):
+    """What one measurement of all free parameters can reach, for the planned frames."""
+
+    weight: Literal["qfi"] = key("Every parameter weighs as much as the light knows of it")
+    sum: Positive = key("Tr WV; the number of free parameters where no two are in conflict")
+    x_nm: Positive = maybe("[nm]")
+    y_nm: Positive = maybe("[nm]")
+    z_nm: Positive = maybe("[nm]")
+    mass_kda: Positive = maybe("[kDa]")
+
+
 class Crosstalk(Document):
     """The direction among the free parameters that is hidden worst."""
 
@@ -143,7 +154,11 @@ class Bounds(Document):
     qfi_imaginary: Matrix4 = key(
         "Its imaginary part; where not zero, no single measurement is best for both parameters",
     )
+    holevo: Holevo = key("Holevo bound over the mode's free parameters")
     information_fraction: dict[Parameter, Number] = key("Share of the light's information")
+    information_fraction_joint: dict[Parameter, Number] = key(
+        "Share of what one measurement of all free parameters can take: (Holevo / CRB joint)²"
+    )
     incompatible: dict[str, float] = key(
         "Pairs that no single measurement estimates best, and how strongly, from 0 to 1"
     )
