@@ -503,7 +503,7 @@ class Result:
         for name in FREE_PARAMETERS[self.mode] if caution(table) is None else ():
             p = precision_of(table, name)
             if p.events:
-                text = f"σ {number(p.sigma)}, CRB {number(p.crb)}, QCRB {number(p.qcrb)}"
+                text = f"σ {number(p.sigma)}{p.shared}, CRB {number(p.crb)}, QCRB {number(p.qcrb)}"
                 facts.append((label_of(self.analysis, name), f"{text} {UNITS[name]} (medians)"))
         return facts + [("warning", text) for text in self.warnings]
 

@@ -61,6 +61,8 @@ class Precision:
         Median of σ/CRB.
     information : float
         Median of (QCRB/CRB)², the share of the light's information that the measurement uses.
+    systematic : float
+        Median of the error that all events share [nm or kDa]; NaN where it is not known.
     """
 
     name: str
@@ -70,6 +72,13 @@ class Precision:
     qcrb: float
     over_crb: float
     information: float
+    systematic: float = math.nan
+
+    @property
+    def shared(self) -> str:
+        """The error that all events share, as text beside σ; empty where it is not known."""
+        known = math.isfinite(self.systematic)
+        return f", common to all events {number(self.systematic)}" if known else ""
 
 
 def counted(table: pd.DataFrame) -> pd.DataFrame:
@@ -143,7 +152,8 @@ def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
         A copy in which ``mass_kda`` and its σ and bounds are contrasts.
     """
     per_kda = (table["contrast"] / table["mass_kda"]).abs()
-    columns = [f"{kind}_mass_kda" for kind in ("sigma", "crb", "qcrb")]
+    kinds = ("sigma", "crb", "qcrb", "systematic")
+    columns = [name for kind in kinds if (name := f"{kind}_mass_kda") in table]
     scaled = {name: table[name] * per_kda for name in columns}
     return table.assign(**scaled, mass_kda=table["contrast"])
 
@@ -218,7 +228,14 @@ def precision_of(table: pd.DataFrame, name: str) -> Precision:
         quantiles(qcrb)[1],
         quantiles(sigma / crb)[1],
         quantiles((qcrb / crb) ** 2)[1],
+        _shared(good, name)[1],
     )
+
+
+def _shared(good: pd.DataFrame, name: str) -> tuple[float, float, float]:
+    """Quartiles of the error that all events share."""
+    column = f"systematic_{name}"
+    return quantiles(good[column].to_numpy(float) if column in good else np.empty(0))
 
 
 def quantiles(values: FloatArray) -> tuple[float, float, float]:
@@ -318,6 +335,11 @@ def _spread(analysis: Analysis, table: pd.DataFrame) -> list[str]:
         good = table[table["status"] == Status.OK.value]
         relative = (good["sigma_mass_kda"] / good["mass_kda"].abs()).to_numpy(float)
         text += f" is {percent(quantiles(relative)[1])} of it"
+        if math.isfinite(p.systematic):
+            shared = (good["systematic_mass_kda"] / good["mass_kda"].abs()).to_numpy(float)
+            text += f", the error common to all events {percent(quantiles(shared)[1])}"
+    else:
+        text += f"{p.shared}{f' {UNITS[name]}' if p.shared else ''}"
     text += f", {number(p.over_crb)} times the Cramér–Rao bound"
     if math.isfinite(p.information):
         text += f"; {percent(p.information)} of the information in the light is used"
@@ -337,12 +359,12 @@ def precision_rows(analysis: Analysis, precision: Sequence[Precision]) -> list[l
     Returns
     -------
     list of list of str
-        Parameter, σ, CRB, QCRB, σ over CRB, light used, rows.
+        Parameter, σ, error common to all events, CRB, QCRB, σ over CRB, light used, rows.
     """
     return [
         [
             f"{label_of(analysis, p.name)} [{UNITS[p.name]}]",
-            *(number(value) for value in (p.sigma, p.crb, p.qcrb, p.over_crb)),
+            *(number(value) for value in (p.sigma, p.systematic, p.crb, p.qcrb, p.over_crb)),
             percent(p.information),
             str(p.events),
         ]
