@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.pixels import pixel_terms
-from iscat_analysis.optics.forward import PEAK_REACH, ForwardModel
+from iscat_analysis.optics.forward import PEAK_REACH, ForwardModel, MassScale
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import PARAMETERS, FloatArray
 
@@ -173,8 +174,8 @@ def mass_drift(model: ForwardModel, amplitude: float, names: Sequence[str]) -> F
         half *= 3 / _PEAK_POINTS
     # where the signal is largest its place does not matter to first order
     there = PixelGrid(np.array([x]), np.array([y]), _PEAK_NM)
-    mass = float(model.scale.mass(np.array(amplitude)))
-    slopes = model.optics_gradient(there, 0.0, 0.0, height, mass, names)[1]
+    plain = replace(model, scale=MassScale())  # below an offset two amplitudes have one mass
+    slopes = plain.optics_gradient(there, 0.0, 0.0, height, amplitude, names)[1]
     return np.asarray(slopes[:, 0, 0] / line.gradient_per_kda)
 
 

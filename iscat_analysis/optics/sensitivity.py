@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.image import Lens, Pixels
 from iscat_analysis._kernels.lattice_rows import lattice_values
 from iscat_analysis._kernels.zernike import zernike
-from iscat_analysis.config import ABERRATIONS, Optics
+from iscat_analysis.config import MEASURABLE, Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.aperture import Aperture, aperture_on, harmonics
 from iscat_analysis.optics.waves import LatticeField
@@ -28,9 +28,6 @@ ComplexArray = NDArray[np.complex128]
 
 Weight = Callable[[Aperture], tuple[ComplexArray, ComplexArray]]
 """Factor of the field's integral, and phase per height, on any quadrature."""
-
-PARAMETERS = ("focus_nm", "na", "reference_phase_deg", "mask_na", "attenuation", *ABERRATIONS)
-"""Parameters of the optics that have a derivative."""
 
 
 def check_names(optics: Optics, names: Sequence[str]) -> None:
@@ -48,9 +45,9 @@ def check_names(optics: Optics, names: Sequence[str]) -> None:
     ConfigError
         A name is unknown, or the paper's convention, whose quadrature has no derivative, is set.
     """
-    unknown = [name for name in names if name not in PARAMETERS]
+    unknown = [name for name in names if name not in MEASURABLE]
     if unknown:
-        raise ConfigError(f"names = {unknown}: choose among {', '.join(PARAMETERS)}")
+        raise ConfigError(f"names = {unknown}: choose among {', '.join(MEASURABLE)}")
     if optics.convention == "dong2021":
         raise ConfigError(
             'optics.convention = "dong2021" has no derivatives: use convention = "exact"'

@@ -180,6 +180,8 @@ def summary_of(
             "sigma_over_crb_median": _median(sigma / crb),
             "information_fraction_median": _median((reachable / crb) ** 2),
         }
+        if f"systematic_{name}" in good:
+            precision[name]["systematic_median"] = _median(good[f"systematic_{name}"])
     return {
         "mode": scene.mode,
         "scheme": scene.model.optics.scheme,

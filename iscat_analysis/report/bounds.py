@@ -22,6 +22,9 @@ BOUNDS_FILES = frozenset(
 )
 """What `write_bounds` may leave in its folder."""
 
+OPTICS_BOUNDS_FILES = frozenset({"optics_bounds.json", "needed.csv", "needed.png", "needed.svg"})
+"""What `write_optics_bounds` leaves in its folder."""
+
 
 def write_bounds(
     report: Mapping[str, Any],
@@ -105,6 +108,79 @@ def tradeoff_figure(report: Mapping[str, Any]) -> Figure:
     axes.set(xlabel="σ of height [nm]", ylabel="σ of mass [kDa]")
     figure.legend(loc="outside upper left", ncols=2, fontsize=8)
     return figure
+
+
+def write_optics_bounds(
+    report: Mapping[str, Any], folder: Path, *, overwrite: bool = False
+) -> Path:
+    """Write how well particles would tell the microscope.
+
+    Parameters
+    ----------
+    report : mapping
+        What ``optics_bounds.json`` holds.
+    folder : Path
+        Where to write.
+    overwrite : bool
+        Whether an earlier result may be replaced.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    DataError
+        The folder may not or cannot be written.
+    """
+    with atomic_folder(folder, overwrite, known=OPTICS_BOUNDS_FILES) as building:
+        (building / "optics_bounds.json").write_text(
+            to_json("optics_bounds", report) + "\n", encoding="utf-8"
+        )
+        needed = pd.DataFrame(report["needed"])
+        needed.to_csv(building / "needed.csv", index=False, lineterminator="\n")
+        publish(needed_figures(report), building)
+    return folder
+
+
+def needed_figures(report: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
+    """Draw how many particles of which mass the precisions take.
+
+    Parameters
+    ----------
+    report : mapping
+        As in `write_optics_bounds`.
+
+    Yields
+    ------
+    name : str
+        ``needed``.
+    figure : Figure
+        Events against mass, both logarithmic.
+    """
+    figure = new_figure(6.4, 4.2)
+    axes = figure.subplots()
+    needed, goals = pd.DataFrame(report["needed"]), report["goals"]
+    lines = (
+        ("focus_nm", f"focus to {goals['focus_nm']:g} nm", BLUE, "-"),
+        ("mass_rel", f"masses to {100 * goals['mass_rel']:g} %, in common", INK, "-"),
+        ("identified", "everything identified", INK, ":"),
+    )
+    for column, label, color, dash in lines:
+        axes.plot(
+            needed["mass_kda"], needed[column].astype(float), dash, color=color, lw=1.8,
+            marker="o", ms=4, label=label,
+        )  # fmt: skip
+    axes.plot(
+        report["at"]["mass_kda"], report["events"], "D", color=VERMILLION, ms=7, label="planned"
+    )
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("mass [kDa]")
+    axes.set_ylabel("particles needed")
+    axes.legend()
+    yield "needed", figure
 
 
 def scan_figures(table: pd.DataFrame, label: str, here: float) -> Iterator[tuple[str, Figure]]:

@@ -140,7 +140,7 @@ def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
     if (p := precision_of(analysis, table, name)).events:
         label, unit = LABELS[name], UNITS[name]
         said = (
-            f"σ {number(p.sigma)}, CRB {number(p.crb)} {unit}",
+            f"σ {number(p.sigma)}{p.shared}, CRB {number(p.crb)} {unit}",
             f", QCRB {number(p.qcrb)} {unit}",
         )
         best = "QCRB"

@@ -64,6 +64,8 @@ class Precision:
     information : float
         Median of (QCRB/CRB)², or of (Holevo/CRB)² where there is that: the share that the
         measurement uses of what can be had of the light's information.
+    systematic : float
+        Median of the error that all events share [nm or kDa]; NaN where it is not known.
     """
 
     name: str
@@ -74,6 +76,13 @@ class Precision:
     holevo: float
     over_crb: float
     information: float
+    systematic: float = math.nan
+
+    @property
+    def shared(self) -> str:
+        """The error that all events share, as text beside σ; empty where it is not known."""
+        known = math.isfinite(self.systematic)
+        return f", common to all events {number(self.systematic)}" if known else ""
 
 
 def counted(table: pd.DataFrame) -> pd.DataFrame:
@@ -147,7 +156,8 @@ def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
         A copy in which ``mass_kda`` and its σ and bounds are contrasts.
     """
     per_kda = (table["contrast"] / table["mass_kda"]).abs()
-    columns = [f"{kind}_mass_kda" for kind in ("sigma", "crb", "qcrb")]
+    kinds = ("sigma", "crb", "qcrb", "systematic")
+    columns = [name for kind in kinds if (name := f"{kind}_mass_kda") in table]
     scaled = {name: table[name] * per_kda for name in columns}
     return table.assign(**scaled, mass_kda=table["contrast"])
 
@@ -228,7 +238,14 @@ def precision_of(analysis: Analysis, table: pd.DataFrame, name: str) -> Precisio
         math.nan if holevo is None else holevo,
         quantiles(sigma / crb)[1],
         information if holevo is None else medians["information_fraction_median"],
+        _shared(good, name)[1],
     )
+
+
+def _shared(good: pd.DataFrame, name: str) -> tuple[float, float, float]:
+    """Quartiles of the error that all events share."""
+    column = f"systematic_{name}"
+    return quantiles(good[column].to_numpy(float) if column in good else np.empty(0))
 
 
 def quantiles(values: FloatArray) -> tuple[float, float, float]:
@@ -322,15 +339,20 @@ def _spread(analysis: Analysis, table: pd.DataFrame) -> list[str]:
     p = precision_of(analysis, table, name)
     if not p.events:
         return []
-    text = f"σ of the {LABELS[name]}, from the curvature of the likelihood,"
-    if not is_uncalibrated(analysis):
-        text += f" is {number(p.sigma)} {UNITS[name]}"
-    else:
-        text = "σ of the contrast, from the curvature of the likelihood,"
+    of_it, sigma = LABELS[name], f"{number(p.sigma)} {UNITS[name]}"
+    shared = f"{number(p.systematic)} {UNITS[name]}" if math.isfinite(p.systematic) else ""
+    if is_uncalibrated(analysis):
         good = table[table["status"] == Status.OK.value]
-        relative = (good["sigma_mass_kda"] / good["mass_kda"].abs()).to_numpy(float)
-        text += f" is {percent(quantiles(relative)[1])} of it"
+        size = good["mass_kda"].abs()
+        of_it = "contrast"
+        sigma = f"{percent(quantiles((good['sigma_mass_kda'] / size).to_numpy(float))[1])} of it"
+        if shared:
+            relative = (good["systematic_mass_kda"] / size).to_numpy(float)
+            shared = f"{percent(quantiles(relative)[1])} of it"
+    text = f"σ of the {of_it}, from the curvature of the likelihood, is {sigma}"
     text += f", {number(p.over_crb)} times the Cramér–Rao bound"
+    if shared:
+        text += f"; the error common to all events is {shared}"
     if math.isfinite(p.information):
         of = "can be had of the light" if math.isfinite(p.holevo) else "is in the light"
         text += f"; {percent(p.information)} of the information that {of} is used"
@@ -350,12 +372,13 @@ def precision_rows(analysis: Analysis, precision: Sequence[Precision]) -> list[l
     Returns
     -------
     list of list of str
-        Parameter, σ, CRB, where there is one Holevo, QCRB, σ over CRB, light used, rows.
+        Parameter, σ, error common to all events, CRB, where there is one Holevo, QCRB, σ over CRB,
+        light used, rows.
     """
     return [
         [
             f"{label_of(analysis, p.name)} [{UNITS[p.name]}]",
-            *(number(value) for value in (p.sigma, p.crb)),
+            *(number(value) for value in (p.sigma, p.systematic, p.crb)),
             *([number(p.holevo)] if math.isfinite(p.holevo) else []),
             *(number(value) for value in (p.qcrb, p.over_crb)),
             percent(p.information),

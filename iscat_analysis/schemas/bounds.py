@@ -13,6 +13,8 @@ from iscat_analysis.schemas.base import (
     Emission,
     Matrix4,
     Mode,
+    Natural,
+    NotNegative,
     Number,
     Parameter,
     Positive,
@@ -170,6 +172,56 @@ class Bounds(Document):
     scan: Scan = maybe("With --scan")
     optimum: Optimum = maybe("With --optimize")
     target: Target = maybe("With --target")
+
+
+class OpticsParameter(Closed):
+    """A parameter of the optics that would be fitted."""
+
+    parameter: str
+    value: float = key("As configured")
+    sigma: Positive = key("Standard deviation, all fitted together; null where it would be held")
+    prior_range: float = key("What is plausible")
+    determined: bool = key("Whether the pictures determine it within that")
+
+
+class HiddenDirection(Closed):
+    """A parameter that would be held, and the direction that pictures do not show."""
+
+    name: str
+    others: list[str] = key("Parameters from which it is not told apart")
+    direction: dict[str, Number] = key("One standard deviation, each in its own unit")
+
+
+class EventsNeeded(Closed):
+    """Particles of one mass that the goals take; null where no number suffices."""
+
+    mass_kda: float
+    snr: NotNegative = key("Signal-to-noise ratio of one picture")
+    identified: Number = key("Events that identify everything that can be")
+    focus_nm: Number
+    mass_rel: Number
+
+
+class OpticsBounds(Document):
+    """What iscat bounds --for optics prints: how well particles would tell the microscope."""
+
+    at: dict[str, Number] = key("The experiment")
+    events: Natural = key("Particles that are fitted together")
+    snr: NotNegative = key("Signal-to-noise ratio of one picture")
+    parameters: list[OpticsParameter]
+    names: list[str] = key("Parameters that are determined, in the order of covariance")
+    covariance: list[list[Number]] = key("Of these, fitted together")
+    unidentifiable: list[str] = key("What the pictures would not tell, one sentence each")
+    hidden: list[HiddenDirection] = key("The same in numbers")
+    common: dict[str, dict[Parameter, Number]] = key(
+        "Mode: standard deviation that the microscope's error puts into all fits alike [nm, kDa]"
+    )
+    single: dict[str, dict[Parameter, Number]] = key(
+        "Mode: Cramér–Rao bound of one particle where the optics are known [nm, kDa]"
+    )
+    goals: dict[str, float] = key("Precisions whose price is told")
+    needed: list[EventsNeeded] = key("Their price, for several masses")
+    warnings: list[str] = key("What the user should know, one line each")
 
 
 class Table1Row(Closed):

@@ -28,7 +28,7 @@ from iscat_analysis.schemas.base import (
 _SIGMA = "Standard deviation from the observed information [{}]; null where it is not free"
 _CRB = "Joint Cramér–Rao bound at the estimate [{}]; null where the parameter is not free"
 _QCRB = "Quantum Cramér–Rao bound for the collected photons [{}]"
-_SYSTEMATIC = "Error common to the movie, from the calibration [{}]"
+_SYSTEMATIC = "Error common to the movie, from calibrations of optics and mass [{}]"
 _REPEAT = "Spread between disjoint parts of the event's frames [{}]"
 
 
@@ -97,6 +97,7 @@ class Medians(Document):
         "(QCRB/CRB)², or (Holevo/CRB)² where height and mass are both free: the share that is used "
         "of what can be had of the light's information"
     )
+    systematic_median: Number = maybe("Error common to the movie, from calibrations [nm or kDa]")
 
 
 class Input(Document):

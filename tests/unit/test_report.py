@@ -16,6 +16,7 @@ from markupsafe import Markup
 
 from iscat_analysis.config import load_config, parse_config
 from iscat_analysis.errors import DataError
+from iscat_analysis.notebook import Result
 from iscat_analysis.records import EVENT_COLUMNS, Analysis, Status
 from iscat_analysis.report import check_output, figures, render_page, render_report, write_report
 from iscat_analysis.report.context import measured_lines
@@ -286,6 +287,9 @@ def test_optional_columns_stand_beside_sigma() -> None:
     assert heads[at + 1] == "systematic [kDa]"
     assert "repeats [kDa]" not in heads
     assert "systematic [kDa]" not in render_report(analysis)
+    shared = ", common to all events 7.00"
+    assert shared in repr(Result(replace(analysis, table=table)))
+    assert shared not in repr(Result(analysis))
 
 
 def test_precision_counts_only_events_that_are_ok() -> None:
