@@ -85,11 +85,19 @@ class Event(Closed):
 class Medians(Document):
     """Medians of one free parameter over the events that are ok."""
 
-    sigma_median: Number = key("Achieved standard deviation [nm or kDa]")
+    sigma_median: Number = key(
+        "Standard deviation from the curvature of the likelihood [nm or kDa]"
+    )
     crb_median: Number = key("Cramér–Rao bound [nm or kDa]")
     qcrb_median: Number = key("Quantum Cramér–Rao bound [nm or kDa]")
-    sigma_over_crb_median: Number = key("1 where the fit uses all that the frames hold")
-    information_fraction_median: Number = key("(QCRB/CRB)², the share of the light's information")
+    holevo_median: Number = maybe(
+        "Holevo bound of all free parameters at once, where height and mass are both free [nm, kDa]"
+    )
+    sigma_over_crb_median: Number = key("Near 1 by construction: σ and CRB are both from the model")
+    information_fraction_median: Number = key(
+        "(QCRB/CRB)², or (Holevo/CRB)² where height and mass are both free: the share that is used "
+        "of what can be had of the light's information"
+    )
     systematic_median: Number = maybe("Error common to the movie, from calibrations [nm or kDa]")
 
 

@@ -21,8 +21,8 @@ from iscat_analysis.calibration.optics.estimate import (
     Settings,
     Sight,
     maximise,
-    prior_range,
 )
+from iscat_analysis.calibration.optics.hidden import find_hidden
 from iscat_analysis.calibration.optics.settings import (
     FREE,
     HIGHER,
@@ -37,6 +37,12 @@ from iscat_analysis.records import FloatArray, Mapper
 
 LEAST_SIGHTS = 12
 """Pictures without which nothing is calibrated: eight to fit and four to judge."""
+
+MOST_SIGHTS = 60
+"""Pictures that are used at most, two thirds of them to fit."""
+
+FAINTEST = 8.0
+"""Signal-to-noise ratio below which a picture says too little of the microscope."""
 
 HELD_OUT = 3
 """One picture in so many is not fitted."""
@@ -346,15 +352,9 @@ class _Search:
     def _identified(self, best: Estimate) -> tuple[Estimate, dict[str, str]]:
         """Hold what the pictures do not determine within the plausible range."""
         held: dict[str, str] = {}
-        while best.names:
-            scale = np.array([prior_range(name) for name in best.names])
-            values, vectors = np.linalg.eigh(best.information * np.outer(scale, scale))
-            if values[0] >= 1:
-                break
-            weakest = np.abs(vectors[:, 0])
-            name = best.names[int(np.argmax(weakest))]
-            mixed = [n for n, w in zip(best.names, weakest, strict=True) if w > 0.3 and n != name]
-            held[name] = "not told apart from " + ", ".join(mixed) if mixed else "not visible"
+        while (worst := find_hidden(best.information, best.names)) is not None:
+            name = worst.name
+            held[name] = worst.why
             kept = tuple(n for n in best.names if n != name)
             settings = {**best.values, name: self.configured[name]}
             best = self._fit(best.sights, settings, kept)
