@@ -293,10 +293,11 @@ def test_optional_columns_stand_beside_sigma() -> None:
 
 
 def test_precision_counts_only_events_that_are_ok() -> None:
-    table = event_table(make_analysis(40))
+    analysis = make_analysis(40)
+    table = event_table(analysis)
     table["sigma_mass_kda"], table["crb_mass_kda"], table["qcrb_mass_kda"] = 3.0, 2.0, 1.0
     table.loc[table["status"] != "ok", "sigma_mass_kda"] = 1e9
-    found = precision_of(table, "mass_kda")
+    found = precision_of(analysis, table, "mass_kda")
     assert found.events == (table["status"] == "ok").sum()
     assert found.sigma == 3.0
     assert found.over_crb == 1.5
