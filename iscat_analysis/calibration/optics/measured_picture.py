@@ -305,7 +305,7 @@ def _prior(
     """Root of the covariance of a picture whose variance fades with the distance, shape (k, k)."""
     side = 2 * math.pi / float(np.min(np.abs(waves.qx[waves.qx != 0])))
     points = 2 * math.ceil(side / step_nm / 2)
-    axis = (np.arange(points) - points // 2) * (side / points)
+    axis = np.asarray((np.arange(points) - points // 2) * (side / points), dtype=np.float64)
     basis = waves.on(axis, axis, None)
     noise = np.einsum("pi,ij,pj->p", basis, covariance, basis, optimize=True)
     energy = (basis @ coefficients) ** 2 - noise
