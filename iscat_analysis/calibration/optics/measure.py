@@ -29,6 +29,7 @@ from iscat_analysis.calibration.optics.settings import (
     HIGHER,
     PRIMARY,
     SECONDARY,
+    exists,
     is_term,
 )
 from iscat_analysis.calibration.optics.starts import (
@@ -37,6 +38,7 @@ from iscat_analysis.calibration.optics.starts import (
     Start,
     average_sights,
     search_starts,
+    turned_starts,
     with_masses,
 )
 from iscat_analysis.records import FloatArray, Mapper
@@ -340,7 +342,7 @@ class _Search:
             name
             for group in self.free
             for name in FREE[group]
-            if (not is_term(name) or name in terms) and (group != "mask" or settings["mask_na"] > 0)
+            if (not is_term(name) or name in terms) and exists(name, settings)
         ]
         return tuple(names)
 
@@ -354,6 +356,8 @@ class _Search:
 
         def begin(state: list[dict[str, Any]]) -> tuple[Start, ...]:
             starts = search_starts(averages, self.build, state, most=_STARTS)
+            if "polarization" in self.free:
+                starts = turned_starts(averages, self.build, starts)
             return starts if "phase" in self.free else tuple(map(self._phased, starts))
 
         def refine(start: Start) -> Estimate:
