@@ -156,7 +156,7 @@ def _length(low_nm: float, high_nm: float) -> AfterValidator:
     return AfterValidator(check)
 
 
-Frames = Annotated[tuple[int, int], BeforeValidator(_two), AfterValidator(_ordered)]
+FrameRange = Annotated[tuple[int, int], BeforeValidator(_two), AfterValidator(_ordered)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -378,7 +378,7 @@ class BackgroundConfig(Section):
         description='"fixed": the mean of frames | "median": their median | "sliding": landing '
         'movies | "tracks": moving particles | "known": level_e',
     )
-    frames: Frames | None = Field(
+    frames: FrameRange | None = Field(
         None, description="pre-binding frames [start, stop); absent in landing movies"
     )
     window_frames: Annotated[int, Field(ge=4)] | None = Field(
@@ -428,7 +428,7 @@ class Fit(Section):
     """The maximum-likelihood fit."""
 
     mode: Mode = Field("mass", description='"mass" | "localize" | "joint" | "track"')
-    frames: Frames | None = Field(
+    frames: FrameRange | None = Field(
         None, description="[start, stop); absent: all after the background"
     )
     roi_nm: Annotated[Positive, _length(50.0, LARGEST_NM)] = Field(

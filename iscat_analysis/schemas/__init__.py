@@ -19,14 +19,14 @@ from pydantic import BaseModel
 
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.schemas.bounds import Bounds, Comparison, OpticsBounds
-from iscat_analysis.schemas.calibration import Calibration, Camera, Optics
+from iscat_analysis.schemas.calibration import Camera, MassCalibration, Optics
 from iscat_analysis.schemas.fit import Fit, Simulate, Summary
 from iscat_analysis.schemas.study import Benchmark
 
 _DOCUMENTS: Mapping[str, type[BaseModel]] = {
     "benchmark": Benchmark,
     "bounds": Bounds,
-    "calibration": Calibration,
+    "calibration": MassCalibration,
     "camera": Camera,
     "comparison": Comparison,
     "fit": Fit,
