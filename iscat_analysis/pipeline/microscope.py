@@ -92,8 +92,8 @@ def calibrate_movie(
     free : str or sequence of str, optional
         What may change: some of ``focus, na, phase, mask, zernike, polarization``; default all.
     focus_step_nm : float, optional
-        The movie is a scan of immobile particles, and from frame to frame the focus rises by this
-        [nm].
+        The movie is a scan of immobile particles, and from frame to frame the focus rises by about
+        this [nm]; where the focus is free, the step is measured too.
     progress : Progress
         Told how far it is.
     notify : callable

@@ -16,7 +16,7 @@ from iscat_analysis.pipeline.microscope import calibrate_movie, goodness
 
 SIGMAS = 4.0
 PIXEL_NM = 84.0
-STEP_NM = 100.0
+STEP_NM = 125.0
 FOCI_NM = np.arange(-1000.0, 1001.0, STEP_NM)
 ABERRATIONS = {7: 10.0, 11: 15.0}
 
