@@ -208,8 +208,8 @@ def optics(
         float | None,
         typer.Option(
             metavar="NM",
-            help="The movie is a scan of immobile particles: rise of the focus per frame [nm], from "
-            "which the search starts; it is measured with focus.",
+            help="The movie is a scan of immobile particles: rise of the focus per frame [nm]; "
+            "where focus is free it is measured as well.",
             show_default=False,
         ),
     ] = None,

@@ -85,6 +85,31 @@ def exists(name: str, settings: Settings) -> bool:
     return name in settings
 
 
+def free_names(groups: Sequence[str], settings: Settings, terms: Sequence[str]) -> tuple[str, ...]:
+    """Name the continuous parameters that are free in a microscope.
+
+    Parameters
+    ----------
+    groups : sequence of str
+        From `free_groups`.
+    settings : mapping
+        The microscope; only what `exists` in it is free.
+    terms : sequence of str
+        Aberrations that may be.
+
+    Returns
+    -------
+    tuple of str
+        Keys of the settings.
+    """
+    return tuple(
+        name
+        for group in groups
+        for name in FREE[group]
+        if (not is_term(name) or name in terms) and exists(name, settings)
+    )
+
+
 def settings_of(config: Config) -> dict[str, Any]:
     """Parameters that a calibration may change, as configured.
 
