@@ -37,11 +37,16 @@ Along the focus, with a figure; the best focus for the mass; what 5 kDa takes:
     iscat bounds --config setup.toml --optimize focus --for mass
 
     iscat bounds --config setup.toml --target mass=5kDa
+
+How well 60 such particles would tell the microscope itself:
+
+    iscat bounds --config setup.toml --for optics --events 60
 """
 
 KINDS = {
     "crb_single": "CRB single",
     "crb_joint": "CRB joint",
+    "holevo": "Holevo",
     "qcrb": "QCRB",
     "qcrb_dong2021": "QCRB (Dong 2021)",
 }
@@ -61,12 +66,13 @@ class Optimized(StrEnum):
 
 
 class Parameter(StrEnum):
-    """What to optimise it for."""
+    """What to optimise it for, or whose bounds to print."""
 
     X = "x"
     Y = "y"
     Z = "z"
     MASS = "mass"
+    OPTICS = "optics"
 
 
 def bounds(
@@ -90,7 +96,32 @@ def bounds(
     ] = None,
     wanted: Annotated[
         Parameter | None,
-        typer.Option("--for", help="What --optimize shall make precise.", show_default=False),
+        typer.Option(
+            "--for",
+            help="What --optimize shall make precise; optics: how well particles would tell focus, "
+            "NA, phase, mask and aberrations, instead of the bounds of one particle.",
+            show_default=False,
+        ),
+    ] = None,
+    events: Annotated[
+        int | None,
+        typer.Option(
+            "--events",
+            metavar="N",
+            min=1,
+            help="With --for optics: particles of particle.mass_kda; default 60.",
+            show_default=False,
+        ),
+    ] = None,
+    free: Annotated[
+        str | None,
+        typer.Option(
+            "--free",
+            metavar="NAMES",
+            help="With --for optics: what is fitted, some of "
+            "focus,na,phase,mask,zernike,polarization; default all.",
+            show_default=False,
+        ),
     ] = None,
     target: Annotated[
         str | None,
@@ -130,6 +161,19 @@ def bounds(
         chosen = [o for o in (scan, optimize, target, preset) if o is not None]
         if len(chosen) > 1:
             raise ConfigError("choose one of --scan, --optimize, --target, --preset")
+        if wanted is Parameter.OPTICS:
+            if chosen or mode is not None:
+                raise ConfigError(
+                    "--for optics stands alone: leave --scan, --optimize, --target, --preset and "
+                    "--mode away"
+                )
+            _optics(
+                messages, load_config(config, settings or ()), events, free, out,
+                overwrite=overwrite, as_json=as_json,
+            )  # fmt: skip
+            return
+        if events is not None or free is not None:
+            raise ConfigError("--events and --free need --for optics")
         if (optimize is None) != (wanted is None):
             raise ConfigError("--optimize and --for go together, as in --optimize focus --for mass")
         if preset is not None:
@@ -191,7 +235,8 @@ def _print(report: Mapping[str, Any]) -> None:
             print_result(report["target"]["note"])
     else:
         print_result(_bounds_table("per photon", report["per_photon"]))
-        print_result(_bounds_table("for these photons", report["actual"]))
+        at_once = {name: report["holevo"][name] for name in report["at"]["free"]}
+        print_result(_bounds_table("for these photons", {**report["actual"], "holevo": at_once}))
         print_result(_information(report))
     for line in report["unidentifiable"]:
         print_result(f"unidentifiable: {line}")
@@ -258,6 +303,64 @@ def _target(config: Config, text: str) -> dict[str, Any]:
     }
 
 
+def _optics(
+    messages: Messages,
+    config: Config,
+    events: int | None,
+    free: str | None,
+    out: Path | None,
+    *,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Print how well particles would tell the microscope."""
+    from iscat_analysis.calibration.optics import forecast_optics
+    from iscat_analysis.calibration.optics.forecast import EVENTS
+    from iscat_analysis.report.bounds import OPTICS_BOUNDS_FILES, write_optics_bounds
+    from iscat_analysis.report.output import check_output
+
+    if out is not None:
+        check_output(out, overwrite, known=OPTICS_BOUNDS_FILES)
+    report = forecast_optics(config, events=events or EVENTS, free=free).to_dict()
+    for line in report["warnings"]:
+        messages.notify(f"warning: {line}")
+    if out is not None:
+        write_optics_bounds(report, out, overwrite=overwrite)
+        messages.notify(f"wrote {out}")
+    if as_json:
+        print_json("optics_bounds", report)
+        return
+    print_result(
+        f"{report['events']} particles of {report['at']['mass_kda']:g} kDa, signal-to-noise ratio "
+        f"{short(report['snr'])} each"
+    )
+    found = table("optics, all fitted together", "value", "±", "plausible")
+    for row in report["parameters"]:
+        sigma = short(row["sigma"]) if row["determined"] else "held"
+        found.add_row(row["parameter"], f"{row['value']:g}", sigma, f"±{row['prior_range']:g}")
+    print_result(found)
+    found = table("error common to all fits", *("x_nm", "y_nm", "z_nm", "mass_kda"))
+    for name, common in report["common"].items():
+        cells = (common.get(key) for key in ("x_nm", "y_nm", "z_nm", "mass_kda"))
+        found.add_row(f"mode {name}", *("–" if cell is None else short(cell) for cell in cells))
+    print_result(found)
+    goals = report["goals"]
+    found = table(
+        "particles needed for", f"focus ±{goals['focus_nm']:g} nm",
+        f"masses ±{100 * goals['mass_rel']:g} %", "SNR of one",
+    )  # fmt: skip
+    for row in report["needed"]:
+        counts = (row[key] for key in ("focus_nm", "mass_rel"))
+        found.add_row(
+            f"{row['mass_kda']:g} kDa",
+            *(f"{count:,.0f}".replace(",", " ") if count == count else "–" for count in counts),
+            short(row["snr"]),
+        )
+    print_result(found)
+    for line in report["unidentifiable"]:
+        print_result(f"unidentifiable: {line}")
+
+
 def _paper(messages: Messages, out: Path, *, overwrite: bool, as_json: bool) -> None:
     from iscat_analysis.bounds.paper import FIELD_NM, reproduce
     from iscat_analysis.report.output import check_output
@@ -297,7 +400,7 @@ def _bounds_table(title: str, values: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def _information(report: Mapping[str, Any]) -> Table:
-    found = table("information used", "of the light's")
+    found = table("information used", "of the light's", "jointly, of what can be had")
     found.add_column("no single measurement is best for it and", no_wrap=True)
     rivals = [pair.split("–") for pair in report["incompatible"]]
     for name, share in report["information_fraction"].items():
@@ -305,10 +408,14 @@ def _information(report: Mapping[str, Any]) -> Table:
         others = [a if b == alias else b for a, b in rivals if alias in (a, b)]
         found.add_row(
             name,
-            "–" if share is None or not math.isfinite(share) else f"{100 * share:.1f} %",
+            *(_percent(value) for value in (share, report["information_fraction_joint"].get(name))),
             ", ".join(other.replace("_rel", "_kda") for other in others) or "–",
         )
     return found
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None or not math.isfinite(share) else f"{100 * share:.1f} %"
 
 
 def _scan_table(scanned: Mapping[str, Any], free: list[str]) -> Table:

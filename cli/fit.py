@@ -245,7 +245,8 @@ def events_table(
     from rich import box
     from rich.table import Table
 
-    columns = _columns(free, mass, compact=width is not None)
+    shared = any(f"systematic_{name}" in row for row in rows for name in ("z_nm", "mass_kda"))
+    columns = _columns(free, mass, compact=width is not None, shared=shared)
     cells = {heading: [cell(row) for row in rows] for heading, cell in columns.items()}
     if width is not None:
         spare = [heading for heading in _spare(mass[0]) if heading in cells]
@@ -265,13 +266,16 @@ _SYMBOLS = {"x_nm": ("x", "nm"), "y_nm": ("y", "nm"), "z_nm": ("z", "nm")}
 def _spare(mass: str) -> tuple[str, ...]:
     """Name what a narrow terminal does without, the first to go first."""
     bounds = ("QCRB\nz", "CRB\nz", f"QCRB\n{mass}", f"CRB\n{mass}")
-    return (*bounds, "frame", "y ± σ\n[nm]", "x ± σ\n[nm]")
+    return (*bounds, "frame", "common\nz", f"common\n{mass}", "y ± σ\n[nm]", "x ± σ\n[nm]")
 
 
 def _columns(
-    free: Sequence[str], mass: tuple[str, str], *, compact: bool
+    free: Sequence[str], mass: tuple[str, str], *, compact: bool, shared: bool
 ) -> dict[str, Callable[[Mapping[str, Any]], str]]:
-    """Give heading → cell; compact, what is not free is left out and headings have two lines."""
+    """Give heading → cell; compact, what is not free is left out and headings have two lines.
+
+    `shared` adds the errors that all events have in common.
+    """
     columns: dict[str, Callable[[Mapping[str, Any]], str]] = {
         "event": lambda row: str(row["event"]),
         "frame": lambda row: str(row["frame"]),
@@ -285,6 +289,10 @@ def _columns(
             )
     for name in ("z_nm", "mass_kda"):
         symbol, unit = symbols[name]
+        if name in free and shared:
+            heading = f"common{chr(10) if compact else ' '}{symbol}"
+            heading += f" [{unit}]" if unit and not compact else ""
+            columns[heading] = lambda row, key=f"systematic_{name}": _short(row.get(key))  # type: ignore[misc]
         for kind in ("crb", "qcrb") if name in free else ():
             title = kind.upper()
             heading = f"{title}\n{symbol}" if compact else f"{title} {symbol}"

@@ -25,6 +25,7 @@ Whole jobs, from a movie to a report::
     result.save("movie.iscat")  # report.html, fits.csv, fits.parquet, …
     ia.calibrate_optics("movie.tif", config=setup)  # focus, aberrations… from the movie itself
     ia.compute_bounds(setup)    # what no estimate from such frames can beat
+    ia.forecast_optics(setup)   # how well they would tell focus, NA, aberrations…
 
 `fit_movie` runs load → calibrate → background → detect → fit → posterior → bounds.  The modules of
 these names hold the stages; `iscat_analysis.pipeline` joins them, and `fit_stack` there is what the
@@ -61,6 +62,7 @@ if TYPE_CHECKING:
     from iscat_analysis.notebook import calibrate_optics as calibrate_optics
     from iscat_analysis.notebook import compute_bounds as compute_bounds
     from iscat_analysis.notebook import fit_movie as fit_movie
+    from iscat_analysis.notebook import forecast_optics as forecast_optics
     from iscat_analysis.notebook import simulate_movie as simulate_movie
     from iscat_analysis.pieces import Camera as Camera
     from iscat_analysis.pieces import LogLikelihood as LogLikelihood
@@ -93,6 +95,7 @@ _HOME = {
     "simulate_movie": "notebook",
     "calibrate_optics": "notebook",
     "compute_bounds": "notebook",
+    "forecast_optics": "notebook",
     "Bounds": "notebook",
     "Config": "config",
     "load_config": "config",
@@ -135,6 +138,7 @@ __all__ = [
     "fit_movie",
     "fit_rois",
     "fit_stack",
+    "forecast_optics",
     "load_config",
     "log_likelihood",
     "open_stack",

@@ -7,6 +7,7 @@ configuration are given as a mapping.
 from __future__ import annotations
 
 import html
+import math
 import textwrap
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,7 +19,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from iscat_analysis.bounds import bounds_report, parse_scan, scan
-from iscat_analysis.calibration.optics import OpticsCalibration
+from iscat_analysis.calibration.optics import OpticsCalibration, OpticsForecast
+from iscat_analysis.calibration.optics import forecast_optics as _forecast
+from iscat_analysis.calibration.optics.forecast import EVENTS
 from iscat_analysis.config import Config, configure
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.pipeline import analyse
@@ -260,6 +263,51 @@ def compute_bounds(
     return Bounds(resolved, bounds_report(resolved))
 
 
+def forecast_optics(
+    config: str | Path | Mapping[str, Any] | Config | None = None,
+    *,
+    settings: Mapping[str, Any] | Iterable[str] | None = None,
+    events: int = EVENTS,
+    free: str | Sequence[str] | None = None,
+) -> OpticsForecast:
+    """Foresee how well particles would determine the microscope, before they are recorded.
+
+    Parameters
+    ----------
+    config : str, Path, mapping or Config, optional
+        As for `configure`: the optics, the camera, the particle and ``fit.roi_nm``; ``[bounds]``
+        has the light and the frames.
+    settings : mapping of str to Any, or iterable of str, optional
+        As for `configure`.
+    events : int
+        Particles of ``particle.mass_kda`` that are fitted together.
+    free : str or sequence of str, optional
+        What is fitted, of ``focus, na, phase, mask, zernike, polarization``; default all.
+
+    Returns
+    -------
+    OpticsForecast
+        Standard deviations of `calibrate_optics`, what the pictures would not tell, and the errors
+        that all later masses and heights would share.
+
+    Raises
+    ------
+    ConfigError
+        A setting is unknown or impossible, or the microscope has no reference.
+
+    Examples
+    --------
+    >>> import iscat_analysis as ia
+    >>> setup = {"camera.pixel_size_nm": 84.4, "optics.attenuation": 0.1, "bounds.n_after": 200}
+    >>> found = ia.forecast_optics(settings=setup | {"particle.mass_kda": 5000.0}, events=40)
+    >>> list(found.values)[:3]
+    ['focus_nm', 'na', 'reference_phase_deg']
+    >>> bool(0 < found.common["mass"]["mass_kda"] < 5000)
+    True
+    """
+    return _forecast(configure(config, settings=settings), events=events, free=free)
+
+
 _KEYS = {
     "mode": "fit.mode",
     "background": "background.frames",
@@ -454,9 +502,11 @@ class Result:
         counts = table["status"].value_counts()
         facts.append(("status", ", ".join(f"{n} {s}" for s, n in counts.items()) or "no events"))
         for name in FREE_PARAMETERS[self.mode] if caution(table) is None else ():
-            p = precision_of(table, name)
+            p = precision_of(self.analysis, table, name)
             if p.events:
-                text = f"σ {number(p.sigma)}, CRB {number(p.crb)}, QCRB {number(p.qcrb)}"
+                text = f"σ {number(p.sigma)}{p.shared}, CRB {number(p.crb)}"
+                text += f", Holevo {number(p.holevo)}" if math.isfinite(p.holevo) else ""
+                text += f", QCRB {number(p.qcrb)}"
                 facts.append((label_of(self.analysis, name), f"{text} {UNITS[name]} (medians)"))
         return facts + [("warning", text) for text in self.warnings]
 

@@ -8,8 +8,10 @@ calibration would.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,19 +67,23 @@ class Pictures:
     ----------
     instrument : Instrument
         The microscope.
+    reach_nm : float
+        Distance from the particle to the farthest pixel.
     """
 
-    def __init__(self, instrument: Instrument) -> None:
+    def __init__(self, instrument: Instrument, reach_nm: float = _FARTHEST_NM) -> None:
         m = instrument
         k = 2 * np.pi / m.wavelength_nm
         alpha = np.arcsin(m.na / m.n_immersion)
-        x, w = np.polynomial.legendre.leggauss(110)
+        reach_nm = max(reach_nm, _FARTHEST_NM)
+        x, w = np.polynomial.legendre.leggauss(math.ceil(170 * reach_nm / _FARTHEST_NM))
+        # θ = θ_c + v|v| smooths the root at the critical angle; the edge of the mask is an end
         critical = np.arcsin(min(m.n_sample, m.na) / m.n_immersion)
-        # θ = θ_c ∓ u² smooths the root at the critical angle
-        below, above = np.sqrt(critical), np.sqrt(max(alpha - critical, 0.0))
-        u1, u2 = below * (x + 1) / 2, above * (x + 1) / 2
-        theta = np.concatenate([critical - u1**2, critical + u2**2])
-        weight = np.concatenate([below * w * u1, above * w * u2])
+        ends = [0.0, np.arcsin(m.mask_na / m.n_immersion), critical, alpha]
+        edges = np.unique([np.sign(t - critical) * np.sqrt(abs(t - critical)) for t in ends])
+        v = np.concatenate([(a + b + (b - a) * x) / 2 for a, b in pairwise(edges)])
+        weight = np.concatenate([(b - a) * w for a, b in pairwise(edges)]) * np.abs(v)
+        theta = critical + v * np.abs(v)
         sin, cos = np.sin(theta), np.cos(theta)
         cos_s = np.sqrt(1 - (m.n_immersion * sin / m.n_sample) ** 2 + 0j)
         cos_g = np.sqrt(1 - (m.n_immersion * sin / m.n_glass) ** 2 + 0j)
@@ -110,7 +116,7 @@ class Pictures:
         pupil = vector * np.exp(1j * k * (path[:, None] + wave)) * (passes * np.sqrt(cos))[:, None]
         harmonics = np.fft.fft(pupil, axis=2) / _AZIMUTHS
         self._orders = [h if h <= 8 else h - _AZIMUTHS for h in (*range(9), *range(56, 64))]
-        r = np.arange(0.0, _FARTHEST_NM, 15.0)
+        r = np.arange(0.0, reach_nm, 15.0)
         argument = k * m.n_immersion * sin * r[:, None]
         tables = []
         whole = [jv(h, argument) * (weight * sin) for h in range(9)]
@@ -186,7 +192,7 @@ class InstrumentMovie:
         rng = np.random.default_rng(seed)
         frames, rows, columns = shape
         y, x = np.arange(rows) * pixel_nm, np.arange(columns) * pixel_nm
-        pictures = Pictures(instrument)
+        pictures = Pictures(instrument, 1.02 * pixel_nm * math.hypot(rows, columns))
         rough = gaussian_filter(rng.standard_normal((rows, columns)), 3.0, mode="wrap")
         light = level_e * (1 + 0.05 * rough / rough.std())
         order = np.argsort(landings.frame)

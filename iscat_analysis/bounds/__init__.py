@@ -1,8 +1,10 @@
 """Bounds: what no unbiased estimator can beat, given the camera or given the light itself.
 
-`quantum` holds what the collected light knows, `classical` what the camera can learn of it, and
-`experiment` plans a measurement from a configuration; `scan` varies one thing, `planning` turns the
-question round, and `paper` reproduces Dong et al. (2021).
+`quantum` holds what the collected light knows, `holevo` what one measurement can take of it for
+several parameters at once, `classical` what the camera can learn of it, and `experiment` plans a
+measurement from a configuration; `shared` says what an uncertain microscope leaves in every
+particle; `scan` varies one thing, `planning` turns the question round, and `paper` reproduces Dong
+et al. (2021).
 """
 
 from __future__ import annotations
@@ -20,6 +22,13 @@ from iscat_analysis.bounds.experiment import (
     plan,
     report_of,
     warnings_of,
+)
+from iscat_analysis.bounds.holevo import (
+    Holevo,
+    holevo_bound,
+    holevo_over_quantum,
+    natural_bound,
+    tradeoff,
 )
 from iscat_analysis.bounds.paper import Reproduction, reproduce
 from iscat_analysis.bounds.planning import (
@@ -39,6 +48,14 @@ from iscat_analysis.bounds.quantum import (
     z_nm_phase_free,
 )
 from iscat_analysis.bounds.scan import AXES, Axis, Scan, changed, parse_scan, scan
+from iscat_analysis.bounds.shared import (
+    displacement,
+    eliminated,
+    imitation,
+    joint_information,
+    mass_drift,
+    shared_sigma,
+)
 
 __all__ = [
     "AXES",
@@ -49,6 +66,7 @@ __all__ = [
     "EventBounds",
     "Experiment",
     "Goal",
+    "Holevo",
     "Reproduction",
     "Scan",
     "Unidentifiable",
@@ -56,10 +74,18 @@ __all__ = [
     "bounds_report",
     "budget",
     "changed",
+    "displacement",
     "effort",
+    "eliminated",
     "event_bounds",
+    "holevo_bound",
+    "holevo_over_quantum",
+    "imitation",
     "incompatible_pairs",
     "information_fraction",
+    "joint_information",
+    "mass_drift",
+    "natural_bound",
     "optimize",
     "parse_scan",
     "parse_target",
@@ -69,6 +95,8 @@ __all__ = [
     "report_of",
     "reproduce",
     "scan",
+    "shared_sigma",
+    "tradeoff",
     "warnings_of",
     "z_nm_phase_free",
 ]

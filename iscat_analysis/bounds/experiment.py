@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.bounds.classical import EventBounds, bounds_from_matrices, event_bounds
+from iscat_analysis.bounds.holevo import natural_bound
 from iscat_analysis.bounds.quantum import (
     NAMES,
     incompatible_pairs,
@@ -281,6 +282,10 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
     root_light = math.sqrt(experiment.collected)
     exact = experiment.quantum
     single, together = quantum_bounds(exact)
+    index = [PARAMETERS.index(name) for name in free]
+    steps = per_step[index]
+    light = experiment.collected * exact[np.ix_(index, index)] / np.outer(steps, steps)
+    at_once = natural_bound(light)
     paper, _ = quantum_bounds(quantum_information(model, z_nm, measure="dong2021"))
     per_photon = {
         "crb_single": _named(NAMES, whole.crb_single * to_rel * root_camera),
@@ -334,7 +339,9 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
         "fisher": whole.fisher,
         "qfi": whole.quantum,
         "qfi_imaginary": experiment.collected * exact.imag / np.outer(per_step, per_step),
+        "holevo": {"weight": "qfi", "sum": at_once.sum} | _named(free, at_once.sigma),
         "information_fraction": _named(PARAMETERS, information_fraction(whole)),
+        "information_fraction_joint": _named(free, (at_once.sigma / joint.crb_joint[index]) ** 2),
         "incompatible": {"–".join(pair): v for pair, v in incompatible_pairs(exact).items()},
         "unidentifiable": [str(direction) for direction in joint.unidentifiable],
         "crosstalk": {

@@ -12,6 +12,7 @@ from iscat_analysis.config.files import OpticsFile, config_to_toml, read_optics_
 from iscat_analysis.config.overrides import configure, load_config, parse_config
 from iscat_analysis.config.schema import (
     ABERRATIONS,
+    MEASURABLE,
     PIXEL_NM,
     BackgroundConfig,
     BoundsConfig,
@@ -24,6 +25,7 @@ from iscat_analysis.config.schema import (
     Method,
     Mode,
     Optics,
+    OpticsCovariance,
     Particle,
     PosteriorConfig,
     Scheme,
@@ -35,6 +37,7 @@ from iscat_analysis.config.schema import (
 
 __all__ = [
     "ABERRATIONS",
+    "MEASURABLE",
     "PIXEL_NM",
     "BackgroundConfig",
     "BoundsConfig",
@@ -47,6 +50,7 @@ __all__ = [
     "Method",
     "Mode",
     "Optics",
+    "OpticsCovariance",
     "OpticsFile",
     "Particle",
     "PosteriorConfig",

@@ -164,6 +164,8 @@ def _toml_value(value: Any) -> str:
         return f'"{escaped}"'
     if isinstance(value, tuple):
         return "[" + ", ".join(_toml_value(v) for v in value) + "]"
+    if isinstance(value, Section):
+        return _toml_value(value.model_dump(exclude_none=True))
     if isinstance(value, dict):
         items = ", ".join(f"{k} = {_toml_value(v)}" for k, v in value.items())
         return f"{{ {items} }}" if items else "{}"

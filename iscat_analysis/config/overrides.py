@@ -250,7 +250,8 @@ def _merge_optics_file(values: dict[str, Any], changes: Iterable[Change]) -> Non
     path = optics.get("file") if isinstance(optics, dict) else None
     if not isinstance(optics, dict) or not isinstance(path, str):
         return
-    measured = read_optics_file(Path(path)).optics
+    found = read_optics_file(Path(path))
+    measured = found.optics | ({"covariance": found.covariance} if found.covariance else {})
     for section, key, value in changes:
         if section == "optics" and key in measured and measured[key] != value:
             raise ConfigError(

@@ -7,6 +7,7 @@ beside it.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
@@ -119,6 +120,9 @@ MOST_WAVES = 0.5
 ABERRATIONS = tuple(f"z{j}" for j in range(5, 38))
 """Zernike terms on offer, by Noll's index."""
 
+MEASURABLE = ("focus_nm", "na", "reference_phase_deg", "mask_na", "attenuation", *ABERRATIONS)
+"""Parameters of the optics that pictures can tell, and that have a derivative."""
+
 
 def _noll_names(terms: dict[str, float]) -> dict[str, float]:
     for name in terms:
@@ -144,7 +148,7 @@ def _length(low_nm: float, high_nm: float) -> AfterValidator:
     return AfterValidator(check)
 
 
-Frames = Annotated[tuple[int, int], BeforeValidator(_two), AfterValidator(_ordered)]
+FrameRange = Annotated[tuple[int, int], BeforeValidator(_two), AfterValidator(_ordered)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -169,6 +173,30 @@ class Section(BaseModel, metaclass=_Called):
     """A section of the file: immutable, and an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class OpticsCovariance(Section):
+    """Errors of measured optics, as ``[covariance]`` of ``optics.toml`` has them."""
+
+    names: tuple[str, ...] = Field(description="keys of [optics], each aberration by its own name")
+    matrix: tuple[tuple[Finite, ...], ...] = Field(description="covariance, in the order of names")
+
+    @model_validator(mode="after")
+    def _symmetric(self) -> OpticsCovariance:
+        size = len(self.names)
+        unknown = [name for name in self.names if name not in MEASURABLE]
+        if unknown:
+            raise ValueError(f"names has {unknown[0]}, which is none of {', '.join(MEASURABLE)}")
+        if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
+            raise ValueError(f"matrix needs {size} rows of {size} numbers, one for each of names")
+        for i, row in enumerate(self.matrix):
+            for j in range(i):
+                room = 1e-6 * math.sqrt(abs(row[i] * self.matrix[j][j]))
+                if abs(row[j] - self.matrix[j][i]) > room:
+                    raise ValueError(f"matrix is not symmetric in {self.names[i]}, {self.names[j]}")
+            if row[i] < 0:
+                raise ValueError(f"matrix gives {self.names[i]} a negative variance")
+        return self
 
 
 class Optics(Section):
@@ -226,6 +254,10 @@ class Optics(Section):
     )
     calibrate: Literal["auto", "always", "never"] = Field(
         "auto", description='"auto" | "always" | "never": learn the optics from the movie'
+    )
+
+    covariance: OpticsCovariance | None = Field(
+        None, description="of the measured keys, { names, matrix }; taken from the file"
     )
 
     @model_validator(mode="before")
@@ -338,7 +370,7 @@ class BackgroundConfig(Section):
         description='"fixed": the mean of frames | "median": their median | "sliding": landing '
         'movies | "tracks": moving particles | "known": level_e',
     )
-    frames: Frames | None = Field(
+    frames: FrameRange | None = Field(
         None, description="pre-binding frames [start, stop); absent in landing movies"
     )
     window_frames: Annotated[int, Field(ge=4)] | None = Field(
@@ -388,7 +420,7 @@ class Fit(Section):
     """The maximum-likelihood fit."""
 
     mode: Mode = Field("mass", description='"mass" | "localize" | "joint" | "track"')
-    frames: Frames | None = Field(
+    frames: FrameRange | None = Field(
         None, description="[start, stop); absent: all after the background"
     )
     roi_nm: Annotated[Positive, _length(50.0, LARGEST_NM)] = Field(

@@ -127,7 +127,9 @@ class Aperture:
                 )
 
 
-def harmonics(waves: ComplexArray, weight: FloatArray) -> ComplexArray:
+def harmonics(
+    waves: ComplexArray, weight: FloatArray, negligible: float = NEGLIGIBLE
+) -> ComplexArray:
     """Fourier series along the azimuth, as far as it is not negligible.
 
     Parameters
@@ -136,6 +138,8 @@ def harmonics(waves: ComplexArray, weight: FloatArray) -> ComplexArray:
         Pupil functions at m equally spaced azimuths.
     weight : ndarray, shape (n,)
         Moduli of the quadrature's weights, which say what is negligible.
+    negligible : float
+        Share of a function's light amplitude below which its harmonics are left out.
 
     Returns
     -------
@@ -146,7 +150,7 @@ def harmonics(waves: ComplexArray, weight: FloatArray) -> ComplexArray:
     size = (np.abs(series) * weight[:, None]).sum(1)
     half = waves.shape[2] // 2 - 1
     both = np.maximum(size[:, 1 : half + 1], size[:, : -half - 1 : -1])
-    kept = np.nonzero((both > NEGLIGIBLE * size.sum(1, keepdims=True)).any(0))[0]
+    kept = np.nonzero((both > negligible * size.sum(1, keepdims=True)).any(0))[0]
     largest = int(kept[-1]) + 1 if kept.size else 0
     order = np.arange(-largest, largest + 1)
     return np.ascontiguousarray(np.moveaxis(series[:, :, order], 2, 1))

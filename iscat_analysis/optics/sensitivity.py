@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.image import Lens, Pixels
 from iscat_analysis._kernels.lattice_rows import lattice_values
 from iscat_analysis._kernels.zernike import zernike
-from iscat_analysis.config import ABERRATIONS, Optics
+from iscat_analysis.config import MEASURABLE, Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.aperture import Aperture, aperture_on, harmonics
 from iscat_analysis.optics.waves import LatticeField
@@ -29,8 +29,11 @@ ComplexArray = NDArray[np.complex128]
 Weight = Callable[[Aperture], tuple[ComplexArray, ComplexArray]]
 """Factor of the field's integral, and phase per height, on any quadrature."""
 
-PARAMETERS = ("focus_nm", "na", "reference_phase_deg", "mask_na", "attenuation", *ABERRATIONS)
-"""Parameters of the optics that have a derivative."""
+NEGLIGIBLE_CHANGE = 1e-6
+"""Share of a change of the light below which its azimuthal harmonics are left out."""
+
+COARSER = 2
+"""Radial step of the changes over that of the field: they are good to a part in 10⁶."""
 
 
 def check_names(optics: Optics, names: Sequence[str]) -> None:
@@ -48,9 +51,9 @@ def check_names(optics: Optics, names: Sequence[str]) -> None:
     ConfigError
         A name is unknown, or the paper's convention, whose quadrature has no derivative, is set.
     """
-    unknown = [name for name in names if name not in PARAMETERS]
+    unknown = [name for name in names if name not in MEASURABLE]
     if unknown:
-        raise ConfigError(f"names = {unknown}: choose among {', '.join(PARAMETERS)}")
+        raise ConfigError(f"names = {unknown}: choose among {', '.join(MEASURABLE)}")
     if optics.convention == "dong2021":
         raise ConfigError(
             'optics.convention = "dong2021" has no derivatives: use convention = "exact"'
@@ -124,10 +127,10 @@ def sensitivity_lattices(
         return field * (1j * k * path)
 
     waves = np.concatenate([field, *(change(name) for name in names)])
-    series = harmonics(waves, np.abs(weight)) * weight
+    series = harmonics(waves, np.abs(weight), NEGLIGIBLE_CHANGE) * weight
     count = len(field)
     lattice = LatticeField(series[:count], axial, whole.pupil.transverse, k * optics.na, reach_nm)
-    stack = lattice.lattices(series, whole.pupil.transverse)
+    stack = lattice.lattices(series, whole.pupil.transverse, COARSER)
     return lattice.lens(rho), stack.reshape(1 + len(names), count, *stack.shape[1:])
 
 
@@ -146,8 +149,8 @@ def signal_derivatives(
     x_nm: float,
     y_nm: float,
     amplitude: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Signal and its derivatives from lattices.
+) -> FloatArray:
+    """Combine lattices to derivatives of the signal.
 
     Parameters
     ----------
@@ -164,13 +167,11 @@ def signal_derivatives(
 
     Returns
     -------
-    signal : ndarray, shape (ny, nx)
-        The signal.
-    derivatives : ndarray, shape (n, ny, nx)
-        Its derivatives, at fixed amplitude.
+    ndarray, shape (n, ny, nx)
+        Derivatives, at fixed amplitude.
     """
     count, components = stack.shape[:2]
     out = np.empty((count, pixels.y.size, pixels.x.size))
     flat = stack.reshape(count * components * 2, *stack.shape[3:])
     lattice_values(flat, lens, pixels, x_nm, y_nm, amplitude, components, out)
-    return out[0], out[1:]
+    return out[1:]

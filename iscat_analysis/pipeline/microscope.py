@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.calibration.optics import (
+    FAINTEST,
     LEAST_SIGHTS,
+    MOST_SIGHTS,
     OpticsCalibration,
     Settings,
     Sight,
@@ -49,12 +51,6 @@ from iscat_analysis.search.bright import (
     find_bright_steps,
 )
 from iscat_analysis.search.sliding import STRIDES
-
-MOST_SIGHTS = 60
-"""Pictures that are used at most, two thirds of them to fit."""
-
-FAINTEST = 8.0
-"""Signal-to-noise ratio below which a picture says too little of the microscope."""
 
 RINGS_NM = 9000.0
 """Farther than this from a particle its rings are left out."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from iscat_analysis.bounds import holevo_over_quantum
 from iscat_analysis.pieces.regions import row_of, table_from
 from iscat_analysis.pipeline.field import Event
 from iscat_analysis.pipeline.scene import Scene, photons_scale
@@ -22,6 +23,9 @@ from iscat_analysis.records import (
     Windows,
 )
 from iscat_analysis.species import Efficiency, describe
+
+_HEIGHTS = 65
+"""Heights at which the Holevo bound is computed for a table; linear in between."""
 
 
 @dataclass(frozen=True)
@@ -161,16 +165,23 @@ def summary_of(
         Nested plain values.
     """
     good = table[table["status"] == Status.OK]
+    free = FREE_PARAMETERS[scene.mode]
+    conflict = {"z_nm", "mass_kda"} <= set(free) and len(good) > 0
+    cost = _holevo_over_quantum(scene, good["z_nm"].to_numpy(float)) if conflict else {}
     precision = {}
-    for name in FREE_PARAMETERS[scene.mode]:
+    for name in free:
         sigma, crb, qcrb = (good[f"{kind}_{name}"] for kind in ("sigma", "crb", "qcrb"))
+        reachable = qcrb * cost.get(name, 1.0)
         precision[name] = {
             "sigma_median": _median(sigma),
             "crb_median": _median(crb),
+            **({"holevo_median": _median(reachable)} if conflict else {}),
             "qcrb_median": _median(qcrb),
             "sigma_over_crb_median": _median(sigma / crb),
-            "information_fraction_median": _median((qcrb / crb) ** 2),
+            "information_fraction_median": _median((reachable / crb) ** 2),
         }
+        if f"systematic_{name}" in good:
+            precision[name]["systematic_median"] = _median(good[f"systematic_{name}"])
     return {
         "mode": scene.mode,
         "scheme": scene.model.optics.scheme,
@@ -194,6 +205,17 @@ def summary_of(
         "distribution": _distribution(scene, good),
         "seconds": {name: round(value, 3) for name, value in timings.items()},
     }
+
+
+def _holevo_over_quantum(scene: Scene, z_nm: FloatArray) -> dict[str, FloatArray]:
+    """Cost of fitting height and mass at once, of each particle, by parameter.
+
+    It depends on the height through the evanescent waves alone, and smoothly.
+    """
+    free = FREE_PARAMETERS[scene.mode]
+    heights = np.linspace(max(z_nm.min(), 0.0), max(z_nm.max(), 1.0), _HEIGHTS)
+    costs = [holevo_over_quantum(scene.model, float(z), free) for z in heights]
+    return {name: np.interp(z_nm, heights, [cost[name] for cost in costs]) for name in free}
 
 
 def _distribution(scene: Scene, good: pd.DataFrame) -> dict[str, Any] | None:

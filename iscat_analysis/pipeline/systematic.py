@@ -9,13 +9,21 @@ shrink when events are averaged.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
+from iscat_analysis.bounds import imitation, joint_information, mass_drift
 from iscat_analysis.calibration.mass import line_sigma_kda
 from iscat_analysis.config import Config
-from iscat_analysis.records import PARAMETERS, FloatArray
+from iscat_analysis.inference.likelihood import LEVEL, asimov_conditional, asimov_poisson
+from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Status
+
+_AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
+_HEIGHTS_PER_FRINGE = 10  # between them it is interpolated
 
 Source = Callable[[Config, pd.DataFrame], Mapping[str, FloatArray]]
 """Gives, by parameter, the standard deviation for every event; none for what it does not move."""
@@ -80,4 +88,161 @@ def _of_the_line(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray
     return {"mass_kda": line_sigma_kda(mass, line.gradient_per_kda, covariance)}
 
 
-_SOURCES: tuple[Source, ...] = (_of_the_line,)
+def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+    """Give what the measured optics may be wrong by: D Σ Dᵀ of `bounds.shared`."""
+    errors, pixel = config.optics.covariance, config.camera.pixel_size_nm
+    suited = config.optics.scheme != "darkfield" and config.optics.convention == "exact"
+    if errors is None or not errors.names or pixel is None or not suited:
+        return {}
+    side = max(5, round(config.fit.roi_nm / pixel))
+    grid = PixelGrid.centred(side, pixel)
+    known = table[["z_nm", "mass_kda"]].notna().all(axis=1).to_numpy()
+    model = forward_model(config, 1.05 * grid.diagonal_nm / 2)
+    shifts = np.full((len(table), len(PARAMETERS), len(errors.names)), np.nan)
+    if known.any():
+        shifts[known] = _shifts(config, model, grid, table[known])
+    covariance = np.array(errors.matrix)
+    variance = np.einsum("eik,kl,eil->ei", shifts, covariance, shifts)
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    free = FREE_PARAMETERS[config.fit.mode]
+    return {name: sigma[:, k] for k, name in enumerate(PARAMETERS) if name in free}
+
+
+def _shifts(
+    config: Config, model: ForwardModel, grid: PixelGrid, table: pd.DataFrame
+) -> FloatArray:
+    """Shift of (x, y, z, mass) of every event per unit of each parameter of the optics, (n, 4, k).
+
+    D changes smoothly with the amplitude and along z with the fringes: a few amplitudes at each of
+    some heights serve all events.
+    """
+    errors = config.optics.covariance
+    names = errors.names if errors is not None else ()
+    free = [name in FREE_PARAMETERS[config.fit.mode] for name in PARAMETERS]
+    amplitude = np.array([model.scale.amplitude(m) for m in table["mass_kda"].astype(float)])
+    nodes = _amplitude_nodes(amplitude, (table["status"] == Status.OK.value).to_numpy())
+    respond = _Response(
+        replace(model, scale=MassScale()), grid, names, tuple(free),
+        level=config.background.method == "sliding",
+        frames=(int(table["n_before"].median()), int(table["n_after"].median())),
+    )  # fmt: skip
+    by_amplitude = _lagrange(nodes, np.clip(amplitude, nodes.min(), nodes.max()))
+    heights, by_height = _height_weights(
+        table["z_nm"].to_numpy(dtype=float), model.z_range_nm, model.fringe_nm
+    )
+    shifts = np.zeros((len(table), len(PARAMETERS), len(names)))
+    for height, weight in zip(heights, by_height.T, strict=True):
+        near = weight != 0
+        found = np.einsum("en,nik->eik", by_amplitude[near], respond.at(float(height), nodes))
+        shifts[near] += weight[near, None, None] * found
+    if free[3]:
+        shifts[:, 3] *= amplitude[:, None]
+        if model.scale.calibration is not None:
+            peak = np.array([mass_drift(model, a, names) / a for a in nodes])
+            drift = amplitude[:, None] * (by_amplitude @ peak)
+            shifts[:, 3] = _calibrated(config, model, respond, amplitude, shifts[:, 3], drift)
+    return shifts
+
+
+@dataclass(frozen=True)
+class _Response:
+    """How the estimates of a particle at the centre of a region move with the optics."""
+
+    model: ForwardModel  # with masses that are amplitudes
+    grid: PixelGrid
+    names: tuple[str, ...]
+    free: tuple[bool, ...]
+    level: bool
+    frames: tuple[int, int]
+
+    def at(self, z_nm: float, amplitudes: FloatArray) -> FloatArray:
+        """D of (x, y, z [nm], ln a) per unit of each parameter, shape (amplitudes, 4, k)."""
+        count, (before, after) = len(self.names), self.frames
+        kept = np.flatnonzero([*self.free, self.level])
+        chosen = np.concatenate([np.arange(count), count + kept])
+        out = np.zeros((len(amplitudes), LEVEL + 1, count))
+        for index, amplitude in enumerate(amplitudes):
+            theta = np.array([*self._centre, z_nm, amplitude, 0.0])
+            expected = (
+                asimov_conditional(self.model, self.grid, theta, 1.0, before, after)
+                if before
+                else asimov_poisson(self.model, self.grid, theta, 1.0, 1.0)
+            )
+            whole = joint_information(expected, theta, self.names)
+            out[index, kept] = imitation(whole[np.ix_(chosen, chosen)], count)
+            out[index, 3] /= amplitude
+        return out[:, :4]
+
+    @property
+    def _centre(self) -> tuple[float, float]:
+        return float(np.mean(self.grid.x_nm)), float(np.mean(self.grid.y_nm))
+
+
+def _calibrated(
+    config: Config,
+    model: ForwardModel,
+    respond: _Response,
+    amplitude: FloatArray,
+    moves: FloatArray,
+    drift: FloatArray,
+) -> FloatArray:
+    """Turn shifts of the amplitude (n, k) into those of a mass that a line ties to the contrast.
+
+    The peak contrast C = L a + Q a² moves less than the amplitude, because L moves too: `drift`.
+    Where the optics come from a file, the standards were fitted with the same: line and contrasts
+    are off by the same factor, that of a faint particle, and only what bright ones have beyond it
+    remains.
+    """
+    scale, names = model.scale, respond.names
+    gradient = float(scale.slope(0.0))
+    slope = np.array([scale.slope(float(a)) for a in amplitude])
+    shifts = slope[:, None] * moves + drift
+    if config.optics.file is not None:
+        faint = 1e-6 * np.abs(amplitude).max()
+        relative = respond.at(model.height_nm, np.array([faint]))[0, 3]
+        relative = relative + mass_drift(model, faint, names) / (faint * gradient)
+        contrast = scale.linear * amplitude + scale.quadratic * amplitude**2
+        shifts -= (contrast * gradient / scale.linear)[:, None] * relative
+    return np.asarray(shifts)
+
+
+def _amplitude_nodes(amplitude: FloatArray, good: NDArray[np.bool_]) -> FloatArray:
+    """Amplitudes for which the response is computed; they span those of the good fits."""
+    spanned = amplitude[good] if good.any() else amplitude
+    low, high = float(spanned.min()), float(spanned.max())
+    middle, half = (low + high) / 2, (high - low) / 2
+    if half <= 1e-9 * abs(middle):
+        return np.array([middle or 1e-9])
+    angles = np.pi * (np.arange(_AMPLITUDES) + 0.5) / _AMPLITUDES
+    nodes = middle + half * np.cos(angles)
+    return np.where(np.abs(nodes) > 1e-6 * half, nodes, 1e-6 * half)
+
+
+def _height_weights(
+    z_nm: FloatArray, span: tuple[float, float], fringe_nm: float
+) -> tuple[FloatArray, FloatArray]:
+    """Heights and the weights (events, heights) of a cubic through the four nearest of them."""
+    if not np.ptp(z_nm):
+        return z_nm[:1], np.ones((z_nm.size, 1))
+    low, high = span
+    count = max(int(np.ceil((high - low) * _HEIGHTS_PER_FRINGE / fringe_nm)), 3)
+    place = (np.clip(z_nm, low, high) - low) / (high - low) * count
+    first = np.clip(np.floor(place).astype(int) - 1, 0, count - 3)
+    weights = np.zeros((z_nm.size, count + 1))
+    cubic = _lagrange(np.arange(4.0), place - first)
+    np.put_along_axis(weights, first[:, None] + np.arange(4), cubic, axis=1)
+    used = np.flatnonzero(np.any(weights != 0, axis=0))
+    heights = np.asarray(low + (high - low) / count * used, dtype=np.float64)
+    return heights, weights[:, used]
+
+
+def _lagrange(nodes: FloatArray, points: FloatArray) -> FloatArray:
+    """Weights of the polynomial through values at the nodes, shape (points, nodes)."""
+    weights = np.ones((points.size, nodes.size))
+    for k, node in enumerate(nodes):
+        for other in np.delete(nodes, k):
+            weights[:, k] *= (points - other) / (node - other)
+    return weights
+
+
+_SOURCES: tuple[Source, ...] = (_of_the_line, _of_the_optics)

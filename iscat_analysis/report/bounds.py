@@ -1,7 +1,4 @@
-"""What `iscat bounds` writes: the bounds of one experiment, and a scan through it.
-
-Everything arrives as tables; nothing is computed here.
-"""
+"""What `iscat bounds` writes: the bounds of one experiment, and a scan through it."""
 
 from __future__ import annotations
 
@@ -13,14 +10,20 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from iscat_analysis.bounds import tradeoff
 from iscat_analysis.records import PARAMETERS
 from iscat_analysis.report.numbers import LABELS, UNITS
 from iscat_analysis.report.output import atomic_folder
 from iscat_analysis.report.style import BLUE, INK, VERMILLION, log_y, new_figure, publish
 from iscat_analysis.schemas import to_json
 
-BOUNDS_FILES = frozenset({"bounds.json", "scan.csv", "scan.png", "scan.svg"})
+BOUNDS_FILES = frozenset(
+    {"bounds.json", "scan.csv", "scan.png", "scan.svg", "tradeoff.png", "tradeoff.svg"}
+)
 """What `write_bounds` may leave in its folder."""
+
+OPTICS_BOUNDS_FILES = frozenset({"optics_bounds.json", "needed.csv", "needed.png", "needed.svg"})
+"""What `write_optics_bounds` leaves in its folder."""
 
 
 def write_bounds(
@@ -37,7 +40,8 @@ def write_bounds(
     Parameters
     ----------
     report : mapping
-        What ``bounds.json`` holds.
+        What ``bounds.json`` holds.  Where height and mass are both free, the figure ``tradeoff``
+        shows what one measurement can reach for the two.
     folder : Path
         Where to write.
     table : pandas.DataFrame, optional
@@ -67,7 +71,116 @@ def write_bounds(
                 building / "scan.csv", index=False, float_format="%.9g", lineterminator="\n"
             )
             publish(scan_figures(table, label, here), building)
+        if {"z_nm", "mass_kda"} <= set(report["at"]["free"]):
+            publish([("tradeoff", tradeoff_figure(report))], building)
     return folder
+
+
+def tradeoff_figure(report: Mapping[str, Any]) -> Figure:
+    """Draw how well one measurement can tell height and mass, and how well this microscope does.
+
+    Parameters
+    ----------
+    report : mapping
+        From `iscat_analysis.bounds.bounds_report`.
+
+    Returns
+    -------
+    Figure
+        The quantum bounds of each, the edge of what can be reached for both, and this microscope.
+    """
+    information = np.asarray(report["qfi"]) + 1j * np.asarray(report["qfi_imaginary"])
+    edge = tradeoff(information[2:, 2:])
+    actual, both = report["actual"], report["holevo"]
+    names = ("z_nm", "mass_kda")
+    own = np.array([actual["qcrb"][name] for name in names])
+    camera = np.array([actual["crb_joint"][name] for name in names])
+    figure = new_figure(5.2, 4.2)
+    axes = figure.add_subplot()
+    axes.axvline(own[0], color=BLUE, lw=1.2, ls="--", label="quantum bound of each alone")
+    axes.axhline(own[1], color=BLUE, lw=1.2, ls="--")
+    axes.plot(*edge.T, color=BLUE, lw=1.8, label="both at once, at best (Holevo)")
+    axes.plot(both["z_nm"], both["mass_kda"], "o", color=BLUE, ms=5, label="with equal weights")
+    if np.isfinite(camera).all():
+        axes.plot(*camera, "D", color=VERMILLION, ms=6, label="this microscope, joint CRB")
+    wide = np.nanmax(np.vstack([camera * 1.15, own * 2.2]), axis=0)
+    axes.set(xlim=(0.8 * own[0], wide[0]), ylim=(0.8 * own[1], wide[1]))
+    axes.set(xlabel="σ of height [nm]", ylabel="σ of mass [kDa]")
+    figure.legend(loc="outside upper left", ncols=2, fontsize=8)
+    return figure
+
+
+def write_optics_bounds(
+    report: Mapping[str, Any], folder: Path, *, overwrite: bool = False
+) -> Path:
+    """Write how well particles would tell the microscope.
+
+    Parameters
+    ----------
+    report : mapping
+        What ``optics_bounds.json`` holds.
+    folder : Path
+        Where to write.
+    overwrite : bool
+        Whether an earlier result may be replaced.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    DataError
+        The folder may not or cannot be written.
+    """
+    with atomic_folder(folder, overwrite, known=OPTICS_BOUNDS_FILES) as building:
+        (building / "optics_bounds.json").write_text(
+            to_json("optics_bounds", report) + "\n", encoding="utf-8"
+        )
+        needed = pd.DataFrame(report["needed"])
+        needed.to_csv(building / "needed.csv", index=False, lineterminator="\n")
+        publish(needed_figures(report), building)
+    return folder
+
+
+def needed_figures(report: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
+    """Draw how many particles of which mass the precisions take.
+
+    Parameters
+    ----------
+    report : mapping
+        As in `write_optics_bounds`.
+
+    Yields
+    ------
+    name : str
+        ``needed``.
+    figure : Figure
+        Events against mass, both logarithmic.
+    """
+    figure = new_figure(6.4, 4.2)
+    axes = figure.subplots()
+    needed, goals = pd.DataFrame(report["needed"]), report["goals"]
+    lines = (
+        ("focus_nm", f"focus to {goals['focus_nm']:g} nm", BLUE, "-"),
+        ("mass_rel", f"masses to {100 * goals['mass_rel']:g} %, in common", INK, "-"),
+        ("identified", "everything identified", INK, ":"),
+    )
+    for column, label, color, dash in lines:
+        axes.plot(
+            needed["mass_kda"], needed[column].astype(float), dash, color=color, lw=1.8,
+            marker="o", ms=4, label=label,
+        )  # fmt: skip
+    axes.plot(
+        report["at"]["mass_kda"], report["events"], "D", color=VERMILLION, ms=7, label="planned"
+    )
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("mass [kDa]")
+    axes.set_ylabel("particles needed")
+    axes.legend()
+    yield "needed", figure
 
 
 def scan_figures(table: pd.DataFrame, label: str, here: float) -> Iterator[tuple[str, Figure]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import PurePath
@@ -64,6 +65,7 @@ def report_context(
     sampled = [view for view in analysis.views if view.posterior is not None]
     started = _when(analysis.provenance.started)
     said = headline(analysis, table)
+    precision = [precision_of(analysis, table, name) for name in FREE_PARAMETERS[analysis.mode]]
     return {
         "title": PurePath(source.replace("\\", "/")).name or "Analysis",
         "subtitle": f"{_SCHEMES[analysis.scheme]}, mode {analysis.mode}: {_MODES[analysis.mode]}. "
@@ -75,9 +77,8 @@ def report_context(
         "headline": [text for text in said if not text.startswith("Not calibrated")],
         "flagged": caution(table) is not None,
         "tiles": _tiles(analysis, table),
-        "precision_rows": precision_rows(
-            analysis, [precision_of(table, name) for name in FREE_PARAMETERS[analysis.mode]]
-        ),
+        "has_holevo": any(math.isfinite(p.holevo) for p in precision),
+        "precision_rows": precision_rows(analysis, precision),
         "warnings": analysis.warnings,
         "figures": figures,
         "histogram": next((name for name in figures if name.endswith("_histogram")), None),
@@ -136,17 +137,20 @@ def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
         }
     )
     name = "mass_kda" if "mass_kda" in FREE_PARAMETERS[analysis.mode] else "z_nm"
-    if (p := precision_of(table, name)).events:
+    if (p := precision_of(analysis, table, name)).events:
         label, unit = LABELS[name], UNITS[name]
         said = (
-            f"σ {number(p.sigma)}, CRB {number(p.crb)} {unit}",
+            f"σ {number(p.sigma)}{p.shared}, CRB {number(p.crb)} {unit}",
             f", QCRB {number(p.qcrb)} {unit}",
         )
+        best = "QCRB"
+        if math.isfinite(p.holevo):
+            best, said = "Holevo", (said[0], f", Holevo {number(p.holevo)} {unit}")
         if is_uncalibrated(analysis):
             label, said = "contrast", ("median of the events' own ratios", "")
         tiles += [
             {
-                "label": f"Spread of {label} over its CRB",
+                "label": f"σ of {label} over its CRB",
                 "value": number(p.over_crb),
                 "unit": "×",
                 "note": said[0],
@@ -154,7 +158,7 @@ def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
             {
                 "label": f"Information on {label} used",
                 "value": percent(p.information),
-                "note": f"(QCRB / CRB)²{said[1]}",
+                "note": f"({best} / CRB)²{said[1]}",
             },
         ]
     return tiles

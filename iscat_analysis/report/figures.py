@@ -48,8 +48,8 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[tuple[str,
     Yields
     ------
     name : str
-        ``overview`` (the field with its events), a histogram, ``timeline``, ``precision`` (achieved
-        σ against the bounds), ``diagnostics`` and ``power``; what has no data is left out.
+        ``overview`` (the field with its events), a histogram, ``timeline``, ``precision`` (σ
+        against the bounds), ``diagnostics`` and ``power``; what has no data is left out.
     figure : Figure
         The figure.
     """
@@ -279,7 +279,7 @@ def precision(analysis: Analysis, table: pd.DataFrame) -> Figure:
         axes.plot(ends, ends, color=INK, lw=1.2, label="CRB")
         look: dict[str, Any] = {"ms": 3.5, "alpha": 0.7, "mew": 0}
         _points(axes, crb, qcrb, usable, "s", color=BLUE, label="QCRB", **look)
-        _points(axes, crb, sigma, usable & good, "o", color=VERMILLION, label="achieved σ", **look)
+        _points(axes, crb, sigma, usable & good, "o", color=VERMILLION, label="σ", **look)
         if (usable & ~good).any():
             _points(axes, crb, sigma, usable & ~good, "x", color=PURPLE, ms=4, label="σ, flagged")
         axes.set(xscale="log", yscale="log", xlim=tuple(ends))

@@ -47,7 +47,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Precision:
-    """How near the fits of one parameter came to its bounds, over the rows that are ok.
+    """What the likelihood promises for one parameter beside its bounds, over the rows that are ok.
 
     Attributes
     ----------
@@ -57,10 +57,15 @@ class Precision:
         Rows with a usable σ and CRB.
     sigma, crb, qcrb : float
         Medians [nm or kDa]; NaN where there is none.
+    holevo : float
+        The same of the Holevo bound, where height and mass are both free; NaN elsewhere.
     over_crb : float
         Median of σ/CRB.
     information : float
-        Median of (QCRB/CRB)², the share of the light's information that the measurement uses.
+        Median of (QCRB/CRB)², or of (Holevo/CRB)² where there is that: the share that the
+        measurement uses of what can be had of the light's information.
+    systematic : float
+        Median of the error that all events share [nm or kDa]; NaN where it is not known.
     """
 
     name: str
@@ -68,8 +73,16 @@ class Precision:
     sigma: float
     crb: float
     qcrb: float
+    holevo: float
     over_crb: float
     information: float
+    systematic: float = math.nan
+
+    @property
+    def shared(self) -> str:
+        """The error that all events share, as text beside σ; empty where it is not known."""
+        known = math.isfinite(self.systematic)
+        return f", common to all events {number(self.systematic)}" if known else ""
 
 
 def counted(table: pd.DataFrame) -> pd.DataFrame:
@@ -143,7 +156,8 @@ def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
         A copy in which ``mass_kda`` and its σ and bounds are contrasts.
     """
     per_kda = (table["contrast"] / table["mass_kda"]).abs()
-    columns = [f"{kind}_mass_kda" for kind in ("sigma", "crb", "qcrb")]
+    kinds = ("sigma", "crb", "qcrb", "systematic")
+    columns = [name for kind in kinds if (name := f"{kind}_mass_kda") in table]
     scaled = {name: table[name] * per_kda for name in columns}
     return table.assign(**scaled, mass_kda=table["contrast"])
 
@@ -191,11 +205,13 @@ def caution(table: pd.DataFrame) -> str | None:
     )
 
 
-def precision_of(table: pd.DataFrame, name: str) -> Precision:
-    """Set the spread of one parameter beside its bounds.
+def precision_of(analysis: Analysis, table: pd.DataFrame, name: str) -> Precision:
+    """Set σ of one parameter beside its bounds.
 
     Parameters
     ----------
+    analysis : Analysis
+        Its summary knows the Holevo bound.
     table : pandas.DataFrame
         Columns `EVENT_COLUMNS`.
     name : str
@@ -210,15 +226,26 @@ def precision_of(table: pd.DataFrame, name: str) -> Precision:
     sigma, crb, qcrb = (good[f"{kind}_{name}"].to_numpy(float) for kind in ("sigma", "crb", "qcrb"))
     usable = np.isfinite(sigma) & np.isfinite(crb) & (crb > 0)
     sigma, crb, qcrb = sigma[usable], crb[usable], qcrb[usable]
+    medians = analysis.summary.get("precision", {}).get(name, {})
+    holevo = medians.get("holevo_median")
+    information = quantiles((qcrb / crb) ** 2)[1]
     return Precision(
         name,
         int(usable.sum()),
         quantiles(sigma)[1],
         quantiles(crb)[1],
         quantiles(qcrb)[1],
+        math.nan if holevo is None else holevo,
         quantiles(sigma / crb)[1],
-        quantiles((qcrb / crb) ** 2)[1],
+        information if holevo is None else medians["information_fraction_median"],
+        _shared(good, name)[1],
     )
+
+
+def _shared(good: pd.DataFrame, name: str) -> tuple[float, float, float]:
+    """Quartiles of the error that all events share."""
+    column = f"systematic_{name}"
+    return quantiles(good[column].to_numpy(float) if column in good else np.empty(0))
 
 
 def quantiles(values: FloatArray) -> tuple[float, float, float]:
@@ -306,21 +333,29 @@ def _with_unit(value: float, main: Quantity) -> str:
 
 
 def _spread(analysis: Analysis, table: pd.DataFrame) -> list[str]:
-    """Set the spread of the mass, or else of the height, beside the bounds."""
+    """Set σ of the mass, or else of the height, beside the bounds."""
     free = FREE_PARAMETERS[analysis.mode]
     name = "mass_kda" if "mass_kda" in free else "z_nm"
-    p = precision_of(table, name)
+    p = precision_of(analysis, table, name)
     if not p.events:
         return []
-    text = f"The spread of {LABELS[name]} is {number(p.sigma)} {UNITS[name]}"
+    of_it, sigma = LABELS[name], f"{number(p.sigma)} {UNITS[name]}"
+    shared = f"{number(p.systematic)} {UNITS[name]}" if math.isfinite(p.systematic) else ""
     if is_uncalibrated(analysis):
-        text = "The spread of the contrast"
         good = table[table["status"] == Status.OK.value]
-        relative = (good["sigma_mass_kda"] / good["mass_kda"].abs()).to_numpy(float)
-        text += f" is {percent(quantiles(relative)[1])} of it"
+        size = good["mass_kda"].abs()
+        of_it = "contrast"
+        sigma = f"{percent(quantiles((good['sigma_mass_kda'] / size).to_numpy(float))[1])} of it"
+        if shared:
+            relative = (good["systematic_mass_kda"] / size).to_numpy(float)
+            shared = f"{percent(quantiles(relative)[1])} of it"
+    text = f"σ of the {of_it}, from the curvature of the likelihood, is {sigma}"
     text += f", {number(p.over_crb)} times the Cramér–Rao bound"
+    if shared:
+        text += f"; the error common to all events is {shared}"
     if math.isfinite(p.information):
-        text += f"; {percent(p.information)} of the information in the light is used"
+        of = "can be had of the light" if math.isfinite(p.holevo) else "is in the light"
+        text += f"; {percent(p.information)} of the information that {of} is used"
     return [f"{text}."]
 
 
@@ -337,12 +372,15 @@ def precision_rows(analysis: Analysis, precision: Sequence[Precision]) -> list[l
     Returns
     -------
     list of list of str
-        Parameter, σ, CRB, QCRB, σ over CRB, light used, rows.
+        Parameter, σ, error common to all events, CRB, where there is one Holevo, QCRB, σ over CRB,
+        light used, rows.
     """
     return [
         [
             f"{label_of(analysis, p.name)} [{UNITS[p.name]}]",
-            *(number(value) for value in (p.sigma, p.crb, p.qcrb, p.over_crb)),
+            *(number(value) for value in (p.sigma, p.systematic, p.crb)),
+            *([number(p.holevo)] if math.isfinite(p.holevo) else []),
+            *(number(value) for value in (p.qcrb, p.over_crb)),
             percent(p.information),
             str(p.events),
         ]

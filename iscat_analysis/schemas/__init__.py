@@ -18,19 +18,20 @@ import numpy as np
 from pydantic import BaseModel
 
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.schemas.bounds import Bounds, Comparison
-from iscat_analysis.schemas.calibration import Calibration, Camera, Optics
+from iscat_analysis.schemas.bounds import Bounds, Comparison, OpticsBounds
+from iscat_analysis.schemas.calibration import Camera, MassCalibration, Optics
 from iscat_analysis.schemas.fit import Fit, Simulate, Summary
 from iscat_analysis.schemas.study import Benchmark
 
 _DOCUMENTS: Mapping[str, type[BaseModel]] = {
     "benchmark": Benchmark,
     "bounds": Bounds,
-    "calibration": Calibration,
+    "calibration": MassCalibration,
     "camera": Camera,
     "comparison": Comparison,
     "fit": Fit,
     "optics": Optics,
+    "optics_bounds": OpticsBounds,
     "simulate": Simulate,
     "summary": Summary,
 }
@@ -54,9 +55,9 @@ def schema(name: str) -> dict[str, Any]:
     ----------
     name : str
         ``"fit"``, ``"simulate"`` or ``"bounds"`` for what the command prints with ``--json``, and
-        ``"comparison"`` for ``iscat bounds --preset``; ``"summary"``, ``"benchmark"``,
-        ``"camera"``, ``"optics"`` or ``"calibration"`` for the file of that name and what is
-        printed beside it.
+        ``"comparison"`` and ``"optics_bounds"`` for ``iscat bounds --preset`` and ``--for optics``;
+        ``"summary"``, ``"benchmark"``, ``"camera"``, ``"optics"`` or ``"calibration"`` for the
+        file of that name and what is printed beside it.
 
     Returns
     -------

@@ -13,6 +13,8 @@ from iscat_analysis.schemas.base import (
     Emission,
     Matrix4,
     Mode,
+    Natural,
+    NotNegative,
     Number,
     Parameter,
     Positive,
@@ -89,6 +91,17 @@ class BoundsPlanned(Document):
     qcrb_dong2021: Planned = key("Quantum, with the mode weight of Dong et al. (2021)")
 
 
+class Holevo(Closed):
+    """What one measurement of all free parameters can reach, for the planned frames."""
+
+    weight: Literal["qfi"] = key("Every parameter weighs as much as the light knows of it")
+    sum: Positive = key("Tr WV; the number of free parameters where no two are in conflict")
+    x_nm: Positive = maybe("[nm]")
+    y_nm: Positive = maybe("[nm]")
+    z_nm: Positive = maybe("[nm]")
+    mass_kda: Positive = maybe("[kDa]")
+
+
 class Crosstalk(Document):
     """The direction among the free parameters that is hidden worst."""
 
@@ -143,7 +156,11 @@ class Bounds(Document):
     qfi_imaginary: Matrix4 = key(
         "Its imaginary part; where not zero, no single measurement is best for both parameters",
     )
+    holevo: Holevo = key("Holevo bound over the mode's free parameters")
     information_fraction: dict[Parameter, Number] = key("Share of the light's information")
+    information_fraction_joint: dict[Parameter, Number] = key(
+        "Share of what one measurement of all free parameters can take: (Holevo / CRB joint)²"
+    )
     incompatible: dict[str, float] = key(
         "Pairs that no single measurement estimates best, and how strongly, from 0 to 1"
     )
@@ -155,6 +172,56 @@ class Bounds(Document):
     scan: Scan = maybe("With --scan")
     optimum: Optimum = maybe("With --optimize")
     target: Target = maybe("With --target")
+
+
+class OpticsParameter(Closed):
+    """A parameter of the optics that would be fitted."""
+
+    parameter: str
+    value: float = key("As configured")
+    sigma: Positive = key("Standard deviation, all fitted together; null where it would be held")
+    prior_range: float = key("What is plausible")
+    determined: bool = key("Whether the pictures determine it within that")
+
+
+class HiddenDirection(Closed):
+    """A parameter that would be held, and the direction that pictures do not show."""
+
+    name: str
+    others: list[str] = key("Parameters from which it is not told apart")
+    direction: dict[str, Number] = key("One standard deviation, each in its own unit")
+
+
+class EventsNeeded(Closed):
+    """Particles of one mass that the goals take; null where no number suffices."""
+
+    mass_kda: float
+    snr: NotNegative = key("Signal-to-noise ratio of one picture")
+    identified: Number = key("Events that identify everything that can be")
+    focus_nm: Number
+    mass_rel: Number
+
+
+class OpticsBounds(Document):
+    """What iscat bounds --for optics prints: how well particles would tell the microscope."""
+
+    at: dict[str, Number] = key("The experiment")
+    events: Natural = key("Particles that are fitted together")
+    snr: NotNegative = key("Signal-to-noise ratio of one picture")
+    parameters: list[OpticsParameter]
+    names: list[str] = key("Parameters that are determined, in the order of covariance")
+    covariance: list[list[Number]] = key("Of these, fitted together")
+    unidentifiable: list[str] = key("What the pictures would not tell, one sentence each")
+    hidden: list[HiddenDirection] = key("The same in numbers")
+    common: dict[str, dict[Parameter, Number]] = key(
+        "Mode: standard deviation that the microscope's error puts into all fits alike [nm, kDa]"
+    )
+    single: dict[str, dict[Parameter, Number]] = key(
+        "Mode: Cramér–Rao bound of one particle where the optics are known [nm, kDa]"
+    )
+    goals: dict[str, float] = key("Precisions whose price is told")
+    needed: list[EventsNeeded] = key("Their price, for several masses")
+    warnings: list[str] = key("What the user should know, one line each")
 
 
 class Table1Row(Closed):

@@ -68,7 +68,7 @@ class Camera(Document):
     out: str = maybe("The folder that was written; not in the file")
 
 
-class Peak(Closed):
+class ContrastPeak(Closed):
     """A peak of the contrasts."""
 
     contrast: NotNegative = key("Size of the peak's contrast")
@@ -99,7 +99,7 @@ class Histogram(Closed):
     counts: list[Count] = key("Events in each")
 
 
-class Calibration(Document):
+class MassCalibration(Document):
     """What iscat calibrate mass prints and writes as calibration.json.
 
     The line between contrast and mass: contrast = gradient · mass + sign · offset.
@@ -116,7 +116,7 @@ class Calibration(Document):
     landing: Literal["dark", "bright"] = key("What landing does to its place")
     events: Count = key("Landing events that were used")
     standards: list[Standard] = key("The standards, lightest first")
-    peaks: list[Peak] = key("Every peak that was found")
+    peaks: list[ContrastPeak] = key("Every peak that was found")
     notes: list[str] = key("What the user should know, one line each")
     histogram: Histogram = maybe("In the file: sizes of the contrasts")
     out: str = maybe("The folder that was written; not in the file")

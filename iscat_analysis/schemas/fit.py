@@ -24,11 +24,12 @@ from iscat_analysis.schemas.base import (
     key,
     maybe,
 )
+from iscat_analysis.schemas.calibration import OpticsParameter, Twin
 
 _SIGMA = "Standard deviation from the observed information [{}]; null where it is not free"
 _CRB = "Joint Cramér–Rao bound at the estimate [{}]; null where the parameter is not free"
 _QCRB = "Quantum Cramér–Rao bound for the collected photons [{}]"
-_SYSTEMATIC = "Error common to the movie, from the calibration [{}]"
+_SYSTEMATIC = "Error common to the movie, from calibrations of optics and mass [{}]"
 _REPEAT = "Spread between disjoint parts of the event's frames [{}]"
 
 
@@ -84,11 +85,20 @@ class Event(Closed):
 class Medians(Document):
     """Medians of one free parameter over the events that are ok."""
 
-    sigma_median: Number = key("Achieved standard deviation [nm or kDa]")
+    sigma_median: Number = key(
+        "Standard deviation from the curvature of the likelihood [nm or kDa]"
+    )
     crb_median: Number = key("Cramér–Rao bound [nm or kDa]")
     qcrb_median: Number = key("Quantum Cramér–Rao bound [nm or kDa]")
-    sigma_over_crb_median: Number = key("1 where the fit uses all that the frames hold")
-    information_fraction_median: Number = key("(QCRB/CRB)², the share of the light's information")
+    holevo_median: Number = maybe(
+        "Holevo bound of all free parameters at once, where height and mass are both free [nm, kDa]"
+    )
+    sigma_over_crb_median: Number = key("Near 1 by construction: σ and CRB are both from the model")
+    information_fraction_median: Number = key(
+        "(QCRB/CRB)², or (Holevo/CRB)² where height and mass are both free: the share that is used "
+        "of what can be had of the light's information"
+    )
+    systematic_median: Number = maybe("Error common to the movie, from calibrations [nm or kDa]")
 
 
 class Input(Document):
@@ -169,6 +179,22 @@ class Injection(Closed):
     frame_in_interval: Share = maybe("Share whose frame lies inside frame_ci95")
 
 
+class Learned(Closed):
+    """What ``optics.calibrate`` did: the test of the optics, and what was learned of them."""
+
+    tested: Count = maybe("Bright particles that stand alone")
+    median_p: Share = maybe("Median p-value of the brightest in the configured optics")
+    calibrated: bool = key("Whether the analysis used learned optics")
+    reason: str = maybe("Why it did not, where the test asked for it or could not be made")
+    accepted: bool = maybe("Whether what was learned could be used")
+    refusals: list[str] = maybe("Why not, one line each")
+    parameters: list[OpticsParameter] = maybe("Every parameter")
+    names: list[str] = maybe("The measured ones, in the order of covariance")
+    covariance: list[list[float]] = maybe("Of the measured parameters")
+    twin: Twin | None = maybe("A second microscope that is as likely")
+    notes: list[str] = maybe("What the user should know, one line each")
+
+
 class Distribution(Document):
     """Species, as a mixture fitted to the events that are ok, each with its own error."""
 
@@ -224,6 +250,7 @@ class Summary(Document):
     background: Background = maybe("Movies with background frames: noise and drift")
     landing: Landing = maybe("Landing movies: windows, search, noise and drift")
     injection: Injection = maybe("With --inject: known particles added to the movie")
+    optics: Learned = maybe("Where the optics were tested: the test, and what was learned")
     distribution: Distribution | None = maybe(
         "Species; null where masses are not fitted once per event"
     )

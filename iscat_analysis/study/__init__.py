@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from iscat_analysis.study.baselines import Baselines
-from iscat_analysis.study.calibration import Calibration, calibrate_posterior
+from iscat_analysis.study.posteriors import PosteriorRanks, calibrate_posterior
 from iscat_analysis.study.scores import (
     Score,
     gaussian_posterior,
@@ -30,7 +30,7 @@ from iscat_analysis.study.trials import Trials, run_trials, trial_generator
 
 __all__ = [
     "Baselines",
-    "Calibration",
+    "PosteriorRanks",
     "Score",
     "Setting",
     "Trials",

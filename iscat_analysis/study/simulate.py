@@ -46,7 +46,7 @@ _NO_UUID = "urn:uuid:00000000-0000-0000-0000-000000000000"
 
 
 @dataclass(frozen=True)
-class Particle:
+class SimulatedParticle:
     """One simulated particle: where, when, how heavy; its place is that in the frame it lands."""
 
     frame: int
@@ -145,7 +145,7 @@ class Movie:
         How far the sample has moved since the first frame, along y and x.
     power : ndarray, shape (t,)
         Laser power of each frame, mean 1.
-    particles : tuple of Particle
+    particles : tuple of SimulatedParticle
         In order of landing.
     """
 
@@ -273,7 +273,7 @@ class Movie:
         moved = fft.irfft2(spectrum * phase_y[:, None] * phase_x, s=(rows, columns))
         return np.asarray(np.maximum(moved[self._field], 0.0))
 
-    def _field_of(self, particle: Particle) -> ComplexArray:
+    def _field_of(self, particle: SimulatedParticle) -> ComplexArray:
         offsets = self._model.samples[0] * self._pixel_nm
         dy, dx = self.drift_px[particle.frame]
         x = (self._grid.x_nm[:, None] + offsets).ravel() - (particle.x_px - dx) * self._pixel_nm
@@ -360,12 +360,12 @@ class Movie:
                 "camera.gain_e_per_adu or lower simulation.photons_per_pixel"
             )
 
-    def _place(self) -> tuple[Particle, ...]:
+    def _place(self) -> tuple[SimulatedParticle, ...]:
         simulation, particle = self._config.simulation, self._config.particle
         nominal = material(particle, self._config.optics.wavelength_nm).mass_kda
         if simulation.count is None:
             return tuple(
-                Particle(
+                SimulatedParticle(
                     e.frame, e.leave, e.x_px, e.y_px,
                     particle.height_nm if e.z_nm is None else e.z_nm,
                     nominal if e.mass_kda is None else e.mass_kda,
@@ -392,7 +392,7 @@ class Movie:
             leaves = i in leavers and landing[i] + 1 <= latest
             leave = int(rng.integers(landing[i] + 1, latest + 1)) if leaves else None
             particles.append(
-                Particle(
+                SimulatedParticle(
                     int(landing[i]), leave, float(x[i]), float(y[i]), particle.height_nm,
                     float(mass[i]),
                 )

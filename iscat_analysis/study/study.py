@@ -19,7 +19,7 @@ from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.benchmark import BENCHMARK_NAMES, render_benchmark
 from iscat_analysis.schemas import to_json
 from iscat_analysis.study.baselines import Baselines
-from iscat_analysis.study.calibration import RANKS, Calibration, calibrate_posterior
+from iscat_analysis.study.posteriors import RANKS, PosteriorRanks, calibrate_posterior
 from iscat_analysis.study.scores import (
     MIN_TRIALS,
     pull_histogram,
@@ -228,7 +228,7 @@ def _pull(trials: Trials, k: int) -> FloatArray:
     return pull
 
 
-def _parameters(setting: Setting, found: Trials, ranked: Calibration) -> dict[str, Any]:
+def _parameters(setting: Setting, found: Trials, ranked: PosteriorRanks) -> dict[str, Any]:
     """Score every free parameter."""
     bounds, kept = setting.bounds, found.usable
     error = found.estimate - found.truth
@@ -267,7 +267,7 @@ def _parameters(setting: Setting, found: Trials, ranked: Calibration) -> dict[st
     return out
 
 
-def _rank_histograms(ranked: Calibration) -> dict[str, Any]:
+def _rank_histograms(ranked: PosteriorRanks) -> dict[str, Any]:
     kept = ranked.ranks[ranked.kept]
     if not len(kept):
         return {}

@@ -42,7 +42,9 @@ def test_scan_writes_table_and_figure(capsys: pytest.CaptureFixture[str], tmp_pa
     out = tmp_path / "focus"
     status, _, _ = run(capsys, "--mode", "joint", "--scan", "focus=-400:400:200", "--out", str(out))
     assert status == 0
-    assert {p.name for p in out.iterdir()} == {"bounds.json", "scan.csv", "scan.png", "scan.svg"}
+    names = {"bounds.json", "scan.csv", "scan.png", "scan.svg", "tradeoff.png", "tradeoff.svg"}
+    assert {p.name for p in out.iterdir()} == names
+    assert "Holevo" in (out / "tradeoff.svg").read_text(encoding="utf-8")
     table = pd.read_csv(out / "scan.csv")
     assert list(table["focus"]) == [-400, -200, 0, 200, 400]
     assert "configured: −300" in (out / "scan.svg").read_text(encoding="utf-8")

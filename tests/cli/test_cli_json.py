@@ -53,7 +53,7 @@ def _printed(capsys, *arguments: str) -> Any:
 def test_schemas_are_schemas() -> None:
     assert set(schema_names()) == {
         "benchmark", "bounds", "calibration", "camera", "comparison", "fit", "optics",
-        "simulate", "summary",
+        "optics_bounds", "simulate", "summary",
     }  # fmt: skip
     for name in schema_names():
         jsonschema.Draft202012Validator.check_schema(schema(name))
@@ -194,3 +194,13 @@ def test_the_schemas_refuse_what_is_wrong(setup, capsys, tmp_path) -> None:
         change(bad)
         with pytest.raises(jsonschema.ValidationError):
             _check(bad, "fit")
+
+
+def test_optics_bounds(capsys, tmp_path, setup) -> None:
+    given = ["--config", str(setup), "--for", "optics", "--events", "15", "--free", "focus,na"]
+    printed = _printed(capsys, "bounds", *given, "--out", str(tmp_path / "plan"))
+    _check(printed, "optics_bounds")
+    written = json.loads((tmp_path / "plan" / "optics_bounds.json").read_text(encoding="utf-8"))
+    assert written == printed
+    with pytest.raises(jsonschema.ValidationError):
+        _check(printed | {"events": 0}, "optics_bounds")

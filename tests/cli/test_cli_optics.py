@@ -53,9 +53,39 @@ def test_a_movie_with_background_frames(movie: Path, tmp_path: Path, capsys: Cap
     given += ["--config", str(movie.with_name("setup.toml"))]
     given += ["--set", "background.frames=[0,38]", "--set", "fit.frames=[120,160]"]
     assert main(given) == 0
-    found = {r["parameter"]: r for r in json.loads(capsys.readouterr().out)["parameters"]}
+    printed = json.loads(capsys.readouterr().out)
+    found = {r["parameter"]: r for r in printed["parameters"]}
     for name, true in OPTICS_TRUTH.items():
         assert abs(found[name]["value"] - true) < SIGMAS * found[name]["sigma"]
+    # the same errors were foreseen from the truth, without the movie
+    wanted = ["bounds", "--for", "optics", "--events", str(printed["particles"]), *FREE, "--json"]
+    wanted += ["--config", str(movie.with_name("setup.toml"))]
+    truth = {f"optics.{name}": value for name, value in OPTICS_TRUTH.items()} | {
+        "particle.mass_kda": 4500, "bounds.photons_per_pixel": 2e4,
+        "bounds.n_before": 38, "bounds.n_after": 40,
+    }  # fmt: skip
+    wanted += [word for key, value in truth.items() for word in ("--set", f"{key}={value}")]
+    assert main(wanted) == 0
+    foreseen = {r["parameter"]: r for r in json.loads(capsys.readouterr().out)["parameters"]}
+    for name in OPTICS_TRUTH:
+        # speckle makes some particles brighter than others
+        assert found[name]["crb"] == pytest.approx(foreseen[name]["sigma"], rel=0.1)
+        assert found[name]["sigma"] == pytest.approx(foreseen[name]["sigma"], rel=0.3)
+
+
+def test_options_of_the_forecast_belong_together(tmp_path: Path, capsys: Captured) -> None:
+    given = ["--set", "camera.pixel_size_nm=84.4", "--set", "particle.mass_kda=4500"]
+    assert main(["bounds", "--events", "20", *given]) == 2
+    assert "--for optics" in capsys.readouterr().err
+    assert main(["bounds", "--for", "optics", "--scan", "z=0:100:50", *given]) == 2
+    assert "stands alone" in capsys.readouterr().err
+    out = tmp_path / "plan"
+    given += ["--free", "focus,na,phase", "--out", str(out)]
+    assert main(["bounds", "--for", "optics", "--events", "20", *given]) == 0
+    assert "particles needed for" in capsys.readouterr().out
+    assert {path.name for path in out.iterdir()} == {
+        "optics_bounds.json", "needed.csv", "needed.png", "needed.svg",
+    }  # fmt: skip
 
 
 def test_too_few_particles_are_one_clear_line(tmp_path: Path, capsys: Captured) -> None:

@@ -164,7 +164,8 @@ def contents(result: Path) -> dict[str, bytes]:
     """All files, without the fields that say when and how fast.
 
     These are, and nothing else is, allowed to differ between two runs: ``seconds`` in
-    ``summary.json``; in ``report.html`` the rows *Started* and *seconds…* of its tables.
+    ``summary.json``; in ``report.html`` the minute in its heading, and the rows *Started* and
+    *seconds…* of its tables.
     """
     files = {}
     for path in sorted(result.rglob("*")):
@@ -178,6 +179,8 @@ def contents(result: Path) -> dict[str, bytes]:
         if path.name == "report.html":
             row = rb"<div><dt>(?:[Ss]tarted|seconds\.\w+)</dt><dd>[^<]*</dd></div>"
             data, count = re.subn(row, b"", data)
+            assert count
+            data, count = re.subn(rb"\d+ \w+ \d{4}, \d\d:\d\d UTC", b"", data)
             assert count
         files[str(path.relative_to(result))] = data
     return files

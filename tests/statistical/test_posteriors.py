@@ -13,7 +13,7 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.records import PARAMETERS, FloatArray, PosteriorResult, Status
 from iscat_analysis.study import (
-    Calibration,
+    PosteriorRanks,
     Setting,
     calibrate_posterior,
     gaussian_posterior,
@@ -31,7 +31,7 @@ SURPRISE = 1e-4
 SMALL = {"roi_nm": 1350.0}
 
 
-def _calibrated(gain: float) -> Calibration:
+def _calibrated(gain: float) -> PosteriorRanks:
     experiment = setting("iscat", "joint", fit=SMALL)
     width = np.array([100.0, 100.0, 12.0, 0.0])
     lower, upper = experiment.truth - width, experiment.truth + width

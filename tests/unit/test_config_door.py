@@ -209,7 +209,7 @@ focus_nm = -370.0
 na = 0.0004
 focus_nm = 2.2
 [covariance]
-parameters = ["na", "focus_nm"]
+names = ["na", "focus_nm"]
 matrix = [[1.6e-7, 0.0], [0.0, 4.84]]
 """
 

@@ -17,11 +17,12 @@ from iscat_analysis.calibration.optics import (
     settings_of,
     with_settings,
 )
-from iscat_analysis.calibration.optics.estimate import _Point, pixel_terms
+from iscat_analysis.calibration.optics.estimate import _Point
 from iscat_analysis.calibration.optics.starts import average_sights, search_starts
 from iscat_analysis.config import config_to_toml, parse_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.pixels import pixel_terms
 
 NAMES = ("focus_nm", "na", "reference_phase_deg", "z7", "z11")
 

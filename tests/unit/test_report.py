@@ -16,6 +16,7 @@ from markupsafe import Markup
 
 from iscat_analysis.config import load_config, parse_config
 from iscat_analysis.errors import DataError
+from iscat_analysis.notebook import Result
 from iscat_analysis.records import EVENT_COLUMNS, Analysis, Status
 from iscat_analysis.report import check_output, figures, render_page, render_report, write_report
 from iscat_analysis.report.context import measured_lines
@@ -286,13 +287,17 @@ def test_optional_columns_stand_beside_sigma() -> None:
     assert heads[at + 1] == "systematic [kDa]"
     assert "repeats [kDa]" not in heads
     assert "systematic [kDa]" not in render_report(analysis)
+    shared = ", common to all events 7.00"
+    assert shared in repr(Result(replace(analysis, table=table)))
+    assert shared not in repr(Result(analysis))
 
 
 def test_precision_counts_only_events_that_are_ok() -> None:
-    table = event_table(make_analysis(40))
+    analysis = make_analysis(40)
+    table = event_table(analysis)
     table["sigma_mass_kda"], table["crb_mass_kda"], table["qcrb_mass_kda"] = 3.0, 2.0, 1.0
     table.loc[table["status"] != "ok", "sigma_mass_kda"] = 1e9
-    found = precision_of(table, "mass_kda")
+    found = precision_of(analysis, table, "mass_kda")
     assert found.events == (table["status"] == "ok").sum()
     assert found.sigma == 3.0
     assert found.over_crb == 1.5

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from iscat_analysis.calibration.mass.calibrate import LEAST_EVENTS, STANDARD_ERROR, calibrate_mass
 from iscat_analysis.calibration.mass.line import Line, york_line
-from iscat_analysis.calibration.mass.peaks import Peak, find_contrast_peaks
+from iscat_analysis.calibration.mass.peaks import ContrastPeak, find_contrast_peaks
 from iscat_analysis.calibration.mass.result import (
     Landing,
     MassCalibration,
@@ -28,10 +28,10 @@ from iscat_analysis.calibration.mass.result import (
 __all__ = [
     "LEAST_EVENTS",
     "STANDARD_ERROR",
+    "ContrastPeak",
     "Landing",
     "Line",
     "MassCalibration",
-    "Peak",
     "calibrate_mass",
     "find_contrast_peaks",
     "line_sigma_kda",

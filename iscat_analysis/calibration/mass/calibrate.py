@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from iscat_analysis.calibration.mass.line import york_line
 from iscat_analysis.calibration.mass.matching import check_match, match
-from iscat_analysis.calibration.mass.peaks import Peak, find_contrast_peaks
+from iscat_analysis.calibration.mass.peaks import ContrastPeak, find_contrast_peaks
 from iscat_analysis.calibration.mass.result import Landing, MassCalibration
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import FloatArray
@@ -151,7 +151,7 @@ def _standards(
 
 def _table(
     calibration: MassCalibration,
-    chosen: Sequence[Peak],
+    chosen: Sequence[ContrastPeak],
     masses: FloatArray,
     masses_se: FloatArray,
     direction: float,

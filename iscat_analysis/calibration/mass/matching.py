@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from iscat_analysis.calibration.mass.line import Line
-from iscat_analysis.calibration.mass.peaks import Peak
+from iscat_analysis.calibration.mass.peaks import ContrastPeak
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import FloatArray
 
@@ -24,12 +24,12 @@ _FITS = 0.05  # relative distance within which a standard is said to fit, when o
 _MOST_STANDARDS = 8  # of more, no subsets are tried for a message
 
 
-def match(peaks: Sequence[Peak], masses: FloatArray, name: str) -> list[Peak]:
+def match(peaks: Sequence[ContrastPeak], masses: FloatArray, name: str) -> list[ContrastPeak]:
     """Choose the peaks that a line with a small offset puts nearest the standards.
 
     Parameters
     ----------
-    peaks : sequence of Peak
+    peaks : sequence of ContrastPeak
         By rising contrast.
     masses : ndarray, shape (n,)
         Of the standards, rising [kDa].
@@ -38,7 +38,7 @@ def match(peaks: Sequence[Peak], masses: FloatArray, name: str) -> list[Peak]:
 
     Returns
     -------
-    list of Peak
+    list of ContrastPeak
         One per standard.
 
     Raises
@@ -55,7 +55,11 @@ def match(peaks: Sequence[Peak], masses: FloatArray, name: str) -> list[Peak]:
 
 
 def check_match(
-    line: Line, chosen: Sequence[Peak], peaks: Sequence[Peak], masses: FloatArray, name: str
+    line: Line,
+    chosen: Sequence[ContrastPeak],
+    peaks: Sequence[ContrastPeak],
+    masses: FloatArray,
+    name: str,
 ) -> None:
     """Refuse a line that misses its standards by its χ², or does not begin near zero.
 
@@ -63,9 +67,9 @@ def check_match(
     ----------
     line : Line
         Signed contrast against mass.
-    chosen : sequence of Peak
+    chosen : sequence of ContrastPeak
         One per standard.
-    peaks : sequence of Peak
+    peaks : sequence of ContrastPeak
         All that were found.
     masses : ndarray, shape (n,)
         Of the standards [kDa].
@@ -95,7 +99,7 @@ def check_match(
         )
 
 
-def _nearest(peaks: Sequence[Peak], masses: FloatArray) -> tuple[list[Peak], float]:
+def _nearest(peaks: Sequence[ContrastPeak], masses: FloatArray) -> tuple[list[ContrastPeak], float]:
     """Choose peaks for the standards, and say how far off they are altogether."""
     most = max(peak.count for peak in peaks)
     best, least = list(peaks[: masses.size]), math.inf
@@ -112,7 +116,7 @@ def _nearest(peaks: Sequence[Peak], masses: FloatArray) -> tuple[list[Peak], flo
     return best, least
 
 
-def _advice(peaks: Sequence[Peak], masses: FloatArray) -> str:
+def _advice(peaks: Sequence[ContrastPeak], masses: FloatArray) -> str:
     """Name the standards that fit the peaks and those that do not."""
     known = _fitting(peaks, masses) if masses.size <= _MOST_STANDARDS else None
     if known is None:
@@ -122,7 +126,7 @@ def _advice(peaks: Sequence[Peak], masses: FloatArray) -> str:
     return f"{_shown(known)} would fit, {_shown(others)} {verb}: leave out what is not there"
 
 
-def _fitting(peaks: Sequence[Peak], masses: FloatArray) -> FloatArray | None:
+def _fitting(peaks: Sequence[ContrastPeak], masses: FloatArray) -> FloatArray | None:
     """Find the largest part of the standards, two at least, that lies on a line through peaks."""
     for size in range(min(int(masses.size) - 1, len(peaks)), 1, -1):
         fits: list[tuple[float, FloatArray]] = []
@@ -139,7 +143,7 @@ def _fitting(peaks: Sequence[Peak], masses: FloatArray) -> FloatArray | None:
     return None
 
 
-def _found(peaks: Sequence[Peak]) -> str:
+def _found(peaks: Sequence[ContrastPeak]) -> str:
     if not peaks:
         return "no peak of |contrast| stands out"
     places = ", ".join(f"{peak.contrast:.3g}" for peak in peaks)

@@ -24,7 +24,7 @@ _ROOT_2PI = math.sqrt(2 * math.pi)
 
 
 @dataclass(frozen=True)
-class Peak:
+class ContrastPeak:
     """A peak of |contrast|.
 
     Attributes
@@ -43,7 +43,9 @@ class Peak:
     count: float
 
 
-def find_contrast_peaks(size: FloatArray, errors: FloatArray, *, detail: float = 1.0) -> list[Peak]:
+def find_contrast_peaks(
+    size: FloatArray, errors: FloatArray, *, detail: float = 1.0
+) -> list[ContrastPeak]:
     """Find the peaks of |contrast|.
 
     Modes of a kernel density that stand out by three standard errors, each then fitted to the
@@ -60,7 +62,7 @@ def find_contrast_peaks(size: FloatArray, errors: FloatArray, *, detail: float =
 
     Returns
     -------
-    list of Peak
+    list of ContrastPeak
         By rising contrast, at most ten: those with most events.
     """
     kept = size <= np.quantile(size, 0.995) * 1.5
@@ -102,7 +104,7 @@ def find_contrast_peaks(size: FloatArray, errors: FloatArray, *, detail: float =
 
 def _settled_peak(
     x: FloatArray, sigma: FloatArray, limits: tuple[float, float], centre: float, width: float
-) -> Peak | None:
+) -> ContrastPeak | None:
     """Fit a peak, then again within the window that its own width asks for, until it stays."""
     peak = None
     noise = float(np.sqrt(np.mean(sigma**2)))
@@ -133,7 +135,7 @@ def _half_width(grid: FloatArray, density: FloatArray, place: int, level: float)
 
 def _fit_peak(
     x: FloatArray, sigma: FloatArray, window: tuple[float, float], centre: float, width: float
-) -> Peak:
+) -> ContrastPeak:
     """Fit a normal distribution, truncated to the window, on a flat background."""
     low, high = window
 
@@ -161,7 +163,7 @@ def _fit_peak(
     except np.linalg.LinAlgError:
         inverse = np.array([[-1.0]])
     se = width * math.sqrt(inverse[0, 0]) if inverse[0, 0] > 0 else fallback
-    return Peak(float(centre + width * theta[0]), max(se, fallback), spread, share * x.size)
+    return ContrastPeak(float(centre + width * theta[0]), max(se, fallback), spread, share * x.size)
 
 
 def _hessian(

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
-from iscat_analysis.calibration.mass.peaks import Peak
+from iscat_analysis.calibration.mass.peaks import ContrastPeak
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.records import FloatArray
 
@@ -106,7 +106,7 @@ class MassCalibration:
         mass_kda, mass_se, contrast (signed), contrast_se, width, count, found_kda (the peak's mass
         by the line), residual_percent, low_kda and high_kda (95 % prediction interval of a mass
         that the line gives there).
-    peaks : tuple of Peak
+    peaks : tuple of ContrastPeak
         Every peak that was found, matched or not.
     landing : str
         ``"dark"`` or ``"bright"``.
@@ -122,7 +122,7 @@ class MassCalibration:
     chi2: float
     dof: int
     standards: pd.DataFrame
-    peaks: tuple[Peak, ...]
+    peaks: tuple[ContrastPeak, ...]
     landing: Landing
     events: int
     notes: tuple[str, ...] = ()

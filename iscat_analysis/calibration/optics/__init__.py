@@ -2,7 +2,8 @@
 
 `starts` finds a microscope that resembles the average picture; `estimate` maximises the joint
 likelihood over the microscope and every particle; `measure` decides what the pictures can tell and
-whether the result describes pictures that were not fitted; `result` hands it on.
+whether the result describes pictures that were not fitted; `result` hands it on; `forecast` says
+before a movie is recorded what it would tell.
 """
 
 from __future__ import annotations
@@ -14,9 +15,12 @@ from iscat_analysis.calibration.optics.estimate import (
     maximise,
     optics_limits,
 )
+from iscat_analysis.calibration.optics.forecast import OpticsForecast, forecast_optics
 from iscat_analysis.calibration.optics.measure import (
+    FAINTEST,
     HELD_OUT_P,
     LEAST_SIGHTS,
+    MOST_SIGHTS,
     Judgement,
     Measured,
     Twin,
@@ -35,18 +39,22 @@ from iscat_analysis.calibration.optics.settings import (
 )
 
 __all__ = [
+    "FAINTEST",
     "FREE",
     "HELD_OUT_P",
     "LEAST_SIGHTS",
+    "MOST_SIGHTS",
     "Estimate",
     "Judgement",
     "Measured",
     "OpticsCalibration",
+    "OpticsForecast",
     "Pictures",
     "Settings",
     "Sight",
     "Twin",
     "build_microscope",
+    "forecast_optics",
     "free_groups",
     "is_term",
     "judge",

@@ -12,7 +12,7 @@ import pandas as pd
 from iscat_analysis.calibration.optics.measure import Judgement, Measured
 from iscat_analysis.calibration.optics.pictures import Pictures
 from iscat_analysis.calibration.optics.settings import is_term, with_settings
-from iscat_analysis.config import Config
+from iscat_analysis.config import Config, OpticsCovariance
 from iscat_analysis.records import FloatArray
 
 COLUMNS = ("parameter", "value", "sigma", "crb", "configured", "state")
@@ -196,8 +196,12 @@ def make_result(
         elif name in measured.dropped:
             state = "dropped"
         rows.append((name, float(value), sigma, crb, float(configured[name]), state))
+    if not measured.refusals:
+        config = _with_covariance(
+            with_settings(config, measured.settings), estimate.names, covariance
+        )
     return OpticsCalibration(
-        config=with_settings(config, measured.settings) if not measured.refusals else config,
+        config=config,
         parameters=pd.DataFrame(rows, columns=list(COLUMNS)),
         names=estimate.names,
         covariance=covariance,
@@ -207,6 +211,13 @@ def make_result(
         source=source,
         notes=_notes(measured),
     )
+
+
+def _with_covariance(config: Config, names: tuple[str, ...], covariance: FloatArray) -> Config:
+    """Put the errors beside the values, from where fits take what is common to all events."""
+    errors = OpticsCovariance(names=names, matrix=tuple(map(tuple, covariance.tolist())))
+    optics = config.optics.model_copy(update={"covariance": errors})
+    return config.model_copy(update={"optics": optics})
 
 
 def _notes(measured: Measured) -> tuple[str, ...]:

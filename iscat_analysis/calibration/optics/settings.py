@@ -62,6 +62,31 @@ def free_groups(text: str | Sequence[str] | None) -> tuple[str, ...]:
     return tuple(name for name in FREE if name in names)
 
 
+def free_names(groups: Sequence[str], settings: Settings, terms: Sequence[str]) -> tuple[str, ...]:
+    """Name the continuous parameters that are free in a microscope.
+
+    Parameters
+    ----------
+    groups : sequence of str
+        From `free_groups`.
+    settings : mapping
+        The microscope: without a mask, its edge and transmission are not free.
+    terms : sequence of str
+        Aberrations that may be.
+
+    Returns
+    -------
+    tuple of str
+        Keys of the settings.
+    """
+    return tuple(
+        name
+        for group in groups
+        for name in FREE[group]
+        if (not is_term(name) or name in terms) and (group != "mask" or settings["mask_na"] > 0)
+    )
+
+
 def settings_of(config: Config) -> dict[str, Any]:
     """Parameters that a calibration may change, as configured.
 

@@ -30,7 +30,7 @@ WALKERS, STEPS = 32, 300
 
 
 @dataclass(frozen=True)
-class Calibration:
+class PosteriorRanks:
     """Ranks and credible intervals over draws from the prior.
 
     Attributes
@@ -76,7 +76,7 @@ def calibrate_posterior(
     workers: int = 1,
     gain: float = 1.0,
     advance: Callable[[int], None] | None = None,
-) -> Calibration:
+) -> PosteriorRanks:
     """Draw particles from a flat prior and rank each among the draws of its posterior.
 
     Parameters
@@ -99,7 +99,7 @@ def calibrate_posterior(
 
     Returns
     -------
-    Calibration
+    PosteriorRanks
         In the order of the draws.
     """
     index = [PARAMETERS.index(name) for name in setting.free]
@@ -149,4 +149,4 @@ def calibrate_posterior(
 
     with ThreadPoolExecutor(workers) as pool:
         done = list(pool.map(one, range(draws)))
-    return Calibration(setting.free, ranks, widths, inside[0], inside[1], draws - sum(done))
+    return PosteriorRanks(setting.free, ranks, widths, inside[0], inside[1], draws - sum(done))

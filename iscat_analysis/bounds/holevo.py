@@ -1,0 +1,308 @@
+"""What one measurement can reach for several parameters at once: the Holevo bound.
+
+Each quantum Cramér–Rao bound is reached by a measurement of its own.  Where two of those
+measurements do not commute, as for height and mass, which are phase and amplitude of nearly the
+same wave, no measurement reaches both.  With the information Q = K + iB of `quantum_information`,
+any measurement of all parameters has a covariance V with
+
+    Tr W V ≥ C_H(W),        and for coherent states one measurement reaches C_H
+
+(physics.md, section 9; Matsumoto, J. Phys. A 35, 3111 (2002); Albarelli, Friel & Datta, Phys. Rev.
+Lett. 123, 200503 (2019)).
+
+What to use when
+----------------
+`natural_bound` weighs every parameter by its own information, W = K.  In coordinates in which K is
+the identity, the commutator becomes a real antisymmetric matrix A with eigenvalues ±iβ, W does not
+change when the coordinates turn, and the problem falls apart into planes of one β each, in which
+V = 2/(1 + √(1 − β²)).  So V = 2 (1 + √(1 − AᵀA))⁻¹, and C_H = Σ 4/(1 + √(1 − β²)) over the planes
+plus 1 for each direction that commutes with all others.
+
+`tradeoff` is the edge of what can be reached for two parameters, for all weights at once.  In the
+same coordinates, V₁ = 1/cos²μ and V₂ = 1/cos²ν with μ + ν = arcsin β.
+
+`holevo_bound` takes any weight and any number of parameters, and solves the semidefinite program.
+
+`holevo_over_quantum` tells what the conflict costs one particle's parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import brentq
+
+from iscat_analysis.bounds.quantum import quantum_information
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.forward import ForwardModel
+from iscat_analysis.records import PARAMETERS
+
+FloatArray = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Holevo:
+    """A bound on all parameters at once.
+
+    Attributes
+    ----------
+    sum : float
+        C_H = Tr WV; with W = K it is the number of parameters where all of them commute.
+    covariance : ndarray, shape (d, d)
+        V of a measurement that reaches it.
+    """
+
+    sum: float
+    covariance: FloatArray
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations that this measurement reaches together, shape (d,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def natural_bound(information: ComplexArray) -> Holevo:
+    """Holevo bound with every parameter weighed by its own information, W = K.
+
+    Parameters
+    ----------
+    information : complex ndarray, shape (d, d)
+        Rows and columns of `quantum_information`, times the number of photons where wanted.
+
+    Returns
+    -------
+    Holevo
+        Exact, from the closed form above.
+
+    Raises
+    ------
+    ConfigError
+        The matrix is not Hermitian and positive, or its parameters are not independent.
+
+    Examples
+    --------
+    A wave's phase and amplitude cost twice the variance when they are measured together.
+
+    >>> import numpy as np
+    >>> from iscat_analysis.bounds import natural_bound
+    >>> natural_bound(np.array([[1, 1j], [-1j, 1]])).sigma.round(3)
+    array([1.414, 1.414])
+    """
+    _, unit, commutator = _orthonormal(information)
+    squared, vectors = np.linalg.eigh(commutator.T @ commutator)
+    variance = 2 / (1 + np.sqrt(np.clip(1 - squared, 0.0, 1.0)))
+    root = unit @ vectors
+    return Holevo(float(variance.sum()), (root * variance) @ root.T)
+
+
+def holevo_over_quantum(
+    model: ForwardModel, z_nm: float, free: tuple[str, ...]
+) -> dict[str, float]:
+    """Cost of estimating parameters together, of which each has a measurement of its own.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Optics.
+    z_nm : float
+        Height of the particle [nm].
+    free : tuple of str
+        Free parameters, a subset of `PARAMETERS`.
+
+    Returns
+    -------
+    dict of str to float
+        For each free parameter σ of the Holevo bound with W = K over 1/√K_jj: at least 1, whatever
+        the number of photons and the unit of the mass.
+    """
+    index = [PARAMETERS.index(name) for name in free]
+    information = quantum_information(model, z_nm)[np.ix_(index, index)]
+    own = np.sqrt(np.diag(information).real)
+    return dict(zip(free, (natural_bound(information).sigma * own).tolist(), strict=True))
+
+
+def holevo_bound(information: ComplexArray, weight: FloatArray) -> Holevo:
+    """Holevo bound for any weight.
+
+    Parameters
+    ----------
+    information : complex ndarray, shape (d, d)
+        As in `natural_bound`.
+    weight : ndarray, shape (d, d)
+        W, symmetric and positive semidefinite, in the inverse units of the covariance.
+
+    Returns
+    -------
+    Holevo
+        From the semidefinite program, to a few 1e-8 of `sum`.
+
+    Raises
+    ------
+    ConfigError
+        A matrix is not what it must be, or the solver did not converge.
+
+    Notes
+    -----
+    min Tr WV subject to [[V, X†], [X, 1]] ⪰ 0 and 2 Re(X†L) = 1, with L†L = Q/4 (Albarelli et al.
+    2019, equation 7, for pure states), in coordinates in which K is the identity and the weight is
+    of order one; solved by Clarabel.
+    """
+    _, unit, commutator = _orthonormal(information)
+    weight = np.asarray(weight, dtype=np.float64)
+    size = len(unit)
+    if weight.shape != (size, size) or not np.allclose(weight, weight.T):
+        raise ConfigError(f"weight: has shape {weight.shape}; give a symmetric ({size}, {size})")
+    turned = unit.T @ weight @ unit
+    scale = float(np.trace(turned))
+    if not scale > 0 or np.linalg.eigvalsh(turned)[0] < -1e-12 * scale:
+        raise ConfigError("weight: is not positive semidefinite")
+    covariance = _solve(np.eye(size) + 1j * commutator, turned / scale)
+    return Holevo(scale * float(np.sum(turned / scale * covariance)), unit @ covariance @ unit.T)
+
+
+def tradeoff(information: ComplexArray, points: int = 101) -> FloatArray:
+    """Edge of what one measurement can reach for two parameters.
+
+    Parameters
+    ----------
+    information : complex ndarray, shape (2, 2)
+        As in `natural_bound`.
+    points : int
+        How many.
+
+    Returns
+    -------
+    ndarray, shape (points, 2)
+        Standard deviations of the two; the ends tend to a single parameter's own bound, where
+        nothing is learned of the other, and are cut at five times it.
+
+    Raises
+    ------
+    ConfigError
+        The matrix is not (2, 2), Hermitian and positive.
+
+    Notes
+    -----
+    For W' = diag(cos²τ, sin²τ) in the coordinates of `natural_bound` the optimum lies on the curve
+    of the module's page; the ellipse of V touches the axes of the given parameters at its σ.
+    """
+    if np.shape(information) != (2, 2):
+        raise ConfigError(f"information: has shape {np.shape(information)}; give (2, 2)")
+    found = []
+    _, unit, commutator = _orthonormal(information)
+    angle = math.asin(min(abs(commutator[0, 1]), 1.0))
+    own = 1 / np.sqrt(np.diag(np.asarray(information).real))
+    for share in np.linspace(0.0, math.pi / 2, points + 2)[1:-1]:
+        # the weight on the given parameters, each in units of its own bound, turned to axes of its
+        # own in the orthonormal coordinates
+        weight = unit.T @ np.diag([math.cos(share) ** 2, math.sin(share) ** 2] / own**2) @ unit
+        sizes, axes = np.linalg.eigh(weight)
+        first = _angle(sizes, angle)
+        variance = 1 / np.cos([first, angle - first]) ** 2
+        root = unit @ axes
+        found.append(np.sqrt(np.diag((root * variance) @ root.T)))
+    return np.clip(found, None, 5 * own)
+
+
+def _angle(sizes: FloatArray, angle: float) -> float:
+    """Find the μ that minimises w₁/cos²μ + w₂/cos²(φ − μ)."""
+
+    def slope(first: float) -> float:
+        return float(
+            sizes[0] * math.tan(first) / math.cos(first) ** 2
+            - sizes[1] * math.tan(angle - first) / math.cos(angle - first) ** 2
+        )
+
+    return float(brentq(slope, 0.0, angle, xtol=1e-14)) if angle else 0.0
+
+
+def _orthonormal(information: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """K, a matrix U with UᵀKU = 1, and the commutator UᵀBU."""
+    information = np.asarray(information, dtype=np.complex128)
+    if information.ndim != 2 or information.shape[0] != information.shape[1]:
+        raise ConfigError(f"information: has shape {information.shape}; give a square matrix")
+    if not np.all(np.isfinite(information)):
+        raise ConfigError("information: is not finite")
+    own = np.diag(information).real
+    if not (np.allclose(information, information.conj().T) and np.all(own > 0)):
+        raise ConfigError("information: is not Hermitian with a positive diagonal")
+    scale = 1 / np.sqrt(own)
+    values, vectors = np.linalg.eigh(information.real * np.outer(scale, scale))
+    if values[0] < 1e-12:
+        raise ConfigError("information: its parameters are not independent of each other")
+    unit = scale[:, None] * vectors / np.sqrt(values)
+    return information.real, unit, unit.T @ information.imag @ unit
+
+
+def _solve(information: ComplexArray, weight: FloatArray) -> FloatArray:
+    """Solve the semidefinite program for Q of order one; the covariance."""
+    import clarabel
+    from scipy import sparse
+
+    size = len(weight)
+    values, vectors = np.linalg.eigh(information / 4)
+    light = np.sqrt(np.clip(values, 0.0, None))[:, None] * vectors.conj().T  # L
+    # The unknowns are the upper triangle of V, then Re X and Im X, row by row.
+    upper = [(i, j) for j in range(size) for i in range(j + 1)]
+    square = [(i, j) for i in range(size) for j in range(size)]
+    covariance = {pair: k for k, pair in enumerate(upper)}
+    real = {pair: len(upper) + k for k, pair in enumerate(square)}
+    imaginary = {pair: len(upper) + len(square) + k for k, pair in enumerate(square)}
+    unknowns = len(upper) + 2 * len(square)
+
+    # A Hermitian H = S + iT is positive where [[S, −T], [T, S]] is.  S = [[V, Re Xᵀ], [Re X, 1]],
+    # T = [[0, −Im Xᵀ], [Im X, 0]].  Its upper triangle goes to the solver column by column, off
+    # the diagonal times √2: constant − matrix·unknowns.
+    whole = 4 * size
+    place = {pair: k for k, pair in enumerate((i, j) for j in range(whole) for i in range(j + 1))}
+    entries: list[tuple[int, int, float]] = []
+    constant = np.zeros(len(place))
+
+    def put(row: int, column: int, unknown: int, factor: float) -> None:
+        if row <= column:
+            entries.append((place[row, column], unknown, -factor))
+
+    for first in (0, 2 * size):  # the two blocks S on the diagonal
+        for i, j in square:
+            put(first + i, first + j, covariance[min(i, j), max(i, j)], 1.0)
+            put(first + i, first + size + j, real[j, i], 1.0)
+        for i in range(size):
+            constant[place[first + size + i, first + size + i]] = 1.0
+    for i, j in square:  # −T above the diagonal: [[0, Im Xᵀ], [−Im X, 0]]
+        put(i, 3 * size + j, imaginary[j, i], 1.0)
+        put(size + i, 2 * size + j, imaginary[i, j], -1.0)
+    diagonal = np.array([row == column for row, column in place])
+    stretch = np.where(diagonal, 1.0, math.sqrt(2))
+    rows, columns, factors = (np.array(part) for part in zip(*entries, strict=True))
+    cone = sparse.csc_matrix((factors * stretch[rows], (rows, columns)), (len(place), unknowns))
+
+    # 2 Re(X†L) = 1: Σ_k Re X_ki Re L_kj + Im X_ki Im L_kj = δ_ij / 2
+    equal = np.zeros((size * size, unknowns))
+    for i, j in square:
+        for k in range(size):
+            equal[i * size + j, real[k, i]] += light[k, j].real
+            equal[i * size + j, imaginary[k, i]] += light[k, j].imag
+    cost = np.zeros(unknowns)
+    for i, j in upper:
+        cost[covariance[i, j]] = weight[i, j] * (1.0 if i == j else 2.0)
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-9
+    solution = clarabel.DefaultSolver(
+        sparse.csc_matrix((unknowns, unknowns)),
+        cost,
+        sparse.vstack([sparse.csc_matrix(equal), cone], format="csc"),
+        np.concatenate([np.eye(size).ravel() / 2, constant]),
+        [clarabel.ZeroConeT(size * size), clarabel.PSDTriangleConeT(whole)],
+        settings,
+    ).solve()
+    if str(solution.status) not in ("Solved", "AlmostSolved"):
+        raise ConfigError(f"the Holevo bound's solver stopped with {solution.status}")
+    found = np.zeros((size, size))
+    for i, j in upper:
+        found[i, j] = found[j, i] = solution.x[covariance[i, j]]
+    return found

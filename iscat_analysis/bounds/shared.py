@@ -1,0 +1,198 @@
+"""What an uncertain microscope leaves in every particle: errors that all events share.
+
+The likelihood of one particle has unknowns of its own, θ = (x, y, z, mass, level), and those of the
+microscope, p.  If p is off by δp, the estimate of θ moves by D δp with D = −I_θθ⁻¹ I_θp: what the
+particle does to imitate the change of the picture.  A covariance Σ of the microscope becomes
+D Σ Dᵀ.  The same blocks say what the particle tells of the microscope once its own unknowns are
+fitted, I_pp − I_pθ I_θθ⁻¹ I_θp.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.pixels import pixel_terms
+from iscat_analysis.optics.forward import PEAK_REACH, ForwardModel, MassScale
+from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.records import PARAMETERS, FloatArray
+
+_PEAK_POINTS = 61  # per axis, of the grid on which the peak of a contrast is looked for
+_PEAK_NM = 0.1  # to which it is found
+
+
+def joint_information(
+    likelihood: Likelihood, theta: FloatArray, names: Sequence[str]
+) -> FloatArray:
+    """Fisher information of one particle about the microscope and about itself.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Of measured or expected counts; its expected information is used.
+    theta : ndarray, shape (5,)
+        Where: x, y, z [nm], amplitude, level.
+    names : sequence of str
+        Parameters of the optics, as in `ForwardModel.optics_gradient`.
+
+    Returns
+    -------
+    ndarray, shape (len(names) + 5, len(names) + 5)
+        Order: `names`, x, y, z [1/nm²], amplitude, level.
+    """
+    x, y, z, amplitude, level = (float(value) for value in theta)
+    model, grid = likelihood.model, likelihood.grid
+    signal, own = model.amplitude_gradient(grid, x, y, z, amplitude)
+    rows = np.empty((len(names) + 5, signal.size))
+    if names:
+        place = (grid, x, y, z, float(model.scale.mass(np.array(amplitude))))
+        rows[: len(names)] = model.optics_gradient(*place, names)[1].reshape(len(names), -1)
+    rows[len(names) : -1] = own.reshape(4, -1)
+    _, _, information, by_signal, by_level = pixel_terms(
+        likelihood.kind, likelihood.data, signal, level
+    )
+    rows[:-1] *= by_signal.ravel()
+    rows[-1] = by_level.ravel()
+    return np.asarray((rows * information.ravel()) @ rows.T)
+
+
+def eliminated(information: FloatArray, shared: int) -> FloatArray:
+    """Information about the first parameters once all others are fitted: the Schur complement.
+
+    Parameters
+    ----------
+    information : ndarray, shape (n, n)
+        Of all.
+    shared : int
+        How many remain.
+
+    Returns
+    -------
+    ndarray, shape (shared, shared)
+        I_pp − I_pθ I_θθ⁻¹ I_θp.
+    """
+    cross = information[:shared, shared:]
+    return np.asarray(information[:shared, :shared] + cross @ imitation(information, shared))
+
+
+def imitation(information: FloatArray, shared: int) -> FloatArray:
+    """How the last parameters move, per unit error of the first ones.
+
+    Parameters
+    ----------
+    information : ndarray, shape (n, n)
+        Of all, the shared ones first.
+    shared : int
+        How many are shared.
+
+    Returns
+    -------
+    ndarray, shape (n − shared, shared)
+        D = −I_θθ⁻¹ I_θp.
+    """
+    block = information[shared:, shared:]
+    scale = 1 / np.sqrt(np.diag(block))
+    solved = np.linalg.solve(
+        block * np.outer(scale, scale), information[shared:, :shared] * scale[:, None]
+    )
+    return np.asarray(-solved * scale[:, None])
+
+
+def displacement(
+    likelihood: Likelihood,
+    theta: FloatArray,
+    names: Sequence[str],
+    free: Sequence[str],
+    *,
+    level: bool = True,
+) -> FloatArray:
+    """How the estimates of a particle move with the microscope that is assumed.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Of measured or expected counts.
+    theta : ndarray, shape (5,)
+        Where: x, y, z [nm], amplitude, level.
+    names : sequence of str
+        Parameters of the optics.
+    free : sequence of str
+        What is fitted of the particle, of `PARAMETERS`.
+    level : bool
+        Whether the level of the light is fitted as well.
+
+    Returns
+    -------
+    ndarray, shape (len(free), len(names))
+        D [nm or kDa per unit of each parameter].  Where a calibration ties mass to contrast, the
+        mass is that of the estimated contrast, which moves less than the amplitude does.
+    """
+    whole = joint_information(likelihood, theta, names)
+    count = len(names)
+    own = [PARAMETERS.index(name) for name in free]
+    kept = [*range(count), *(count + i for i in own), *([count + 4] if level else [])]
+    moves = imitation(whole[np.ix_(kept, kept)], count)[: len(own)]
+    if "mass_kda" in free:
+        row, model = list(free).index("mass_kda"), likelihood.model
+        moves[row] *= model.scale.slope(float(theta[3]))
+        moves[row] += mass_drift(model, float(theta[3]), names)
+    return moves
+
+
+def mass_drift(model: ForwardModel, amplitude: float, names: Sequence[str]) -> FloatArray:
+    """Change of the mass that a calibration gives an amplitude, with the microscope.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        The microscope.
+    amplitude : float
+        Of the scattered field.
+    names : sequence of str
+        Parameters of the optics.
+
+    Returns
+    -------
+    ndarray, shape (len(names),)
+        ∂(peak contrast)/∂p over the line's gradient [kDa per unit]; 0 without a calibration.
+    """
+    line, height = model.scale.calibration, model.height_nm
+    if line is None or not names:
+        return np.zeros(len(names))
+    spot = model.optics.wavelength_nm / model.optics.na
+    x, y, half = 0.0, 0.0, min(PEAK_REACH * spot, model.reach_nm - spot) / math.sqrt(2)
+    while half > _PEAK_NM:
+        axis = np.linspace(-half, half, _PEAK_POINTS)
+        grid = PixelGrid(x + axis, y + axis, _PEAK_NM)
+        signal = np.abs(model.amplitude_image(grid, 0.0, 0.0, height, amplitude))
+        row, column = np.unravel_index(int(np.argmax(signal)), signal.shape)
+        x, y = float(grid.x_nm[column]), float(grid.y_nm[row])
+        half *= 3 / _PEAK_POINTS
+    # where the signal is largest its place does not matter to first order
+    there = PixelGrid(np.array([x]), np.array([y]), _PEAK_NM)
+    plain = replace(model, scale=MassScale())  # below an offset two amplitudes have one mass
+    slopes = plain.optics_gradient(there, 0.0, 0.0, height, amplitude, names)[1]
+    return np.asarray(slopes[:, 0, 0] / line.gradient_per_kda)
+
+
+def shared_sigma(moves: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Give the standard deviations that an uncertain microscope puts into all particles alike.
+
+    Parameters
+    ----------
+    moves : ndarray, shape (k, n)
+        D, from `displacement`.
+    covariance : ndarray, shape (n, n)
+        Σ of the microscope's parameters.
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        Roots of the diagonal of D Σ Dᵀ.
+    """
+    variance = np.einsum("ki,ij,kj->k", moves, covariance, moves)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

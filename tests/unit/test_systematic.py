@@ -1,0 +1,186 @@
+"""Errors of measured optics, which all events share, against fits with optics that are off."""
+
+from __future__ import annotations
+
+import time
+import tomllib
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from iscat_analysis.calibration.optics import settings_of
+from iscat_analysis.config import Calibration, Config, config_to_toml, configure
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.counts import counts_likelihood
+from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.pipeline.systematic import systematic
+from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, PARAMETERS
+
+NAMES = ("focus_nm", "na", "z8", "z11")
+SIGMA = np.array([3.0, 0.003, 1.0, 1.0])
+CORRELATION = np.array([[1, 0.5, 0, -0.9], [0.5, 1, 0, -0.4], [0, 0, 1, 0], [-0.9, -0.4, 0, 1.0]])
+COVARIANCE = CORRELATION * np.outer(SIGMA, SIGMA)
+LIGHT = 1e8
+
+
+def _config(covariance: np.ndarray[Any, Any] = COVARIANCE, **settings: Any) -> Config:
+    errors = {"names": NAMES, "matrix": covariance.tolist()}
+    base = {
+        "optics.focus_nm": -300.0,
+        "optics.covariance": errors,
+        "camera.pixel_size_nm": 100.0,
+        "fit.roi_nm": 1500.0,
+        "particle.mass_kda": 480.0,
+        "background.frames": (0, 200),
+    }
+    return configure(settings=base | settings)
+
+
+def _fitted(
+    config: Config, truth: Config, z_nm: float, amplitude: float, mode: str
+) -> dict[str, float]:
+    """Fit the picture that one microscope makes, without noise, with another."""
+    grid = PixelGrid.centred(round(config.fit.roi_nm / 100), 100.0)
+    signal = forward_model(truth, 2000.0).amplitude_image(grid, 0, 0, z_nm, amplitude)
+    model = forward_model(config, 2000.0)
+    light = np.full(grid.shape, LIGHT)
+    likelihood = counts_likelihood(
+        model, grid, light, light * (1 + signal), 1.0, background=1.0, use_conditional=True
+    )
+    start = np.array([0.0, 0.0, z_nm, amplitude, 0.0])
+    width = np.array([150.0, 150.0, 60.0, 0.5 * abs(amplitude), 0.0])
+    free = np.array([name in FREE_PARAMETERS[mode] for name in PARAMETERS] + [False])
+    width = np.where(free, width, 0.0)
+    found = likelihood.maximize(start, free, start - width, start + width, tolerance=1e-9).theta
+    mass = float(model.scale.mass(np.asarray(found[3])))
+    return dict(zip(PARAMETERS, (*map(float, found[:3]), mass), strict=True))
+
+
+def _event(config: Config, z_nm: float, amplitude: float) -> pd.DataFrame:
+    mass = float(forward_model(config, 2000.0).scale.mass(np.asarray(amplitude)))
+    row = dict.fromkeys(EVENT_COLUMNS, 0.0)
+    values = {"z_nm": z_nm, "mass_kda": mass, "n_before": 200, "n_after": 200, "status": "ok"}
+    return pd.DataFrame([row | values])
+
+
+def _moved(config: Config, shifts: np.ndarray[Any, Any], names: tuple[str, ...] = NAMES) -> Config:
+    settings = settings_of(config)
+    for name, shift in zip(names, shifts, strict=True):
+        settings[name] = settings[name] + float(shift)
+    terms = {k: v for k, v in settings.items() if k[0] == "z" and k[1:].isdigit() and v}
+    changed = {k: settings[k] for k in ("focus_nm", "na")} | {"aberrations_nm": terms}
+    return config.model_copy(update={"optics": config.optics.model_copy(update=changed)})
+
+
+@pytest.mark.parametrize("mode", ["mass", "joint"])
+@pytest.mark.parametrize("line", [None, Calibration(gradient_per_kda=-3.1e-5, offset=-2e-4)])
+def test_a_small_error_of_one_parameter_moves_the_fit_as_predicted(
+    mode: str, line: Calibration | None
+) -> None:
+    z_nm, amplitude, step = 100.0, 400.0, 1e-2
+    plain = _config(**{"fit.mode": mode}).model_copy(update={"calibration": line})
+    for k, name in enumerate(NAMES):
+        single = np.zeros((4, 4))
+        single[k, k] = (step * SIGMA[k]) ** 2
+        config = _config(single, **{"fit.mode": mode}).model_copy(update={"calibration": line})
+        predicted = systematic(config, _event(config, z_nm, amplitude))
+        shift = step * SIGMA * np.eye(4)[k]
+        up, down = (
+            _fitted(_moved(plain, s * shift), plain, z_nm, amplitude, mode) for s in (1, -1)
+        )
+        for parameter in FREE_PARAMETERS[mode]:
+            moved = abs(up[parameter] - down[parameter]) / 2
+            floor = 1e-6 * (1.0 if parameter != "mass_kda" else amplitude)
+            assert predicted[parameter][0] == pytest.approx(moved, rel=5e-3, abs=floor), (
+                name,
+                parameter,
+            )
+
+
+def test_the_column_is_the_spread_over_draws_of_the_optics() -> None:
+    """200 draws tell a standard deviation to 5 %."""
+    config, draws = _config(), 200
+    rng = np.random.default_rng(11)
+    shifts = rng.multivariate_normal(np.zeros(4), COVARIANCE, draws)
+    fits = pd.DataFrame([_fitted(_moved(config, s), config, 5.0, 480.0, "mass") for s in shifts])
+    event = _event(config, 5.0, 480.0)
+    column = systematic(config, event)
+    uncorrelated = systematic(_config(np.diag(np.diag(COVARIANCE))), event)
+    pulls = {
+        name: (fits[name].std() / column[name][0] - 1) * np.sqrt(2 * draws)
+        for name in ("x_nm", "mass_kda")
+    }
+    assert max(map(abs, pulls.values())) < 3.5, pulls
+    wrong = (fits["mass_kda"].std() / uncorrelated["mass_kda"][0] - 1) * np.sqrt(2 * draws)
+    assert abs(wrong) > 5  # the correlations matter, and the test sees it
+
+
+def test_a_line_from_the_same_optics_takes_the_common_factor_away() -> None:
+    """Standards and sample through the same wrong microscope: only bright particles differ."""
+    standard, light, bright = 10.0, 480.0, 3e5
+    line = Calibration(gradient_per_kda=-1.0)
+
+    def masses(config: Config) -> np.ndarray[Any, Any]:
+        contrasts = [
+            _fitted(config, _config(), 5.0, a, "mass")["mass_kda"] * -1.0
+            for a in (standard, light, bright)
+        ]
+        return np.array(contrasts[1:]) / contrasts[0]
+
+    config = _config().model_copy(update={"calibration": line})
+    shifts = 0.03 * np.sqrt(np.diag(COVARIANCE)) * np.array([1, 0, 0, 0])
+    up, down = (masses(_moved(config, s * shifts)) for s in (1, -1))
+    remains = np.abs(np.log(up / down)) / 2
+    single = np.diag(shifts**2)
+    filed = _config(single).optics.model_copy(update={"file": "optics.toml"})
+    for optics, factor in ((filed, 1.0), (_config(single).optics, 0.0)):
+        same = config.model_copy(update={"optics": optics})
+        for amplitude, left in zip((light, bright), remains, strict=True):
+            event = _event(same, 5.0, amplitude)
+            share = systematic(same, event)["mass_kda"][0] / abs(event["mass_kda"][0])
+            if factor:
+                assert share == pytest.approx(left, rel=0.05, abs=2e-7)
+            else:
+                assert share > 1e-5
+    assert remains[1] > 5 * remains[0]
+
+
+def test_a_thousand_events_cost_less_than_a_second() -> None:
+    config = _config(**{"fit.mode": "joint", "fit.roi_nm": 3000.0, "camera.pixel_size_nm": 84.4})
+    rng = np.random.default_rng(3)
+    table = pd.concat([_event(config, 5.0, 480.0)] * 1000, ignore_index=True)
+    table["z_nm"] = rng.uniform(0, 1000, 1000)
+    table["mass_kda"] = rng.uniform(100, 1000, 1000)
+    systematic(config, table[:2])  # compiles
+    start = time.process_time()
+    found = systematic(config, table)
+    assert time.process_time() - start < 2  # 1 s, on a machine that does nothing else
+    for index in range(5):
+        alone = systematic(config, table[index : index + 1])
+        for name in PARAMETERS:
+            room = 0.01 * float(np.max(found[name]))
+            assert found[name][index] == pytest.approx(alone[name][0], rel=0.05, abs=room + 1e-9)
+
+
+def test_what_is_not_known_has_no_column() -> None:
+    table = _event(_config(), 5.0, 480.0)
+    for settings in (
+        {"optics.covariance": None},
+        {"optics.scheme": "darkfield"},
+        {"optics.convention": "dong2021"},
+    ):
+        assert systematic(_config(**settings), table) == {}
+    empty = systematic(_config(), table[:0])
+    assert set(empty) == {"x_nm", "y_nm", "mass_kda"}
+
+
+def test_the_covariance_survives_the_way_through_a_file() -> None:
+    config = _config()
+    again = configure(tomllib.loads(config_to_toml(config)))
+    assert again.optics.covariance == config.optics.covariance
+    with pytest.raises(ConfigError, match="names has focus, which is none of"):
+        _config(**{"optics.covariance": {"names": ["focus"], "matrix": [[1.0]]}})
+    with pytest.raises(ConfigError, match="not symmetric"):
+        _config(np.triu(COVARIANCE))
