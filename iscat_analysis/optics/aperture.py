@@ -104,9 +104,16 @@ class Aperture:
         c, d = np.cos(turned), np.sin(turned)
         return np.stack([p * c**2 + s * d**2, (p - s) * (c * d)])
 
-    def seen(self, phi: FloatArray, *, masked: bool = True) -> ComplexArray:
+    def turning(self, phi: FloatArray) -> ComplexArray:
+        """Slope of `polarised` with the direction of linear light [1/rad], shape (2, n, m)."""
+        difference = (self.pupil.t_p_cos - self.pupil.t_s)[:, None]
+        turned = 2 * (phi - math.radians(self.optics.polarization_deg))
+        return np.stack([difference * np.sin(turned), -difference * np.cos(turned)])
+
+    def seen(self, phi: FloatArray, *, masked: bool = True, turning: bool = False) -> ComplexArray:
         """Components that reach the camera, with mask and aberrations, shape (1 or 2, n, m)."""
-        components = self.polarised(phi)[: 1 if self.optics.analyzer else 2]
+        whole = self.turning(phi) if turning else self.polarised(phi)
+        components = whole[: 1 if self.optics.analyzer else 2]
         wave: ComplexArray = components * np.exp(1j * self.wavenumber * self.path_nm(phi))
         return wave * self.transmission[:, None] if masked else wave
 
@@ -127,7 +134,9 @@ class Aperture:
                 )
 
 
-def harmonics(waves: ComplexArray, weight: FloatArray) -> ComplexArray:
+def harmonics(
+    waves: ComplexArray, weight: FloatArray, negligible: float = NEGLIGIBLE
+) -> ComplexArray:
     """Fourier series along the azimuth, as far as it is not negligible.
 
     Parameters
@@ -136,6 +145,8 @@ def harmonics(waves: ComplexArray, weight: FloatArray) -> ComplexArray:
         Pupil functions at m equally spaced azimuths.
     weight : ndarray, shape (n,)
         Moduli of the quadrature's weights, which say what is negligible.
+    negligible : float
+        Share of a function's light amplitude below which its harmonics are left out.
 
     Returns
     -------
@@ -146,7 +157,7 @@ def harmonics(waves: ComplexArray, weight: FloatArray) -> ComplexArray:
     size = (np.abs(series) * weight[:, None]).sum(1)
     half = waves.shape[2] // 2 - 1
     both = np.maximum(size[:, 1 : half + 1], size[:, : -half - 1 : -1])
-    kept = np.nonzero((both > NEGLIGIBLE * size.sum(1, keepdims=True)).any(0))[0]
+    kept = np.nonzero((both > negligible * size.sum(1, keepdims=True)).any(0))[0]
     largest = int(kept[-1]) + 1 if kept.size else 0
     order = np.arange(-largest, largest + 1)
     return np.ascontiguousarray(np.moveaxis(series[:, :, order], 2, 1))

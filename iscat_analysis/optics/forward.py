@@ -353,7 +353,8 @@ class ForwardModel:
         lens, stack = self._sensitivities(z_nm, tuple(names))
         amplitude = self.scale.amplitude(mass_kda)
         _, pixels, *_ = self._geometry(grid, x_nm, y_nm, amplitude)
-        return signal_derivatives(stack, lens, pixels, x_nm, y_nm, amplitude)
+        signal, _ = self.amplitude_gradient(grid, x_nm, y_nm, z_nm, amplitude)
+        return signal, signal_derivatives(stack, lens, pixels, x_nm, y_nm, amplitude)
 
     @cached_property
     def _sensitivities(self) -> Callable[[float, tuple[str, ...]], tuple[Lens, FloatArray]]:

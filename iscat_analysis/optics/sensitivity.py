@@ -29,6 +29,12 @@ ComplexArray = NDArray[np.complex128]
 Weight = Callable[[Aperture], tuple[ComplexArray, ComplexArray]]
 """Factor of the field's integral, and phase per height, on any quadrature."""
 
+NEGLIGIBLE_CHANGE = 1e-6
+"""Share of a change of the light below which its azimuthal harmonics are left out."""
+
+COARSER = 2
+"""Radial step of the changes over that of the field: they are good to a part in 10⁶."""
+
 
 def check_names(optics: Optics, names: Sequence[str]) -> None:
     """Refuse what has no derivative.
@@ -51,6 +57,10 @@ def check_names(optics: Optics, names: Sequence[str]) -> None:
     if optics.convention == "dong2021":
         raise ConfigError(
             'optics.convention = "dong2021" has no derivatives: use convention = "exact"'
+        )
+    if "polarization_deg" in names and optics.polarization != "linear":
+        raise ConfigError(
+            f'polarization_deg: optics.polarization = "{optics.polarization}" has no direction'
         )
 
 
@@ -117,14 +127,16 @@ def sensitivity_lattices(
             return clear * ((optics.attenuation - 1) * at_edge[:, None])
         if name == "attenuation":
             return clear * behind[:, None] - field * (rho / (optics.attenuation or 1.0))
+        if name == "polarization_deg":
+            return whole.seen(phi, turning=True) * (inner[:, None] * math.pi / 180)
         path: FloatArray = zernike(int(name[1:]), whole.rho[:, None], phi)[0]
         return field * (1j * k * path)
 
     waves = np.concatenate([field, *(change(name) for name in names)])
-    series = harmonics(waves, np.abs(weight)) * weight
+    series = harmonics(waves, np.abs(weight), NEGLIGIBLE_CHANGE) * weight
     count = len(field)
     lattice = LatticeField(series[:count], axial, whole.pupil.transverse, k * optics.na, reach_nm)
-    stack = lattice.lattices(series, whole.pupil.transverse)
+    stack = lattice.lattices(series, whole.pupil.transverse, COARSER)
     return lattice.lens(rho), stack.reshape(1 + len(names), count, *stack.shape[1:])
 
 
@@ -143,8 +155,8 @@ def signal_derivatives(
     x_nm: float,
     y_nm: float,
     amplitude: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Signal and its derivatives from lattices.
+) -> FloatArray:
+    """Combine lattices to derivatives of the signal.
 
     Parameters
     ----------
@@ -161,13 +173,11 @@ def signal_derivatives(
 
     Returns
     -------
-    signal : ndarray, shape (ny, nx)
-        The signal.
-    derivatives : ndarray, shape (n, ny, nx)
-        Its derivatives, at fixed amplitude.
+    ndarray, shape (n, ny, nx)
+        Derivatives, at fixed amplitude.
     """
     count, components = stack.shape[:2]
     out = np.empty((count, pixels.y.size, pixels.x.size))
     flat = stack.reshape(count * components * 2, *stack.shape[3:])
     lattice_values(flat, lens, pixels, x_nm, y_nm, amplitude, components, out)
-    return out[0], out[1:]
+    return out[1:]

@@ -273,15 +273,20 @@ class LatticeField:
         ]
         return np.concatenate(parts).reshape(heights_nm.size, 3, 2 * len(self.harmonics), -1)
 
-    def lattices(self, harmonics: ComplexArray, transverse: FloatArray) -> FloatArray:
+    def lattices(
+        self, harmonics: ComplexArray, transverse: FloatArray, coarser: int = 1
+    ) -> FloatArray:
         """Coefficients of any fields in this pupil, shape (k, 2, nodes, nodes)."""
-        waves = self._waves(harmonics, transverse)
-        return spread(waves, self.radial_step_nm, self.step_nm, self.half)
+        step = coarser * self.radial_step_nm
+        waves = self._waves(harmonics, transverse, step)
+        return spread(waves, step, self.step_nm, self.half)
 
-    def _waves(self, harmonics: ComplexArray, transverse: FloatArray) -> FloatArray:
+    def _waves(
+        self, harmonics: ComplexArray, transverse: FloatArray, radial_step_nm: float
+    ) -> FloatArray:
         reach = reach_of_samples(self.reach_nm, self.step_nm)
-        intervals = math.ceil(reach / self.radial_step_nm)
-        return radial_waves(harmonics, transverse, self.radial_step_nm, intervals)
+        intervals = math.ceil(reach / radial_step_nm)
+        return radial_waves(harmonics, transverse, radial_step_nm, intervals)
 
     def _stack(self, heights_nm: FloatArray, orders: int, kappa: float) -> FloatArray:
         """Lattices of every height, order and component."""
@@ -307,7 +312,7 @@ class LatticeField:
     def _waves_at(self):  # type: ignore[no-untyped-def]
         def at(z_nm: float) -> FloatArray:
             weights = self._weights(np.array([z_nm]), 1, 0.0)[0, 0]
-            return self._waves(weights, self.transverse)
+            return self._waves(weights, self.transverse, self.radial_step_nm)
 
         return lru_cache(_HEIGHTS_KEPT)(at)
 

@@ -217,7 +217,8 @@ def analyse(
             partial=partial,
             identity=fingerprint(movie.path) if partial else "",
         )
-        scene, image, further = result.scene, result.image, {"landing": result.summary}
+        scene, image = result.scene, result.image
+        further["landing"] = result.summary
         found = Found(result.table, result.views, result.windows, result.interrupted)
         config = scene.config
         clock.lap("landing")
@@ -235,9 +236,10 @@ def analyse(
                 f"`inject` = {inject}: particles are added to landing movies only, which have an "
                 'interferometric scheme and background.method = "sliding"; leave it out'
             )
-        scene, found, image, further = _measured_background(
+        scene, found, image, measured = _measured_background(
             movie, config, camera, clock, tell=tell, notify=notify, progress=progress
         )
+        further |= measured
     windows = found.windows
     if found.interrupted:  # what was finished is now gathered and kept, which takes a moment
         progress("report", 0, 1)

@@ -39,6 +39,9 @@ REJECTED_P = 1e-3
 """Half of the brightest particles must fit worse than this before the optics are doubted: a few
 that are not alone do not suffice."""
 
+LEAST_TESTED = 4
+"""Bright particles without which the optics are not even tested."""
+
 _TESTED = 24
 
 
@@ -77,13 +80,20 @@ def learn_optics(
         or config.fit.mode == "track"
     ):
         return config, {}
+    tested: dict[str, Any] = {}
     try:
         with ThreadPoolExecutor(config.compute.workers) as pool:
             find = landing_sights if has_landings(config) else _bound
             sights, others = find(movie, config, camera, pool)
-            median = _median_p(sights, config) if len(sights) >= LEAST_SIGHTS else 1.0
+            if len(sights) < LEAST_TESTED:
+                raise DataError(
+                    f"{movie.name}: shows {len(sights)} bright particles that stand alone, and "
+                    f"{LEAST_TESTED} are needed to test the optics, {LEAST_SIGHTS} to learn them"
+                )
+            median = _median_p(sights, config)
+            tested = {"tested": len(sights), "median_p": median}
             if optics.calibrate == "auto" and median >= REJECTED_P:
-                return config, {"tested": len(sights), "median_p": median, "calibrated": False}
+                return config, tested | {"calibrated": False}
             found = calibrate_sights(
                 sights,
                 others,
@@ -93,17 +103,12 @@ def learn_optics(
                 mapper=pool.map,
             )
     except DataError as error:
-        if optics.calibrate == "always":
-            tell(f"the optics stay as configured: {error}")
-        return config, {"calibrated": False, "reason": str(error)}
-    summary = {"tested": len(sights), "median_p": median, **_told(found)}
+        tell(f"{_verdict(tested)}: {error}; the analysis goes on as configured")
+        return config, tested | {"calibrated": False, "reason": str(error)}
+    summary = tested | _told(found)
     learned, why = _usable(found, config)
     if learned is None:
-        tell(
-            f"the configured optics do not describe the brightest {len(sights)} particles (median "
-            f"p-value {median:.1g}), and they cannot be learned from them: {why}; the analysis "
-            "goes on as configured"
-        )
+        tell(f"{_verdict(tested)}: {why}; the analysis goes on as configured")
         return config, summary | {"calibrated": False, "reason": why}
     tell(f"optics learned from the movie, instead of the configured ones: {found.headline()}")
     for note in found.notes:
@@ -127,12 +132,24 @@ def _median_p(sights: list[Sight], config: Config) -> float:
     return float(np.median([goodness(sight, model)[1] for sight in fitted]))
 
 
+def _verdict(tested: dict[str, Any]) -> str:
+    """Say what the test found where the optics are not learned."""
+    if not tested:
+        return "the optics cannot be tested on this movie"
+    if tested["median_p"] >= REJECTED_P:
+        return "the optics cannot be learned from this movie"
+    return (
+        f"the configured optics do not describe the brightest {min(tested['tested'], _TESTED)} "
+        f"particles (median p-value {tested['median_p']:.1g}), and they cannot be learned from them"
+    )
+
+
 def _told(found: OpticsCalibration) -> dict[str, Any]:
     """Give what the summary says of a calibration."""
     told = found.to_dict()
     return {
         key: told[key]
-        for key in ("accepted", "refusals", "parameters", "names", "covariance", "notes")
+        for key in ("accepted", "refusals", "parameters", "names", "covariance", "twin", "notes")
     }
 
 

@@ -24,6 +24,7 @@ from iscat_analysis.schemas.base import (
     key,
     maybe,
 )
+from iscat_analysis.schemas.calibration import OpticsParameter, Twin
 
 _SIGMA = "Standard deviation from the observed information [{}]; null where it is not free"
 _CRB = "Joint Cramér–Rao bound at the estimate [{}]; null where the parameter is not free"
@@ -178,6 +179,22 @@ class Injection(Closed):
     frame_in_interval: Share = maybe("Share whose frame lies inside frame_ci95")
 
 
+class Learned(Closed):
+    """What ``optics.calibrate`` did: the test of the optics, and what was learned of them."""
+
+    tested: Count = maybe("Bright particles that stand alone")
+    median_p: Share = maybe("Median p-value of the brightest in the configured optics")
+    calibrated: bool = key("Whether the analysis used learned optics")
+    reason: str = maybe("Why it did not, where the test asked for it or could not be made")
+    accepted: bool = maybe("Whether what was learned could be used")
+    refusals: list[str] = maybe("Why not, one line each")
+    parameters: list[OpticsParameter] = maybe("Every parameter")
+    names: list[str] = maybe("The measured ones, in the order of covariance")
+    covariance: list[list[float]] = maybe("Of the measured parameters")
+    twin: Twin | None = maybe("A second microscope that is as likely")
+    notes: list[str] = maybe("What the user should know, one line each")
+
+
 class Distribution(Document):
     """Species, as a mixture fitted to the events that are ok, each with its own error."""
 
@@ -233,6 +250,7 @@ class Summary(Document):
     background: Background = maybe("Movies with background frames: noise and drift")
     landing: Landing = maybe("Landing movies: windows, search, noise and drift")
     injection: Injection = maybe("With --inject: known particles added to the movie")
+    optics: Learned = maybe("Where the optics were tested: the test, and what was learned")
     distribution: Distribution | None = maybe(
         "Species; null where masses are not fitted once per event"
     )

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.stats import kstest
@@ -29,16 +28,11 @@ from iscat_analysis.calibration.optics.settings import (
     HIGHER,
     PRIMARY,
     SECONDARY,
+    free_names,
     is_term,
 )
-from iscat_analysis.calibration.optics.starts import (
-    FOCUS_RANGE_NM,
-    FOCUS_STEP_NM,
-    Start,
-    average_sights,
-    search_starts,
-    with_masses,
-)
+from iscat_analysis.calibration.optics.starts import average_sights, with_masses
+from iscat_analysis.calibration.optics.states import StateSearch, same_state
 from iscat_analysis.records import FloatArray, Mapper
 
 LEAST_SIGHTS = 12
@@ -62,13 +56,10 @@ HELD_OUT_P = 1e-3
 CONTAMINATED_P = 1e-4
 """A single picture with a smaller p-value, where most are fine, shows more than one particle."""
 
-_STARTS = 2  # microscopes that are refined on the average picture, per state
 _PLACE = ("x_nm", "y_nm")
-_ROUGH = 1.0  # gain in log-likelihood that ends a search on the average picture
-_ROUGH_PASSES = 25
-_OTHERS_PASSES = 8
-_MASKS_NA = (0.35, 0.65)
-_MASK_TRANSMITS = 0.3  # where no attenuation is configured
+_OTHERS_PASSES = 6
+_RUNG_PASSES = 12
+_TOO_FEW = 20.0  # log-likelihood that fewer aberrations lose where still fewer cannot be better
 _CONTAMINATED_SHARE = 0.25  # more than this is the model's fault
 _TRIAL_PASSES = 12  # of a second microscope on all pictures
 _CLOSE = 0.01  # states whose average is explained this much worse are tried on all pictures
@@ -248,14 +239,6 @@ def _held_out(sights: Sequence[Sight]) -> list[Sight]:
     return list(sights[1::HELD_OUT])
 
 
-def _same_state(one: Estimate, other: Estimate) -> bool:
-    """Whether two microscopes have the same polarisation, and both a mask or none."""
-    return bool(
-        one.values["polarization"] == other.values["polarization"]
-        and (one.values["mask_na"] > 0) == (other.values["mask_na"] > 0)
-    )
-
-
 @dataclass
 class _Search:
     """One measurement of the microscope; its steps in order of `run`."""
@@ -325,6 +308,7 @@ class _Search:
         others = self._fit(
             tuple(self.mapper(clear, others)), best.values, (), _OTHERS_PASSES
         ).sights
+        self.others = others  # where they are is known the next time
         fitted = tuple(self.mapper(clear, best.sights))
         judged = tuple(self.mapper(clear, held_out))
         judged = self._own(judged, best.values) if judged else ()
@@ -334,16 +318,6 @@ class _Search:
         """Fit what is a sight's own."""
         return self._fit(sights, settings, ()).sights
 
-    def _names(self, settings: Settings, terms: Sequence[str]) -> tuple[str, ...]:
-        """Give the continuous parameters that are free in a state, with some of the aberrations."""
-        names = [
-            name
-            for group in self.free
-            for name in FREE[group]
-            if (not is_term(name) or name in terms) and (group != "mask" or settings["mask_na"] > 0)
-        ]
-        return tuple(names)
-
     def _best_state(
         self, averages: Sequence[Sight], placed: Sequence[Sight]
     ) -> tuple[Estimate, tuple[Sight, ...]]:
@@ -351,33 +325,14 @@ class _Search:
 
         The pictures that are not fitted come back with their places and masses.
         """
-
-        def begin(state: list[dict[str, Any]]) -> tuple[Start, ...]:
-            starts = search_starts(averages, self.build, state, most=_STARTS)
-            return starts if "phase" in self.free else tuple(map(self._phased, starts))
-
-        def refine(start: Start) -> Estimate:
-            there = [
-                replace(a, x_nm=start.x_nm, y_nm=start.y_nm, mass_kda=start.mass_kda)
-                for a in averages
-            ]
-            names = self._names(start.values, PRIMARY + SECONDARY)
-            return maximise(
-                there, self.build, start.values, names,
-                limits=self.limits, tolerance=_ROUGH, passes=_ROUGH_PASSES,
-            )  # fmt: skip
-
-        states = self._states()
-        begun = [start for starts in self.mapper(begin, states) for start in starts]
-        refined = list(self.mapper(refine, begun))
-        refined.sort(key=lambda e: -e.log_likelihood)
+        states = StateSearch(self.configured, self.build, self.free, self.limits, self.mapper)
+        refined = states.run(averages)
         top = refined[0].log_likelihood
         joint: list[tuple[float, Estimate, tuple[Sight, ...]]] = []
         tried: list[Estimate] = []
         for rough in refined:
             far = top - rough.log_likelihood > max(_CLOSE * top, 2 * TWIN_GAP)
-            same = any(_same_state(rough, other) for other in tried)
-            if far or same:
+            if far or any(same_state(rough, other) for other in tried):
                 continue
             x_nm, y_nm = (np.median([getattr(a, k) for a in rough.sights]) for k in _PLACE)
             sights = with_masses(
@@ -385,7 +340,7 @@ class _Search:
                 self.build,
                 rough.values,
             )
-            names = self._names(rough.values, FREE["zernike"])
+            names = free_names(self.free, rough.values, FREE["zernike"])
             passes = _TRIAL_PASSES if tried else 40
             tried.append(rough)
             fit = self._fit(_fitted(sights), rough.values, names, passes)
@@ -393,39 +348,6 @@ class _Search:
             joint.append((judged.log_likelihood, fit, judged.sights))
         _, best, held_out = max(joint, key=lambda each: each[0])
         return best, held_out
-
-    def _states(self) -> list[list[dict[str, Any]]]:
-        """Give the settings to start from, those of one discrete state together."""
-        now = dict(self.configured)
-        lights = ["linear", "circular"] if "polarization" in self.free else [now["polarization"]]
-        masks: list[list[dict[str, Any]]] = [[{}]]
-        if "mask" in self.free:
-            dims = now["attenuation"] if now["attenuation"] < 0.9 else _MASK_TRANSMITS
-            edges = sorted({*_MASKS_NA, *([now["mask_na"]] if now["mask_na"] else [])})
-            masks = [
-                [{"mask_na": 0.0, "attenuation": now["attenuation"]}],
-                [{"mask_na": edge, "attenuation": dims} for edge in edges],
-            ]
-        foci = [now["focus_nm"]]
-        if "focus" in self.free:
-            steps = math.ceil(FOCUS_RANGE_NM / FOCUS_STEP_NM)
-            foci = [now["focus_nm"] + FOCUS_STEP_NM * i for i in range(-steps, steps + 1)]
-        return [
-            [
-                {**now, **mask, "polarization": light, "focus_nm": focus}
-                for mask in kind
-                for focus in foci
-            ]
-            for light in lights
-            for kind in masks
-        ]
-
-    def _phased(self, start: Start) -> Start:
-        """Put the configured reference phase back."""
-        phase = self.configured["reference_phase_deg"]
-        flipped = math.cos(math.radians(start.values["reference_phase_deg"] - phase)) < 0
-        mass = -start.mass_kda if flipped else start.mass_kda
-        return replace(start, values={**start.values, "reference_phase_deg": phase}, mass_kda=mass)
 
     def _identified(self, best: Estimate) -> tuple[Estimate, dict[str, str]]:
         """Hold what the pictures do not determine within the plausible range."""
@@ -464,11 +386,13 @@ class _Search:
         ]
         rungs = list(dict.fromkeys([*ladder, terms]))
         tried: list[tuple[float, Estimate]] = []
-        for rung in rungs:
+        for rung in reversed(rungs):  # the most first; fewer than too few are not tried
             names = tuple(n for n in best.names if not is_term(n) or n in rung)
             start = {**best.values, **{n: 0.0 for n in terms if n not in rung}}
-            fit = best if rung == terms else self._fit(best.sights, start, names, passes=12)
+            fit = best if rung == terms else self._fit(best.sights, start, names, _RUNG_PASSES)
             tried.append((self._fit(held_out, fit.values, ()).log_likelihood, fit))
+            if tried[-1][0] < tried[0][0] - _TOO_FEW:
+                break
         _, chosen = max(tried, key=lambda pair: pair[0])
         return chosen, tuple(n for n in terms if n not in chosen.names)
 

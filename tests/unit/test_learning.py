@@ -1,0 +1,82 @@
+"""The optics are tested before a movie is analysed, and what came of it is always said."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from calibrations import configuration, make_sights
+
+from iscat_analysis.config import Config
+from iscat_analysis.movie.camera import camera_from_config
+from iscat_analysis.pipeline import learning
+from iscat_analysis.pipeline.learning import LEAST_TESTED, learn_optics
+
+MOVIE: Any = SimpleNamespace(name="movie.tif")
+
+
+def _learn(
+    monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], count: int, calibrate: str = "auto"
+) -> tuple[bool, dict[str, Any], list[str]]:
+    """Whether the configuration stayed, the summary, and what the user was told."""
+    config = _config(calibrate)
+    sights, _, _ = make_sights(changes, count, seed=3)
+    monkeypatch.setattr(learning, "landing_sights", lambda *_: (sights, []))
+    camera = camera_from_config(config.camera, (64, 64), "uint16")
+    said: list[str] = []
+    learned, summary = learn_optics(MOVIE, config, camera, tell=said.append)
+    return learned == config, summary, said
+
+
+def _config(calibrate: str) -> Config:
+    config = configuration(calibrate=calibrate)
+    sliding = config.background.model_copy(update={"method": "sliding"})
+    return config.model_copy(update={"background": sliding})
+
+
+def test_optics_that_describe_the_particles_stay_without_a_word(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stayed, summary, said = _learn(monkeypatch, {}, 14)
+    assert stayed
+    assert not said
+    assert summary["tested"] == 14
+    assert summary["median_p"] > learning.REJECTED_P
+    assert summary["calibrated"] is False
+
+
+def test_too_few_particles_to_test_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    stayed, summary, said = _learn(monkeypatch, {}, LEAST_TESTED - 1)
+    assert stayed
+    assert len(said) == 1
+    assert said[0].startswith("the optics cannot be tested on this movie: movie.tif: shows 3 ")
+    assert said[0].endswith("the analysis goes on as configured")
+    assert summary == {"calibrated": False, "reason": summary["reason"]}
+
+
+def test_too_few_particles_to_learn_from_are_said_where_the_test_fails(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stayed, summary, said = _learn(monkeypatch, {"z11": 25.0}, 8)
+    assert stayed
+    assert len(said) == 1
+    assert "do not describe the brightest 8 particles" in said[0]
+    assert "at least 12 are needed to learn the optics; record more" in said[0]
+    assert said[0].endswith("the analysis goes on as configured")
+    assert summary["median_p"] < learning.REJECTED_P
+    assert summary["calibrated"] is False
+
+
+def test_always_is_told_why_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    stayed, _, said = _learn(monkeypatch, {}, 8, "always")
+    assert stayed
+    assert len(said) == 1
+    assert said[0].startswith("the optics cannot be learned from this movie: movie.tif: shows 8 ")
+
+
+def test_never_looks_at_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    stayed, summary, said = _learn(monkeypatch, {"z11": 25.0}, 14, "never")
+    assert stayed
+    assert not summary
+    assert not said
