@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -9,11 +10,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from iscat_analysis.calibration.optics.estimate import FOCUS_STEP
 from iscat_analysis.calibration.optics.measure import Judgement, Measured
 from iscat_analysis.calibration.optics.pictures import Pictures
-from iscat_analysis.calibration.optics.settings import is_term, with_settings
+from iscat_analysis.calibration.optics.settings import exists, is_term, with_settings
 from iscat_analysis.config import Config, OpticsCovariance
 from iscat_analysis.records import FloatArray
+
+_ODD_NA = 0.02  # between the aperture of an objective and what is engraved on it
+_ODD_SIGMAS = 5.0
 
 COLUMNS = ("parameter", "value", "sigma", "crb", "configured", "state")
 """Columns of `OpticsCalibration.parameters`."""
@@ -79,6 +84,10 @@ class OpticsCalibration:
             if name in self.names:
                 label = {"focus_nm": "focus", "na": "NA", "reference_phase_deg": "phase"}[name]
                 parts.append(with_error(label, self.value(name), self.sigma(name), unit))
+        if FOCUS_STEP in self.names:
+            parts.append(
+                with_error("steps of", self.value(FOCUS_STEP), self.sigma(FOCUS_STEP), "nm")
+            )
         terms = [n for n in self.names if is_term(n)]
         if terms:
             rms = float(np.sqrt(sum(self.value(n) ** 2 for n in terms)))
@@ -112,12 +121,15 @@ class OpticsCalibration:
             lines.append(f"{key} = {text}")
         terms = ", ".join(f"{n} = {v:.9g}" for n, v in optics.aberrations_nm.items())
         lines += [f"aberrations_nm = {{ {terms} }}", "", "[uncertainty]"]
-        lines += [f"{name} = {self.sigma(name):.6g}" for name in self.names]
-        quoted = ", ".join(f'"{name}"' for name in self.names)
+        names, covariance = _of_optics(self.names, self.covariance)
+        lines += [f"{name} = {self.sigma(name):.6g}" for name in names]
+        quoted = ", ".join(f'"{name}"' for name in names)
         lines += ["", "[covariance]", f"names = [{quoted}]", "matrix = ["]
-        lines += [f"  [{', '.join(f'{v:.9g}' for v in row)}]," for row in self.covariance]
+        lines += [f"  [{', '.join(f'{v:.9g}' for v in row)}]," for row in covariance]
         lines += ["]", "", "[provenance]"]
         lines += [f"{key} = {_quoted(text)}" for key, text in self.source.items()]
+        if FOCUS_STEP in self.names:
+            lines += [f"{FOCUS_STEP} = {self.value(FOCUS_STEP):.9g}"]
         return "\n".join([*lines, f"particles = {self.sights}", ""])
 
     def to_dict(self) -> dict[str, Any]:
@@ -183,7 +195,8 @@ def make_result(
     covariance, bound = estimate.covariance, estimate.bound
     rows = []
     for name, value in measured.settings.items():
-        if isinstance(value, str | bool) or name == "polarization_deg":
+        turns = name == "polarization_deg"
+        if isinstance(value, str | bool) or (turns and not exists(name, measured.settings)):
             continue
         state = "given"
         sigma = crb = float("nan")
@@ -198,7 +211,7 @@ def make_result(
         rows.append((name, float(value), sigma, crb, float(configured[name]), state))
     if not measured.refusals:
         config = _with_covariance(
-            with_settings(config, measured.settings), estimate.names, covariance
+            with_settings(config, measured.settings), *_of_optics(estimate.names, covariance)
         )
     return OpticsCalibration(
         config=config,
@@ -209,8 +222,16 @@ def make_result(
         pictures=pictures,
         sights=len(estimate.sights),
         source=source,
-        notes=_notes(measured),
+        notes=(*_notes(measured), *_on_the_pixel(config, configured, measured)),
     )
+
+
+def _of_optics(
+    names: tuple[str, ...], covariance: FloatArray
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Leave out what is no key of ``[optics]``."""
+    kept = [k for k, name in enumerate(names) if name != FOCUS_STEP]
+    return tuple(names[k] for k in kept), covariance[np.ix_(kept, kept)]
 
 
 def _with_covariance(config: Config, names: tuple[str, ...], covariance: FloatArray) -> Config:
@@ -250,6 +271,25 @@ def _notes(measured: Measured) -> tuple[str, ...]:
             "the sample's index would tell them apart"
         )
     return tuple(notes)
+
+
+def _on_the_pixel(
+    config: Config, configured: Mapping[str, Any], measured: Measured
+) -> tuple[str, ...]:
+    """Say that a wrong pixel size looks like a wrong aperture, where the aperture is another."""
+    estimate, pixel = measured.estimate, config.camera.pixel_size_nm
+    if "na" not in estimate.names or pixel is None:
+        return ()
+    k = estimate.names.index("na")
+    apart = measured.settings["na"] - configured["na"]
+    if abs(apart) < max(_ODD_NA, _ODD_SIGMAS * math.sqrt(estimate.covariance[k, k])):
+        return ()
+    other = pixel * measured.settings["na"] / configured["na"]
+    return (
+        f"the numerical aperture differs by {apart:+.3f} from the configured one; pixels of about "
+        f"{other:.1f} nm instead of {pixel:g} nm would look much the same: check "
+        "camera.pixel_size_nm",
+    )
 
 
 def _judged(judgement: Judgement) -> dict[str, Any]:
