@@ -208,7 +208,8 @@ def optics(
         float | None,
         typer.Option(
             metavar="NM",
-            help="The movie is a scan of immobile particles: rise of the focus per frame [nm].",
+            help="The movie is a scan of immobile particles: rise of the focus per frame [nm]; "
+            "where focus is free it is measured as well.",
             show_default=False,
         ),
     ] = None,

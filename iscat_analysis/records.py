@@ -286,6 +286,8 @@ class FitResult:
         Signed peak contrast of the model over the plane, at the estimate.
     log_likelihood : float
         At its maximum, without terms that do not depend on the parameters.
+    snr : float
+        √(2 Δℓ) against no particle, a level that is free being fitted in both.
     iterations : int
         Scoring steps taken by the best start.
     chi2_reduced, p_value : float
@@ -310,6 +312,7 @@ class FitResult:
     covariance: FloatArray
     contrast: float
     log_likelihood: float
+    snr: float
     iterations: int
     chi2_reduced: float
     p_value: float

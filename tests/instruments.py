@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -24,6 +24,8 @@ FloatArray = NDArray[np.float64]
 PEAK_PER_KDA = 3.1e-5
 _AZIMUTHS = 64
 _FARTHEST_NM = 20_000.0
+_NEAREST_NM = 4_000.0
+_NEGLIGIBLE = 1e-10  # share of a harmonic below which it is left out
 
 
 @dataclass(frozen=True)
@@ -75,8 +77,8 @@ class Pictures:
         m = instrument
         k = 2 * np.pi / m.wavelength_nm
         alpha = np.arcsin(m.na / m.n_immersion)
-        reach_nm = max(reach_nm, _FARTHEST_NM)
-        x, w = np.polynomial.legendre.leggauss(math.ceil(170 * reach_nm / _FARTHEST_NM))
+        reach_nm = max(reach_nm, _NEAREST_NM)
+        x, w = np.polynomial.legendre.leggauss(math.ceil(170 * max(1, reach_nm / _FARTHEST_NM)))
         # θ = θ_c + v|v| smooths the root at the critical angle; the edge of the mask is an end
         critical = np.arcsin(min(m.n_sample, m.na) / m.n_immersion)
         ends = [0.0, np.arcsin(m.mask_na / m.n_immersion), critical, alpha]
@@ -126,7 +128,10 @@ class Pictures:
         # amplitude of the dipole: −i; the reference's own phase is added to it
         phase = np.exp(1j * np.deg2rad(m.reference_phase_deg))
         self._reference = reference * phase
-        self._spline = CubicSpline(r, -1j * np.array(tables), axis=1)
+        size = [np.abs(table).max() for table in tables]
+        kept = [n for n, largest in enumerate(size) if largest > _NEGLIGIBLE * max(size)]
+        self._orders = [self._orders[n] for n in kept]
+        self._spline = CubicSpline(r, -1j * np.array(tables)[kept], axis=1)
         near = np.linspace(-900.0, 900.0, 181)
         linear, _ = self._terms(near[None, :], near[:, None])
         top = linear.flat[np.argmax(np.abs(linear))]
@@ -145,6 +150,57 @@ class Pictures:
         linear, square = self._terms(dx_nm, dy_nm)
         amplitude = mass_kda * self._per_kda
         return amplitude * linear + amplitude**2 * square
+
+    def scatterer(
+        self, dx_nm: FloatArray, dy_nm: FloatArray, field_over_reference: complex
+    ) -> FloatArray:
+        """Contrast of a scatterer of absolute strength, see `strength_of_sphere`."""
+        r, phi = np.hypot(dx_nm, dy_nm), np.arctan2(dy_nm, dx_nm)
+        parts = self._spline(r)
+        e = field_over_reference * sum(
+            parts[n] * np.exp(1j * h * phi)[..., None] for n, h in enumerate(self._orders)
+        )
+        return 2 * np.real(e @ np.conj(self._reference)) + np.sum(np.abs(e) ** 2, axis=-1)
+
+
+def strength_of_sphere(
+    instrument: Instrument, diameter_nm: float, refractive_index: complex
+) -> complex:
+    """Field of a small sphere over the reflected reference, energy-conserving emission."""
+    m = instrument
+    k = 2 * np.pi / m.wavelength_nm
+    inside, outside = refractive_index**2, m.n_sample**2
+    polarizability = np.pi / 2 * diameter_nm**3 * (inside - outside) / (inside + 2 * outside)
+    into_sample = 2 * m.n_glass / (m.n_glass + m.n_sample)
+    back = (m.n_glass - m.n_sample) / (m.n_glass + m.n_sample)
+    dipole = (m.n_sample * k) ** 2 * polarizability * into_sample / (4 * np.pi)
+    return complex(k * m.n_immersion * dipole / (m.attenuation * back))
+
+
+def focus_scan(
+    instrument: Instrument,
+    focus_nm: FloatArray,
+    places_px: FloatArray,
+    strengths: NDArray[np.complex128],
+    shape: tuple[int, int],
+    *,
+    level_e: float,
+    pixel_nm: float,
+    seed: int,
+) -> NDArray[np.uint16]:
+    """Frames of immobile scatterers under even light, one for each focus, with Poisson noise."""
+    rng = np.random.default_rng(seed)
+    y, x = (np.arange(n) * pixel_nm for n in shape)
+    farthest = float(np.hypot(*shape)) * pixel_nm
+    frames = np.empty((len(focus_nm), *shape), dtype=np.uint16)
+    for t, focus in enumerate(focus_nm):
+        pictures = Pictures(replace(instrument, focus_nm=float(focus)), farthest)
+        expected = np.full(shape, level_e)
+        for (x_px, y_px), strength in zip(places_px, strengths, strict=True):
+            at = (x - x_px * pixel_nm)[None, :], (y - y_px * pixel_nm)[:, None]
+            expected *= 1 + pictures.scatterer(*at, complex(strength))
+        frames[t] = rng.poisson(expected)
+    return frames
 
 
 @dataclass(frozen=True)

@@ -91,9 +91,7 @@ def _row_value(kind: int, data: FloatArray, row: int, level: float, s: FloatArra
         for j in range(s.size):
             base = max(c1[j] + c3[j], FLOOR)
             rate = level * (c1[j] + c2[j] * s[j]) + c3[j]
-            if c0[j] > 0:
-                total += c0[j] * np.log(max(rate, FLOOR) / base)
-            total -= rate - base
+            total += c0[j] * np.log(max(rate, FLOOR) / base) - (rate - base)
     return total
 
 

@@ -120,7 +120,15 @@ MOST_WAVES = 0.5
 ABERRATIONS = tuple(f"z{j}" for j in range(5, 38))
 """Zernike terms on offer, by Noll's index."""
 
-MEASURABLE = ("focus_nm", "na", "reference_phase_deg", "mask_na", "attenuation", *ABERRATIONS)
+MEASURABLE = (
+    "focus_nm",
+    "na",
+    "reference_phase_deg",
+    "mask_na",
+    "attenuation",
+    "polarization_deg",
+    *ABERRATIONS,
+)
 """Parameters of the optics that pictures can tell, and that have a derivative."""
 
 

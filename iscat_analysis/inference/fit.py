@@ -22,7 +22,7 @@ import numpy as np
 
 from iscat_analysis.inference.bias import first_order_bias
 from iscat_analysis.inference.goodness import goodness_of_fit
-from iscat_analysis.inference.likelihood import Derivatives, Likelihood, Optimum
+from iscat_analysis.inference.likelihood import LEVEL, Derivatives, Likelihood, Optimum
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     PARAMETERS,
@@ -48,6 +48,9 @@ said to be at a bound: fewer are chance, and the end of the range is then where 
 
 SCANS_PER_FRINGE = 8
 """Heights scanned per interference fringe before fitting."""
+
+AMPLITUDE = 3
+"""Index of the amplitude in θ."""
 
 _STARTS = 8  # local maxima of the scan that are followed
 _WINDOW_NM = 350.0  # how far x and y may move from the start
@@ -200,6 +203,7 @@ def fit_particle(
         covariance=covariance,
         contrast=model.amplitude_contrast(z, amplitude),
         log_likelihood=best.log_likelihood,
+        snr=detection_snr(likelihood, best, box),
         iterations=best.passes,
         chi2_reduced=chi2_reduced,
         p_value=p_value,
@@ -207,6 +211,37 @@ def fit_particle(
         flags=noticed,
         alternatives=alternatives,
     )
+
+
+def detection_snr(likelihood: Likelihood, best: Optimum, box: Box) -> float:
+    """Signal-to-noise ratio of a particle: √(2 Δℓ) against the same light without it.
+
+    Where the level is a nuisance it is fitted without the particle too: a region that became
+    brighter as a whole is no evidence of a particle in it.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        The one that was maximised.
+    best : Optimum
+        Where it has its maximum.
+    box : Box
+        What was free there, and within which bounds.
+
+    Returns
+    -------
+    float
+        At least 0.
+    """
+    nothing = 0.0  # log-likelihoods count from no particle and no change of the level
+    if box.free[LEVEL]:
+        alone = np.arange(box.free.size) == LEVEL
+        empty = best.theta.copy()
+        empty[AMPLITUDE] = 0.0
+        empty[LEVEL] = 0.0
+        lower, upper = (np.where(alone, end, empty) for end in (box.lower, box.upper))
+        nothing = likelihood.maximize(empty, alone, lower, upper).log_likelihood
+    return math.sqrt(2 * max(best.log_likelihood - nothing, 0.0))
 
 
 def start_theta(likelihood: Likelihood, start: Candidate) -> FloatArray:

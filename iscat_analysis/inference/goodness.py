@@ -265,7 +265,7 @@ def _tail(view: _View, i: int) -> float:
     if variance > MANY_COUNTS:
         return float(2 * ndtr(-abs(view.residual[i])))
     if view.total is None:
-        k = math.floor(k + 1e-9)
+        k = max(math.floor(k + 1e-9), 0)
         above = float(gammainc(k, mean)) if k > 0 else 1.0
         return min(1.0, 2 * min(above, float(gammaincc(k + 1, mean))))
     # read noise takes its share of the variance, as if that share of the counts were lost

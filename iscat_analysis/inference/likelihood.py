@@ -633,7 +633,7 @@ def poisson(
             f"scale_e = {float(scale.flat[0]):g}: give the photoelectrons for unit signal, a "
             "positive number"
         )
-    data = np.stack([np.maximum(counts + extra, 0.0), background, scale, extra])
+    data = np.stack([counts + extra, background, scale, extra])
     data[:, masked | (scale <= 0)] = 0.0
     return Likelihood(model, grid, POISSON, data)
 

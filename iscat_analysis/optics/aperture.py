@@ -104,9 +104,16 @@ class Aperture:
         c, d = np.cos(turned), np.sin(turned)
         return np.stack([p * c**2 + s * d**2, (p - s) * (c * d)])
 
-    def seen(self, phi: FloatArray, *, masked: bool = True) -> ComplexArray:
+    def turning(self, phi: FloatArray) -> ComplexArray:
+        """Slope of `polarised` with the direction of linear light [1/rad], shape (2, n, m)."""
+        difference = (self.pupil.t_p_cos - self.pupil.t_s)[:, None]
+        turned = 2 * (phi - math.radians(self.optics.polarization_deg))
+        return np.stack([difference * np.sin(turned), -difference * np.cos(turned)])
+
+    def seen(self, phi: FloatArray, *, masked: bool = True, turning: bool = False) -> ComplexArray:
         """Components that reach the camera, with mask and aberrations, shape (1 or 2, n, m)."""
-        components = self.polarised(phi)[: 1 if self.optics.analyzer else 2]
+        whole = self.turning(phi) if turning else self.polarised(phi)
+        components = whole[: 1 if self.optics.analyzer else 2]
         wave: ComplexArray = components * np.exp(1j * self.wavenumber * self.path_nm(phi))
         return wave * self.transmission[:, None] if masked else wave
 

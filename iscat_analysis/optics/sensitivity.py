@@ -58,6 +58,10 @@ def check_names(optics: Optics, names: Sequence[str]) -> None:
         raise ConfigError(
             'optics.convention = "dong2021" has no derivatives: use convention = "exact"'
         )
+    if "polarization_deg" in names and optics.polarization != "linear":
+        raise ConfigError(
+            f'polarization_deg: optics.polarization = "{optics.polarization}" has no direction'
+        )
 
 
 def sensitivity_lattices(
@@ -123,6 +127,8 @@ def sensitivity_lattices(
             return clear * ((optics.attenuation - 1) * at_edge[:, None])
         if name == "attenuation":
             return clear * behind[:, None] - field * (rho / (optics.attenuation or 1.0))
+        if name == "polarization_deg":
+            return whole.seen(phi, turning=True) * (inner[:, None] * math.pi / 180)
         path: FloatArray = zernike(int(name[1:]), whole.rho[:, None], phi)[0]
         return field * (1j * k * path)
 

@@ -22,10 +22,12 @@ from iscat_analysis.pipeline.scene import (
     SPREAD_NM,
     Region,
     Scene,
-    field_likelihood,
+    judge,
+    noise_cumulants,
     photons_scale,
     region_likelihood,
     search_both,
+    search_likelihood,
 )
 from iscat_analysis.records import (
     FREE_PARAMETERS,
@@ -36,7 +38,6 @@ from iscat_analysis.records import (
     Status,
     Windows,
     silent,
-    verdict,
 )
 from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, LISTED, is_dwarfed
 from iscat_analysis.search.templates import LARGEST_IMAGE, find_particles
@@ -46,7 +47,6 @@ MAX_ROUNDS = 8
 
 _SWEEPS = 2  # fits of everything with everything else in place, after the last round
 _DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
-_SATURATION_NM = 500.0  # saturated pixels nearer than this spoil a fit
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Event:
     @property
     def snr(self) -> float:
         """√(2 Δℓ) against no particle."""
-        return math.sqrt(2 * max(self.fit.log_likelihood, 0.0))
+        return self.fit.snr
 
 
 def fit_field(
@@ -178,14 +178,16 @@ def _search(
     """Find new particles, and what may be but the side lobe of a known one."""
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
     explained = total_signal(scene, shape, events)
+    likelihood = search_likelihood(scene, windows, explained)
     found = find_particles(
-        field_likelihood(scene, windows),
+        likelihood,
         scene.templates,
         search_both(scene.config.detection),
         roi_px=scene.roi_px,
         explained=explained,
         excess_noise=excess_noise,
         known=[(e.candidate.x_px, e.candidate.y_px) for e in events],
+        cumulants=noise_cumulants(scene, windows, likelihood),
     )
     near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na) / scene.pixel_nm
     fresh: list[Candidate] = []
@@ -316,15 +318,13 @@ def _judged(
         lobe = number >= len(events) or is_dwarfed(
             event.snr, event.fit.chi2_reduced, event.likelihood.n_pixels, brightest
         )
-        rows, columns = np.nonzero(windows.saturated[event.region.slices])
-        dx = (columns + event.region.columns[0]) * scene.pixel_nm - x
-        dy = (rows + event.region.rows[0]) * scene.pixel_nm - y
-        burnt = bool(np.any(np.hypot(dx, dy) < _SATURATION_NM))
-        status, flags = verdict([
-            *event.fit.flags,
-            *([Status.SIDELOBE] if lobe else []),
-            *([Status.SATURATED] if burnt else []),
-            *([Status.TOO_CLOSE] if crowded else []),
-        ])  # fmt: skip
-        judged.append(replace(event, fit=replace(event.fit, status=status, flags=flags)))
+        fit = judge(
+            scene,
+            event.fit,
+            event.region,
+            windows.saturated[event.region.slices],
+            sidelobe=lobe,
+            too_close=crowded,
+        )
+        judged.append(replace(event, fit=fit))
     return judged

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.calibration.optics import (
     FAINTEST,
+    FOCUS_STEP,
     LEAST_SIGHTS,
     MOST_SIGHTS,
     OpticsCalibration,
@@ -55,6 +56,9 @@ from iscat_analysis.search.sliding import STRIDES
 RINGS_NM = 9000.0
 """Farther than this from a particle its rings are left out."""
 
+STEP_FACTORS = (0.5, 2.0)
+"""How much smaller or larger than said the steps of a scan may turn out."""
+
 APART_NM = 2000.0
 """Particles that all bound at once are used if no other is nearer; the rings are accounted for."""
 
@@ -88,8 +92,8 @@ def calibrate_movie(
     free : str or sequence of str, optional
         What may change: some of ``focus, na, phase, mask, zernike, polarization``; default all.
     focus_step_nm : float, optional
-        The movie is a scan of immobile particles, and from frame to frame the focus rises by this
-        [nm].
+        The movie is a scan of immobile particles, and from frame to frame the focus rises by about
+        this [nm]; where the focus is free, the step is measured too.
     progress : Progress
         Told how far it is.
     notify : callable
@@ -118,7 +122,7 @@ def calibrate_movie(
         progress("particles", 0, 1)
         if focus_step_nm is not None:
             others: list[Sight] = []
-            sights = scan_sights(movie, config, camera, focus_step_nm)
+            sights = scan_sights(movie, config, camera)
         elif has_landings(config):
             sights, others = landing_sights(movie, config, camera, pool)
         else:
@@ -131,7 +135,10 @@ def calibrate_movie(
             else "landing movie" if has_landings(config) else "frames before and after",
             "version": version("iscat-analysis"),
         }  # fmt: skip
-        return calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
+        return calibrate_sights(
+            sights, others, config, groups, source,
+            focus_step_nm=focus_step_nm, mapper=pool.map,
+        )  # fmt: skip
 
 
 def refuse_uncalibratable(config: Config) -> None:
@@ -163,6 +170,7 @@ def calibrate_sights(
     groups: Sequence[str],
     source: Mapping[str, str],
     *,
+    focus_step_nm: float | None = None,
     mapper: Mapper = map,
 ) -> OpticsCalibration:
     """Measure the optics from pictures.
@@ -179,6 +187,8 @@ def calibrate_sights(
         From `free_groups`.
     source : mapping of str to str
         Where the pictures came from.
+    focus_step_nm : float, optional
+        Of a scan: rise of the focus from frame to frame, from which the search starts [nm].
     mapper : callable
         `map`, or the one of a pool.
 
@@ -199,15 +209,20 @@ def calibrate_sights(
             "brighter ones (20 nm gold, or protein of 400 kDa and more), or more photons per frame"
         )
     configured = settings_of(config)
+    limits = optics_limits(config.optics.n_immersion, config.optics.n_glass)
+    if focus_step_nm is not None:
+        configured[FOCUS_STEP] = focus_step_nm
+        low, high = sorted(factor * focus_step_nm for factor in STEP_FACTORS)
+        limits[FOCUS_STEP] = (low, high)
     build = microscopes(config, max(reach_nm(sight) for sight in sights))
     optics = config.optics
     measured = measure_microscope(
         sights,
         configured,
         build,
-        lambda sight, settings: goodness(sight, build(settings)),
+        lambda sight, settings: goodness(sight, build(sight.seen_with(settings))),
         free=groups,
-        limits=optics_limits(optics.n_immersion, optics.n_glass),
+        limits=limits,
         side=int(math.copysign(1, optics.focus_nm)) if optics.focus_nm else 0,
         landing=1,
         others=others,
@@ -418,7 +433,7 @@ def bound_sights(movie: Stack, config: Config, camera: Camera) -> tuple[list[Sig
     return _bright(map(with_neighbours, sights)), [with_neighbours(o) for o in others]
 
 
-def scan_sights(movie: Stack, config: Config, camera: Camera, focus_step_nm: float) -> list[Sight]:
+def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
     """Cut the particles of a scan of the focus out of its frames.
 
     The particles stay where they are, so that no frame shows the background alone.  It comes from
@@ -433,8 +448,6 @@ def scan_sights(movie: Stack, config: Config, camera: Camera, focus_step_nm: flo
         Resolved; ``optics.focus_nm`` is that of the first frame that is fitted.
     camera : Camera
         Counts → photoelectrons.
-    focus_step_nm : float
-        Rise of the focus from frame to frame [nm].
 
     Returns
     -------
@@ -488,7 +501,7 @@ def scan_sights(movie: Stack, config: Config, camera: Camera, focus_step_nm: flo
                     model, grid, frame, level, level, extra_variance_e2=read[cut], masked=masked
                 )
             sight = _centred(likelihood, config, frame=first + int(index))
-            seen.append(replace(sight, focus_offset_nm=focus_step_nm * float(index)))
+            seen.append(replace(sight, focus_steps=float(index)))
         weights = [sight.snr**2 for sight in seen]
         x_nm, y_nm = (
             float(np.average([getattr(sight, key) for sight in seen], weights=weights))

@@ -3,20 +3,34 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from iscat_analysis.config import Config, Detection
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import KNOWN, MEAN, MEDIAN, counts_likelihood
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.movie.background import smooth_background
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Windows
+from iscat_analysis.records import (
+    FREE_PARAMETERS,
+    BoolArray,
+    FitResult,
+    FloatArray,
+    Status,
+    Windows,
+    verdict,
+)
 from iscat_analysis.search.templates import Templates, make_templates
 
 SPREAD_NM = 10_000.0
 """Farther than this from a particle its rings are left out; they are 1e-4 of its peak."""
 
+
+SATURATION_NM = 500.0
+"""Saturated pixels nearer than this spoil a fit."""
 
 _VARIANCE_OF_BACKGROUND = {"fixed": MEAN, "sliding": MEAN, "median": MEDIAN, "known": KNOWN}
 """Variance of a measured background over that of the mean of its frames."""
@@ -155,6 +169,42 @@ def field_likelihood(scene: Scene, windows: Windows) -> Likelihood:
     return region_likelihood(scene, windows, Region((0, rows), (0, columns)), None)
 
 
+def search_likelihood(scene: Scene, windows: Windows, explained: FloatArray) -> Likelihood:
+    """Likelihood of the whole field with weights that no particle may have made.
+
+    Where the counts are few, weights made of those before alone are large where these are low by
+    chance, and there the particles seem to have landed.  Counts before and after together say as
+    much of the noise and nothing of the change.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    windows : Windows
+        Sums before and after.
+    explained : ndarray, shape (y, x)
+        Signal of the particles that are known.
+
+    Returns
+    -------
+    Likelihood
+        For the matched filter.
+    """
+    whole = field_likelihood(scene, windows)
+    if not scene.additive or not windows.n_before:
+        return whole
+    counts, level, scale, extra = whole.data
+    ratio = windows.power_ratio
+    read = windows.read_variance_after_e2, windows.read_variance_before_e2
+    both = windows.before_e + (counts - extra) - scale * explained
+    noise = (read[0] + read[1]) / (1 + ratio) ** 2
+    steady = smooth_background(both / (1 + ratio), noise, windows.masked)
+    factor = _VARIANCE_OF_BACKGROUND[scene.config.background.method or "fixed"]
+    variance = steady * ratio * (1 + ratio * factor) + read[0] + ratio**2 * read[1]
+    other = np.where(whole.used, variance - level, 0.0)
+    return replace(whole, data=np.stack([counts - extra + other, level, scale, other]))
+
+
 def region_likelihood(
     scene: Scene, windows: Windows, region: Region, others: FloatArray | None
 ) -> Likelihood:
@@ -193,6 +243,41 @@ def region_likelihood(
     )  # fmt: skip
 
 
+def noise_cumulants(
+    scene: Scene, windows: Windows, likelihood: Likelihood
+) -> tuple[FloatArray, FloatArray] | None:
+    """Third and fourth cumulants of the counts against their background.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its background says which counts are compared.
+    windows : Windows
+        Sums before and after.
+    likelihood : Likelihood
+        From `search_likelihood`, whose noise it is.
+
+    Returns
+    -------
+    (ndarray, ndarray) or None
+        Of each pixel [e³, e⁴]; None in interferometric schemes, where the counts are many.
+
+    Notes
+    -----
+    Of a Poisson count μ every cumulant is μ; of a − ρ b the k-th is μ_a + (−ρ)ᵏ μ_b.  Read noise
+    has none, and a median of frames has hardly any.
+    """
+    if not scene.additive:
+        return None
+    _, level, _, extra = likelihood.data
+    factor = _VARIANCE_OF_BACKGROUND[scene.config.background.method or "fixed"]
+    ratio = windows.power_ratio
+    read = windows.read_variance_after_e2 + ratio**2 * windows.read_variance_before_e2
+    light = np.maximum(level + extra - read, 0.0) / (1 + ratio * factor)
+    counted = ratio if factor == MEAN else 0.0
+    return light * (1 - counted**2), light * (1 + counted**3)
+
+
 def photons_scale(scene: Scene, windows: Windows) -> float:
     """Scale of the signal in dark field.
 
@@ -217,6 +302,75 @@ def photons_scale(scene: Scene, windows: Windows) -> float:
         )
     per_frame = scene.model.photons_per_intensity(photons, scene.pixel_nm)
     return per_frame * windows.power_ratio * max(windows.n_before, 1)
+
+
+def is_saturated(scene: Scene, saturated: BoolArray, region: Region, fit: FitResult) -> bool:
+    """Whether pixels that were saturated spoil a fit.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its pixel size.
+    saturated : ndarray of bool, shape (rows, columns)
+        Those of the region.
+    region : Region
+        Where it lies in the full frame.
+    fit : FitResult
+        In the full frame.
+
+    Returns
+    -------
+    bool
+        Whether one lies within `SATURATION_NM` of the particle.
+    """
+    rows, columns = np.nonzero(saturated)
+    dx = (columns + region.columns[0]) * scene.pixel_nm - fit.x_nm
+    dy = (rows + region.rows[0]) * scene.pixel_nm - fit.y_nm
+    return bool(np.any(np.hypot(dx, dy) < SATURATION_NM))
+
+
+def judge(
+    scene: Scene,
+    fit: FitResult,
+    region: Region,
+    saturated: BoolArray,
+    *,
+    sidelobe: bool,
+    too_close: bool,
+    poor_fit: bool = False,
+) -> FitResult:
+    """Add what the surroundings of a particle say of its fit.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its pixel size.
+    fit : FitResult
+        With the flags that it raised itself, in the full frame.
+    region : Region
+        Of the fit, in the full frame.
+    saturated : ndarray of bool, shape (rows, columns)
+        Pixels of the region that were saturated.
+    sidelobe : bool
+        Whether the particle may be no more than what the model leaves over of a brighter one.
+    too_close : bool
+        Whether another one is too near to be kept out of the fit.
+    poor_fit : bool
+        Whether its light changes otherwise than by one step.
+
+    Returns
+    -------
+    FitResult
+        With the verdict on all of them.
+    """
+    status, flags = verdict([
+        *fit.flags,
+        *([Status.SIDELOBE] if sidelobe else []),
+        *([Status.SATURATED] if is_saturated(scene, saturated, region, fit) else []),
+        *([Status.TOO_CLOSE] if too_close else []),
+        *([Status.POOR_FIT] if poor_fit else []),
+    ])  # fmt: skip
+    return replace(fit, status=status, flags=flags)
 
 
 def search_both(detection: Detection, *, searches: int = 1) -> Detection:

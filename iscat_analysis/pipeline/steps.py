@@ -15,7 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.inference.fit import POOR_FIT_P, fit_particle, search_box, start_theta
+from iscat_analysis.inference.fit import (
+    POOR_FIT_P,
+    detection_snr,
+    fit_particle,
+    search_box,
+    start_theta,
+)
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pipeline.field import Event
 from iscat_analysis.pipeline.neighbours import (
@@ -25,16 +31,13 @@ from iscat_analysis.pipeline.neighbours import (
     spans,
 )
 from iscat_analysis.pipeline.pattern import MovingPattern
-from iscat_analysis.pipeline.scene import Region, Scene, reported_steps
+from iscat_analysis.pipeline.scene import Region, Scene, judge, reported_steps
 from iscat_analysis.pipeline.tasks import Task, TaskBuilder
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     Candidate,
-    FitResult,
     FloatArray,
-    Status,
     Windows,
-    verdict,
 )
 from iscat_analysis.search.residue import (
     EXCEEDS,
@@ -55,19 +58,16 @@ from iscat_analysis.search.sliding import (
     make_filter,
     sliding_maps,
 )
-from iscat_analysis.search.templates import LARGEST_IMAGE, refuse_flood
+from iscat_analysis.search.templates import FAR_LOBE, LARGEST_IMAGE, SIDELOBE, refuse_flood
 
 ROUNDS = 6
 """Searches at most; each takes what was found so far off the contrast."""
 
 _SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
-_SIDELOBE = 0.5  # of a stronger peak, below which a peak in its region waits for the next round
-_FAR_LOBE = 0.05  # the same where only its outer rings reach
 _RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
 _RINGS = 0.04  # the same for the rest of its region
 _EXPLAINED = 0.7  # of the threshold; a fit that reaches less is what other steps explain
 _SAME_PX = 1.5
-_SATURATION_NM = 500.0
 
 
 @dataclass(frozen=True)
@@ -206,10 +206,9 @@ class ChunkFitter:
             for i, s in enumerate(everything)
             if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
         ]
-        found = self._pool.map(
-            lambda i: self._finish(i, everything, seen, lobe=i >= len(steps)), own
-        )
-        fitted = self._without_dwarfs([f for f in found if f is not None])
+        found = self._pool.map(lambda i: self._finish(i, everything, seen), own)
+        finished = [(i >= len(steps), *f) for i, f in zip(own, found, strict=True) if f is not None]
+        fitted = self._judged(finished)
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
 
     # ---- search ----------------------------------------------------------------------------
@@ -304,7 +303,7 @@ class ChunkFitter:
         far = max(dx, dy) >= self._roi_px
         if far and max(dx, dy) >= LARGEST_IMAGE * self._roi_px:
             return False
-        return abs(peak.snr) < (_FAR_LOBE if far else _SIDELOBE) * abs(one.snr)
+        return abs(peak.snr) < (FAR_LOBE if far else SIDELOBE) * abs(one.snr)
 
     def _is_residue(self, step: Step, peak: Peak) -> bool:
         """Whether a peak may be what a fitted step left over: the model is never quite right."""
@@ -362,14 +361,13 @@ class ChunkFitter:
                 y_px=float(best.theta[1]) / pixel - y_px,
                 mass_kda=mass,
             )
-            snr = math.sqrt(2 * max(best.log_likelihood, 0.0))
             return self._neighbours.drawn(
                 replace(
                     step,
                     at=task.at,
                     start=moved,
                     theta=best.theta,
-                    snr=snr,
+                    snr=detection_snr(likelihood, best, box),
                     excess=chi2_excess(likelihood.residuals(best.theta)),
                 )
             )
@@ -385,9 +383,9 @@ class ChunkFitter:
         return "mass" if "mass_kda" in FREE_PARAMETERS[self._scene.mode] else "localize"
 
     def _finish(
-        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]], *, lobe: bool
-    ) -> FittedStep | None:
-        """Fit a step for good and judge it."""
+        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]]
+    ) -> tuple[FittedStep, Task] | None:
+        """Fit a step for good."""
         scene, step = self._scene, steps[index]
         task = self._tasks.build(index, steps, near)
         if task is None:
@@ -400,7 +398,6 @@ class ChunkFitter:
         fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=True)
         if fit.mass_kda <= 0 and "mass_kda" in fit.free:
             return None
-        fit = _judged(scene, fit, task, lobe=lobe)
         pixel = scene.pixel_nm
         fit = replace(fit, x_nm=fit.x_nm - x_px * pixel, y_nm=fit.y_nm - y_px * pixel)
         local = Region(
@@ -411,29 +408,33 @@ class ChunkFitter:
         if event.snr < _EXPLAINED * scene.templates.threshold:
             return None
         step = replace(step, at=task.at)
-        return FittedStep(step, event, task.region, task.windows, task.n_before, task.n_after)
+        fitted = FittedStep(step, event, task.region, task.windows, task.n_before, task.n_after)
+        return fitted, task
 
-    def _without_dwarfs(self, fitted: Sequence[FittedStep]) -> list[FittedStep]:
-        """Flag what explains less than it leaves over, beside a step that is far brighter."""
-        flagged = []
-        for one in fitted:
-            fit = one.event.fit
+    def _judged(self, finished: Sequence[tuple[bool, FittedStep, Task]]) -> list[FittedStep]:
+        """Judge all steps, those that may be side lobes, or explain less than they leave, too."""
+        judged = []
+        for lobe, one, task in finished:
+            event = one.event
             brightest = max(
                 (
                     other.event.snr
-                    for other in fitted
+                    for _, other, _ in finished
                     if _apart(other.step, one.step) < self._window
                     and distance_px(other.step, one.step) < LARGEST_IMAGE * self._roi_px
                 ),
                 default=0.0,
             )
-            if Status.SIDELOBE not in fit.flags and is_dwarfed(
-                one.event.snr, fit.chi2_reduced, one.event.likelihood.n_pixels, brightest
-            ):
-                status, flags = verdict([Status.SIDELOBE, *fit.flags])
-                fit = replace(fit, status=status, flags=flags)
-            flagged.append(replace(one, event=replace(one.event, fit=fit)))
-        return flagged
+            fit = judge(
+                self._scene, event.fit, task.region, task.windows.saturated,
+                sidelobe=lobe or is_dwarfed(
+                    event.snr, event.fit.chi2_reduced, event.likelihood.n_pixels, brightest
+                ),
+                too_close=task.crowded,
+                poor_fit=task.at.p_constant < POOR_FIT_P,
+            )  # fmt: skip
+            judged.append(replace(one, event=replace(event, fit=fit)))
+        return judged
 
     def _credible(self, steps: Sequence[Step]) -> list[Step]:
         """Leave out what the others explain, and the weaker of two steps that describe one."""
@@ -447,21 +448,6 @@ class ChunkFitter:
             ):
                 kept.append(step)
         return kept
-
-
-def _judged(scene: Scene, fit: FitResult, task: Task, *, lobe: bool) -> FitResult:
-    """Add the verdicts that need the neighbourhood."""
-    rows, columns = np.nonzero(task.windows.saturated)
-    dx = (columns + task.region.columns[0]) * scene.pixel_nm - fit.x_nm
-    dy = (rows + task.region.rows[0]) * scene.pixel_nm - fit.y_nm
-    status, flags = verdict([
-        *fit.flags,
-        *([Status.SIDELOBE] if lobe else []),
-        *([Status.SATURATED] if np.any(np.hypot(dx, dy) < _SATURATION_NM) else []),
-        *([Status.TOO_CLOSE] if task.crowded else []),
-        *([Status.POOR_FIT] if task.at.p_constant < POOR_FIT_P else []),
-    ])  # fmt: skip
-    return replace(fit, status=status, flags=flags)
 
 
 def _ids(steps: Sequence[Step]) -> set[int]:

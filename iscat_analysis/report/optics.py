@@ -22,6 +22,8 @@ _LABELS = {
     "reference_phase_deg": ("reference phase", "deg"),
     "mask_na": ("edge of the mask", "NA"),
     "attenuation": ("amplitude that the mask passes", ""),
+    "polarization_deg": ("direction of polarisation", "deg"),
+    "focus_step_nm": ("rise of the focus per picture", "nm"),
     "z5": ("Z5 astigmatism, 45°", "nm"),
     "z6": ("Z6 astigmatism, 0°", "nm"),
     "z7": ("Z7 coma, y", "nm"),

@@ -23,6 +23,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
+from iscat_analysis.search.peaks import SAMPLED, vertex
 from iscat_analysis.search.residue import size_on_ring
 
 HEIGHTS_PER_FRINGE = 8
@@ -180,6 +181,7 @@ def find_particles(
     explained: FloatArray | None = None,
     known: Sequence[tuple[float, float]] = (),
     excess_noise: str = "",
+    cumulants: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[Candidate, ...]:
     """Peaks of the matched filter above the threshold, strongest first.
 
@@ -202,6 +204,9 @@ def find_particles(
         Where those are, (x, y) [pixels].
     excess_noise : str
         What is known of noise beyond the expected.
+    cumulants : (ndarray, ndarray), optional
+        Third and fourth cumulants of each pixel's counts [e³, e⁴]; without them the noise is
+        normal.
 
     Returns
     -------
@@ -221,39 +226,65 @@ def find_particles(
         ranked = np.where(signs == wanted, np.abs(snr) if not templates.quadratic else snr, 0.0)
         if not templates.two_sided and templates.z_nm.size > 1:
             ranked = np.where(snr > 0, ranked, 0.0)
+    if cumulants is not None:
+        ranked = ranked / _lift(likelihood, templates, explained, cumulants)
     best = ranked.max(axis=0)
-    peaks = (best == maximum_filter(best, size=3)) & (best > templates.threshold)
-    rows, columns = np.nonzero(peaks)
-    refuse_flood(rows.size, excess_noise)
+    peaks = sorted(_peaks(ranked, best, templates.threshold), key=lambda p: -p.height)
+    refuse_flood(len(peaks), excess_noise)
     found: list[Candidate] = []
-    strongest_first = np.argsort(-best[rows, columns])
-    for row, column in zip(rows[strongest_first], columns[strongest_first], strict=True):
-        height = best[row, column]
-        shadowed = any(
-            height
-            < abs(other.snr)
-            * (
-                SIDELOBE
-                if max(abs(column - other.x_px), abs(row - other.y_px)) < roi_px
-                else FAR_LOBE
-            )
+    for peak in peaks:
+        near = (
+            (peak.height, other, max(abs(peak.column - other.x_px), abs(peak.row - other.y_px)))
             for other in found
-        ) or any(math.hypot(column - other.x_px, row - other.y_px) < roi_px / 6 for other in found)
+        )
+        shadowed = any(
+            height < abs(other.snr) * (SIDELOBE if away < roi_px else FAR_LOBE)
+            for height, other, away in near
+        ) or any(
+            math.hypot(peak.column - other.x_px, peak.row - other.y_px) < roi_px / 6
+            for other in found
+        )
         if shadowed:
             continue
-        k = int(ranked[:, row, column].argmax())
-        dy, dx = _subpixel(best, row, column)
+        at = peak.layer, peak.row, peak.column
+        higher = peak.height / float(ranked[at])
         found.append(
             Candidate(
-                x_px=float(column + dx),
-                y_px=float(row + dy),
-                z_nm=float(templates.z_nm[k]),
-                mass_kda=_mass(likelihood.model, templates, float(strength[k, row, column])),
-                snr=float(snr[k, row, column]),
-                beside=_beside(best, (float(column + dx), float(row + dy)), known, roi_px),
+                x_px=peak.x_px,
+                y_px=peak.y_px,
+                z_nm=float(templates.z_nm[peak.layer]),
+                mass_kda=_mass(likelihood.model, templates, float(strength[at]) * higher),
+                snr=float(snr[at]) * higher,
+                beside=_beside(best, (peak.x_px, peak.y_px), known, roi_px),
             )
         )
     return tuple(found)
+
+
+@dataclass(frozen=True)
+class _Peak:
+    """A maximum of the ranked maps: its layer and pixel, and where and how high it is between."""
+
+    layer: int
+    row: int
+    column: int
+    y_px: float
+    x_px: float
+    height: float
+
+
+def _peaks(ranked: FloatArray, best: FloatArray, threshold: float) -> list[_Peak]:
+    """Maxima above the threshold; the field between pixels and heights is what exceeds it."""
+    sampled = (best == maximum_filter(best, size=3)) & (best > SAMPLED * threshold)
+    found = []
+    for row, column in np.argwhere(sampled).tolist():
+        layer = int(ranked[:, row, column].argmax())
+        (dy, above), (dx, beside) = vertex(best[:, column], row), vertex(best[row], column)
+        height = float(best[row, column]) + above + beside
+        height += vertex(ranked[:, row, column], layer)[1]
+        if height > threshold:
+            found.append(_Peak(layer, row, column, row + dy, column + dx, height))
+    return found
 
 
 def _beside(
@@ -289,6 +320,33 @@ def refuse_flood(candidates: int, excess_noise: str, frames: str = "") -> None:
     """
     if excess_noise and candidates > FLOOD:
         raise DataError(f"{candidates} places{frames} pass the detection threshold: {excess_noise}")
+
+
+def _lift(
+    likelihood: Likelihood,
+    templates: Templates,
+    explained: FloatArray | None,
+    cumulants: tuple[FloatArray, FloatArray],
+) -> FloatArray:
+    """How much higher than normal noise the noise of few counts reaches equally often.
+
+    Notes
+    -----
+    The quantile of E. A. Cornish and R. A. Fisher, Rev. Inst. Int. Stat. 5, 307 (1938), to the
+    fourth cumulant.
+    """
+    weight = likelihood.signal_information(explained)
+    scale = likelihood.data[2]
+    per_count = np.where(weight > 0, weight / np.where(weight > 0, scale, 1.0), 0.0)
+    variance = _correlate(weight, templates.images**2)
+    variance = np.maximum(variance, 1e-9 * variance.max() if variance.max() > 0 else 1.0)
+    skew = _correlate(per_count**3 * cumulants[0], templates.images**3) / variance**1.5
+    tails = _correlate(per_count**4 * cumulants[1], templates.images**4) / variance**2
+    u = templates.threshold
+    quantile = (
+        u + skew * (u**2 - 1) / 6 + tails * (u**3 - 3 * u) / 24 - skew**2 * (2 * u**3 - 5 * u) / 36
+    )
+    return np.maximum(quantile / u, 1.0)
 
 
 def _correlate(image: FloatArray, kernels: FloatArray) -> FloatArray:
@@ -341,17 +399,3 @@ def _threshold(
     polynomial = sides * (plane * heights + volume * (heights**2 - 1))
     expected = np.log(polynomial) - heights**2 / 2
     return float(np.interp(-math.log(alarms), -expected, heights))
-
-
-def _subpixel(image: FloatArray, row: int, column: int) -> tuple[float, float]:
-    """Vertex of the parabola through a maximum and its neighbours, along each axis."""
-    shifts = []
-    for axis, index in ((0, row), (1, column)):
-        line = image[:, column] if axis == 0 else image[row]
-        if not 0 < index < line.size - 1:
-            shifts.append(0.0)
-            continue
-        low, mid, high = line[index - 1 : index + 2]
-        bend = low - 2 * mid + high
-        shifts.append(float(np.clip(0.5 * (low - high) / bend, -0.5, 0.5)) if bend < 0 else 0.0)
-    return shifts[0], shifts[1]

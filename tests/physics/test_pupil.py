@@ -288,10 +288,12 @@ def test_optics_gradient_agrees_with_a_sum_over_rays(optics: dict[str, Any]) -> 
         return (np.abs(field) ** 2).sum(0) + 2 * field[0].real
 
     model = build(optics)
+    linear = model.optics.polarization == "linear"
+    names = [*NAMES, "polarization_deg"] if linear else [*NAMES]
     found = [
         model.optics_gradient(
             PixelGrid(np.array([x]), np.array([y]), 1.0), 0.0, 0.0, AT[2],
-            model.material.mass_kda, NAMES,
+            model.material.mass_kda, names,
         )
         for x, y in zip(dx, dy, strict=True)
     ]  # fmt: skip
@@ -299,7 +301,7 @@ def test_optics_gradient_agrees_with_a_sum_over_rays(optics: dict[str, Any]) -> 
     assert np.abs(signal - rays(optics)).max() < 4 * TABLE * np.abs(signal).max()
     steps = {"focus_nm": 1.0, "na": 1e-4, "mask_na": 1e-4, "attenuation": 1e-4}
     base = microscope(optics).optics
-    for k, name in enumerate(NAMES):
+    for k, name in enumerate(names):
         if name == "mask_na" and not base.mask_na:
             continue
         step = steps.get(name, 0.5)
@@ -336,6 +338,8 @@ def test_optics_gradient_over_pixels_is_the_slope_of_the_image() -> None:
     )
     numeric = (above - below) / (2 * step)
     assert np.abs(slopes[0] - numeric).max() < 1e-5 * np.abs(numeric).max()
+    with pytest.raises(ConfigError, match='"circular" has no direction'):
+        build({"polarization": "circular"}).optics_gradient(GRID, *AT, mass, ["polarization_deg"])
     with pytest.raises(ConfigError, match="z4"):
         model.optics_gradient(GRID, *AT, mass, ["z4"])
 

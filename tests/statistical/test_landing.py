@@ -148,7 +148,9 @@ def events(request: pytest.FixtureRequest) -> pd.DataFrame:
                         "mass_kda": MASSES[len(placed) % 3],
                     }
                 )
-        config = _config(115, 260, *_moving(request.param))
+        # those of noise are counted above
+        alarms = "detection.false_alarms_per_movie=1e-3"
+        config = _config(115, 260, *_moving(request.param), alarms)
         simulation = type(config.simulation).model_validate(
             {**config.simulation.model_dump(), "events": placed}
         )

@@ -119,6 +119,10 @@ def test_a_level_is_fitted_where_asked() -> None:
     told = fit_particle(brighter, _start(), "mass", (0, 1000), level=True)
     assert told.mass_kda == pytest.approx(1000.0, abs=0.05 * told.sigma[3])
     assert math.exp(told.theta[4]) == pytest.approx(1.01, rel=1e-5)
+    still = models.conditional(exact.model, GRID, before, exact.data[0], 1.0)
+    usual = fit_particle(still, _start(), "mass", (0, 1000), level=True)
+    assert told.snr == pytest.approx(usual.snr, rel=0.01)  # more light is no more of a particle
+    assert told.snr < 0.5 * math.sqrt(2 * told.log_likelihood)
     untold = fit_particle(brighter, _start(), "mass", (0, 1000), level=False)
     assert abs(untold.mass_kda - 1000.0) > 5 * untold.sigma[3]
 

@@ -174,6 +174,22 @@ def test_peaks_of_equal_size_far_apart_are_all_found(known_errors: bool) -> None
     assert abs(found.gradient_per_kda + 3.1e-5) < 4 * math.sqrt(found.covariance[0, 0])
 
 
+def test_a_dozen_events_of_each_standard_are_enough() -> None:
+    sigma, passed = 2.8e-4, 0
+    for seed in range(20):
+        rng = np.random.default_rng(80 + seed)
+        contrast = np.concatenate(
+            [-3.1e-5 * m + sigma * rng.standard_normal(12) for m in STANDARDS]
+        )
+        try:
+            found = calibrate_mass(contrast, STANDARDS, sigmas=np.full(contrast.size, sigma))
+        except DataError:
+            continue
+        passed += 1
+        assert found.gradient_per_kda == pytest.approx(-3.1e-5, rel=0.05)
+    assert passed >= 17  # 97 % are expected, 19.4 ± 0.8 of 20; with the finer kernels alone 5
+
+
 def test_landing_and_leaving_weigh_the_same() -> None:
     for gradient in (GRADIENT, -GRADIENT):
         offset = math.copysign(OFFSET, -gradient)

@@ -9,6 +9,7 @@ before a movie is recorded what it would tell.
 from __future__ import annotations
 
 from iscat_analysis.calibration.optics.estimate import (
+    FOCUS_STEP,
     Estimate,
     Settings,
     Sight,
@@ -40,6 +41,7 @@ from iscat_analysis.calibration.optics.settings import (
 
 __all__ = [
     "FAINTEST",
+    "FOCUS_STEP",
     "FREE",
     "HELD_OUT_P",
     "LEAST_SIGHTS",

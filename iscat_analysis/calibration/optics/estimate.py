@@ -26,12 +26,18 @@ PRIOR_RANGE = {
     "reference_phase_deg": 180.0,
     "mask_na": 0.3,
     "attenuation": 0.5,
+    "polarization_deg": 90.0,
+    "focus_step_nm": 50.0,
 }
 """How far a parameter may plausibly lie from the configured one; what the data leave wider than
 this, they do not tell."""
 
 TERM_RANGE_NM = 100.0
 """The same for every aberration [nm]."""
+
+FOCUS_STEP = "focus_step_nm"
+"""Rise of the focus from picture to picture of a scan [nm]; the one parameter that is not a key of
+``[optics]``."""
 
 PRIVATE = 4
 """Unknowns of one sight: x, y [nm], mass [kDa] and the logarithm of the background level."""
@@ -42,6 +48,8 @@ _LARGEST_STEP = {
     "reference_phase_deg": 40.0,
     "mask_na": 0.1,
     "attenuation": 0.1,
+    "polarization_deg": 30.0,
+    "focus_step_nm": 2.0,
 }
 _TERM_STEP_NM = 25.0
 _PLACE_STEP_NM = 60.0
@@ -104,8 +112,9 @@ class Sight:
         Signed mass from which the search starts, 0 where unknown [kDa].
     level : float
         Logarithm of the background level from which the search starts.
-    focus_offset_nm : float
-        Known focus of this picture relative to the first of a scan [nm].
+    focus_steps : float
+        Steps of the focus since the first picture of a scan; ``focus_step_nm`` of the settings is
+        their size.
     frame : int
         First frame of the new state.
     snr : float
@@ -127,7 +136,7 @@ class Sight:
     z_nm: float
     mass_kda: float = 0.0
     level: float = 0.0
-    focus_offset_nm: float = 0.0
+    focus_steps: float = 0.0
     frame: int = 0
     snr: float = 0.0
     neighbours: tuple[tuple[int, float], ...] = ()
@@ -157,6 +166,12 @@ class Sight:
             ratio = np.where(used, now / np.where(used, then, 1.0), 1.0)
             baseline = float(np.sum(np.where(used, data[0] * np.log(ratio) - now + then, 0.0)))
         return replace(self, data=data, rings=rings, baseline=baseline)
+
+    def seen_with(self, settings: Settings) -> dict[str, Any]:
+        """Return the settings with the focus of this picture, as keys of ``[optics]``."""
+        own = {key: value for key, value in settings.items() if key != FOCUS_STEP}
+        own["focus_nm"] += self.focus_steps * settings.get(FOCUS_STEP, 0.0)
+        return own
 
     def moved(self, private: FloatArray) -> Sight:
         """Return the same pictures with another start."""
@@ -367,15 +382,13 @@ class _Point:
         mapper: Mapper,
     ) -> _Point:
         models: dict[float, Microscope] = {}
-        for offset in {sight.focus_offset_nm for sight in sights}:
-            shifted = dict(values)
-            if offset:
-                shifted["focus_nm"] = shifted["focus_nm"] + offset
-            models[offset] = build(shifted)
+        for sight in sights:
+            if sight.focus_steps not in models:
+                models[sight.focus_steps] = build(sight.seen_with(values))
 
         def one(index: int) -> tuple[float, FloatArray, FloatArray, FloatArray]:
             sight = sights[index]
-            return _scores(sight, models[sight.focus_offset_nm], names, private[index])
+            return _scores(sight, models[sight.focus_steps], names, private[index])
 
         found = list(mapper(one, range(len(sights))))
         value = math.fsum(each[0] for each in found)
@@ -449,7 +462,16 @@ def _scores(
     place = (sight.grid, x, y, sight.z_nm, mass)
     k = len(names)
     if names:
-        signal, shared = model.optics_gradient(*place, names)
+        wanted = tuple(dict.fromkeys("focus_nm" if n == FOCUS_STEP else n for n in names))
+        signal, slopes = model.optics_gradient(*place, wanted)
+        shared = np.stack(
+            [
+                sight.focus_steps * slopes[wanted.index("focus_nm")]
+                if name == FOCUS_STEP
+                else slopes[wanted.index(name)]
+                for name in names
+            ]
+        )
     signal, own = model.gradient(*place)
     rows = np.empty((k + PRIVATE, signal.size))
     if names:

@@ -23,7 +23,7 @@ from iscat_analysis.bounds.shared import displacement, eliminated, joint_informa
 from iscat_analysis.calibration.optics.estimate import prior_range
 from iscat_analysis.calibration.optics.hidden import Hidden, find_hidden
 from iscat_analysis.calibration.optics.measure import FAINTEST, LEAST_SIGHTS, MOST_SIGHTS
-from iscat_analysis.calibration.optics.settings import FREE, free_groups, settings_of
+from iscat_analysis.calibration.optics.settings import FREE, exists, free_groups, settings_of
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
@@ -242,9 +242,9 @@ def _names(config: Config, free: str | Sequence[str] | None) -> tuple[str, ...]:
             f'optics.scheme = "{optics.scheme}", optics.convention = "{optics.convention}": optics '
             'are learned from interference with a reference, in the convention "exact"'
         )
-    missing = {"mask": not optics.mask_na, "polarization": optics.polarization != "linear"}
+    settings = settings_of(config)
     names = tuple(
-        name for group in free_groups(free) if not missing.get(group) for name in FREE[group]
+        name for group in free_groups(free) for name in FREE[group] if exists(name, settings)
     )
     if not names:
         raise ConfigError(f"free = {free!r}: this microscope has no such continuous parameter")

@@ -76,9 +76,8 @@ def make_pictures(sights: Sequence[Sight], build: Build, settings: Settings) -> 
     sums, weight, noise = np.zeros((2, *shape)), 0.0, np.zeros(shape)
     typical = float(np.median([abs(sight.mass_kda) for sight in sights]))
     for sight in sights:
-        shifted = {**settings, "focus_nm": settings["focus_nm"] + sight.focus_offset_nm}
         place = (sight.grid, sight.x_nm, sight.y_nm, sight.z_nm, sight.mass_kda)
-        model, _ = build(shifted).gradient(*place)
+        model, _ = build(sight.seen_with(settings)).gradient(*place)
         contrast, variance = contrast_of(sight)
         used = variance < 1e5
         contrast = np.where(used, contrast, model)

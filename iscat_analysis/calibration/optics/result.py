@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from iscat_analysis.calibration.optics.estimate import FOCUS_STEP
 from iscat_analysis.calibration.optics.measure import Judgement, Measured
 from iscat_analysis.calibration.optics.pictures import Pictures
-from iscat_analysis.calibration.optics.settings import is_term, with_settings
+from iscat_analysis.calibration.optics.settings import exists, is_term, with_settings
 from iscat_analysis.config import Config, OpticsCovariance
 from iscat_analysis.records import FloatArray
 
@@ -79,6 +80,10 @@ class OpticsCalibration:
             if name in self.names:
                 label = {"focus_nm": "focus", "na": "NA", "reference_phase_deg": "phase"}[name]
                 parts.append(with_error(label, self.value(name), self.sigma(name), unit))
+        if FOCUS_STEP in self.names:
+            parts.append(
+                with_error("steps of", self.value(FOCUS_STEP), self.sigma(FOCUS_STEP), "nm")
+            )
         terms = [n for n in self.names if is_term(n)]
         if terms:
             rms = float(np.sqrt(sum(self.value(n) ** 2 for n in terms)))
@@ -112,12 +117,15 @@ class OpticsCalibration:
             lines.append(f"{key} = {text}")
         terms = ", ".join(f"{n} = {v:.9g}" for n, v in optics.aberrations_nm.items())
         lines += [f"aberrations_nm = {{ {terms} }}", "", "[uncertainty]"]
-        lines += [f"{name} = {self.sigma(name):.6g}" for name in self.names]
-        quoted = ", ".join(f'"{name}"' for name in self.names)
+        names, covariance = _of_optics(self.names, self.covariance)
+        lines += [f"{name} = {self.sigma(name):.6g}" for name in names]
+        quoted = ", ".join(f'"{name}"' for name in names)
         lines += ["", "[covariance]", f"names = [{quoted}]", "matrix = ["]
-        lines += [f"  [{', '.join(f'{v:.9g}' for v in row)}]," for row in self.covariance]
+        lines += [f"  [{', '.join(f'{v:.9g}' for v in row)}]," for row in covariance]
         lines += ["]", "", "[provenance]"]
         lines += [f"{key} = {_quoted(text)}" for key, text in self.source.items()]
+        if FOCUS_STEP in self.names:
+            lines += [f"{FOCUS_STEP} = {self.value(FOCUS_STEP):.9g}"]
         return "\n".join([*lines, f"particles = {self.sights}", ""])
 
     def to_dict(self) -> dict[str, Any]:
@@ -183,7 +191,8 @@ def make_result(
     covariance, bound = estimate.covariance, estimate.bound
     rows = []
     for name, value in measured.settings.items():
-        if isinstance(value, str | bool) or name == "polarization_deg":
+        turns = name == "polarization_deg"
+        if isinstance(value, str | bool) or (turns and not exists(name, measured.settings)):
             continue
         state = "given"
         sigma = crb = float("nan")
@@ -198,7 +207,7 @@ def make_result(
         rows.append((name, float(value), sigma, crb, float(configured[name]), state))
     if not measured.refusals:
         config = _with_covariance(
-            with_settings(config, measured.settings), estimate.names, covariance
+            with_settings(config, measured.settings), *_of_optics(estimate.names, covariance)
         )
     return OpticsCalibration(
         config=config,
@@ -211,6 +220,14 @@ def make_result(
         source=source,
         notes=_notes(measured),
     )
+
+
+def _of_optics(
+    names: tuple[str, ...], covariance: FloatArray
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Leave out what is no key of ``[optics]``."""
+    kept = [k for k, name in enumerate(names) if name != FOCUS_STEP]
+    return tuple(names[k] for k in kept), covariance[np.ix_(kept, kept)]
 
 
 def _with_covariance(config: Config, names: tuple[str, ...], covariance: FloatArray) -> Config:

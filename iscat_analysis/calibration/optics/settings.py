@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from iscat_analysis.calibration.optics.estimate import Settings
+from iscat_analysis.calibration.optics.estimate import FOCUS_STEP, Settings
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import ForwardModel, forward_model
@@ -20,15 +20,15 @@ HIGHER = ("z22",)
 """Secondary spherical aberration."""
 
 FREE = {
-    "focus": ("focus_nm",),
+    "focus": ("focus_nm", FOCUS_STEP),
     "na": ("na",),
     "phase": ("reference_phase_deg",),
     "mask": ("mask_na", "attenuation"),
     "zernike": (*PRIMARY, *SECONDARY, *HIGHER),
-    "polarization": (),
+    "polarization": ("polarization_deg",),
 }
-"""What ``--free`` may name, and the continuous parameters that each stands for; the state of
-polarisation is chosen among a few."""
+"""What ``--free`` may name, and the continuous parameters that each stands for; whether light is
+linear or circular is a choice beside them."""
 
 
 def free_groups(text: str | Sequence[str] | None) -> tuple[str, ...]:
@@ -62,6 +62,29 @@ def free_groups(text: str | Sequence[str] | None) -> tuple[str, ...]:
     return tuple(name for name in FREE if name in names)
 
 
+def exists(name: str, settings: Settings) -> bool:
+    """Tell whether a microscope has a parameter.
+
+    Parameters
+    ----------
+    name : str
+        One of `FREE`.
+    settings : mapping
+        The microscope: without a mask it has no edge and no transmission, circular light has no
+        direction, and only a scan has steps.
+
+    Returns
+    -------
+    bool
+        Whether it can be fitted.
+    """
+    if name in ("mask_na", "attenuation"):
+        return bool(settings["mask_na"] > 0)
+    if name == "polarization_deg":
+        return bool(settings["polarization"] == "linear")
+    return name in settings
+
+
 def free_names(groups: Sequence[str], settings: Settings, terms: Sequence[str]) -> tuple[str, ...]:
     """Name the continuous parameters that are free in a microscope.
 
@@ -70,7 +93,7 @@ def free_names(groups: Sequence[str], settings: Settings, terms: Sequence[str]) 
     groups : sequence of str
         From `free_groups`.
     settings : mapping
-        The microscope: without a mask, its edge and transmission are not free.
+        The microscope; only what `exists` in it is free.
     terms : sequence of str
         Aberrations that may be.
 
@@ -83,7 +106,7 @@ def free_names(groups: Sequence[str], settings: Settings, terms: Sequence[str]) 
         name
         for group in groups
         for name in FREE[group]
-        if (not is_term(name) or name in terms) and (group != "mask" or settings["mask_na"] > 0)
+        if (not is_term(name) or name in terms) and exists(name, settings)
     )
 
 
@@ -122,7 +145,7 @@ def with_settings(config: Config, settings: Settings) -> Config:
     Config
         With these optics; aberrations of exactly 0 are left out.
     """
-    plain = {key: value for key, value in settings.items() if not is_term(key)}
+    plain = {k: v for k, v in settings.items() if not is_term(k) and k != FOCUS_STEP}
     terms = {key: value for key, value in settings.items() if is_term(key) and value}
     optics = config.optics.model_copy(update={**plain, "aberrations_nm": terms})
     return config.model_copy(update={"optics": optics})

@@ -3,7 +3,9 @@
 The pictures are registered on each other, with the sign of each, and averaged; no model takes part
 in that.  For one focus the contrast of a weak particle is linear in the cosine and the sine of the
 reference phase, so that the phase and the amplitude that fit the average best follow from a 2 × 2
-system at every shift of the picture.
+system at every shift of the picture.  Of a strong particle one sees the scattered light itself as
+well, with the square of the amplitude: the best amplitude is then the root of a cubic equation for
+every phase.
 """
 
 from __future__ import annotations
@@ -30,6 +32,11 @@ FOCUS_STEP_NM = 80.0
 
 _FOCI = 7  # of a scan, whose averages are searched
 _ROUNDS = 3  # of registration
+_CENTRE = (0.0, 0.0)
+_UNIT_KDA = 1e3  # at which interference and scattered light are told apart, by their powers
+_TURNS = 24  # of half a circle of phases, for strong particles
+_FAINT = 1e-3  # share of what is explained below which the scattered light alone is left out
+_DIRECTIONS_DEG = (45.0, 90.0, 135.0)
 _SHIFT_PX = 4.0  # a picture's first centre is off by no more
 
 
@@ -72,8 +79,8 @@ def average_sights(sights: Sequence[Sight]) -> tuple[tuple[Sight, ...], tuple[Si
     """
     placed = list(sights)
     averages = {}
-    for offset in sorted({sight.focus_offset_nm for sight in sights}):
-        members = [i for i, sight in enumerate(sights) if sight.focus_offset_nm == offset]
+    for offset in sorted({sight.focus_steps for sight in sights}):
+        members = [i for i, sight in enumerate(sights) if sight.focus_steps == offset]
         averages[offset], group = _average([sights[i] for i in members])
         for i, sight in zip(members, group, strict=True):
             placed[i] = sight
@@ -112,7 +119,7 @@ def _average(sights: Sequence[Sight]) -> tuple[Sight, list[Sight]]:
     grid = PixelGrid.centred(template.shape[0], pixel)
     average = Sight(
         grid, CONDITIONAL, data, 0.0, 0.0, sights[0].z_nm,
-        focus_offset_nm=sights[0].focus_offset_nm,
+        focus_steps=sights[0].focus_steps,
     )  # fmt: skip
     placed = [
         replace(
@@ -172,7 +179,7 @@ def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> 
 def with_masses(
     sights: Sequence[Sight], build: Build, settings: Mapping[str, Any]
 ) -> tuple[Sight, ...]:
-    """Give every sight the mass that fits it best where it stands, weak particles assumed.
+    """Give every sight the mass that fits it best where it stands.
 
     Parameters
     ----------
@@ -191,17 +198,53 @@ def with_masses(
     models: dict[float, Any] = {}
     out = []
     for sight in sights:
-        offset = sight.focus_offset_nm
-        if offset not in models:
-            models[offset] = build({**settings, "focus_nm": settings["focus_nm"] + offset})
-        place = (sight.grid, sight.x_nm, sight.y_nm, sight.z_nm, 0.0)
-        picture = models[offset].gradient(*place)[1][3]
+        if sight.focus_steps not in models:
+            models[sight.focus_steps] = build(sight.seen_with(settings))
+        parts = _parts(models[sight.focus_steps], sight, (sight.x_nm, sight.y_nm))
         contrast, variance = contrast_of(sight)
         weight = 1 / variance
-        picture = picture - np.average(picture, weights=weight)
-        mass = float(np.sum(weight * picture * contrast) / np.sum(weight * picture**2))
-        out.append(replace(sight, mass_kda=mass))
+        pictures = np.array([part - np.average(part, weights=weight) for part in parts])
+        gram = np.einsum("yx,iyx,jyx->ij", weight, pictures, pictures)
+        overlaps = np.einsum("yx,iyx,yx->i", weight, pictures, contrast)
+        mass, _ = _strengths(overlaps[0], overlaps[1], gram[0, 0], gram[0, 1], gram[1, 1])
+        out.append(replace(sight, mass_kda=float(mass)))
     return tuple(out)
+
+
+def _parts(model: Any, sight: Sight, place: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
+    """Contrast per mass, and per square of the mass: interference, and the scattered light."""
+    signal, slopes = model.gradient(sight.grid, *place, sight.z_nm, _UNIT_KDA)
+    slope = slopes[3]
+    return (2 * signal - _UNIT_KDA * slope) / _UNIT_KDA, (_UNIT_KDA * slope - signal) / _UNIT_KDA**2
+
+
+def _strengths(
+    linear: FloatArray, square: FloatArray, ll: FloatArray, ls: FloatArray, ss: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Best amplitude a of a picture a·L + a²·Q, of either sign, and the χ² that it explains.
+
+    `linear` and `square` are the overlaps of L and Q with the data, `ll`, `ls`, `ss` their own; all
+    broadcast.
+    """
+    linear, square, ll, ls, ss = np.broadcast_arrays(linear, square, ll, ls, ss)
+    weak = linear / ll
+    unit = np.where(weak == 0, 1.0, np.abs(weak))
+    # b + (2 q − ll) a − 3 ls a² − 2 ss a³ = 0, in units in which the weak solution is ±1
+    terms = np.stack([linear, (2 * square - ll) * unit, -3 * ls * unit**2, -2 * ss * unit**3])
+    lead = np.where(np.abs(terms[3]) > 1e-12 * np.abs(terms).max(axis=0), terms[3], np.inf)
+    companion = np.zeros((*weak.shape, 3, 3))
+    companion[..., 1, 0] = companion[..., 2, 1] = 1.0
+    companion[..., :, 2] = -np.moveaxis(terms[:3] / lead, 0, -1)
+    roots = np.linalg.eigvals(companion)
+    real = np.where(np.abs(roots.imag) < 1e-6 * (1 + np.abs(roots.real)), roots.real, 0.0)
+    tried = np.concatenate([real * unit[..., None], weak[..., None]], axis=-1)
+    b, q, g, h, k = (v[..., None] for v in (linear, square, ll, ls, ss))
+    explained = 2 * (b * tried + q * tried**2) - (g * tried**2 + 2 * h * tried**3 + k * tried**4)
+    best = np.argmax(explained, axis=-1)[..., None]
+    return (
+        np.take_along_axis(tried, best, -1)[..., 0],
+        np.take_along_axis(explained, best, -1)[..., 0],
+    )
 
 
 def search_starts(
@@ -238,28 +281,24 @@ def search_starts(
     here = np.arange(-reach, reach + 1)
     found = []
     for values in candidates:
-        gram, overlaps = np.zeros((2, 2)), np.zeros((2, here.size, here.size))
+        gram, overlaps = np.zeros((3, 3)), np.zeros((3, here.size, here.size))
         for average, (spectrum, noise) in zip(averages, spectra, strict=True):
-            focus = values["focus_nm"] + average.focus_offset_nm
-            pictures = []
-            for phase in (0.0, 90.0):
-                model = build({**values, "focus_nm": focus, "reference_phase_deg": phase})
-                picture = model.gradient(average.grid, 0.0, 0.0, average.z_nm, 0.0)[1][3]
-                pictures.append(picture - picture.mean())
+            now = average.seen_with(values)
+            cosine, square = _parts(build({**now, "reference_phase_deg": 0.0}), average, _CENTRE)
+            sine, _ = _parts(build({**now, "reference_phase_deg": 90.0}), average, _CENTRE)
+            pictures = [picture - picture.mean() for picture in (cosine, sine, square)]
             gram += np.einsum("iyx,jyx->ij", pictures, pictures) / noise
             for k, picture in enumerate(pictures):
                 match = fft.irfft2(spectrum * np.conj(fft.rfft2(picture)), s=shape)
                 overlaps[k] += match[np.ix_(here, here)] / noise
-        solved = np.einsum("ij,jyx->iyx", np.linalg.pinv(gram), overlaps)
-        explained = np.einsum("iyx,iyx->yx", solved, overlaps)
+        amplitude, phase, explained = _best_phase(gram, overlaps)
         row, column = np.unravel_index(int(np.argmax(explained)), explained.shape)
-        cosine, sine = solved[:, row, column]
         found.append(
             Start(
-                {**values, "reference_phase_deg": math.degrees(math.atan2(sine, cosine))},
+                {**values, "reference_phase_deg": math.degrees(phase[row, column])},
                 x_nm=float(here[column]) * pixel,
                 y_nm=float(here[row]) * pixel,
-                mass_kda=math.hypot(cosine, sine),
+                mass_kda=float(amplitude[row, column]),
                 explained=float(explained[row, column]),
             )
         )
@@ -276,3 +315,61 @@ def search_starts(
         if len(kept) == most:
             break
     return tuple(kept)
+
+
+def _best_phase(
+    gram: FloatArray, overlaps: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Amplitude, reference phase and explained χ² at every shift, shape of the last axes.
+
+    `gram` and `overlaps` are of the pictures at phases 0 and 90°, and of the scattered light.
+    """
+    linear = np.einsum("ij,jyx->iyx", np.linalg.pinv(gram[:2, :2]), overlaps[:2])
+    explained = np.einsum("iyx,iyx->yx", linear, overlaps[:2])
+    amplitude, phase = np.hypot(*linear), np.arctan2(linear[1], linear[0])
+    if amplitude.max() ** 4 * gram[2, 2] < _FAINT * explained.max():
+        return amplitude, phase, explained
+    turns = np.concatenate([
+        np.pi * np.arange(_TURNS)[:, None, None] / _TURNS * np.ones_like(phase), phase[None]
+    ])  # fmt: skip
+    way = np.stack([np.cos(turns), np.sin(turns)])
+    tried, gained = _strengths(
+        np.einsum("itab,iab->tab", way, overlaps[:2]),
+        overlaps[2],
+        np.einsum("itab,ij,jtab->tab", way, gram[:2, :2], way),
+        np.einsum("itab,i->tab", way, gram[:2, 2]),
+        gram[2, 2],
+    )
+    best = np.argmax(gained, axis=0)[None]
+    tried, turns, gained = (np.take_along_axis(v, best, 0)[0] for v in (tried, turns, gained))
+    return np.abs(tried), turns + np.pi * (tried < 0), gained
+
+
+def turned_starts(
+    averages: Sequence[Sight], build: Build, starts: Sequence[Start]
+) -> tuple[Start, ...]:
+    """Turn the linear light of every start to the direction that explains most.
+
+    Parameters
+    ----------
+    averages : sequence of Sight
+        From `average_sights`.
+    build : callable
+        Makes the microscope.
+    starts : sequence of Start
+        From `search_starts`.
+
+    Returns
+    -------
+    tuple of Start
+        As many; those of circular light as they were.
+    """
+    out = []
+    for start in starts:
+        if start.values["polarization"] == "linear":
+            first = start.values["polarization_deg"]
+            turns = [{**start.values, "polarization_deg": first + t} for t in _DIRECTIONS_DEG]
+            (best,) = search_starts(averages, build, turns, most=1)
+            start = max(start, best, key=lambda each: each.explained)
+        out.append(start)
+    return tuple(out)

@@ -19,6 +19,7 @@ from iscat_analysis.calibration.optics.starts import (
     FOCUS_STEP_NM,
     Start,
     search_starts,
+    turned_starts,
 )
 from iscat_analysis.records import Mapper
 
@@ -137,6 +138,8 @@ class StateSearch:
         most: int = _STARTS,
     ) -> tuple[Start, ...]:
         starts = search_starts(averages, self.build, candidates, most=most)
+        if "polarization" in self.free:
+            starts = turned_starts(averages, self.build, starts)
         return starts if "phase" in self.free else tuple(map(self._phased, starts))
 
     def _promising(self, start: Start, found: Sequence[Sequence[Start]]) -> bool:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +19,13 @@ from scipy import fft
 
 from iscat_analysis._kernels.sliding import contrast_map, step_peaks
 from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.search.peaks import SAMPLED, vertex
 from iscat_analysis.search.sliding.frames import Chunk
 
 MapArray = NDArray[np.float32]
 
 STRIDES = 4
 """Boundaries searched per window: a step midway between two loses an eighth of its height."""
-
-_SAMPLED = 0.85  # of a peak's height that the pixel next to it has at least
 
 
 @dataclass(frozen=True)
@@ -224,10 +222,10 @@ def find_steps(
         With sub-pixel positions.
     """
     peaks = []
-    for k, i, j in step_peaks(snr, _SAMPLED * threshold):
+    for k, i, j in step_peaks(snr, SAMPLED * threshold):
         value = float(snr[k, i, j])
         image = snr[k] * np.sign(value)
-        (dy, above), (dx, beside) = _vertex(image[:, j], int(i)), _vertex(image[i], int(j))
+        (dy, above), (dx, beside) = vertex(image[:, j], int(i)), vertex(image[i], int(j))
         height = math.copysign(abs(value) + above + beside, value)
         if abs(height) <= threshold:
             continue
@@ -235,15 +233,3 @@ def find_steps(
         boundary = chunk.first + int(chunk.edges[k + 1])
         peaks.append(Peak(boundary, float(j + dx), float(i + dy), height, amplitude))
     return sorted(peaks, key=lambda p: -abs(p.snr))
-
-
-def _vertex(line: NDArray[Any], index: int) -> tuple[float, float]:
-    """Vertex of the parabola through a maximum and its neighbours, and its height above it."""
-    if not 0 < index < line.size - 1:
-        return 0.0, 0.0
-    low, mid, high = (float(v) for v in line[index - 1 : index + 2])
-    bend = low - 2 * mid + high
-    if bend >= 0:
-        return 0.0, 0.0
-    shift = float(np.clip(0.5 * (low - high) / bend, -0.5, 0.5))
-    return shift, 0.25 * (high - low) * shift
