@@ -17,7 +17,8 @@ spread of the pulls, p-values, every learned parameter near the truth; where a t
 or the twin.  A spread is known to 1/√(2n), so that one row may be off by two of these more, and
 all rows together may not.
 
-``--quick`` takes three microscopes, ``--only`` those whose name contains the text.
+``--quick`` takes three microscopes, ``--only`` those whose name contains the text.  Movies with
+background frames have ``microscopes_fixed.py``.
 """
 
 from __future__ import annotations

@@ -213,6 +213,13 @@ def optics(
             show_default=False,
         ),
     ] = None,
+    measured: Annotated[
+        bool,
+        typer.Option(
+            "--measured",
+            help="Measure the picture itself instead, where no optics describe it; mode mass.",
+        ),
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -228,10 +235,17 @@ def optics(
 ) -> None:
     """Learn focus, aperture, phase, mask, aberrations and polarisation from a movie.
 
-    Writes optics.toml (name it as optics.file in a configuration), optics.json and optics.html.
+    Writes optics.toml (name it as optics.file in a configuration), optics.json and optics.html;
+    with --measured template.npz, template.json and template.html beside optics.toml.
     """
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
+        if measured:
+            _measure(
+                movie, config, settings, free, focus_step, out, messages,
+                overwrite=overwrite, as_json=as_json,
+            )  # fmt: skip
+            return
         from iscat_analysis.config import load_config
         from iscat_analysis.errors import DataError
         from iscat_analysis.pipeline.calibrations import optics_calibration
@@ -260,6 +274,45 @@ def optics(
                 f"{movie}: the optics are refused: {'; '.join(found.measured.refusals)}; record "
                 "brighter or more particles that stand alone, or let more change with --free"
             )
+
+
+def _measure(
+    movie: Path,
+    config: Path | None,
+    settings: list[str] | None,
+    free: str | None,
+    focus_step: float | None,
+    out: Path | None,
+    messages: Messages,
+    *,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Measure the picture of a particle."""
+    from iscat_analysis.config import load_config
+    from iscat_analysis.errors import ConfigError, DataError
+    from iscat_analysis.pipeline.calibrations import template_calibration
+
+    if free is not None or focus_step is not None:
+        raise ConfigError(
+            "--measured takes the picture as it is at one focus: leave out --free and --focus-step"
+        )
+    folder = out if out is not None else movie.with_suffix(".optics")
+    with messages.progress() as progress:
+        found = template_calibration(
+            movie, load_config(config, settings or ()), folder,
+            overwrite=overwrite, progress=progress, notify=messages.notify,
+        )  # fmt: skip
+    if as_json:
+        print_json("template", {**found.to_dict(), "out": str(folder)})
+    else:
+        print_result(found.headline())
+    messages.notify(f"wrote {folder}; open {folder / 'template.html'}")
+    if not found.accepted:
+        raise DataError(
+            f"{movie}: the template is refused: {'; '.join(found.refusals)}; record more particles "
+            "that stand alone"
+        )
 
 
 def _standards(text: str) -> tuple[list[float], list[float]]:

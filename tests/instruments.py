@@ -46,6 +46,8 @@ class Instrument:
     attenuation: float = 1.0
     reference_phase_deg: float = 0.0
     aberrations_nm: Mapping[int, float] = field(default_factory=dict)
+    ghost: tuple[float, float, float, float] | None = None
+    """A second image of the particle's light: amplitude, phase [deg] and place [nm]."""
 
 
 def _zernike(j: int, rho: FloatArray, phi: FloatArray) -> FloatArray:
@@ -125,6 +127,7 @@ class Pictures:
         for h in self._orders:
             bessel = whole[abs(h)] * (-1 if h < 0 and h % 2 else 1)
             tables.append(1j**h * np.einsum("rt,ct->rc", bessel, harmonics[:, :, h]))
+        self._ghost = m.ghost
         # amplitude of the dipole: −i; the reference's own phase is added to it
         phase = np.exp(1j * np.deg2rad(m.reference_phase_deg))
         self._reference = reference * phase
@@ -138,10 +141,18 @@ class Pictures:
         self.sign = float(np.sign(top))
         self._per_kda = PEAK_PER_KDA / abs(top)
 
-    def _terms(self, dx_nm: FloatArray, dy_nm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _field(self, dx_nm: FloatArray, dy_nm: FloatArray) -> NDArray[np.complex128]:
         r, phi = np.hypot(dx_nm, dy_nm), np.arctan2(dy_nm, dx_nm)
         parts = self._spline(r)
         e = sum(parts[n] * np.exp(1j * h * phi)[..., None] for n, h in enumerate(self._orders))
+        return np.where((r < _FARTHEST_NM - 15.0)[..., None], e, 0.0)
+
+    def _terms(self, dx_nm: FloatArray, dy_nm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        e = self._field(dx_nm, dy_nm)
+        if self._ghost is not None:
+            size, degrees, x, y = self._ghost
+            turn = size * np.exp(1j * np.deg2rad(degrees))
+            e = e + turn * self._field(dx_nm - x, dy_nm - y)
         linear = 2 * np.real(e @ np.conj(self._reference))
         return linear, np.sum(np.abs(e) ** 2, axis=-1)
 

@@ -44,7 +44,8 @@ DEGREE = 10
 """Degree of the polynomials that stand for the window between two nodes."""
 
 _SHARPNESS = 20.0  # of the window, best for TAPS and LATTICE_STEP
-_FILTER = 10  # half length of the filter that undoes the window
+FILTER = 10
+"""Half length of the filter that undoes the window."""
 _BLOCK = 48  # radial nodes whose Bessel functions are held at once
 
 RADIAL_STEP = 0.3
@@ -75,7 +76,7 @@ def window() -> tuple[FloatArray, FloatArray]:
     bell = weights @ np.vander(t, count, increasing=True).T
     band = np.linspace(0, LATTICE_STEP, 400)
     smoothing = np.einsum("lt,ltw,t->w", bell, np.cos(x[..., None] * band), quadrature)
-    waves = np.cos(np.outer(band, np.arange(_FILTER + 1)))
+    waves = np.cos(np.outer(band, np.arange(FILTER + 1)))
     waves[:, 1:] *= 2
     undo = np.linalg.lstsq(smoothing[:, None] * waves, np.ones(band.size), rcond=1e-14)[0]
     return np.ascontiguousarray(weights.T), np.concatenate([undo[:0:-1], undo])
@@ -292,15 +293,15 @@ def spread(waves: FloatArray, radial_step_nm: float, step_nm: float, half: int) 
     ndarray, shape (k, 2, 2·half + 1, 2·half + 1)
         Real and imaginary parts; x along the third axis, y along the fourth.
     """
-    side = 2 * (half + _FILTER) + 1
+    side = 2 * (half + FILTER) + 1
     fields = np.empty((waves.shape[4], 2, side, side))
     _sample(waves, 1 / radial_step_nm, step_nm, fields)
     _, undo = window()
-    inner = slice(_FILTER, -_FILTER)
+    inner = slice(FILTER, -FILTER)
     along_x = convolve1d(fields, undo, axis=2, mode="constant")[:, :, inner]
     return np.ascontiguousarray(convolve1d(along_x, undo, axis=3, mode="constant")[..., inner])
 
 
 def reach_of_samples(reach_nm: float, step_nm: float) -> float:
     """Distance of the farthest sample that matters to an image out to a distance [nm]."""
-    return reach_nm + math.sqrt(2) * (TAPS / 2 + 1 + _FILTER) * step_nm
+    return reach_nm + math.sqrt(2) * (TAPS / 2 + 1 + FILTER) * step_nm

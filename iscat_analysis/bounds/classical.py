@@ -118,7 +118,8 @@ def event_bounds(
     Returns
     -------
     EventBounds
-        A singular matrix gives NaN and names the direction.
+        A singular matrix gives NaN and names the direction; there is no quantum bound where the
+        picture was measured.
 
     Raises
     ------
@@ -129,6 +130,8 @@ def event_bounds(
     if unknown or not free:
         raise ConfigError(f"free = {list(free)}: choose one or more of {', '.join(PARAMETERS)}")
     model = likelihood.model
+    if model.is_measured:  # nothing is known of the light itself
+        quantum, collected = np.zeros((4, 4), dtype=complex), 0.0
     if quantum is None:
         quantum = quantum_information(model, theta[2])
     slope = abs(model.scale.slope(theta[3]))

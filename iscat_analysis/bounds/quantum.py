@@ -78,6 +78,11 @@ def quantum_information(
     ConfigError
         The height is negative.
     """
+    if model.is_measured:
+        raise ConfigError(
+            'optics.psf = "measured" has no quantum bound, because a picture does not say what '
+            'light made it: use optics.psf = "model"'
+        )
     opening, density = _photons(model, z_nm, measure, light)
     pupil = opening.pupil
     kappa = pupil.axial

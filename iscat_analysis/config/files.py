@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +85,9 @@ def read_optics_file(path: Path) -> OpticsFile:
     """
     values = read_toml(path)
     tables = {name: values.pop(name, {}) for name in ("optics", "uncertainty", "covariance")}
+    checksum = values.get("template", {}).get("sha256")
+    if checksum is not None:
+        _check_sum(path, Path(tables["optics"].get("template", "")), checksum)
     if not tables["optics"] or not all(isinstance(table, dict) for table in tables.values()):
         raise ConfigError(
             f"{path}: has no table [optics], which optics.file needs; "
@@ -92,6 +96,22 @@ def read_optics_file(path: Path) -> OpticsFile:
     if "file" in tables["optics"]:
         raise ConfigError(f"{path}: names another optics file: give that one as optics.file")
     return OpticsFile(**tables)
+
+
+def _check_sum(path: Path, template: Path, checksum: str) -> None:
+    """Refuse a template that is not the one an optics file was written with."""
+    try:
+        found = sha256(template.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: names the template {template}, which cannot be read ({error.strerror}): keep "
+            "both files of `iscat calibrate optics --measured` together"
+        ) from None
+    if found != checksum:
+        raise ConfigError(
+            f"{template}: is not the template that {path.name} was written with (its SHA-256 "
+            f"differs): keep both files of `iscat calibrate optics --measured` together"
+        )
 
 
 def _explain(text: str, message: str) -> str:
@@ -173,7 +193,7 @@ def _toml_value(value: Any) -> str:
 
 
 _PATH_KEYS = {
-    "optics": ("file",),
+    "optics": ("file", "template"),
     "camera": ("gain_e_per_adu", "offset_adu", "read_noise_e"),
     "simulation": ("background",),
 }

@@ -258,7 +258,10 @@ class Optics(Section):
         description='"reciprocal" (energy-conserving) | "dong2021" (the paper\'s own)',
     )
     psf: Literal["model", "measured"] = Field(
-        "model", description='"model" | "measured" (from the movie itself; mode mass only)'
+        "model", description='"model" | "measured" (the picture in template; mode mass only)'
+    )
+    template: str | None = Field(
+        None, description="of `iscat calibrate optics --measured`, whose optics.toml names it"
     )
     calibrate: Literal["auto", "always", "never"] = Field(
         "auto", description='"auto" | "always" | "never": learn the optics from the movie'
@@ -297,6 +300,16 @@ class Optics(Section):
             raise ValueError(
                 f"na = {self.na} must be below n_glass = {self.n_glass}: such light cannot "
                 "cross the coverslip"
+            )
+        if self.psf == "measured" and self.template is None:
+            raise ValueError(
+                'psf = "measured" needs a template: run `iscat calibrate optics MOVIE --measured` '
+                "and give its optics.toml as optics.file"
+            )
+        if self.psf == "measured" and self.scheme == "darkfield":
+            raise ValueError(
+                'psf = "measured" needs an interferometric scheme: in dark field the picture is a '
+                "square of what the template holds"
             )
         if self.scheme == "iscat" and self.n_glass == self.n_sample:
             raise ValueError(
@@ -623,6 +636,15 @@ class Config(Section):
             raise ValueError(
                 'background.method = "sliding" has no tracks: give background.frames for '
                 'fit.mode = "track"'
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _template_suits_mode(self) -> Config:
+        if self.optics.psf == "measured" and self.fit.mode != "mass":
+            raise ValueError(
+                f'fit.mode = "{self.fit.mode}" needs the picture at every height, and optics.psf = '
+                '"measured" has it at one: use fit.mode = "mass", or optics.psf = "model"'
             )
         return self
 

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,7 @@ from iscat_analysis.optics.aperture import (
 )
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.materials import Material, material
+from iscat_analysis.optics.measured import MeasuredField, Template
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.sensitivity import (
     check_names,
@@ -56,6 +58,8 @@ __all__ = [
     "PixelGrid",
     "check_table",
     "forward_model",
+    "peak_per_amplitude",
+    "with_template",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -94,7 +98,7 @@ class ForwardModel:
         reference.
     oil_nm : float
         Excess thickness of the oil that stays when the particle moves [nm].
-    wave : RadialField or LatticeField
+    wave : RadialField, LatticeField or MeasuredField
         The scattered field, tabulated.
     strength : complex
         E1·e^{iψ0} per unit amplitude [nm].
@@ -127,6 +131,11 @@ class ForwardModel:
     def wavenumber(self) -> float:
         """2π over the vacuum wavelength [rad/nm]."""
         return 2 * math.pi / self.optics.wavelength_nm
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the picture was measured, so that nothing is known of the light in the pupil."""
+        return isinstance(self.wave, MeasuredField)
 
     @property
     def lens(self) -> Lens:
@@ -350,6 +359,8 @@ class ForwardModel:
             A name is unknown, or the convention is D21's.
         """
         check_names(self.optics, names)
+        if self.is_measured:
+            raise ConfigError('optics.psf = "measured" knows no parameters of the optics')
         lens, stack = self._sensitivities(z_nm, tuple(names))
         amplitude = self.scale.amplitude(mass_kda)
         _, pixels, *_ = self._geometry(grid, x_nm, y_nm, amplitude)
@@ -442,8 +453,11 @@ class ForwardModel:
         Returns
         -------
         float
-            Area [nm²]; in dark field per unit incident intensity.
+            Area [nm²]; in dark field per unit incident intensity; NaN where the picture was
+            measured.
         """
+        if self.is_measured:
+            return math.nan
         p = self.aperture.pupil
         decay = np.exp(-2 * p.axial.imag * z_nm)
         density = (np.abs(p.t_p_cos) ** 2 + np.abs(p.t_s) ** 2) * np.sin(p.theta) * decay
@@ -579,9 +593,52 @@ def forward_model(
         z_range_nm=(min(config.fit.z_range_nm[0], height), z_max_nm),
         samples=(points / 2, weights / 2),
     )
+    if optics.psf == "measured":
+        template = Template.read(Path(optics.template or ""))
+        template.refuse_mismatch(config.camera.pixel_size_nm, config.fit.roi_nm)
+        model = with_template(model, template)
     if config.calibration is None:
         return model
     return replace(model, scale=_mass_scale(model, config.calibration))
+
+
+def with_template(model: ForwardModel, template: Template) -> ForwardModel:
+    """Put a measured picture in the place of the computed one.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        An interferometric microscope; it gives the scale of masses: its peak contrast per kDa.
+    template : Template
+        The picture.
+
+    Returns
+    -------
+    ForwardModel
+        With the same peak contrast, of the template's sign.
+    """
+    wave = MeasuredField(template, peak_per_amplitude(model), model.reach_nm)
+    return replace(model, wave=wave, scale=MassScale())
+
+
+def peak_per_amplitude(model: ForwardModel) -> float:
+    """Give the magnitude of the peak contrast of a faint particle, per unit amplitude.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        An interferometric microscope, at the height for which it was focused.
+
+    Returns
+    -------
+    float
+        Contrast per unit amplitude.
+    """
+    if isinstance(model.wave, MeasuredField):
+        return model.wave.gain
+    weak = 1e-6 / math.sqrt(model.collected_area_nm2(model.height_nm, 1.0))
+    linear, _ = model.wave.peak(model.height_nm, weak, model.rho)
+    return abs(linear / weak)
 
 
 def _pupil(
@@ -652,14 +709,17 @@ def _wave(
 def _mass_scale(model: ForwardModel, line: Calibration) -> MassScale:
     if not model.rho:
         raise ConfigError("[calibration] relates contrast to mass; dark field has no contrast")
-    weak = 1e-6 / math.sqrt(model.collected_area_nm2(model.height_nm, 1.0))
+    measured = isinstance(model.wave, MeasuredField)
+    area = 0.0 if measured else model.collected_area_nm2(model.height_nm, 1.0)
+    weak = 1e-6 / (peak_per_amplitude(model) if measured else math.sqrt(area))
     linear, quadratic = model.wave.peak(model.height_nm, weak, model.rho)
     linear, quadratic = linear / weak, quadratic / weak**2
     if linear * line.gradient_per_kda < 0:
         seen = "bright" if linear > 0 else "dark"
+        cause = "optics.template" if measured else f"optics.focus_nm = {model.optics.focus_nm:g}"
         raise ConfigError(
             f"calibration.gradient_per_kda = {line.gradient_per_kda:g} has the wrong sign: with "
-            f"optics.focus_nm = {model.optics.focus_nm:g} the model's particles are {seen}; "
-            "change the sign or the focus"
+            f"{cause} the model's particles are {seen}; change the sign"
+            f"{'' if measured else ' or the focus'}"
         )
     return MassScale(line, linear, quadratic)

@@ -27,6 +27,7 @@ from iscat_analysis._kernels.lattice import (
 )
 from iscat_analysis._kernels.radial import STEP, AxialTable, bessel_table, radial_profile
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.measured import MeasuredField
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -361,7 +362,7 @@ class LatticeField:
         return lru_cache(_HEIGHTS_KEPT)(at)
 
 
-Field = RadialField | LatticeField
+Field = RadialField | LatticeField | MeasuredField
 
 
 def axial_table(field: Field, z_range_nm: tuple[float, float]) -> AxialTable:
@@ -369,7 +370,7 @@ def axial_table(field: Field, z_range_nm: tuple[float, float]) -> AxialTable:
 
     Parameters
     ----------
-    field : RadialField or LatticeField
+    field : RadialField, LatticeField or MeasuredField
         The field.
     z_range_nm : (float, float)
         Heights to cover [nm].

@@ -195,6 +195,11 @@ def analyse(
         )
         particle = config.particle.model_copy(update={"photons_per_frame": photons})
         config = config.model_copy(update={"particle": particle})
+    if config.optics.psf == "measured":
+        tell(
+            'optics.psf = "measured": bounds are those of the template, and there is no quantum '
+            "bound, because a picture does not say what light made it"
+        )
     shape = (movie.shape[1], movie.shape[2])
     camera = camera_from_config(config.camera, shape, movie.dtype)
     refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)

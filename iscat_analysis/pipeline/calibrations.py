@@ -18,11 +18,14 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.event_tables import read_events
+from iscat_analysis.optics.measured import sha256_of
 from iscat_analysis.pipeline.microscope import calibrate_movie
+from iscat_analysis.pipeline.picture import MeasuredPicture, measure_template
 from iscat_analysis.records import Progress, Status, silent
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.calibration import camera_page, mass_page
 from iscat_analysis.report.optics import optics_page
+from iscat_analysis.report.template import template_page
 from iscat_analysis.schemas import jsonable, to_json
 
 CAMERA_FILES = frozenset(
@@ -43,6 +46,9 @@ MASS_FILES = frozenset({"calibration.json", "calibration.toml", "calibration.htm
 
 OPTICS_FILES = frozenset({"optics.json", "optics.toml", "optics.html"})
 """Everything a calibration of the optics may leave in its folder."""
+
+TEMPLATE_FILES = frozenset({"template.json", "template.npz", "template.html", "optics.toml"})
+"""Everything a measured picture may leave in its folder."""
 
 _BINS = 120
 
@@ -177,6 +183,62 @@ def optics_calibration(
             (folder / "optics.toml").write_text(toml, encoding="utf-8")
         page = optics_page(movie.name, jsonable(contents), toml)
         (folder / "optics.html").write_text(page, encoding="utf-8")
+    return found
+
+
+def template_calibration(
+    movie: Path,
+    config: Config,
+    out: Path,
+    *,
+    overwrite: bool = False,
+    progress: Progress = silent,
+    notify: Callable[[str], None] | None = None,
+) -> MeasuredPicture:
+    """Measure the picture of a particle in a movie and write what was found.
+
+    Parameters
+    ----------
+    movie : Path
+        A landing movie, or one with background frames.
+    config : Config
+        The microscope as far as it is known.
+    out : Path
+        Folder for template.json, template.html and, unless the result is refused, template.npz and
+        optics.toml, which names it.
+    overwrite : bool
+        Whether an earlier result may be replaced.
+    progress : Progress
+        Told how far it is.
+    notify : callable, optional
+        Given each note, a sentence.
+
+    Returns
+    -------
+    MeasuredPicture
+        What was found.
+
+    Raises
+    ------
+    DataError
+        The movie shows too few particles, or the folder may not be written.
+    ConfigError
+        The configuration has no such picture.
+    """
+    check_output(out, overwrite, known=TEMPLATE_FILES)
+    with open_stack(movie) as stack:
+        found = measure_template(stack, config, progress=progress, notify=notify)
+    content = found.template.to_bytes()
+    toml = found.to_toml("template.npz", sha256_of(content))
+    contents = found.to_dict()
+    with atomic_folder(out, overwrite, known=TEMPLATE_FILES) as folder:
+        text = to_json("template", contents)
+        (folder / "template.json").write_text(text + "\n", encoding="utf-8")
+        if found.accepted:
+            (folder / "template.npz").write_bytes(content)
+            (folder / "optics.toml").write_text(toml, encoding="utf-8")
+        page = template_page(movie.name, jsonable(contents), found.template, toml)
+        (folder / "template.html").write_text(page, encoding="utf-8")
     return found
 
 

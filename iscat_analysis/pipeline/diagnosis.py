@@ -172,6 +172,8 @@ def misfit_warning(config: Config, events: Sequence[Event]) -> str:
     str
         One line; empty where most of the brightest are described, or nothing stands out.
     """
+    if config.optics.psf == "measured":
+        return ""
     alone = [e for e in events if not _DISTURBED.intersection(e.fit.flags)]
     brightest = sorted(alone, key=lambda e: -e.snr)[:_BRIGHTEST]
     missed = [e for e in brightest if Status.POOR_FIT in e.fit.flags]

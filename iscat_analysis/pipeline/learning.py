@@ -71,6 +71,7 @@ def learn_optics(
     """
     optics = config.optics
     suited = optics.scheme != "darkfield" and optics.convention == "exact"
+    suited = suited and optics.psf == "model"
     measured = config.background.method in ("sliding", "fixed", "median")
     if (
         optics.calibrate == "never"

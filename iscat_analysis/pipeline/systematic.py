@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -20,6 +21,7 @@ from iscat_analysis.calibration.mass import line_sigma_kda
 from iscat_analysis.config import Config
 from iscat_analysis.inference.likelihood import LEVEL, asimov_conditional, asimov_poisson
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
+from iscat_analysis.optics.measured import Template
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Status
 
 _AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
@@ -92,6 +94,7 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
     """Give what the measured optics may be wrong by: D Σ Dᵀ of `bounds.shared`."""
     errors, pixel = config.optics.covariance, config.camera.pixel_size_nm
     suited = config.optics.scheme != "darkfield" and config.optics.convention == "exact"
+    suited = suited and config.optics.psf == "model"
     if errors is None or not errors.names or pixel is None or not suited:
         return {}
     side = max(5, round(config.fit.roi_nm / pixel))
@@ -245,4 +248,17 @@ def _lagrange(nodes: FloatArray, points: FloatArray) -> FloatArray:
     return weights
 
 
-_SOURCES: tuple[Source, ...] = (_of_the_line, _of_the_optics)
+def _of_the_template(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+    """Give what the peak of a measured picture may be wrong by.
+
+    All contrasts share its relative error.  The standards of a line that was measured with the
+    same template have it too, and it cancels; places are relative to the picture's own centre.
+    """
+    optics = config.optics
+    if optics.psf != "measured" or optics.template is None or config.calibration is not None:
+        return {}
+    mass = table["mass_kda"].to_numpy(dtype=float)
+    return {"mass_kda": np.abs(mass) * Template.read(Path(optics.template)).peak_se}
+
+
+_SOURCES: tuple[Source, ...] = (_of_the_line, _of_the_optics, _of_the_template)

@@ -155,7 +155,7 @@ def _figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     yield "average", _average(pictures)
     yield "radial", _radial(pictures)
     yield "pupil", _pupil(pictures)
-    yield "p-values", _p_values(found["held_out"]["p_values"])
+    yield "p-values", draw_p_values(found["held_out"]["p_values"])
     yield "correlation", _correlation(found["names"], found["correlation"])
 
 
@@ -215,7 +215,19 @@ def _pupil(pictures: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _p_values(p_values: list[float]) -> Figure:
+def draw_p_values(p_values: list[float]) -> Figure:
+    """Draw the histogram of p-values.
+
+    Parameters
+    ----------
+    p_values : list of float
+        Of pictures that were not fitted.
+
+    Returns
+    -------
+    Figure
+        The histogram.
+    """
     figure = new_figure(4.6, 3.0)
     ax = figure.subplots()
     ax.hist(p_values, bins=10, range=(0.0, 1.0), color=VERMILLION)

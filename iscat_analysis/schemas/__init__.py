@@ -19,7 +19,7 @@ from pydantic import BaseModel
 
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.schemas.bounds import Bounds, Comparison, OpticsBounds
-from iscat_analysis.schemas.calibration import Camera, MassCalibration, Optics
+from iscat_analysis.schemas.calibration import Camera, MassCalibration, Optics, Template
 from iscat_analysis.schemas.fit import Fit, Simulate, Summary
 from iscat_analysis.schemas.study import Benchmark
 
@@ -34,6 +34,7 @@ _DOCUMENTS: Mapping[str, type[BaseModel]] = {
     "optics_bounds": OpticsBounds,
     "simulate": Simulate,
     "summary": Summary,
+    "template": Template,
 }
 
 
@@ -56,8 +57,8 @@ def schema(name: str) -> dict[str, Any]:
     name : str
         ``"fit"``, ``"simulate"`` or ``"bounds"`` for what the command prints with ``--json``, and
         ``"comparison"`` and ``"optics_bounds"`` for ``iscat bounds --preset`` and ``--for optics``;
-        ``"summary"``, ``"benchmark"``, ``"camera"``, ``"optics"`` or ``"calibration"`` for the
-        file of that name and what is printed beside it.
+        ``"summary"``, ``"benchmark"``, ``"camera"``, ``"optics"``, ``"template"`` or
+        ``"calibration"`` for the file of that name and what is printed beside it.
 
     Returns
     -------

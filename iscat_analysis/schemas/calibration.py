@@ -151,6 +151,22 @@ class Twin(Closed):
     gap: float = key("Log-likelihood by which it is worse")
 
 
+class Template(Document):
+    """What iscat calibrate optics --measured prints and writes as template.json."""
+
+    accepted: bool = key("Whether the template may be used")
+    refusals: list[str] = key("Why it may not, one line each")
+    particles: Count = key("Pictures that made it")
+    contaminated: Count = key("Pictures left out, because something else happened in them")
+    determined: float = key("Numbers of the picture that the data determine")
+    peak_se: float = key("Relative standard error of the peak, common to all contrasts")
+    pixel_nm: float = key("Pixel side [nm]")
+    roi_nm: float = key("Side of the square in which it is known [nm]")
+    held_out: HeldOut = key("Pictures that were held out, by a template of the others")
+    source: dict[str, str] = key("Where the pictures came from")
+    out: str = maybe("When printed: the output folder")
+
+
 class OpticsPictures(Closed):
     """What the page shows."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from iscat_analysis.calibration.optics.estimate import optics_limits
 from iscat_analysis.calibration.optics.measure import HELD_OUT_P, _Search, measure_microscope
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.pipeline.microscope import calibrate_sights, goodness
 
 SIGMAS = 4.0
@@ -108,6 +110,51 @@ def test_too_few_particles_are_refused_with_what_to_record() -> None:
     sights, _, _ = make_sights({}, 8, seed=17, masses_kda=(300.0,))
     with pytest.raises(DataError, match=r"8 bright particles.*12 are needed.*record more"):
         calibrate_sights(sights, (), configuration(), ROUND, {"movie": "faint.tif"})
+
+
+def test_a_parameter_at_its_limit_is_refused() -> None:
+    config = configuration()
+    sights, _, build = make_sights({"na": 1.33}, 15, seed=19)
+    found = measure_microscope(
+        sights,
+        settings_of(config),
+        build,
+        lambda sight, settings: goodness(sight, build(settings)),
+        free=("focus", "na", "phase"),
+        limits={**optics_limits(1.515, 1.515), "na": (1.36, 1.5)},
+        side=-1,
+        landing=1,
+    )
+    assert any(line.startswith("na = 1.36 lies at its limit") for line in found.refusals)
+
+
+def test_a_wrong_pixel_size_is_suspected() -> None:
+    """Pixels that are said to be 6 % larger than they are look like a smaller aperture."""
+    from iscat_analysis.calibration.optics import OpticsCalibration
+
+    said, factor = configuration(), 1.06
+    pixel = said.camera.pixel_size_nm
+    assert pixel is not None
+    sights, _, _ = make_sights({}, 18, seed=20)
+    larger = said.model_copy(
+        update={"camera": said.camera.model_copy(update={"pixel_size_nm": factor * pixel})}
+    )
+    stretched = [
+        replace(
+            s,
+            grid=PixelGrid.centred(s.grid.shape[0], factor * pixel),
+            x_nm=factor * s.x_nm,
+            y_nm=factor * s.y_nm,
+        )
+        for s in sights
+    ]
+    found = calibrate_sights(stretched, (), larger, ROUND, {"movie": "m.tif"})
+    assert isinstance(found, OpticsCalibration)
+    (note,) = [line for line in found.notes if "camera.pixel_size_nm" in line]
+    guess = float(note.partition("pixels of about ")[2].split()[0])
+    assert guess == pytest.approx(pixel, rel=0.02)
+    fine = calibrate_sights(sights, (), said, ROUND, {"movie": "m.tif"})
+    assert not any("camera.pixel_size_nm" in line for line in fine.notes)
 
 
 def test_what_the_pictures_do_not_tell_is_held() -> None:

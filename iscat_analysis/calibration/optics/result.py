@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,9 @@ from iscat_analysis.calibration.optics.pictures import Pictures
 from iscat_analysis.calibration.optics.settings import exists, is_term, with_settings
 from iscat_analysis.config import Config, OpticsCovariance
 from iscat_analysis.records import FloatArray
+
+_ODD_NA = 0.02  # between the aperture of an objective and what is engraved on it
+_ODD_SIGMAS = 5.0
 
 COLUMNS = ("parameter", "value", "sigma", "crb", "configured", "state")
 """Columns of `OpticsCalibration.parameters`."""
@@ -218,7 +222,7 @@ def make_result(
         pictures=pictures,
         sights=len(estimate.sights),
         source=source,
-        notes=_notes(measured),
+        notes=(*_notes(measured), *_on_the_pixel(config, configured, measured)),
     )
 
 
@@ -267,6 +271,25 @@ def _notes(measured: Measured) -> tuple[str, ...]:
             "the sample's index would tell them apart"
         )
     return tuple(notes)
+
+
+def _on_the_pixel(
+    config: Config, configured: Mapping[str, Any], measured: Measured
+) -> tuple[str, ...]:
+    """Say that a wrong pixel size looks like a wrong aperture, where the aperture is another."""
+    estimate, pixel = measured.estimate, config.camera.pixel_size_nm
+    if "na" not in estimate.names or pixel is None:
+        return ()
+    k = estimate.names.index("na")
+    apart = measured.settings["na"] - configured["na"]
+    if abs(apart) < max(_ODD_NA, _ODD_SIGMAS * math.sqrt(estimate.covariance[k, k])):
+        return ()
+    other = pixel * measured.settings["na"] / configured["na"]
+    return (
+        f"the numerical aperture differs by {apart:+.3f} from the configured one; pixels of about "
+        f"{other:.1f} nm instead of {pixel:g} nm would look much the same: check "
+        "camera.pixel_size_nm",
+    )
 
 
 def _judged(judgement: Judgement) -> dict[str, Any]:

@@ -1,0 +1,89 @@
+"""Movies of other microscopes with background frames, analysed with the nominal one.
+
+    python benchmarks/microscopes_fixed.py [--seed N] [--only NAME]
+
+Through each microscope of the table in ``microscopes.py`` a movie in which all particles bind after
+the background frames, and which is analysed with a model that stays wrong.  An event counts as true
+within 3 pixels of a particle; every other row that is not a side lobe is false.  Exit status 1
+where more than a twentieth of the true ones are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from microscopes import FALSE, MICROSCOPES, TIME, match, nominal
+
+from instruments import Instrument, InstrumentMovie, draw_landings  # isort: skip
+
+from iscat_analysis.config import Config
+from iscat_analysis.movie.background import measure_windows
+from iscat_analysis.movie.camera import camera_from_config
+from iscat_analysis.pipeline.chunks import FRAME_COLUMN
+from iscat_analysis.pipeline.diagnosis import misfit_warning
+from iscat_analysis.pipeline.field import fit_field
+from iscat_analysis.pipeline.results import Row, table_of
+from iscat_analysis.pipeline.scene import make_scene
+
+SHAPE = (200, 200, 200)
+BOUND = 100
+"""Frame from which the particles are there."""
+COUNT = 30
+
+
+def fixed(config: Config) -> Config:
+    """Give the same configuration with background frames."""
+    background = config.background.model_copy(update={"method": "fixed", "frames": (0, BOUND)})
+    return config.model_copy(update={"background": background})
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=5)
+    parser.add_argument("--only", choices=list(MICROSCOPES), action="append")
+    options = parser.parse_args()
+    landings = draw_landings(SHAPE, COUNT, seed=options.seed, frame=BOUND, apart_px=12.0)
+    config = fixed(nominal())
+    scene = make_scene(config, SHAPE[1:])
+    base, broken = 0.0, False
+    print(f"{COUNT} particles in {SHAPE[2]} x {SHAPE[1]} pixels, seed {options.seed}")
+    for name in (
+        "as configured",
+        *(options.only or MICROSCOPES),
+    ):  # the first one compiles, and is not shown
+        instrument = Instrument(**MICROSCOPES[name])
+        movie = InstrumentMovie(instrument, SHAPE, landings, seed=options.seed + 2)
+        start = time.process_time()
+        camera = camera_from_config(config.camera, movie.shape[1:], movie.dtype)
+        windows = measure_windows(movie, camera, (0, BOUND), (BOUND, SHAPE[0]))
+        with ThreadPoolExecutor(1) as pool:
+            events, windows = fit_field(scene, windows, pool=pool)
+        table = table_of(scene, [Row(k, event, windows) for k, event in enumerate(events)])
+        seconds = time.process_time() - start
+        table = table[table["status"] != "sidelobe"].reset_index(drop=True)
+        matched = match(landings, table.assign(frame=BOUND, **{FRAME_COLUMN: 0}))
+        if not base:
+            base = -1.0
+            continue
+        base = seconds if base < 0 else base
+        ratio = seconds / base
+        error = np.sqrt(max(matched.false, 1)) / COUNT
+        bad = matched.false > FALSE * COUNT or ratio > TIME
+        broken |= bad
+        print(
+            f"{name:20s} found {int((matched.rows >= 0).sum()):3d}  false {matched.false:2d} "
+            f"({matched.false / COUNT:.1%} ± {error:.1%})  ok {(table['status'] == 'ok').sum():3d}"
+            f"  time x {ratio:.1f}{'  BROKEN' if bad else ''}\n    "
+            f"{misfit_warning(config, events)}",
+            flush=True,
+        )
+    return int(broken)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

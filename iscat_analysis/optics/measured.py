@@ -1,0 +1,276 @@
+"""A picture that was measured, in place of one that was computed.
+
+Whatever is wrong with a microscope, its light comes through its pupil: the interference of a faint
+particle, 2 Re e, has no detail finer than the largest wave vector that the glass carries, so that
+samples on a lattice say all of it, between the pixels too.  The lattice is that of any other pupil
+(`iscat_analysis._kernels.lattice`), with a field that is real: what is not seen in the interference
+is not known.  The scattered light itself, |e|², is then the least that such an interference can
+come with, (Re e)².
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
+
+from iscat_analysis._kernels.image import Lens
+from iscat_analysis._kernels.lattice import FILTER, LATTICE_STEP, lattice_half, window
+from iscat_analysis.errors import ConfigError
+
+FloatArray = NDArray[np.float64]
+
+_KEPT = 4  # lattices at hand, one for each number of orders
+_SLOW = 1e-3  # a rate [rad/nm] for tables along z, where nothing changes
+_STORED = ("contrast", "sigma", "step_nm", "pixel_nm", "roi_nm", "peak_se", "sights")
+_SAME_PIXEL = 1e-3  # relative difference of pixel sizes that is rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """The contrast of a faint particle, measured.
+
+    Attributes
+    ----------
+    contrast : ndarray, shape (n, n)
+        On a square lattice around the particle, rows along y; the largest magnitude anywhere is 1.
+    sigma : ndarray, shape (n, n)
+        Its standard deviation.
+    step_nm : float
+        Step of the lattice [nm].
+    pixel_nm : float
+        Side of the pixels that it was measured with [nm].
+    roi_nm : float
+        Side of the square around a particle in which it is known [nm].
+    peak_se : float
+        Relative standard error of the peak, which is common to all contrasts.
+    sights : int
+        Pictures that made it.
+    """
+
+    contrast: FloatArray
+    sigma: FloatArray
+    step_nm: float
+    pixel_nm: float
+    roi_nm: float
+    peak_se: float
+    sights: int
+
+    def to_bytes(self) -> bytes:
+        """Give the content of an ``.npz`` file, the same bytes for the same template."""
+        out = io.BytesIO()
+        values: dict[str, Any] = {k: np.asarray(getattr(self, k)) for k in _STORED}
+        np.savez(out, **values)
+        return out.getvalue()
+
+    @classmethod
+    def read(cls, path: Path) -> Template:
+        """Read what `to_bytes` gave.
+
+        Parameters
+        ----------
+        path : Path
+            The file.
+
+        Returns
+        -------
+        Template
+            The template.
+
+        Raises
+        ------
+        ConfigError
+            It cannot be read, or is no template.
+        """
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+        return _parsed(str(path), content)
+
+    def refuse_mismatch(self, pixel_nm: float | None, roi_nm: float) -> None:
+        """Refuse pixels or squares that the template was not measured with.
+
+        Parameters
+        ----------
+        pixel_nm : float or None
+            Pixel side, where it is known [nm].
+        roi_nm : float
+            Side of the fitted square [nm].
+
+        Raises
+        ------
+        ConfigError
+            Another pixel size, or a larger square.
+        """
+        if pixel_nm is not None and abs(pixel_nm / self.pixel_nm - 1) > _SAME_PIXEL:
+            raise ConfigError(
+                f"optics.template was measured with pixels of {self.pixel_nm:g} nm, and "
+                f"camera.pixel_size_nm = {pixel_nm:g}: run `iscat calibrate optics --measured` on "
+                "a movie with these pixels"
+            )
+        if roi_nm > self.roi_nm * (1 + _SAME_PIXEL):
+            raise ConfigError(
+                f"optics.template is known in a square of {self.roi_nm:g} nm, and fit.roi_nm = "
+                f"{roi_nm:g}: lower fit.roi_nm, or measure a larger template with it"
+            )
+
+
+def sha256_of(content: bytes) -> str:
+    """Give the checksum that ``optics.toml`` names its template with.
+
+    Parameters
+    ----------
+    content : bytes
+        Of the file.
+
+    Returns
+    -------
+    str
+        Hexadecimal SHA-256.
+    """
+    return hashlib.sha256(content).hexdigest()
+
+
+@lru_cache(_KEPT)
+def _parsed(name: str, content: bytes) -> Template:
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+            values: dict[str, Any] = {key: stored[key] for key in _STORED}
+    except (KeyError, ValueError, OSError):
+        raise ConfigError(
+            f"{name}: is no template of `iscat calibrate optics --measured`"
+        ) from None
+    for key in _STORED[2:-1]:
+        values[key] = float(values[key])
+    return Template(**values | {"sights": int(values["sights"])})
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredField:
+    """Field of a measured picture, at all heights the same; beside `RadialField`.
+
+    Attributes
+    ----------
+    template : Template
+        The picture.
+    gain : float
+        Its peak per unit amplitude.
+    reach_nm : float
+        Largest distance from the particle at which images are wanted; nothing is seen beyond the
+        template [nm].
+    """
+
+    template: Template
+    gain: float
+    reach_nm: float
+
+    @property
+    def axial(self) -> NDArray[np.complex128]:
+        """Phases per height that tables along z go by; nothing changes there [rad/nm]."""
+        return np.array([-_SLOW, _SLOW], dtype=np.complex128)
+
+    @property
+    def half(self) -> int:
+        """Nodes on either side of the particle."""
+        return lattice_half(self.reach_nm, self.template.step_nm)
+
+    @property
+    def width(self) -> int:
+        """Numbers in the profile of one order."""
+        return 2 * (2 * self.half + 1) ** 2
+
+    def lens(self, rho: float) -> Lens:
+        """How the kernels make a signal of a profile, with the reference ρ."""
+        step = self.template.step_nm
+        return Lens(1 / step, rho, 1.0, 0.0, 0.0, 0.0, 0.0, self.half, 1, window()[0])
+
+    def profile(self, _z_nm: float, orders: int) -> FloatArray:
+        """Profile at any height, shape (2·orders, nodes, nodes)."""
+        profile: FloatArray = self._profiles(orders)
+        return profile
+
+    def profiles(self, heights_nm: FloatArray, _kappa: float) -> FloatArray:
+        """Profiles with ∂/∂z and ∂²/∂z², shape (n, 3, channels, width)."""
+        one = self.profile(0.0, 3).reshape(1, 3, 2, -1)
+        return np.repeat(one, heights_nm.size, axis=0)
+
+    @cached_property
+    def _profiles(self):  # type: ignore[no-untyped-def]
+        def with_orders(orders: int) -> FloatArray:
+            side = 2 * self.half + 1
+            out = np.zeros((2 * orders, side, side))
+            out[0] = self._coefficients()
+            return out
+
+        return lru_cache(_KEPT)(with_orders)
+
+    def _coefficients(self) -> FloatArray:
+        """Sample Re e on the lattice of the reach, and undo the smoothing of its window."""
+        side = 2 * (self.half + FILTER) + 1
+        samples = np.zeros((side, side))
+        known = self.template.contrast.T * (self.gain / 2)
+        have = (known.shape[0] - 1) // 2
+        half = min(have, self.half + FILTER)
+        inner, kept = (slice(c - half, c + half + 1) for c in (self.half + FILTER, have))
+        samples[inner, inner] = known[kept, kept]
+        _, undo = window()
+        for axis in (0, 1):
+            samples = convolve1d(samples, undo, axis=axis, mode="constant")
+        return np.ascontiguousarray(samples[FILTER:-FILTER, FILTER:-FILTER])
+
+    def components(
+        self, dx_nm: FloatArray, dy_nm: FloatArray, _z_nm: float
+    ) -> NDArray[np.complex128]:
+        """Real field at points, shape (1, *dx_nm.shape)."""
+        plane, step = self._coefficients(), self.template.step_nm
+        dx, dy = np.broadcast_arrays(dx_nm, dy_nm)
+        weights, _ = window()
+        taps = weights.shape[1]
+        out = np.zeros(dx.shape)
+        px, py = (np.clip(d / step + self.half, taps, 2 * self.half - taps) for d in (dx, dy))
+        ix, iy = np.floor(px).astype(int), np.floor(py).astype(int)
+        powers = np.arange(weights.shape[0])
+        wx = ((px - ix)[..., None] ** powers) @ weights
+        wy = ((py - iy)[..., None] ** powers) @ weights
+        for k in range(taps):
+            for m in range(taps):
+                at = plane[ix - taps // 2 + 1 + k, iy - taps // 2 + 1 + m]
+                out += wx[..., k] * wy[..., m] * at
+        return out.astype(np.complex128)[None]
+
+    def peak(self, _z_nm: float, amplitude: float, rho: float) -> tuple[float, float]:
+        """Parts of the signal of largest magnitude that are linear and quadratic in a."""
+        top = self._sign * self.gain * amplitude
+        return rho * top, top**2 / 4
+
+    @cached_property
+    def _sign(self) -> float:
+        contrast = self.template.contrast
+        return float(np.sign(contrast.flat[np.argmax(np.abs(contrast))]))
+
+
+def lattice_step_nm(wavelength_nm: float, n_glass: float) -> float:
+    """Step of the lattice on which light of a wavelength is known, whatever the pupil.
+
+    Parameters
+    ----------
+    wavelength_nm : float
+        In vacuum [nm].
+    n_glass : float
+        Index that no numerical aperture reaches.
+
+    Returns
+    -------
+    float
+        Step [nm].
+    """
+    return LATTICE_STEP * wavelength_nm / (2 * math.pi * n_glass)
