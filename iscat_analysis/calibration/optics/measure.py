@@ -323,6 +323,7 @@ class _Search:
     ) -> tuple[Estimate, tuple[Sight, ...]]:
         """Try every state on the average picture, the best ones on the pictures to be fitted.
 
+        A mask of which the configuration knows nothing must earn its two parameters.
         The pictures that are not fitted come back with their places and masses.
         """
         states = StateSearch(self.configured, self.build, self.free, self.limits, self.mapper)
@@ -345,7 +346,9 @@ class _Search:
             tried.append(rough)
             fit = self._fit(_fitted(sights), rough.values, names, passes)
             judged = self._fit(_held_out(sights), fit.values, ())
-            joint.append((judged.log_likelihood, fit, judged.sights))
+            new_mask = fit.values["mask_na"] > 0 and not self.configured["mask_na"]
+            earned = judged.log_likelihood - (TWIN_GAP if new_mask else 0.0)
+            joint.append((earned, fit, judged.sights))
         _, best, held_out = max(joint, key=lambda each: each[0])
         return best, held_out
 
