@@ -77,6 +77,7 @@ def report_context(
         "headline": [text for text in said if not text.startswith("Not calibrated")],
         "flagged": caution(table) is not None,
         "tiles": _tiles(analysis, table),
+        "has_common": any(math.isfinite(p.systematic) for p in precision),
         "has_holevo": any(math.isfinite(p.holevo) for p in precision),
         "precision_rows": precision_rows(analysis, precision),
         "warnings": analysis.warnings,

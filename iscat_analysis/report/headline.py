@@ -372,14 +372,18 @@ def precision_rows(analysis: Analysis, precision: Sequence[Precision]) -> list[l
     Returns
     -------
     list of list of str
-        Parameter, σ, error common to all events, CRB, where there is one Holevo, QCRB, σ over CRB,
-        light used, rows.
+        Parameter, σ, the error common to all events, CRB, Holevo, QCRB, σ over CRB, light used,
+        rows; without the common error and Holevo where no parameter has them.
     """
+    common = any(math.isfinite(p.systematic) for p in precision)
+    holevo = any(math.isfinite(p.holevo) for p in precision)
     return [
         [
             f"{label_of(analysis, p.name)} [{UNITS[p.name]}]",
-            *(number(value) for value in (p.sigma, p.systematic, p.crb)),
-            *([number(p.holevo)] if math.isfinite(p.holevo) else []),
+            number(p.sigma),
+            *([number(p.systematic)] if common else []),
+            number(p.crb),
+            *([number(p.holevo)] if holevo else []),
             *(number(value) for value in (p.qcrb, p.over_crb)),
             percent(p.information),
             str(p.events),
