@@ -225,7 +225,7 @@ def row_of(
         "mass_kda": fit.mass_kda,
         "contrast": fit.contrast if model.rho else np.nan,
         "n_scattered": collected,
-        "snr": math.sqrt(2 * max(fit.log_likelihood, 0.0)),
+        "snr": fit.snr,
         "chi2_reduced": fit.chi2_reduced,
         "p_value": fit.p_value,
         "status": str(fit.status),
