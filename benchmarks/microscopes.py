@@ -187,8 +187,8 @@ def parameter_pulls(found: Mapping[str, Any], truth: Instrument) -> dict[str, fl
         pulls = {}
         for row in rows:
             off = one.get(row["parameter"], row["value"]) - true.get(row["parameter"], 0.0)
-            if row["parameter"] == "reference_phase_deg":
-                off = (off + 90) % 180 - 90  # half a turn is the sign of the contrast
+            if row["parameter"] in ("reference_phase_deg", "polarization_deg"):
+                off = (off + 90) % 180 - 90  # half a turn: the sign of the contrast; the same axis
             pulls[row["parameter"]] = off / row["sigma"]
         if not best or max(map(abs, pulls.values())) < max(map(abs, best.values())):
             best = pulls

@@ -342,14 +342,15 @@ class _Search:
                 rough.values,
             )
             names = free_names(self.free, rough.values, FREE["zernike"])
-            passes = _TRIAL_PASSES if tried else 40
             tried.append(rough)
-            fit = self._fit(_fitted(sights), rough.values, names, passes)
+            fit = self._fit(_fitted(sights), rough.values, names, _TRIAL_PASSES)
             judged = self._fit(_held_out(sights), fit.values, ())
             new_mask = fit.values["mask_na"] > 0 and not self.configured["mask_na"]
             earned = judged.log_likelihood - (TWIN_GAP if new_mask else 0.0)
             joint.append((earned, fit, judged.sights))
         _, best, held_out = max(joint, key=lambda each: each[0])
+        if not best.converged:
+            best = self._fit(best.sights, best.values, best.names)
         return best, held_out
 
     def _identified(self, best: Estimate) -> tuple[Estimate, dict[str, str]]:

@@ -24,7 +24,7 @@ from iscat_analysis.calibration.optics.starts import (
 from iscat_analysis.records import Mapper
 
 _STARTS = 2  # microscopes that are refined, per state
-_FIRST_PASSES, _MORE_PASSES = 6, 14  # of all starts, and of those that lead then
+_FIRST_PASSES, _MORE_PASSES = 6, 10  # of all starts, and of those that lead then
 _LEADERS = 2  # beside the best of every state
 _ROUGH = 1.0  # gain in log-likelihood that ends a search
 _HOPELESS = 0.03  # share of the log-likelihood by which a state lags that is given up
@@ -96,7 +96,7 @@ class StateSearch:
         begun = [start for starts in found for start in starts if self._promising(start, found)]
         refined = self._refine(averages, begun)
         hidden = self._hidden_masks(averages, refined)
-        refined += self._refine(averages, hidden) if hidden else []
+        refined += self._refine(averages, hidden, refined) if hidden else []
         return sorted(refined, key=lambda e: -e.log_likelihood)
 
     def states(self) -> list[list[dict[str, Any]]]:
@@ -162,8 +162,13 @@ class StateSearch:
         mass = -start.mass_kda if flipped else start.mass_kda
         return replace(start, values={**start.values, "reference_phase_deg": phase}, mass_kda=mass)
 
-    def _refine(self, averages: Sequence[Sight], begun: Sequence[Start]) -> list[Estimate]:
-        """Fit the averages from every start, and go on with those that lead after a few passes."""
+    def _refine(
+        self, averages: Sequence[Sight], begun: Sequence[Start], known: Sequence[Estimate] = ()
+    ) -> list[Estimate]:
+        """Fit the averages from every start, and go on with those that lead after a few passes.
+
+        What is behind a known microscope of the same light is left out.
+        """
 
         def first(start: Start) -> Estimate:
             there = [
@@ -176,6 +181,15 @@ class StateSearch:
             return fit if fit.converged else self._fit(fit.sights, fit.values, _MORE_PASSES)
 
         fits = sorted(self.mapper(first, begun), key=lambda e: -e.log_likelihood)
+        fits = [
+            fit
+            for fit in fits
+            if not any(
+                fit.values["polarization"] == other.values["polarization"]
+                and fit.log_likelihood < other.log_likelihood
+                for other in known
+            )
+        ]
         leading = [
             fit
             for rank, fit in enumerate(fits)
