@@ -116,6 +116,22 @@ class ArrayFrames:
         """Leave the array as it is; it belongs to the caller."""
 
 
+def printable(text: str) -> str:
+    """Escape the bytes of a file name that are not text, which no file in UTF-8 can hold.
+
+    Parameters
+    ----------
+    text : str
+        As the system gives it.
+
+    Returns
+    -------
+    str
+        With the escapes of Python written out.
+    """
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
 class Stack:
     """A movie in a file or an array; `iscat_analysis.movie.open_stack` makes it.
 
@@ -155,8 +171,8 @@ class Stack:
 
     @property
     def name(self) -> str:
-        """The file's name, without its folder."""
-        return self._path.name
+        """The file's name, without its folder, as text that can be written."""
+        return printable(self._path.name)
 
     @property
     def shape(self) -> tuple[int, int, int]:

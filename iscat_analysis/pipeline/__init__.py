@@ -25,6 +25,7 @@ from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.background import measure_windows
 from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts, refuse_ratio
 from iscat_analysis.movie.metadata import resolve_metadata
+from iscat_analysis.movie.stack import printable
 from iscat_analysis.pipeline.diagnosis import (
     EXCESS_NOISE,
     drift_warning,
@@ -252,8 +253,8 @@ def analyse(
     summary = summary_of(scene, found.table, windows, clock.seconds)
     sampled = config.samples_posterior
     provenance = Provenance(
-        command=_printable(command) or "iscat_analysis.pipeline.analyse",
-        input_path=_printable(str(movie.path)),
+        command=printable(command) or "iscat_analysis.pipeline.analyse",
+        input_path=printable(str(movie.path)),
         input_sha256=digest.result(),
         versions=_versions(),
         seed=config.compute.seed if sampled else None,
@@ -415,11 +416,6 @@ def _warm_up(scene: Scene, notify: Notify) -> None:
         compile_kernels(scene.model)
     finally:
         timer.cancel()
-
-
-def _printable(text: str) -> str:
-    """Escape the bytes of a file name that are not text, which no file in UTF-8 can hold."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 class _Clock:
