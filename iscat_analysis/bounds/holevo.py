@@ -92,7 +92,7 @@ def natural_bound(information: ComplexArray) -> Holevo:
     >>> natural_bound(np.array([[1, 1j], [-1j, 1]])).sigma.round(3)
     array([1.414, 1.414])
     """
-    _, unit, commutator = _orthonormal(information)
+    unit, commutator = _orthonormal(information)
     squared, vectors = np.linalg.eigh(commutator.T @ commutator)
     variance = 2 / (1 + np.sqrt(np.clip(1 - squared, 0.0, 1.0)))
     root = unit @ vectors
@@ -151,7 +151,7 @@ def holevo_bound(information: ComplexArray, weight: FloatArray) -> Holevo:
     2019, equation 7, for pure states), in coordinates in which K is the identity and the weight is
     of order one; solved by Clarabel.
     """
-    _, unit, commutator = _orthonormal(information)
+    unit, commutator = _orthonormal(information)
     weight = np.asarray(weight, dtype=np.float64)
     size = len(unit)
     if weight.shape != (size, size) or not np.allclose(weight, weight.T):
@@ -193,7 +193,7 @@ def tradeoff(information: ComplexArray, points: int = 101) -> FloatArray:
     if np.shape(information) != (2, 2):
         raise ConfigError(f"information: has shape {np.shape(information)}; give (2, 2)")
     found = []
-    _, unit, commutator = _orthonormal(information)
+    unit, commutator = _orthonormal(information)
     angle = math.asin(min(abs(commutator[0, 1]), 1.0))
     own = 1 / np.sqrt(np.diag(np.asarray(information).real))
     for share in np.linspace(0.0, math.pi / 2, points + 2)[1:-1]:
@@ -220,8 +220,8 @@ def _angle(sizes: FloatArray, angle: float) -> float:
     return float(brentq(slope, 0.0, angle, xtol=1e-14)) if angle else 0.0
 
 
-def _orthonormal(information: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """K, a matrix U with UᵀKU = 1, and the commutator UᵀBU."""
+def _orthonormal(information: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """Matrix U with UᵀKU = 1, and the commutator UᵀBU."""
     information = np.asarray(information, dtype=np.complex128)
     if information.ndim != 2 or information.shape[0] != information.shape[1]:
         raise ConfigError(f"information: has shape {information.shape}; give a square matrix")
@@ -235,7 +235,7 @@ def _orthonormal(information: ComplexArray) -> tuple[FloatArray, FloatArray, Flo
     if values[0] < 1e-12:
         raise ConfigError("information: its parameters are not independent of each other")
     unit = scale[:, None] * vectors / np.sqrt(values)
-    return information.real, unit, unit.T @ information.imag @ unit
+    return unit, unit.T @ information.imag @ unit
 
 
 def _solve(information: ComplexArray, weight: FloatArray) -> FloatArray:

@@ -461,6 +461,10 @@ class Fit(Section):
             raise ValueError(f"z_range_nm = {list(self.z_range_nm)} is empty")
         return self
 
+    def roi_px(self, pixel_nm: float) -> int:
+        """Side of the square that is fitted, in pixels of a given side [nm]."""
+        return max(5, round(self.roi_nm / pixel_nm))
+
 
 class PosteriorConfig(Section):
     """Sampling of the posterior with emcee."""

@@ -21,8 +21,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
-from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.fit import window_nm
+from iscat_analysis.errors import DataError
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
@@ -43,7 +42,13 @@ from iscat_analysis.pipeline.injection import InjectedMovie, draw_particles, rec
 from iscat_analysis.pipeline.pattern import follow
 from iscat_analysis.pipeline.results import Row, table_of, view_of
 from iscat_analysis.pipeline.resume import Store
-from iscat_analysis.pipeline.scene import Scene, reported_steps, search_both
+from iscat_analysis.pipeline.scene import (
+    Scene,
+    reported_steps,
+    search_both,
+    square_model,
+    square_of,
+)
 from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
 from iscat_analysis.records import EventView, FloatArray, Progress, Status, Windows
 from iscat_analysis.search.sliding import STRIDES, Chunk
@@ -346,18 +351,8 @@ def make_landing_scene(config: Config, field_px: tuple[int, int], *, searches: i
     ConfigError
         The region is larger than the field, or the calibration has the wrong sign.
     """
-    pixel = config.camera.pixel_size_nm
-    if pixel is None:
-        raise ConfigError(
-            "camera.pixel_size_nm is needed: set it, as in camera.pixel_size_nm = 84.4"
-        )
-    roi_px = max(5, round(config.fit.roi_nm / pixel))
-    if roi_px > min(field_px):
-        raise ConfigError(
-            f"fit.roi_nm = {config.fit.roi_nm:g} is {roi_px} pixels, more than the field of "
-            f"{field_px[0]} x {field_px[1]}: lower fit.roi_nm or check camera.pixel_size_nm"
-        )
-    model = forward_model(config, math.sqrt(2) * (roi_px * pixel / 2 + window_nm(pixel) + pixel))
+    pixel, roi_px = square_of(config, field_px)
+    model = square_model(config, pixel, roi_px)
     return Scene(
         config=config,
         model=model,

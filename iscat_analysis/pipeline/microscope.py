@@ -566,7 +566,7 @@ def _pixel_nm(config: Config) -> float:
 
 
 def _roi_px(config: Config) -> int:
-    return max(5, round(config.fit.roi_nm / _pixel_nm(config)))
+    return config.fit.roi_px(_pixel_nm(config))
 
 
 def _spot_px(config: Config) -> float:

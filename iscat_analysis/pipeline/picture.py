@@ -188,7 +188,7 @@ def measure_template(
             'does not give: use fit.mode = "mass"'
         )
     pixel = float(config.camera.pixel_size_nm or np.nan)
-    roi_nm = max(5, round(config.fit.roi_nm / pixel)) * pixel
+    roi_nm = config.fit.roi_px(pixel) * pixel
     larger = config.fit.model_copy(update={"roi_nm": roi_nm + 2 * MARGIN_PX * pixel})
     physics = config.optics.model_copy(update={"psf": "model", "template": None})
     cut = config.model_copy(update={"fit": larger, "optics": physics, "calibration": None})

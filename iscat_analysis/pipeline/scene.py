@@ -86,7 +86,7 @@ class Scene:
     @property
     def roi_px(self) -> int:
         """Side of the fitted square [pixels]."""
-        return max(5, round(self.config.fit.roi_nm / self.pixel_nm))
+        return self.config.fit.roi_px(self.pixel_nm)
 
     @property
     def additive(self) -> bool:
@@ -116,21 +116,14 @@ def make_scene(config: Config, field_px: tuple[int, int], *, searches: int = 1) 
     ConfigError
         The region is too small or too large, or the likelihood does not suit the scheme.
     """
-    pixel = _pixel_nm(config)
-    roi_px = max(5, round(config.fit.roi_nm / pixel))
-    if roi_px > min(field_px):
-        raise ConfigError(
-            f"fit.roi_nm = {config.fit.roi_nm:g} is {roi_px} pixels, more than the field of "
-            f"{field_px[0]} x {field_px[1]}: lower fit.roi_nm or check camera.pixel_size_nm"
-        )
+    pixel, roi_px = square_of(config, field_px)
     darkfield = config.optics.scheme == "darkfield"
     if config.fit.likelihood == "conditional" and (darkfield or not _is_counted(config)):
         raise ConfigError(
             'fit.likelihood = "conditional" needs an interferometric scheme and '
             'background.method = "fixed" or "sliding": use "auto"'
         )
-    reach = math.sqrt(2) * (roi_px * pixel / 2 + window_nm(pixel) + pixel)
-    model = forward_model(config, reach)
+    model = square_model(config, pixel, roi_px)
     mode = config.fit.mode
     free_z = "z_nm" in FREE_PARAMETERS[mode]
     field_nm = math.hypot(field_px[0] + 1, field_px[1] + 1) * pixel
@@ -147,6 +140,60 @@ def make_scene(config: Config, field_px: tuple[int, int], *, searches: int = 1) 
             field_px=field_px,
         ),
         mode=mode,
+    )
+
+
+def square_of(config: Config, field_px: tuple[int, int]) -> tuple[float, int]:
+    """Give the side of a pixel and of the square that is fitted.
+
+    Parameters
+    ----------
+    config : Config
+        With a pixel size.
+    field_px : (int, int)
+        Rows and columns of the field.
+
+    Returns
+    -------
+    pixel_nm : float
+        Side of a pixel [nm].
+    roi_px : int
+        Side of the square [pixels].
+
+    Raises
+    ------
+    ConfigError
+        The pixel size is missing, or the square is larger than the field.
+    """
+    pixel = _pixel_nm(config)
+    roi_px = config.fit.roi_px(pixel)
+    if roi_px > min(field_px):
+        raise ConfigError(
+            f"fit.roi_nm = {config.fit.roi_nm:g} is {roi_px} pixels, more than the field of "
+            f"{field_px[0]} x {field_px[1]}: lower fit.roi_nm or check camera.pixel_size_nm"
+        )
+    return pixel, roi_px
+
+
+def square_model(config: Config, pixel_nm: float, roi_px: int) -> ForwardModel:
+    """Build the forward model of the square that is fitted.
+
+    Parameters
+    ----------
+    config : Config
+        Optics, particle and calibration.
+    pixel_nm : float
+        Side of a pixel [nm].
+    roi_px : int
+        Side of the square [pixels].
+
+    Returns
+    -------
+    ForwardModel
+        It reaches over the square from wherever a fit may put the particle.
+    """
+    return forward_model(
+        config, math.sqrt(2) * (roi_px * pixel_nm / 2 + window_nm(pixel_nm) + pixel_nm)
     )
 
 

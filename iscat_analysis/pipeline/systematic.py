@@ -97,7 +97,7 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
     suited = suited and config.optics.psf == "model"
     if errors is None or not errors.names or pixel is None or not suited:
         return {}
-    side = max(5, round(config.fit.roi_nm / pixel))
+    side = config.fit.roi_px(pixel)
     grid = PixelGrid.centred(side, pixel)
     known = table[["z_nm", "mass_kda"]].notna().all(axis=1).to_numpy()
     model = forward_model(config, 1.05 * grid.diagonal_nm / 2)

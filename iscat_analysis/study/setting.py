@@ -255,7 +255,7 @@ def make_setting(
         `make_scene`.
     """
     pixel_nm = config.camera.pixel_size_nm
-    side = max(5, round(config.fit.roi_nm / pixel_nm)) if pixel_nm else config.bounds.pixels
+    side = config.fit.roi_px(pixel_nm) if pixel_nm else config.bounds.pixels
     changes: dict[str, Mapping[str, Any]] = {
         "bounds": {"pixels": side},
         "fit": {"mode": mode},

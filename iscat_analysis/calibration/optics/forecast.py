@@ -262,7 +262,7 @@ def _model(config: Config) -> tuple[ForwardModel, PixelGrid]:
             f"camera.read_noise_e = {camera.read_noise_e!r} is a map: bounds need a number, as in "
             "camera.read_noise_e = 1.5"
         )
-    grid = PixelGrid.centred(max(5, round(config.fit.roi_nm / pixel)), pixel)
+    grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
     reach = grid.diagonal_nm / 2 + pixel
     return forward_model(config, reach, z_max_nm=config.particle.height_nm), grid
 
