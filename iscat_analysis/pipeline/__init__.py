@@ -29,6 +29,7 @@ from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.movie.stack import printable
 from iscat_analysis.pipeline.achieved import (
     measure_spread,
+    spread_verdict,
     with_measured_sigma,
     with_repeats,
 )
@@ -264,8 +265,13 @@ def analyse(
     if found.repeats:
         achieved = measure_spread(scene.mode, found.table, found.repeats, found.empty)
         table = with_repeats(scene.mode, found.table, found.repeats)
-        if config.fit.sigma == "measured":
+        scaled = config.fit.sigma == "measured"
+        if scaled:
             table = with_measured_sigma(table, achieved)
+        noise = further.get("landing") or further.get("background") or {}
+        further["repeats"] = spread_verdict(achieved, noise, scaled=scaled)
+        if further["repeats"]["message"]:
+            tell(further["repeats"]["message"])
         found = replace(found, table=table)
     summary = summary_of(scene, found.table, windows, clock.seconds, achieved)
     sampled = config.samples_posterior

@@ -21,6 +21,7 @@ from iscat_analysis.inference.repeats import (
     series_of,
 )
 from iscat_analysis.movie import Stack
+from iscat_analysis.movie.background import smooth_background
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.field import Event, total_signal
@@ -399,7 +400,10 @@ def _field_of(
     read: FloatArray,
     events: Sequence[Event],
 ) -> EmptyField:
-    mean = windows.before_e / powers[0].sum()
+    mean = windows.before_e
+    if scene.additive:  # counts may be few, and weights must not follow their chance
+        mean = smooth_background(mean, windows.read_variance_before_e2, windows.masked)
+    mean = mean / powers[0].sum()
     return _empty_field(scene, mean, read, ~windows.masked, [e.fit for e in events], level=False)
 
 

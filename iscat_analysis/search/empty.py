@@ -90,9 +90,10 @@ class EmptyField:
         )  # fmt: skip
         self._n_free = n_free
         self._mean = mean_e
-        variance = np.where(used, np.maximum(mean_e, 0.0) + read_e2, 1.0)
+        noise = np.maximum(mean_e, 0.0) + read_e2
         light = np.ones_like(mean_e) if additive else mean_e
-        self._weight = np.where(used & (variance > 0), light / variance, 0.0)
+        seen = used & (noise > 0)
+        self._weight = np.where(seen, light / np.where(seen, noise, 1.0), 0.0)
         scale = np.sqrt(np.einsum("iyx,iyx->i", slopes, slopes))
         unit = slopes / scale[:, None, None]
         pairs = [(i, j) for i in range(n) for j in range(i, n)]

@@ -148,7 +148,7 @@ def test_named_arguments_win(movie, config) -> None:
 
 def test_the_table_is_a_frame(result) -> None:
     assert isinstance(result.table, pd.DataFrame)
-    assert tuple(result.table.columns) == ia.EVENT_COLUMNS
+    assert tuple(result.table.columns) == (*ia.EVENT_COLUMNS, *REPEAT_COLUMNS)
     assert len(result) == len(result.table) == 2
 
 
