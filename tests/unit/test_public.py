@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 import iscat_analysis as ia
 from iscat_analysis import notebook
+from iscat_analysis.records import REPEAT_COLUMNS
 from iscat_analysis.report.pictures import draw
 
 SMALL = {
