@@ -26,6 +26,7 @@ SIGNIFICANT = 3.0
 LEAST_EXCESS = 0.02
 """Relative excess below which nothing is said."""
 
+_WIDEST = 5.0  # half-width of an interval of ln ratio, beyond which nothing is known
 _FEWEST_TILES = 6
 _FEWEST_COUNTS = 200
 
@@ -132,7 +133,7 @@ def pooled(
     ratio2 = max(ratio2, 1e-6)
     error = math.sqrt(variance) / (2 * ratio2)  # of ln ratio
     ratio = math.sqrt(ratio2)
-    reach = float(student.ppf(0.975, max(degrees, 2))) * error
+    reach = min(float(student.ppf(0.975, max(degrees, 2))) * error, _WIDEST)
     # what Student's law makes of the error, in normal standard errors
     chance = float(student.sf(abs(math.log(ratio)) / error, max(degrees, 2)))
     significance = math.copysign(_normal_quantile(chance), math.log(ratio))

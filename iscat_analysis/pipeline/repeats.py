@@ -46,6 +46,8 @@ MOST_WINDOWS, FEWEST_WINDOWS = 12, 2
 """Windows of a chunk that are looked at."""
 
 _NEAR, _NEAR_POOR = 1 / 3, 1 / 2  # of the square's side; a poor fit leaves its rings over
+_LEAST_LIGHT_E = 1e4  # of a frame, whose power is then known to 1 %
+_OUTSHONE = 0.1
 _BLOCK_BYTES = 16 * 2**20
 
 
@@ -304,7 +306,10 @@ def field_repeats(
         owns.append(None if response is None else _Own(event, response, ([], [])))
     spans = (windows.frames_before, windows.frames_after)
     n_before = windows.n_before
-    powers = (windows.power[:n_before].copy(), windows.power[n_before:].copy())
+    power = windows.power
+    if windows.before_e.sum() < _LEAST_LIGHT_E * max(n_before, 1):
+        power = np.ones_like(power)  # too dark to tell one frame's from the next's
+    powers = (power[:n_before], power[n_before:])
     # the level of the light is the one that the fits use
     scale = windows.power_ratio * max(powers[0].sum(), 1.0) / powers[1].sum() if n_before else 1.0
     powers = (powers[0], powers[1] * scale)
@@ -314,6 +319,8 @@ def field_repeats(
         [(e.candidate.x_px, e.candidate.y_px, Status.POOR_FIT not in e.fit.flags) for e in events],
     )  # fmt: skip
     signal = total_signal(scene, shape, events)
+    if scene.additive:  # where particles outshine the background their light has noise of its own
+        taken |= photons_scale(scene, windows) * signal > _OUTSHONE * windows.after_e.mean()
     parts: tuple[list[FloatArray], list[FloatArray]] = ([], [])
     lights: tuple[list[float], list[float]] = ([], [])
     for side, (span, power) in enumerate(zip(spans, powers, strict=True)):
