@@ -39,7 +39,7 @@ from iscat_analysis.records import (
     Windows,
     silent,
 )
-from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, LISTED, is_dwarfed
+from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, is_dwarfed, is_hidden
 from iscat_analysis.search.templates import LARGEST_IMAGE, find_particles
 
 MAX_ROUNDS = 8
@@ -200,7 +200,7 @@ def _search(
         size = max(size, EXCEEDS * candidate.beside)
         if abs(candidate.snr) > size:
             fresh.append(candidate)
-        elif abs(candidate.snr) > LISTED * size:
+        elif not is_hidden(candidate.snr, size):
             doubtful.append(candidate)
     return fresh, doubtful
 

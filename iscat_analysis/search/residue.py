@@ -61,6 +61,24 @@ def is_dwarfed(snr: float, chi2_reduced: float, n_pixels: int, brightest: float)
     return excess > noise and snr**2 < EXPLAINS * excess and brightest > DWARFS * snr
 
 
+def is_hidden(snr: float, size: float) -> bool:
+    """Whether a candidate is too low to be listed, even as a side lobe.
+
+    Parameters
+    ----------
+    snr : float
+        Its signal-to-noise ratio.
+    size : float
+        What it must exceed to be a particle.
+
+    Returns
+    -------
+    bool
+        Whether it is below `LISTED` of that.
+    """
+    return abs(snr) <= LISTED * size
+
+
 def chi2_excess(residuals: NDArray[Any]) -> float:
     """Measure what a fit left over.
 
@@ -110,14 +128,14 @@ def size_on_ring(
         (max(math.floor(c - far), 0), max(min(math.ceil(c + far) + 1, n), 0))
         for c, n in zip((y0, x0), snr.shape, strict=True)
     )
-    y, x = np.mgrid[top:bottom, left:right]
-    away = np.hypot(y - y0, x - x0)
-    ring = np.abs(away - distance) < _RING_PX
-    ring &= np.hypot(y - yc, x - xc) > _PATCH_PX
-    y, x, away = y[ring], x[ring], away[ring]
-    own = np.ones(away.shape, dtype=np.bool_)
+    rows, columns = np.arange(top, bottom), np.arange(left, right)
+    away2 = (rows - y0)[:, None] ** 2 + (columns - x0) ** 2
+    y, x = np.nonzero((away2 > (distance - _RING_PX) ** 2) & (away2 < far**2))
+    away2, y, x = away2[y, x], rows[y], columns[x]
+    own = (y - yc) ** 2 + (x - xc) ** 2 > _PATCH_PX**2
     for xo, yo in others:
-        own &= np.hypot(y - yo, x - xo) > away
+        if math.hypot(xo - x0, yo - y0) < 2 * far:  # a farther one is nearer to no pixel of it
+            own &= (y - yo) ** 2 + (x - xo) ** 2 > away2
     y, x = y[own], x[own]
     if not y.size:
         return 0.0
