@@ -111,24 +111,33 @@ class Sieve:
         return distance < 1.5 * self.roi_px and abs(peak.snr) < share * abs(start.snr)
 
     def _left_over(self, peak: Peak, steps: Sequence[Step], snr: MapArray) -> float:
-        """Largest misfit of a step at a peak; the search ends with one that hides the peak."""
-        size = 0.0
-        for step in steps:
-            size = max(size, self._misfit(step, peak, steps, snr))
-            if is_hidden(peak.snr, size):
+        """Signal-to-noise ratio that a peak must exceed not to be what the fits left over.
+
+        The nearest steps come first, and the search ends with one that hides the peak.
+        """
+        away = [math.hypot(peak.x_px - s.start.x_px, peak.y_px - s.start.y_px) for s in steps]
+        size = max(
+            (
+                self._inside(s, peak)
+                for s, d in zip(steps, away, strict=True)
+                if d < self.roi_px / 2
+            ),
+            default=0.0,
+        )
+        places = [(s.start.x_px, s.start.y_px) for s in steps]
+        j = round((peak.frame - self.first) / self.stride) - 1
+        for i in np.argsort(away, kind="stable").tolist():
+            if is_hidden(peak.snr, size) or away[i] > LARGEST_IMAGE * self.roi_px:
                 break
+            others = places[:i] + places[i + 1 :]
+            beside = size_on_ring(snr[j], places[i], (peak.x_px, peak.y_px), others)
+            size = max(size, EXCEEDS * beside)
         return size
 
-    def _misfit(self, step: Step, peak: Peak, steps: Sequence[Step], snr: MapArray) -> float:
-        """Signal-to-noise ratio that a peak must exceed not to be what the fit of a step left."""
-        x0, y0 = step.start.x_px, step.start.y_px
-        distance = math.hypot(peak.x_px - x0, peak.y_px - y0)
-        if distance > LARGEST_IMAGE * self.roi_px:
-            return 0.0
-        # a window that holds the step only in part sees that part of the misfit
+    def _inside(self, step: Step, peak: Peak) -> float:
+        """Give what a peak in a step's fitted region must exceed.
+
+        A window that holds the step only in part sees that part of the misfit.
+        """
         part = max(1 - abs(step.at.frame - peak.frame) / self.window, 0.0)
-        whole = part * math.sqrt(EXPLAINS * step.excess) if distance < self.roi_px / 2 else 0.0
-        others = [(s.start.x_px, s.start.y_px) for s in steps if s is not step]
-        j = round((peak.frame - self.first) / self.stride) - 1
-        beside = size_on_ring(snr[j], (x0, y0), (peak.x_px, peak.y_px), others)
-        return max(whole, EXCEEDS * beside)
+        return part * math.sqrt(EXPLAINS * step.excess)

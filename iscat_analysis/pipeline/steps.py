@@ -40,7 +40,7 @@ from iscat_analysis.records import (
     FloatArray,
     Windows,
 )
-from iscat_analysis.search.residue import chi2_excess, is_dwarfed
+from iscat_analysis.search.residue import chi2_excess
 from iscat_analysis.search.sliding import (
     STRIDES,
     Chunk,
@@ -347,20 +347,15 @@ class ChunkFitter:
         judged = []
         for lobe, one, task in finished:
             event = one.event
-            brightest = max(
-                (
-                    other.event.snr
-                    for _, other, _ in finished
-                    if _apart(other.step, one.step) < self._window
-                    and distance_px(other.step, one.step) < LARGEST_IMAGE * self._roi_px
-                ),
-                default=0.0,
+            near = (
+                other.event.described
+                for _, other, _ in finished
+                if _apart(other.step, one.step) < self._window
+                and distance_px(other.step, one.step) < LARGEST_IMAGE * self._roi_px
             )
             fit = judge(
                 self._scene, event.fit, task.region, task.windows.saturated,
-                sidelobe=lobe or is_dwarfed(
-                    event.snr, event.fit.chi2_reduced, event.likelihood.n_pixels, brightest
-                ),
+                sidelobe=lobe or event.described.is_dwarfed(near),
                 too_close=task.crowded,
                 poor_fit=task.at.p_constant < POOR_FIT_P,
             )  # fmt: skip

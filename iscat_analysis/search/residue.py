@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -37,28 +38,60 @@ _HEIGHT = 0.8  # share of the ring that is lower than what counts as its height
 _PATCH_PX = 5.0  # around the candidate, which is its own
 
 
-def is_dwarfed(snr: float, chi2_reduced: float, n_pixels: int, brightest: float) -> bool:
-    """Whether a fit explains less than it leaves over, beside a particle that is far brighter.
+@dataclass(frozen=True)
+class Described:
+    """How well a fit describes its region.
 
-    Parameters
+    Attributes
     ----------
     snr : float
-        Of the fitted event.
-    chi2_reduced : float
-        Of its fit.
-    n_pixels : int
-        In its region.
-    brightest : float
-        Largest signal-to-noise ratio of the events that reach there.
-
-    Returns
-    -------
-    bool
-        Whether it is no more than a side lobe, as far as the model can tell.
+        Of the particle.
+    excess : float
+        χ² above its expectation; 0 where that may be noise.
     """
-    excess = (chi2_reduced - 1) * n_pixels
-    noise = _EXCESS_SIGMAS * math.sqrt(2 * n_pixels)
-    return excess > noise and snr**2 < EXPLAINS * excess and brightest > DWARFS * snr
+
+    snr: float
+    excess: float
+
+    @classmethod
+    def of(cls, snr: float, chi2_reduced: float, n_pixels: int) -> Described:
+        """Take it from a fit.
+
+        Parameters
+        ----------
+        snr : float
+            Of the particle.
+        chi2_reduced : float
+            Of its fit.
+        n_pixels : int
+            In its region.
+
+        Returns
+        -------
+        Described
+            The fit.
+        """
+        return cls(snr, _significant((chi2_reduced - 1) * n_pixels, n_pixels))
+
+    def is_dwarfed(self, others: Iterable[Described]) -> bool:
+        """Whether it explains less than it leaves over, beside a particle that is far brighter.
+
+        A model that is wrong leaves the same share of every particle, which the brighter one shows:
+        so much of the excess is the particle's own.
+
+        Parameters
+        ----------
+        others : iterable of Described
+            Those that reach there.
+
+        Returns
+        -------
+        bool
+            Whether it is no more than a side lobe, as far as the model can tell.
+        """
+        brightest = max(others, key=lambda other: other.snr, default=self)
+        own = brightest.excess * (self.snr / brightest.snr) ** 2 if brightest.snr else 0.0
+        return brightest.snr > DWARFS * self.snr and self.snr**2 < EXPLAINS * (self.excess - own)
 
 
 def is_hidden(snr: float, size: float) -> bool:
@@ -93,8 +126,12 @@ def chi2_excess(residuals: NDArray[Any]) -> float:
         χ² above its expectation; 0 where that may be noise.
     """
     n = int(np.count_nonzero(np.isfinite(residuals)))
-    excess = float(np.nansum(residuals**2)) - n
-    return excess if excess > _EXCESS_SIGMAS * math.sqrt(2 * n) else 0.0
+    return _significant(float(np.nansum(residuals**2)) - n, n)
+
+
+def _significant(excess: float, n_pixels: int) -> float:
+    """Give a χ² in excess, 0 where that may be noise."""
+    return excess if excess > _EXCESS_SIGMAS * math.sqrt(2 * n_pixels) else 0.0
 
 
 def size_on_ring(
