@@ -209,16 +209,21 @@ def radial_profile(
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
-def _mix(heights: FloatArray, i: int, channel: int, w: FloatArray, out: FloatArray) -> None:
+def _mix(
+    heights: FloatArray, i: int, channel: int, start: int, w: FloatArray, out: FloatArray
+) -> None:
     """Fill `out` (n) with the combination w (6) of a channel's rows at heights i and i + 1.
 
-    Three rows at a time: against more that might overlap, the compiler gives up on vectors.
+    The rows begin at `start`.  Three at a time: against more that might overlap, the compiler gives
+    up on vectors, as it does where it does not know that a row's numbers follow one another.
     """
-    t0, t1, t2 = heights[i, 0, channel], heights[i, 1, channel], heights[i, 2, channel]
+    span = slice(start, start + out.size)
+    low, high = heights[i], heights[i + 1]
+    t0, t1, t2 = low[0, channel, span], low[1, channel, span], low[2, channel, span]
     w0, w1, w2 = w[0], w[1], w[2]
     for j in range(out.size):
         out[j] = w0 * t0[j] + w1 * t1[j] + w2 * t2[j]
-    t0, t1, t2 = heights[i + 1, 0, channel], heights[i + 1, 1, channel], heights[i + 1, 2, channel]
+    t0, t1, t2 = high[0, channel, span], high[1, channel, span], high[2, channel, span]
     w0, w1, w2 = w[3], w[4], w[5]
     for j in range(out.size):
         out[j] += w0 * t0[j] + w1 * t1[j] + w2 * t2[j]
@@ -286,12 +291,11 @@ def profile_at(
     channels, width = heights.shape[2:]
     with_slope = profile.shape[0] > channels
     cos, sin = np.cos(kappa * z_nm), np.sin(kappa * z_nm)
-    flat = profile.reshape(profile.shape[0], width)[:, start:stop]
-    used = heights[:, :, :, start:stop]
+    flat = profile.reshape(profile.shape[0], width)
     for channel in range(channels):
-        _mix(used, i, channel, v, work[channel, 0, start:stop])
+        _mix(heights, i, channel, start, v, work[channel, 0, start:stop])
         if with_slope:
-            _mix(used, i, channel, d, work[channel, 1, start:stop])
+            _mix(heights, i, channel, start, d, work[channel, 1, start:stop])
     for c in range(0, channels, 2):
         re, im = work[c, 0, start:stop], work[c + 1, 0, start:stop]
         if with_slope:
@@ -299,5 +303,8 @@ def profile_at(
             for j in range(re.size):
                 slope_re[j] -= kappa * im[j]
                 slope_im[j] += kappa * re[j]
-            _turn(slope_re, slope_im, cos, sin, flat[c + channels], flat[c + channels + 1])
-        _turn(re, im, cos, sin, flat[c], flat[c + 1])
+            _turn(
+                slope_re, slope_im, cos, sin,
+                flat[c + channels, start:stop], flat[c + channels + 1, start:stop],
+            )  # fmt: skip
+        _turn(re, im, cos, sin, flat[c, start:stop], flat[c + 1, start:stop])

@@ -45,6 +45,9 @@ SERIES = 0.2
 FLOOR = 1e-300
 """Least expected count or intensity: keeps quotients finite where a dark fringe is exactly zero."""
 
+SLACK_NM = 1e-6
+"""Rounding of coordinates near the edge of the support."""
+
 
 @njit(inline="always")
 def _log1p(x: float) -> float:
@@ -238,6 +241,31 @@ def scratch(axial: AxialTable, lens: Lens, orders: int) -> tuple[FloatArray, Flo
     last = 2 * lens.half + 1 if lens.half else 6
     work = np.empty((channels, 2, width))
     return work, np.empty((orders * channels, width // last, last))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def supported(
+    thetas: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+    half_pixel: float,
+    reach: float,
+    low: float,
+    high: float,
+    largest_level: float,
+) -> BoolArray:
+    """Tell at which θ (n, 5) every pixel is within reach, the height known and all finite."""
+    inside = np.empty(thetas.shape[0], dtype=np.bool_)
+    for k in range(thetas.shape[0]):
+        dx = max(abs(thetas[k, 0] - x[0]), abs(thetas[k, 0] - x[-1])) + half_pixel
+        dy = max(abs(thetas[k, 1] - y[0]), abs(thetas[k, 1] - y[-1])) + half_pixel
+        inside[k] = (
+            np.hypot(dx, dy) <= reach
+            and low - SLACK_NM <= thetas[k, 2] <= high + SLACK_NM
+            and np.isfinite(thetas[k, 3])
+            and abs(thetas[k, 4]) <= largest_level
+        )
+    return inside
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

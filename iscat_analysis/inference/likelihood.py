@@ -35,6 +35,7 @@ from iscat_analysis._kernels.scoring import (
     maximize,
     scan_heights,
     score_pass,
+    supported,
     value_batch,
 )
 from iscat_analysis.errors import ConfigError, DataError
@@ -51,8 +52,6 @@ LEVEL = 4
 
 LARGEST_LEVEL = 50.0
 """Logarithm of the level beyond which no light is meant, and counts would overflow."""
-
-_SLACK_NM = 1e-6  # rounding of coordinates near the edge of the support
 
 
 @dataclass(frozen=True)
@@ -180,19 +179,10 @@ class Likelihood:
             False for heights outside the model's `z_range_nm`, for places with a pixel of the grid
             beyond its `reach_nm`, and for values that are not finite.
         """
-        x, y, z, amplitude, level = thetas.T
-        low, high = self.model.z_range_nm
-        half = self.grid.pixel_nm / 2
-        columns, rows = self.grid.x_nm, self.grid.y_nm
-        far_x = np.maximum(np.abs(x - columns[0]), np.abs(x - columns[-1])) + half
-        far_y = np.maximum(np.abs(y - rows[0]), np.abs(y - rows[-1])) + half
-        inside: BoolArray = (
-            (np.hypot(far_x, far_y) <= self.model.reach_nm)
-            & (z >= low - _SLACK_NM)
-            & (z <= high + _SLACK_NM)
-            & np.isfinite(amplitude)
-            & (np.abs(level) <= LARGEST_LEVEL)
-        )
+        inside: BoolArray = supported(
+            thetas, self.grid.x_nm, self.grid.y_nm, self.grid.pixel_nm / 2, self.model.reach_nm,
+            *self.model.z_range_nm, LARGEST_LEVEL,
+        )  # fmt: skip
         return inside
 
     def score_fisher(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
