@@ -606,6 +606,12 @@ class BoundsConfig(Section):
     )
     n_before: Annotated[int, Field(ge=0)] = Field(200, description="0: the background is known")
     n_after: Annotated[int, Field(ge=1)] = Field(200, description="frames with the particle")
+    false_alarm_probability: Annotated[float, Field(gt=0, lt=0.5)] = Field(
+        1e-3, description="of the smallest mass that is detected: that noise is taken for it"
+    )
+    miss_probability: Annotated[float, Field(gt=0, lt=0.5)] = Field(
+        0.05, description="of the smallest mass that is detected: that it is not found"
+    )
 
 
 class Compute(Section):
