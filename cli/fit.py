@@ -37,7 +37,8 @@ EXAMPLE = """Example: 200 frames before the particles bound, the rest after.
     iscat fit movie.tif --mode mass --config setup.toml --background 0:200
 
 Exit status: 0 done; 1 the data cannot be analysed; 2 usage or configuration;
-3 done, but something is flagged and --strict was given; 130 interrupted.
+3 done, but --strict was given and something is flagged or σ understated;
+130 interrupted.
 """
 
 
@@ -94,7 +95,11 @@ def fit(
     ] = None,
     overwrite: OverwriteOption = False,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Exit with status 3 if any result is flagged.")
+        bool,
+        typer.Option(
+            "--strict",
+            help="Exit with status 3 if any result is flagged, or σ is understated.",
+        ),
     ] = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -143,8 +148,9 @@ def fit(
         flagged = [row for row in rows if _is_flagged(row)]
         if flagged:
             _advise(messages, flagged)
-            if strict:
-                raise typer.Exit(FLAGGED)
+        understated = analysis.summary.get("repeats", {}).get("understated", False)
+        if strict and (flagged or understated):
+            raise typer.Exit(FLAGGED)
 
 
 def _changes(

@@ -36,6 +36,10 @@ EVENT_COLUMNS = (
 )  # fmt: skip
 """The columns of ``fits.csv``, in order."""
 
+REPEAT_COLUMNS = ("repeat_x_nm", "repeat_y_nm", "repeat_z_nm", "repeat_mass_kda")
+"""Columns of ``fits.csv`` where an event has several frames: its standard errors as disjoint parts
+of its own frames show them."""
+
 
 class Progress(Protocol):
     """Told how far a stage has come; the command line turns it into a bar on stderr."""

@@ -450,6 +450,10 @@ class Fit(Section):
     likelihood: Literal["auto", "poisson", "conditional"] = Field(
         "auto", description='"auto" | "poisson" | "conditional"'
     )
+    sigma: Literal["curvature", "measured"] = Field(
+        "curvature",
+        description='"curvature" (of the likelihood) | "measured": scaled by the measured spread',
+    )
     z_range_nm: tuple[
         Annotated[NonNegative, _length(0.0, LARGEST_NM)],
         Annotated[NonNegative, _length(0.0, LARGEST_NM)],

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.achieved import Achieved
 from iscat_analysis.inference.likelihood import compile_kernels
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.movie import Stack, open_stack
@@ -26,6 +27,12 @@ from iscat_analysis.movie.background import measure_windows
 from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts, refuse_ratio
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.movie.stack import printable
+from iscat_analysis.pipeline.achieved import (
+    measure_spread,
+    spread_verdict,
+    with_measured_sigma,
+    with_repeats,
+)
 from iscat_analysis.pipeline.diagnosis import (
     EXCESS_NOISE,
     allow_for_correlation,
@@ -40,6 +47,7 @@ from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.landing import analyse_landings, has_landings, inject_and_recover
 from iscat_analysis.pipeline.learning import learn_optics
 from iscat_analysis.pipeline.ranges import frame_ranges
+from iscat_analysis.pipeline.repeats import field_repeats
 from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
 from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
 from iscat_analysis.pipeline.scene import Scene, field_likelihood, make_scene
@@ -227,7 +235,10 @@ def analyse(
         )
         scene, image = result.scene, result.image
         further["landing"] = result.summary
-        found = Found(result.table, result.views, result.windows, result.interrupted)
+        found = Found(
+            result.table, result.views, result.windows, result.interrupted,
+            result.repeats, result.empty,
+        )  # fmt: skip
         config = scene.config
         clock.lap("landing")
         if inject and not result.interrupted:
@@ -252,7 +263,19 @@ def analyse(
     if found.interrupted:  # what was finished is now gathered and kept, which takes a moment
         progress("report", 0, 1)
     found = replace(found, table=with_systematic(config, found.table))
-    summary = summary_of(scene, found.table, windows, clock.seconds)
+    achieved: dict[str, Achieved] = {}
+    if found.repeats:
+        achieved = measure_spread(scene.mode, found.table, found.repeats, found.empty)
+        table = with_repeats(scene.mode, found.table, found.repeats)
+        scaled = config.fit.sigma == "measured"
+        if scaled:
+            table = with_measured_sigma(table, achieved)
+        noise = further.get("landing") or further.get("background") or {}
+        further["repeats"] = spread_verdict(achieved, noise, scaled=scaled)
+        if further["repeats"]["message"]:
+            tell(further["repeats"]["message"])
+        found = replace(found, table=table)
+    summary = summary_of(scene, found.table, windows, clock.seconds, achieved)
     sampled = config.samples_posterior
     provenance = Provenance(
         command=printable(command) or "iscat_analysis.pipeline.analyse",
@@ -349,8 +372,9 @@ def _measured_background(
             noisy = gain is not None and gain.noise_ratio > EXCESS_NOISE
             excess = (gain.message or "") if gain is not None and noisy else ""
             found = _bound_particles(
-                scene, windows, clock, excess_noise=excess, tell=tell, pool=pool, progress=progress
-            )
+                scene, movie, camera, windows, clock,
+                excess_noise=excess, tell=tell, pool=pool, progress=progress,
+            )  # fmt: skip
     windows = found.windows
     image = field_likelihood(scene, windows).measured_signal()
     if scene.additive:
@@ -361,6 +385,8 @@ def _measured_background(
 
 def _bound_particles(
     scene: Scene,
+    movie: Stack,
+    camera: Camera,
     windows: Windows,
     clock: _Clock,
     *,
@@ -377,13 +403,15 @@ def _bound_particles(
     cause = misfit_warning(scene.config, events)
     if cause:
         tell(cause)
+    repeats, empty = field_repeats(scene, movie, camera, windows, events)
+    clock.lap("repeats")
     rows = [Row(number, event, windows) for number, event in enumerate(events)]
     interrupted = False
     if scene.config.samples_posterior:
         rows, interrupted = _sampled(scene, rows, pool, progress)
         clock.lap("posterior")
     views = tuple(view_of(row) for row in rows)
-    return Found(table_of(scene, rows), views, windows, interrupted)
+    return Found(table_of(scene, rows), views, windows, interrupted, tuple(repeats), empty)
 
 
 def _sampled(

@@ -29,6 +29,7 @@ from iscat_analysis.records import (
     Mapper,
     Windows,
 )
+from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.sliding import (
     SHORTEST_MOVIE,
     Chunk,
@@ -49,6 +50,9 @@ VIEWS = 1000
 
 FRAME_COLUMN = "frame_ci95"
 """Column after `EVENT_COLUMNS`: half-width of the 95 % interval of ``frame`` [frames]."""
+
+REPEATS_COLUMN = "repeats"
+"""Column of a chunk's table, not of ``fits.csv``: what parts of an event's frames say, flat."""
 
 _MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _PIECE_BYTES = 8 * 2**20
@@ -349,6 +353,7 @@ class Done:
     stopped: bool = False  # in the middle of its chains
     trajectory: Trajectory | None = None  # of the pattern, in all frames that were read
     cause: str = ""  # what the model probably has wrong
+    empty: EmptySpread | None = None  # noise where nothing lands or leaves
 
 
 class Merged:
@@ -365,6 +370,7 @@ class Merged:
         self._strongest = np.zeros((2, *shape))
         self.sampled = 0
         self.cause = ""
+        self.empty: EmptySpread | None = None
 
     def add(self, done: Done) -> None:
         """Take one more."""
@@ -372,6 +378,8 @@ class Merged:
         self._strongest = np.where(stronger, done.strongest, self._strongest)
         self.sampled += done.sampled
         self.cause = self.cause or done.cause
+        if done.empty is not None:
+            self.empty = done.empty if self.empty is None else self.empty + done.empty
         # the images are merged; holding them for every chunk would grow with the movie
         small = np.empty((2, 0, 0))
         kept = done.views if sum(len(d.views) for d in self._done) < 2 * VIEWS else ()
@@ -395,6 +403,7 @@ class Merged:
         if not homes:
             empty = table_of(scene, [])
             empty[FRAME_COLUMN] = np.empty(0, dtype=np.int64)
+            empty[REPEATS_COLUMN] = np.empty(0, dtype=object)
             return empty, ()
         table = pd.concat([t for t in tables if len(t)], ignore_index=True)
         cores = np.array([self._done[i].core for i, _ in homes])

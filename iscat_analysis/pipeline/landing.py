@@ -28,6 +28,7 @@ from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.pipeline.chunks import (
     FRAME_COLUMN,
+    REPEATS_COLUMN,
     VIEWS,
     Done,
     Frames,
@@ -50,7 +51,15 @@ from iscat_analysis.pipeline.scene import (
     square_of,
 )
 from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
-from iscat_analysis.records import EventView, FloatArray, Progress, Status, Windows
+from iscat_analysis.records import (
+    FREE_PARAMETERS,
+    EventView,
+    FloatArray,
+    Progress,
+    Status,
+    Windows,
+)
+from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.sliding import STRIDES, Chunk
 from iscat_analysis.search.spectrum import NoiseSpectrum
 from iscat_analysis.search.templates import LARGEST_IMAGE, make_templates
@@ -84,6 +93,10 @@ class LandingResult:
         Contrast of the strongest step that each pixel saw, by the matched filter.
     scene : Scene
         Models and threshold.
+    repeats : tuple of ndarray
+        What parts of the frames of each event say; from `iscat_analysis.inference.repeats`.
+    empty : EmptySpread or None
+        The noise of whole windows where nothing lands or leaves.
     summary : dict
         What ``summary.json`` adds under ``"landing"``.
     trajectory : Trajectory or None
@@ -97,6 +110,8 @@ class LandingResult:
     windows: Windows
     image: FloatArray
     scene: Scene
+    repeats: tuple[FloatArray, ...]
+    empty: EmptySpread | None
     summary: dict[str, Any]
     trajectory: Trajectory | None
     interrupted: bool
@@ -209,6 +224,8 @@ def analyse_landings(
             pool.shutdown(wait=False, cancel_futures=True)
             interrupted = True
     table, views = merged.result(scene)
+    shape = (-1, len(FREE_PARAMETERS[scene.mode]) + 1)
+    repeats = tuple(np.reshape(flat, shape) for flat in table.pop(REPEATS_COLUMN))
     windows, light = merged.windows(reader.shape, (first, last))
     wanted = config.background.drift_correction
     for text in frame_warnings(movie.name, merged, light, first, window, corrected=wanted):
@@ -245,6 +262,8 @@ def analyse_landings(
         windows=windows,
         image=merged.image * strongest / amplitude,
         scene=scene,
+        repeats=repeats,
+        empty=merged.empty,
         summary=summary,
         trajectory=merged.trajectory(),
         interrupted=interrupted,
@@ -421,6 +440,7 @@ def _analyse_chunk(
     table["mass_kda"] *= sign
     table["contrast"] *= sign
     table[FRAME_COLUMN] = [s.step.at.half_width for s in steps]
+    table[REPEATS_COLUMN] = [s.repeats.ravel().tolist() for s in steps]
     inside = slice(core[0] - chunk.first, core[1] - chunk.first)
     light = np.where(chunk.good, chunk.power, np.nan) * float(chunk.mean_e.mean())
     return Done(
@@ -437,6 +457,7 @@ def _analyse_chunk(
         stopped=stopped,
         trajectory=trajectory,
         cause=misfit_warning(scene.config, [s.event for s in steps]),
+        empty=fitter.empty,
     )
 
 

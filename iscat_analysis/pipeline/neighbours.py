@@ -123,7 +123,7 @@ class Neighbours:
         """Whether a step lies inside frames relative to the chunk."""
         return start < step.at.frame - self._chunk.first < stop
 
-    def _presence(self, step: Step, frames: slice) -> float:
+    def presence(self, step: Step, frames: slice) -> float:
         """Share of the frames' light that shines while the particle is there."""
         power = self._power
         whole = power[frames.stop] - power[frames.start]
@@ -133,16 +133,21 @@ class Neighbours:
         later = (power[frames.stop] - power[turn]) / whole
         return float(later if step.sign > 0 else 1 - later)
 
+    def box(self, step: Step) -> tuple[slice, slice]:
+        """Pixels of the field that a step's image covers."""
+        rows, columns = spans(step.corner, step.image.shape)
+        return slice(*rows), slice(*columns)
+
     def factor(
         self, step: Step, before: slice, after: slice, inside: tuple[slice, slice] = WHOLE
     ) -> FloatArray:
         """Light after over light before that a step's particle makes, pixel by pixel."""
         image = step.image[inside]
-        shares = self._presence(step, before), self._presence(step, after)
+        shares = self.presence(step, before), self.presence(step, after)
         if self._pattern is None:
             factor: FloatArray = (1 + shares[1] * image) / (1 + shares[0] * image)
             return factor
-        held = self._presence(step, self._pattern.span(before, after))
+        held = self.presence(step, self._pattern.span(before, after))
         if shares == (held, held):
             return np.ones(image.shape)
         windows = before, after
@@ -168,7 +173,7 @@ class Neighbours:
         strong = abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK
         if strong or self._pattern is not None:
             return self.factor(step, before, after) - 1
-        return (self._presence(step, after) - self._presence(step, before)) * step.image
+        return (self.presence(step, after) - self.presence(step, before)) * step.image
 
     def _present(self, step: Step, frames: slice) -> slice:
         """Those of the frames in which the particle is there; all where it is in none."""

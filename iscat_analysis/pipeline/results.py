@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from iscat_analysis.bounds import holevo_over_quantum
+from iscat_analysis.inference.achieved import Achieved
 from iscat_analysis.pieces.regions import row_of, table_from
 from iscat_analysis.pipeline.field import Event
 from iscat_analysis.pipeline.scene import Scene, photons_scale
@@ -22,6 +24,7 @@ from iscat_analysis.records import (
     Status,
     Windows,
 )
+from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.species import Efficiency, describe
 
 _HEIGHTS = 65
@@ -52,12 +55,19 @@ class Found:
         The sums, with the final laser power.
     interrupted : bool
         Whether the user stopped it; what was finished is kept.
+    repeats : tuple of ndarray
+        What parts of the frames of each row say, from `iscat_analysis.inference.repeats`; empty
+        where every row has a single frame.
+    empty : EmptySpread or None
+        The noise of whole windows where there is no particle.
     """
 
     table: pd.DataFrame
     views: tuple[EventView, ...]
     windows: Windows
     interrupted: bool = False
+    repeats: tuple[FloatArray, ...] = ()
+    empty: EmptySpread | None = None
 
 
 def collected_photons(scene: Scene, windows: Windows, event: Event) -> float:
@@ -144,7 +154,11 @@ def view_of(row: Row) -> EventView:
 
 
 def summary_of(
-    scene: Scene, table: pd.DataFrame, windows: Windows, timings: Mapping[str, float]
+    scene: Scene,
+    table: pd.DataFrame,
+    windows: Windows,
+    timings: Mapping[str, float],
+    achieved: Mapping[str, Achieved] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Gather counts, medians and efficiency, for ``summary.json``.
 
@@ -158,6 +172,8 @@ def summary_of(
         Frame ranges and power.
     timings : mapping of str to float
         Seconds per stage.
+    achieved : mapping of str to Achieved
+        Measured spread of each free parameter over its bound, where it was measured.
 
     Returns
     -------
@@ -180,6 +196,8 @@ def summary_of(
             "sigma_over_crb_median": _median(sigma / crb),
             "information_fraction_median": _median((reachable / crb) ** 2),
         }
+        if name in achieved:
+            precision[name] |= _repeats(achieved[name])
         if f"systematic_{name}" in good:
             precision[name]["systematic_median"] = _median(good[f"systematic_{name}"])
     return {
@@ -204,6 +222,21 @@ def summary_of(
         "precision": precision,
         "distribution": _distribution(scene, good),
         "seconds": {name: round(value, 3) for name, value in timings.items()},
+    }
+
+
+def _repeats(found: Achieved) -> dict[str, Any]:
+    """Give what the summary says of a measured spread."""
+    return {
+        "repeat_over_crb": found.over_crb,
+        "repeat_over_crb_ci95": list(found.ci95),
+        "repeat_significance": found.significance,
+        "repeat_events": found.events,
+        "repeat_whole": found.whole,
+        "repeat_frames": list(found.frames),
+        "repeat_over_crb_by_frames": list(found.by_frames),
+        "repeat_over_crb_by_frames_se": list(found.by_frames_se),
+        "empty_over_crb": list(found.empty),
     }
 
 

@@ -18,6 +18,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pipeline.chunks import Done
 from iscat_analysis.records import EventView, FloatArray
+from iscat_analysis.search.empty import EmptySpread
 
 
 class Store:
@@ -90,6 +91,7 @@ class Store:
                     ends_e=data["ends_e"],
                     trajectory=_trajectory(data["trajectory"]),
                     cause=str(data["cause"]),
+                    empty=_empty(data["squares"], data["number"]),
                 )
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
             return None  # never finished, or cut short
@@ -121,6 +123,8 @@ class Store:
                     ends_e=done.ends_e,
                     trajectory=_columns(done.trajectory),
                     cause=np.array(done.cause),
+                    squares=np.empty(0) if done.empty is None else done.empty.squares,
+                    number=np.empty(0) if done.empty is None else done.empty.counts,
                 )
             building.replace(path)
         except OSError:
@@ -136,6 +140,10 @@ def _columns(way: Trajectory | None) -> FloatArray:
     if way is None:
         return np.empty((0, 5))
     return np.column_stack([way.frames, way.shift_px, way.error_px])
+
+
+def _empty(squares: FloatArray, counts: FloatArray) -> EmptySpread | None:
+    return EmptySpread(squares, counts) if counts.size else None
 
 
 def _trajectory(columns: FloatArray) -> Trajectory | None:

@@ -28,17 +28,19 @@ from iscat_analysis.pipeline.neighbours import (
     Neighbours,
     Step,
     distance_px,
-    spans,
 )
 from iscat_analysis.pipeline.pattern import MovingPattern
+from iscat_analysis.pipeline.repeats import step_controls, step_repeats
 from iscat_analysis.pipeline.scene import Region, Scene, judge, reported_steps
 from iscat_analysis.pipeline.tasks import Task, TaskBuilder
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     Candidate,
     FloatArray,
+    Status,
     Windows,
 )
+from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.residue import (
     EXCEEDS,
     EXPLAINS,
@@ -86,6 +88,8 @@ class FittedStep:
         The sums of the region, those with the particle as "after".
     n_before, n_after : int
         Frames before and after the step that were used.
+    repeats : ndarray
+        From `iscat_analysis.pipeline.repeats.step_repeats`.
     """
 
     step: Step
@@ -94,6 +98,7 @@ class FittedStep:
     windows: Windows
     n_before: int
     n_after: int
+    repeats: FloatArray
 
 
 class ChunkFitter:
@@ -152,6 +157,7 @@ class ChunkFitter:
         self._near: list[list[Step]] = []  # steps that each of the maps knows of
         self.strongest = np.zeros((2, *chunk.shape))
         self.rounds = 0
+        self.empty: EmptySpread | None = None  # noise where nothing lands or leaves
 
     def run(self, keep: tuple[int, int]) -> list[FittedStep]:
         """Find and fit every step.
@@ -210,6 +216,13 @@ class ChunkFitter:
         found = self._pool.map(lambda i: self._finish(i, everything, seen), own)
         finished = [(i >= len(steps), *f) for i, f in zip(own, found, strict=True) if f is not None]
         fitted = self._judged(finished)
+        if fitted and not self._pattern:
+            described = [f for f in fitted if f.event.fit.status == Status.OK] or fitted
+            self.empty = step_controls(
+                scene=self._scene, chunk=self._chunk, window=self._window,
+                fits=[(f.step, f.event.fit) for f in described],
+                steps=everything, neighbours=self._neighbours,
+            )  # fmt: skip
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
 
     # ---- search ----------------------------------------------------------------------------
@@ -231,9 +244,7 @@ class ChunkFitter:
                 return moving.contrast[j] if moving else None
             total = np.zeros(chunk.shape)
             for step in near[j]:
-                rows, columns = spans(step.corner, step.image.shape)
-                here = (slice(*rows), slice(*columns))
-                total[here] += self._neighbours.change(step, before, after)
+                total[self._neighbours.box(step)] += self._neighbours.change(step, before, after)
             return total + moving.contrast[j] * (1 + total) if moving else total
 
         self._maps = snr, effective = sliding_maps(
@@ -409,7 +420,13 @@ class ChunkFitter:
         if event.snr < _EXPLAINED * scene.templates.threshold:
             return None
         step = replace(step, at=task.at)
-        fitted = FittedStep(step, event, task.region, task.windows, task.n_before, task.n_after)
+        repeats = step_repeats(
+            self._chunk, event, task.region, task.windows, step,
+            [steps[i] for i in near[index]], self._neighbours, self._pattern,
+        )  # fmt: skip
+        fitted = FittedStep(
+            step, event, task.region, task.windows, task.n_before, task.n_after, repeats
+        )
         return fitted, task
 
     def _judged(self, finished: Sequence[tuple[bool, FittedStep, Task]]) -> list[FittedStep]:

@@ -16,7 +16,6 @@ from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Status
 from iscat_analysis.report.event_figures import event_images
 from iscat_analysis.report.headline import (
     caution,
-    counted,
     headline,
     is_uncalibrated,
     label_of,
@@ -27,6 +26,7 @@ from iscat_analysis.report.headline import (
     sizes,
 )
 from iscat_analysis.report.numbers import LABELS, UNITS, count, decimals_for, fixed, number, percent
+from iscat_analysis.report.spread import counted, species_widths
 
 _MODES = {
     "mass": "position and mass, height fixed",
@@ -78,6 +78,10 @@ def report_context(
         "flagged": caution(table) is not None,
         "tiles": _tiles(analysis, table),
         "has_common": any(math.isfinite(p.systematic) for p in precision),
+        "has_measured": any(p.is_measured for p in precision),
+        "spread_lines": species_widths(analysis.summary)
+        if caution(table) is None and not is_uncalibrated(analysis)
+        else [],
         "has_holevo": any(math.isfinite(p.holevo) for p in precision),
         "precision_rows": precision_rows(analysis, precision),
         "warnings": analysis.warnings,
@@ -149,13 +153,22 @@ def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
             best, said = "Holevo", (said[0], f", Holevo {number(p.holevo)} {unit}")
         if is_uncalibrated(analysis):
             label, said = "contrast", ("median of the events' own ratios", "")
-        tiles += [
-            {
-                "label": f"σ of {label} over its CRB",
-                "value": number(p.over_crb),
+        over = {
+            "label": f"σ of {label} over its CRB",
+            "value": number(p.over_crb),
+            "unit": "×",
+            "note": said[0],
+        }
+        if p.is_measured:
+            low, high = p.measured_ci95
+            over = {
+                "label": f"Measured spread of {label} over its CRB",
+                "value": fixed(p.measured, 2),
                 "unit": "×",
-                "note": said[0],
-            },
+                "note": f"95 % {fixed(low, 2)} to {fixed(high, 2)}; {said[0]}",
+            }
+        tiles += [
+            over,
             {
                 "label": f"Information on {label} used",
                 "value": percent(p.information),

@@ -19,8 +19,9 @@ from iscat_analysis.records import (
     Status,
 )
 from iscat_analysis.report.event_figures import HALO, display_range, scale_bar
-from iscat_analysis.report.headline import as_contrasts, counted, label_of, main_quantity
+from iscat_analysis.report.headline import as_contrasts, label_of, main_quantity
 from iscat_analysis.report.numbers import UNITS
+from iscat_analysis.report.spread import counted, spread_figure
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, VERMILLION, new_figure
 
 NUMBERED_EVENTS = 100
@@ -49,7 +50,8 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[tuple[str,
     ------
     name : str
         ``overview`` (the field with its events), a histogram, ``timeline``, ``precision`` (σ
-        against the bounds), ``diagnostics`` and ``power``; what has no data is left out.
+        against the bounds), ``spread`` (what was measured of it), ``diagnostics`` and ``power``;
+        what has no data is left out.
     figure : Figure
         The figure.
     """
@@ -60,6 +62,8 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[tuple[str,
         yield f"{_NAMES.get(main, main)}_histogram", histogram(analysis, table)
         yield "timeline", timeline(analysis, table)
         yield "precision", precision(analysis, table)
+    if (measured := spread_figure(analysis, label_of)) is not None:
+        yield "spread", measured
     if (found := diagnostics(analysis, table)) is not None:
         yield "diagnostics", found
     power_known = np.isfinite(np.asarray(analysis.power, float))

@@ -8,14 +8,16 @@ calibration the headline is the contrast, because the model's absolute scale is 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from iscat_analysis.records import FREE_PARAMETERS, Analysis, FloatArray, Status
-from iscat_analysis.report.numbers import LABELS, UNITS, count, number, percent
+from iscat_analysis.report.numbers import LABELS, UNITS, count, fixed, number, percent
+from iscat_analysis.report.spread import counted, rejection
 
 MOST_FLAGGED = 0.2
 """Share of flagged rows above which no headline is given."""
@@ -66,6 +68,12 @@ class Precision:
         measurement uses of what can be had of the light's information.
     systematic : float
         Median of the error that all events share [nm or kDa]; NaN where it is not known.
+    measured : float
+        Measured spread over the CRB; NaN where it was not measured.
+    measured_ci95 : (float, float)
+        Its 95 % interval.
+    whole : bool
+        Whether it holds at the full length of the windows.
     """
 
     name: str
@@ -77,28 +85,26 @@ class Precision:
     over_crb: float
     information: float
     systematic: float = math.nan
+    measured: float = math.nan
+    measured_ci95: tuple[float, float] = (math.nan, math.nan)
+    whole: bool = False
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the spread was measured."""
+        return math.isfinite(self.measured)
+
+    @property
+    def measured_text(self) -> str:
+        """The measured spread over the bound with its interval."""
+        low, high = self.measured_ci95
+        return f"{fixed(self.measured, 2)} ({fixed(low, 2)} to {fixed(high, 2)})"
 
     @property
     def shared(self) -> str:
         """The error that all events share, as text beside σ; empty where it is not known."""
         known = math.isfinite(self.systematic)
         return f", common to all events {number(self.systematic)}" if known else ""
-
-
-def counted(table: pd.DataFrame) -> pd.DataFrame:
-    """Leave out the rows that stay in the table but are no events: side lobes of others.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        With a column ``status``.
-
-    Returns
-    -------
-    pandas.DataFrame
-        The rows that count as events.
-    """
-    return table[table["status"] != "sidelobe"]
 
 
 def is_uncalibrated(analysis: Analysis) -> bool:
@@ -239,7 +245,16 @@ def precision_of(analysis: Analysis, table: pd.DataFrame, name: str) -> Precisio
         quantiles(sigma / crb)[1],
         information if holevo is None else medians["information_fraction_median"],
         _shared(good, name)[1],
+        *_measured(medians),
     )
+
+
+def _measured(medians: Mapping[str, Any]) -> tuple[float, tuple[float, float], bool]:
+    """Read the measured spread, its interval and its reach off a summary."""
+    if medians.get("repeat_over_crb") is None:
+        return math.nan, (math.nan, math.nan), False
+    low, high = medians["repeat_over_crb_ci95"]
+    return medians["repeat_over_crb"], (low, high), medians["repeat_whole"]
 
 
 def _shared(good: pd.DataFrame, name: str) -> tuple[float, float, float]:
@@ -312,7 +327,7 @@ def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
         ]
     warned = [NOT_A_MASS] if is_uncalibrated(analysis) else []
     if (flagged := caution(table)) is not None:
-        return [flagged, *warned]
+        return [flagged, *spread_lines(analysis, table), *warned]
     good = int((table["status"] == Status.OK.value).sum())
     kind = "fitted position" if analysis.mode == "track" else "event"
     text = f"{count(len(table), kind)}, {good if good < len(table) else 'all'} of them ok."
@@ -325,7 +340,8 @@ def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
             f" Median {main.label} {_with_unit(middle, main)}, middle half {number(low)} to "
             f"{_with_unit(high, main)}."
         )
-    return [text, *_spread(analysis, table), *warned]
+    spread = _spread(analysis, table)
+    return [text, *spread, *spread_lines(analysis, table), *warned]
 
 
 def _with_unit(value: float, main: Quantity) -> str:
@@ -359,6 +375,47 @@ def _spread(analysis: Analysis, table: pd.DataFrame) -> list[str]:
     return [f"{text}."]
 
 
+def spread_lines(analysis: Analysis, table: pd.DataFrame) -> list[str]:
+    """Say what spread was measured, and where the model is rejected.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    table : pandas.DataFrame
+        Its table.
+
+    Returns
+    -------
+    list of str
+        One or two sentences; empty where nothing was measured.
+    """
+    free = FREE_PARAMETERS[analysis.mode]
+    rejected = rejection(table)
+    said = analysis.summary.get("repeats", {}).get("message", "")
+    lines = []
+    if said:
+        lines.append(f"{said if said.startswith('σ') else said[:1].upper() + said[1:]}.")
+    else:
+        name = "mass_kda" if "mass_kda" in free else "z_nm"
+        p = precision_of(analysis, table, name)
+        if p.is_measured:
+            where = (
+                "between parts of each event's frames and, at full length, where there is no "
+                "particle"
+                if p.whole
+                else "between parts of each event's frames; slower noise does not show there"
+            )
+            of_it = "contrast" if is_uncalibrated(analysis) else LABELS[name]
+            lines.append(
+                f"The measured spread of the {of_it}, {where}, is {p.measured_text} times the "
+                "Cramér–Rao bound."
+            )
+    if rejected:
+        lines.append(rejected)
+    return lines
+
+
 def precision_rows(analysis: Analysis, precision: Sequence[Precision]) -> list[list[str]]:
     """Write the table of precisions.
 
@@ -372,11 +429,13 @@ def precision_rows(analysis: Analysis, precision: Sequence[Precision]) -> list[l
     Returns
     -------
     list of list of str
-        Parameter, σ, the error common to all events, CRB, Holevo, QCRB, σ over CRB, light used,
-        rows; without the common error and Holevo where no parameter has them.
+        Parameter, σ, the error common to all events, CRB, Holevo, QCRB, σ over CRB, measured spread
+        over CRB, light used, rows; without the common error, Holevo and the measured spread where
+        no parameter has them.
     """
     common = any(math.isfinite(p.systematic) for p in precision)
     holevo = any(math.isfinite(p.holevo) for p in precision)
+    measured = any(p.is_measured for p in precision)
     return [
         [
             f"{label_of(analysis, p.name)} [{UNITS[p.name]}]",
@@ -385,6 +444,7 @@ def precision_rows(analysis: Analysis, precision: Sequence[Precision]) -> list[l
             number(p.crb),
             *([number(p.holevo)] if holevo else []),
             *(number(value) for value in (p.qcrb, p.over_crb)),
+            *([p.measured_text if p.is_measured else "—"] if measured else []),
             percent(p.information),
             str(p.events),
         ]

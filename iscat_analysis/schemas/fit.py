@@ -30,7 +30,7 @@ _SIGMA = "Standard deviation from the observed information [{}]; null where it i
 _CRB = "Joint Cramér–Rao bound at the estimate [{}]; null where the parameter is not free"
 _QCRB = "Quantum Cramér–Rao bound for the collected photons [{}]"
 _SYSTEMATIC = "Error common to the movie, from calibrations of optics and mass [{}]"
-_REPEAT = "Spread between disjoint parts of the event's frames [{}]"
+_REPEAT = "Standard error from eight disjoint parts of the event's own frames, itself to 19 % [{}]"
 
 
 class Event(Closed):
@@ -99,6 +99,25 @@ class Medians(Document):
         "of what can be had of the light's information"
     )
     systematic_median: Number = maybe("Error common to the movie, from calibrations [nm or kDa]")
+    repeat_over_crb: Number = maybe(
+        "Measured spread over the Cramér–Rao bound: from parts of the events' own frames and, at "
+        "full length, from places without a particle"
+    )
+    repeat_over_crb_ci95: tuple[Number, Number] = maybe("Its 95 % interval")
+    repeat_significance: Number = maybe("Its difference from 1, in standard errors")
+    repeat_events: Count = maybe("Events whose frames were compared")
+    repeat_whole: bool = maybe(
+        "Whether the noise was seen at the full length of the windows; otherwise in parts of them"
+    )
+    repeat_frames: list[Count] = maybe("Frames averaged")
+    repeat_over_crb_by_frames: list[Number] = maybe(
+        "Spread of averages of so many of the events' own frames over their bound"
+    )
+    repeat_over_crb_by_frames_se: list[Number] = maybe("Its standard errors")
+    empty_over_crb: list[Number] = maybe(
+        "The same without a particle: between eight parts of a window, neighbouring eighths, "
+        "quarters, halves, and whole windows; empty where there is no room"
+    )
 
 
 class Input(Document):
@@ -192,6 +211,14 @@ class Injection(Closed):
     frame_in_interval: Share = maybe("Share whose frame lies inside frame_ci95")
 
 
+class Repeats(Closed):
+    """Whether the measured spread agrees with σ."""
+
+    understated: bool = key("Whether σ is smaller than the measured spread; --strict fails then")
+    message: str = key("What the user is told; empty where they agree")
+    cause: str = key("What kind of noise it looks like")
+
+
 class Learned(Closed):
     """What ``optics.calibrate`` did: the test of the optics, and what was learned of them."""
 
@@ -263,6 +290,7 @@ class Summary(Document):
     background: Background = maybe("Movies with background frames: noise and drift")
     landing: Landing = maybe("Landing movies: windows, search, noise and drift")
     injection: Injection = maybe("With --inject: known particles added to the movie")
+    repeats: Repeats = maybe("Whether the measured spread agrees with σ")
     optics: Learned = maybe("Where the optics were tested: the test, and what was learned")
     distribution: Distribution | None = maybe(
         "Species; null where masses are not fitted once per event"

@@ -218,6 +218,15 @@ def test_strict_exits_with_3_where_something_is_flagged(library, rows, status) -
     assert main_fit(["movie.tif"]) == 0
 
 
+@pytest.mark.parametrize(("understated", "status"), [(True, 3), (False, 0)])
+def test_strict_exits_with_3_where_sigma_is_understated(library, understated, status) -> None:
+    analysis = _analysis(_row(0))
+    analysis.summary["repeats"] = {"understated": understated, "message": "", "cause": ""}
+    library(_returning(analysis))
+    assert main_fit(["movie.tif", "--strict"]) == status
+    assert main_fit(["movie.tif"]) == 0
+
+
 @pytest.mark.parametrize(
     ("error", "status", "line"),
     [

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from iscat_analysis.config import load_config
-from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS
+from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, REPEAT_COLUMNS
 from iscat_cli import main, main_fit
 
 MODES = ["mass", "localize", "joint"]
@@ -79,7 +79,7 @@ def test_bounds_of_the_samples(mode: str, sample_configs, capsys) -> None:
 def test_fits_meet_the_truth(mode: str, fitted, movies) -> None:
     fits = pd.read_csv(fitted[mode] / "fits.csv")
     truth = pd.read_csv(movies[mode].with_suffix(".truth.csv"))
-    assert list(fits.columns) == list(EVENT_COLUMNS)
+    assert list(fits.columns) == [*EVENT_COLUMNS, *REPEAT_COLUMNS]
     assert len(fits) == len(truth) == 8
     assert set(fits["status"]) == {"ok"}
     distance = np.hypot(

@@ -15,7 +15,13 @@ from scenes import make_config
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, Analysis
+from iscat_analysis.records import (
+    EVENT_COLUMNS,
+    FREE_PARAMETERS,
+    PARAMETERS,
+    REPEAT_COLUMNS,
+    Analysis,
+)
 from iscat_analysis.study.simulate import write_stack
 
 SIGMAS = 4.0
@@ -111,8 +117,10 @@ def sampled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Analysis, p
 def test_columns_are_the_promised_ones(sampled) -> None:
     folder, analysis, truth = sampled
     table = pd.read_csv(folder / "out" / "fits.csv")
-    assert tuple(table.columns) == EVENT_COLUMNS
-    assert tuple(analysis.table.columns) == EVENT_COLUMNS
+    assert tuple(table.columns) == (*EVENT_COLUMNS, *REPEAT_COLUMNS)
+    assert tuple(analysis.table.columns) == (*EVENT_COLUMNS, *REPEAT_COLUMNS)
+    for name in PARAMETERS:  # of eight parts before and after: 14 degrees of freedom
+        assert ((table[f"repeat_{name}"] / table[f"crb_{name}"]).between(0.3, 2.0)).all()
     _assert_true(table, truth, "joint")
     assert (table["frame"] == 30).all()
     np.testing.assert_allclose(table["x_nm"], table["x_px"] * 84.4, rtol=1e-6)
@@ -122,7 +130,7 @@ def test_columns_are_the_promised_ones(sampled) -> None:
 def test_parquet_holds_what_csv_holds(sampled) -> None:
     folder, analysis, _ = sampled
     parquet = pd.read_parquet(folder / "out" / "fits.parquet")
-    assert tuple(parquet.columns) == EVENT_COLUMNS
+    assert tuple(parquet.columns) == (*EVENT_COLUMNS, *REPEAT_COLUMNS)
     csv = pd.read_csv(folder / "out" / "fits.csv", dtype={"flags": str}, keep_default_na=False,
                       na_values={name: [""] for name in EVENT_COLUMNS[:-2]})  # fmt: skip
     for name in EVENT_COLUMNS:

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 import iscat_analysis as ia
 from iscat_analysis import notebook
+from iscat_analysis.records import REPEAT_COLUMNS
 from iscat_analysis.report.pictures import draw
 
 SMALL = {
@@ -148,7 +149,7 @@ def test_named_arguments_win(movie, config) -> None:
 
 def test_the_table_is_a_frame(result) -> None:
     assert isinstance(result.table, pd.DataFrame)
-    assert tuple(result.table.columns) == ia.EVENT_COLUMNS
+    assert tuple(result.table.columns) == (*ia.EVENT_COLUMNS, *REPEAT_COLUMNS)
     assert len(result) == len(result.table) == 2
 
 

@@ -1,0 +1,269 @@
+"""What the frames of one event say of its error: the estimate on disjoint parts of them.
+
+Near the estimate a fit answers linearly to the counts of every frame, so that one step of scoring
+from the full fit refits any part of the frames, and the errors of the parts add up to that of the
+whole.  A part is set beside others on the same side of the step: a particle that is there all the
+time, and whatever the model gets wrong about it, drops out, and what is left is noise.
+
+Parts of n frames each see the noise at that length and at shorter ones.  The longest that fits is
+half a window; noise that is slower shows in the estimate and not between its parts.  It is seen
+where there is no particle, see `iscat_analysis.search.empty`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+PARTS = 8
+"""Contiguous parts of the frames on either side of a step, between which ``repeat_*`` is taken."""
+
+LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 700, 1000)
+"""Frames averaged, for the spread as a function of them."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """What one photoelectron more in a pixel does to the estimates.
+
+    Attributes
+    ----------
+    before, after : ndarray, shape (n, ny, nx)
+        Of the counts before and after, for each free parameter of the particle, in the units of θ.
+    variance : ndarray, shape (n,)
+        Cramér–Rao bound of each, squared.
+    """
+
+    before: FloatArray
+    after: FloatArray
+    variance: FloatArray
+
+
+@dataclass(frozen=True)
+class Series:
+    """Errors that single frames of one window contribute to the estimates.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n, t)
+        Photoelectrons weighted with the response.
+    power : ndarray, shape (t,)
+        Light of each frame, relative.
+    shot : ndarray, shape (n,)
+        Variance of `values` that the model expects per unit of power.
+    read : ndarray, shape (n,)
+        The same of read noise, per frame.
+    """
+
+    values: FloatArray
+    power: FloatArray
+    shot: FloatArray
+    read: FloatArray
+
+
+def response_of(
+    likelihood: Likelihood,
+    theta: FloatArray,
+    free: BoolArray,
+    before_e: FloatArray,
+    power_ratio: float,
+) -> Response | None:
+    """Linearise an estimate in the counts it was made of.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        The one that was maximised.
+    theta : ndarray, shape (5,)
+        Where it has its maximum.
+    free : ndarray of bool, shape (5,)
+        What was fitted.
+    before_e : ndarray, shape (ny, nx)
+        Photoelectrons before, which the likelihood knows as a background [e].
+    power_ratio : float
+        Light after over light before.
+
+    Returns
+    -------
+    Response or None
+        None where the information is singular.
+
+    Notes
+    -----
+    θ̂ − θ = F⁻¹ Σ ∂η (counts − expected), to first order: the score is linear in the counts.
+    """
+    x, y, z, amplitude, _ = (float(value) for value in theta)
+    signal, first = likelihood.model.amplitude_gradient(likelihood.grid, x, y, z, amplitude)
+    level = float(np.exp(theta[LEVEL]))
+    used = likelihood.used
+    _, c1, c2, c3 = (np.where(used, c, 0.0) for c in likelihood.data)
+    slope = np.zeros((5, *signal.shape))
+    if likelihood.kind == CONDITIONAL:
+        bright = np.maximum(1 + signal, FLOOR)
+        odds = c2 * level * bright
+        p = odds / (1 + odds)
+        slope[:4], slope[LEVEL] = first / bright, 1.0
+        weight = c3 * c1 * p * (1 - p)
+        after, before = c3 * (1 - p), -c3 * p
+    else:
+        light = level * (c1 + c2 * signal)
+        rate = np.maximum(light + c3, FLOOR)
+        slope[:4], slope[LEVEL] = level * c2 * first / rate, light / rate
+        weight, after = rate, np.ones(signal.shape)
+        multiplies = likelihood.model.rho > 0
+        counted = light / np.maximum(before_e, FLOOR) if multiplies else power_ratio
+        before = -np.broadcast_to(counted, signal.shape)
+    index = np.flatnonzero(free)
+    slope = np.where(used, slope[index], 0.0)
+    fisher = np.einsum("iyx,jyx,yx->ij", slope, slope, weight)
+    unit = 1 / np.sqrt(np.maximum(np.diag(fisher), FLOOR))
+    try:
+        inverse = np.linalg.inv(fisher * np.outer(unit, unit)) * np.outer(unit, unit)
+    except np.linalg.LinAlgError:
+        return None
+    particle = np.flatnonzero(index < LEVEL)
+    variance = np.diag(inverse)[particle]
+    if not np.all(np.isfinite(variance) & (variance > 0)):
+        return None
+    weights = np.einsum("ij,jyx->iyx", inverse[particle], slope)
+    return Response(weights * before, weights * after, variance)
+
+
+def series_of(
+    counts: NDArray[np.generic],
+    weights: FloatArray,
+    power: FloatArray,
+    *,
+    gain: float | FloatArray,
+    offset: float | FloatArray,
+    mean_e: FloatArray,
+    read_variance_e2: FloatArray,
+) -> Series:
+    """Weigh the counts of every frame with a response.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, ny, nx)
+        Stored counts.
+    weights : ndarray, shape (n, ny, nx)
+        `Response.before` or `Response.after`.
+    power : ndarray, shape (t,)
+        Light of each frame, relative; 0 for frames that are left out.
+    gain, offset : float or ndarray, shape (ny, nx)
+        Of the camera [e per count, counts].
+    mean_e : ndarray, shape (ny, nx)
+        Expected photoelectrons per unit of power [e].
+    read_variance_e2 : ndarray, shape (ny, nx)
+        Read noise of one frame [e²].
+
+    Returns
+    -------
+    Series
+        Of the frames that are used.
+    """
+    lit = power > 0
+    flat = weights.reshape(len(weights), -1)
+    seen = (weights * gain).reshape(len(weights), -1)
+    values = seen @ counts[lit].reshape(int(lit.sum()), -1).T.astype(np.float64)
+    values -= np.sum(weights * gain * offset, axis=(1, 2))[:, None]
+    squared = flat**2
+    return Series(
+        values, power[lit], squared @ np.maximum(mean_e, 0.0).ravel(),
+        squared @ read_variance_e2.ravel(),
+    )  # fmt: skip
+
+
+def spread_of_parts(series: Series, parts: int = PARTS) -> tuple[FloatArray, int]:
+    """Scatter of an estimate between contiguous parts of the frames of one window.
+
+    Parameters
+    ----------
+    series : Series
+        Of the window.
+    parts : int
+        Parts, of frames that follow each other.
+
+    Returns
+    -------
+    squares : ndarray, shape (n,)
+        Sum of squared deviations over the variance that the model expects.
+    degrees : int
+        What it comes to under the model; 0 for fewer than two frames.
+    """
+    frames = series.power.size
+    parts = min(parts, frames)
+    if parts < 2:
+        return np.zeros(len(series.values)), 0
+    edges = np.linspace(0, frames, parts + 1).round().astype(int)
+    mean, variance = _blocks(series, edges)
+    weight = 1 / variance
+    middle = np.sum(weight * mean, axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)
+    return np.sum(weight * (mean - middle) ** 2, axis=1), parts - 1
+
+
+def spread_at(series: Series, length: int) -> tuple[FloatArray, int]:
+    """Scatter between neighbouring averages, as the Allan variance has it.
+
+    Parameters
+    ----------
+    series : Series
+        Of one window.
+    length : int
+        Frames averaged.
+
+    Returns
+    -------
+    squares : ndarray, shape (n,)
+        Sum of squared differences over the variance that the model expects.
+    pairs : int
+        How many differences.
+    """
+    pairs = series.power.size // (2 * length)
+    if not pairs:
+        return np.zeros(len(series.values)), 0
+    mean, variance = _blocks(series, np.arange(2 * pairs + 1) * length)
+    apart = mean[:, 1::2] - mean[:, 0::2]
+    return np.sum(apart**2 / (variance[:, 1::2] + variance[:, 0::2]), axis=1), pairs
+
+
+def repeats_of(windows: tuple[Series, ...]) -> FloatArray:
+    """Gather what the windows of one event say of the spread of its estimates.
+
+    Parameters
+    ----------
+    windows : tuple of Series
+        Before and after; one alone where the background is known.
+
+    Returns
+    -------
+    ndarray, shape (1 + len(LENGTHS), n + 1)
+        Squares over what the model expects, and in the last column how many: between `PARTS` parts,
+        then between neighbouring averages of `LENGTHS` frames.
+    """
+    out = np.zeros((1 + len(LENGTHS), len(windows[0].values) + 1))
+    for series in windows:
+        for row, found in enumerate(
+            [spread_of_parts(series), *(spread_at(series, n) for n in LENGTHS)]
+        ):
+            out[row, :-1] += found[0]
+            out[row, -1] += found[1]
+    return out
+
+
+def _blocks(series: Series, edges: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    """Mean of contiguous frames per unit of power, and its expected variance."""
+    starts = edges[:-1]
+    last = int(edges[-1])
+    total = np.add.reduceat(series.values[:, :last], starts, axis=1)
+    power = np.add.reduceat(series.power[:last], starts)
+    frames = np.diff(edges)
+    variance = series.shot[:, None] * power + series.read[:, None] * frames
+    return total / power, variance / power**2

@@ -1,0 +1,219 @@
+"""The measured spread of an analysis: columns ``repeat_*``, and the pooled ratio to the bound."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.inference.achieved import Achieved, pooled
+from iscat_analysis.records import FREE_PARAMETERS, REPEAT_COLUMNS, FloatArray, Status
+from iscat_analysis.search.empty import EmptySpread
+
+_NOISE_SHOWS = frozenset({Status.OK.value, Status.POOR_FIT.value})
+"""Verdicts with which the noise can still be read; excess noise itself makes fits poor."""
+
+
+_SHARE = 0.3  # of an excess that is worth naming
+_DRIFTS = 4.0  # growth of the excess from half a window to a whole one, above which it is a drift
+
+
+def measure_spread(
+    mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray], empty: EmptySpread | None
+) -> dict[str, Achieved]:
+    """Pool the repeats of all events that are ok or whose only fault is a poor fit.
+
+    Parameters
+    ----------
+    mode : str
+        Key of `FREE_PARAMETERS`.
+    table : pandas.DataFrame
+        Columns `EVENT_COLUMNS`.
+    repeats : sequence of ndarray
+        Of each row, from `iscat_analysis.inference.repeats.repeats_of`.
+    empty : EmptySpread or None
+        The noise of whole windows, where it was looked at.
+
+    Returns
+    -------
+    dict of str to Achieved
+        By free parameter; empty where no event has repeats.
+    """
+    kept = [
+        repeat
+        for repeat, status, flags in zip(repeats, table["status"], table["flags"], strict=True)
+        if {status, *str(flags).split(";")} - {""} <= _NOISE_SHOWS
+    ]
+    if not kept:
+        return {}
+    own = np.stack(kept)
+    found: dict[str, Achieved] = {}
+    for k, name in enumerate(FREE_PARAMETERS[mode]):
+        one = pooled(
+            own[:, :, [k, -1]],
+            None if empty is None else empty.squares[:, k],
+            None if empty is None else empty.counts,
+        )
+        if one is not None:
+            found[name] = one
+    return found
+
+
+def with_repeats(mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray]) -> pd.DataFrame:
+    """Add the columns ``repeat_*``: the error of each event as parts of its own frames show it.
+
+    Parameters
+    ----------
+    mode : str
+        Key of `FREE_PARAMETERS`.
+    table : pandas.DataFrame
+        Columns `EVENT_COLUMNS`.
+    repeats : sequence of ndarray
+        Of each row.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A copy; NaN where the parameter is not free or the frames could not be compared.
+    """
+    columns = {name: np.full(len(table), np.nan) for name in REPEAT_COLUMNS}
+    for k, name in enumerate(FREE_PARAMETERS[mode]):
+        squares, counts = (np.array([r[0, i] for r in repeats], dtype=float) for i in (k, -1))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            spread = np.sqrt(squares / counts)
+        columns[f"repeat_{name}"] = table[f"crb_{name}"].to_numpy(float) * spread
+    return table.assign(**columns)
+
+
+def with_measured_sigma(table: pd.DataFrame, found: Mapping[str, Achieved]) -> pd.DataFrame:
+    """Scale σ by the measured spread over the bound, for ``fit.sigma = "measured"``.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        With columns ``sigma_*``.
+    found : mapping of str to Achieved
+        From `measure_spread`.
+
+    Returns
+    -------
+    pandas.DataFrame
+        A copy; σ never becomes smaller.
+    """
+    return table.assign(
+        **{f"sigma_{name}": table[f"sigma_{name}"] * max(a.over_crb, 1.0)
+           for name, a in found.items()}
+    )  # fmt: skip
+
+
+def spread_verdict(
+    found: Mapping[str, Achieved], noise: Mapping[str, Any], *, scaled: bool
+) -> dict[str, Any]:
+    """Say whether σ is too small, by what factor, and what the noise suggests.
+
+    Parameters
+    ----------
+    found : mapping of str to Achieved
+        From `measure_spread`.
+    noise : mapping
+        What the summary holds under ``landing`` or ``background``: the noise of single pixels.
+    scaled : bool
+        Whether σ was scaled by the measured spread.
+
+    Returns
+    -------
+    dict
+        ``understated``: whether σ is smaller than the measured spread; ``message``: one line, empty
+        where there is nothing to say; ``cause``: the part that names the noise.
+    """
+    high = {name: a for name, a in found.items() if a.exceeds}
+    low = {name: a for name, a in found.items() if a.falls_short}
+    if not high:
+        message = ""
+        if low:
+            message = (
+                f"the measured spread is {_ratios(low)} times the Cramér–Rao bound: there is less "
+                "noise than the camera's numbers say, look at camera.gain_e_per_adu and "
+                "camera.read_noise_e"
+            )
+        return {"understated": False, "message": message, "cause": ""}
+    worst = max(high.values(), key=lambda a: a.significance)
+    cause = likely_noise(worst, noise)
+    if scaled:
+        message = (
+            f"σ is scaled by the measured spread, {_ratios(high)} times the Cramér–Rao bound; "
+            f"{cause}"
+        )
+    else:
+        message = (
+            f"σ is too small: the measured spread is {_ratios(high)} times the Cramér–Rao bound; "
+            f'{cause}; fit.sigma = "measured" scales σ by it'
+        )
+    return {"understated": not scaled, "message": message, "cause": cause}
+
+
+def likely_noise(found: Achieved, noise: Mapping[str, Any]) -> str:
+    """Name what an excess of noise looks like.
+
+    Parameters
+    ----------
+    found : Achieved
+        Of one parameter.
+    noise : mapping
+        As in `spread_verdict`.
+
+    Returns
+    -------
+    str
+        Half a sentence.
+
+    Notes
+    -----
+    In units of the bound's variance, noise from frame to frame is the same at every length; that of
+    constant power per octave (flicker) doubles with the length, a drift at constant speed grows
+    eightfold.
+    """
+    excess = found.over_crb**2 - 1
+    single = found.by_frames[0] ** 2 if found.by_frames else 1.0
+    said = []
+    if single - 1 > _SHARE * excess:
+        over_shot = [v for v in noise.get("noise_variance_over_shot", ()) if v is not None]
+        pixels = over_shot[0] if over_shot else single
+        if abs(pixels - 1) > _SHARE * (single - 1):
+            said.append(
+                f"single frames have {single:.3g} times the variance that the camera's numbers "
+                "give: a wrong camera.gain_e_per_adu, or a source or camera with noise of its own"
+            )
+        else:
+            said.append(
+                "the noise of single pixels is as expected but that of an image is not: "
+                "neighbouring pixels are correlated, by crosstalk or a filter in the camera"
+            )
+    if found.empty:
+        halves, whole = (found.empty[k] ** 2 for k in (-2, -1))
+        slow = whole - found.empty[0] ** 2
+        if slow > _SHARE * excess:
+            growth = (whole - single) / max(halves - single, 1e-3)
+            name = (
+                "a drift of the fixed pattern (speckle): set background.drift_correction = true"
+                if growth > _DRIFTS
+                else "flicker (1/f noise)"
+            )
+            said.append(f"it grows with the frames that are averaged, as {name}, or average fewer")
+        own = found.over_crb**2 - whole
+        if own > _SHARE * excess:
+            said.append(
+                "it is larger at the particles than elsewhere: they move or change in the light"
+            )
+    return "; ".join(said) or "its kind is not clear"
+
+
+def _ratios(found: Mapping[str, Achieved]) -> str:
+    names = {"x_nm": "x", "y_nm": "y", "z_nm": "z", "mass_kda": "mass"}
+    parts = [
+        f"{a.over_crb:.2f} ({a.ci95[0]:.2f} to {a.ci95[1]:.2f}) in {names[name]}"
+        for name, a in found.items()
+    ]
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -1,0 +1,467 @@
+"""Repeats: every estimate on parts of its own frames, and the same frames where nothing landed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.inference.likelihood import LEVEL
+from iscat_analysis.inference.repeats import (
+    PARTS,
+    Response,
+    Series,
+    repeats_of,
+    response_of,
+    series_of,
+)
+from iscat_analysis.movie import Stack
+from iscat_analysis.movie.background import smooth_background
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.pipeline.field import Event, total_signal
+from iscat_analysis.pipeline.neighbours import Neighbours, Step
+from iscat_analysis.pipeline.pattern import LocalPattern, MovingPattern
+from iscat_analysis.pipeline.scene import Region, Scene, photons_scale
+from iscat_analysis.records import (
+    FREE_PARAMETERS,
+    BoolArray,
+    FitResult,
+    FloatArray,
+    Status,
+    Windows,
+)
+from iscat_analysis.search.empty import EmptyField, EmptySpread
+from iscat_analysis.search.sliding import Chunk
+
+PLACES = 40_000
+"""Places times windows at which the noise of a chunk is looked at."""
+
+MOST_WINDOWS, FEWEST_WINDOWS = 12, 2
+"""Windows of a chunk that are looked at."""
+
+_NEAR, _NEAR_POOR = 1 / 3, 1 / 2  # of the square's side; a poor fit leaves its rings over
+_LEAST_LIGHT_E = 1e4  # of a frame, whose power is then known to 1 %
+_OUTSHONE = 0.1
+_BLOCK_BYTES = 16 * 2**20
+
+
+def nothing_repeated(mode: str) -> FloatArray:
+    """Give what is known of an event whose frames could not be compared.
+
+    Parameters
+    ----------
+    mode : str
+        Key of `FREE_PARAMETERS`.
+
+    Returns
+    -------
+    ndarray
+        As `repeats_of` returns it, zero throughout.
+    """
+    empty = Series(np.zeros((len(FREE_PARAMETERS[mode]), 0)), *(np.zeros(0) for _ in range(3)))
+    return repeats_of((empty,))
+
+
+# ---- landing movies --------------------------------------------------------------------------
+
+
+def step_repeats(
+    chunk: Chunk,
+    event: Event,
+    region: Region,
+    windows: Windows,
+    step: Step,
+    others: Sequence[Step],
+    neighbours: Neighbours,
+    pattern: MovingPattern | None,
+) -> FloatArray:
+    """Compare parts of the frames of one landing or leaving.
+
+    Parameters
+    ----------
+    chunk : Chunk
+        The frames.
+    event : Event
+        The fit.
+    region : Region
+        Its pixels, in the full frame.
+    windows : Windows
+        Its sums, those with the particle as "after".
+    step : Step
+        When and where.
+    others : sequence of Step
+        Those that its fit knows of; what lands or leaves in the windows is taken off.
+    neighbours : Neighbours
+        Of the chunk.
+    pattern : MovingPattern, optional
+        Of the chunk, where its motion is corrected.
+
+    Returns
+    -------
+    ndarray
+        From `repeats_of`.
+    """
+    fit = event.fit
+    response = _response(event, windows)
+    if response is None:
+        return nothing_repeated("mass")[:, : len(fit.free) + 1]
+    local = pattern.local(region, step.at.frame) if pattern else None
+    series = []
+    for span, weights in (
+        (windows.frames_before, response.before),
+        (windows.frames_after, response.after),
+    ):
+        patch = chunk.patch(*span, region.rows, region.columns)
+        read = np.square(patch.read_noise_e) * np.ones(region.shape)
+        one = series_of(
+            patch.counts, weights, patch.power,
+            gain=patch.gain, offset=patch.offset, mean_e=patch.mean_e, read_variance_e2=read,
+        )  # fmt: skip
+        known = np.zeros(one.values.shape)
+        light = patch.mean_e
+        frames = np.arange(patch.first, patch.first + len(patch.power))[patch.power > 0]
+        for other in others:
+            shared = neighbours.shared(other, region)
+            if shared is None or not span[0] < other.at.frame < span[1]:
+                continue
+            here, inside = shared
+            height = np.einsum("iyx,yx->i", weights[(slice(None), *here)],
+                               light[here] * other.image[inside])  # fmt: skip
+            known += np.outer(other.sign * height, frames >= other.at.frame)
+        if pattern and local:
+            known += _moved(chunk, step, region, weights, light, frames, pattern, local, neighbours)
+        series.append(Series(one.values - known * one.power, one.power, one.shot, one.read))
+    return repeats_of(tuple(series))
+
+
+def _moved(
+    chunk: Chunk,
+    step: Step,
+    region: Region,
+    weights: FloatArray,
+    light: FloatArray,
+    frames: NDArray[np.int64],
+    pattern: MovingPattern,
+    local: LocalPattern,
+    neighbours: Neighbours,
+) -> FloatArray:
+    """Give what the motion of the pattern, and of the particle, adds to each frame."""
+    shared = neighbours.shared(step, region)
+    stride = int(chunk.edges[1] - chunk.edges[0])
+    centres, heights = [], []
+    for start in range(0, frames.size, stride):
+        part = frames[start : start + stride]
+        cut = chunk.cut(int(part[0]), int(part[-1]) + 1)
+        seen = pattern.seen(local, cut)
+        if shared is not None:
+            here, inside = shared
+            there = (part[len(part) // 2] >= step.at.frame) == (step.sign > 0)
+            seen[here] += there * light[here] * neighbours.seen(step, cut, inside)
+        centres.append(float(part.mean()))
+        heights.append(np.einsum("iyx,yx->i", weights, seen))
+    return np.stack([np.interp(frames, centres, height) for height in np.transpose(heights)])
+
+
+def step_controls(
+    scene: Scene,
+    chunk: Chunk,
+    window: int,
+    fits: Sequence[tuple[Step, FitResult]],
+    steps: Sequence[Step],
+    neighbours: Neighbours,
+) -> EmptySpread | None:
+    """Look at the windows of some events where nothing lands or leaves.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    chunk : Chunk
+        The frames.
+    window : int
+        Frames before and after a step.
+    fits : sequence of (Step, FitResult)
+        Events at whose times, heights and masses the noise is looked at.
+    steps : sequence of Step
+        All that are known.
+    neighbours : Neighbours
+        Of the chunk.
+
+    Returns
+    -------
+    EmptySpread or None
+        None without events whose windows lie in the chunk.
+    """
+    times = sorted({s.at.frame for s, _ in fits})
+    times = [t for t in times if chunk.first <= t - window and t + window <= chunk.stop]
+    if not times:
+        return None
+    field = _empty_field(
+        scene, chunk.mean_e, chunk.camera.read_variance_e2(chunk.shape), chunk.usable,
+        [fit for _, fit in fits], level=True,
+    )  # fmt: skip
+    most = int(np.clip(PLACES // max(field.places, 1), FEWEST_WINDOWS, MOST_WINDOWS))
+    apart: list[int] = []
+    for t in times:
+        if not apart or t >= apart[-1] + window:
+            apart.append(t)
+    chosen = [apart[i] for i in np.unique(np.linspace(0, len(apart) - 1, most).round().astype(int))]
+    total: EmptySpread | None = None
+    for turn in chosen:
+        near = [s for s in steps if abs(s.at.frame - turn) <= window]
+        taken = _taken(
+            scene, chunk.shape, [(s.start.x_px, s.start.y_px, s.excess == 0) for s in near]
+        )
+        sides, powers = [], []
+        for start, stop in ((turn - window, turn), (turn, turn + window)):
+            parts, light = [], []
+            for cut in _cuts(chunk, start, stop):
+                power = float(chunk.power[cut].sum())
+                sum_e = _summed(chunk, cut)
+                known = np.zeros(chunk.shape)
+                for s in near:
+                    box = neighbours.box(s)
+                    known[box] += neighbours.presence(s, cut) * s.image
+                parts.append(field.errors(sum_e, power, known * chunk.mean_e))
+                light.append(power)
+            sides.append(parts)
+            powers.append(np.array(light))
+        if min(len(p) for p in powers) < 2:
+            continue
+        found = field.spread(sides[0], sides[1], (powers[0], powers[1]), taken)
+        total = found if total is None else total + found
+    return total
+
+
+def _cuts(chunk: Chunk, start: int, stop: int) -> Iterator[slice]:
+    """Contiguous parts of the good frames of a window, relative to the chunk."""
+    good = np.flatnonzero(chunk.power[chunk.cut(start, stop)] > 0) + (start - chunk.first)
+    parts = min(PARTS, good.size)
+    edges = np.linspace(0, good.size, parts + 1).round().astype(int)
+    for a, b in pairwise(edges):
+        if b > a:
+            yield slice(int(good[a]), int(good[b - 1]) + 1)
+
+
+def _summed(chunk: Chunk, cut: slice) -> FloatArray:
+    camera = chunk.camera
+    good = chunk.good[cut]
+    counts = chunk.counts[cut][good]
+    whole = np.issubdtype(counts.dtype, np.integer)
+    total = counts.sum(axis=0, dtype=np.int64 if whole else np.float64)
+    electrons: FloatArray = camera.gain_e_per_adu * (total - good.sum() * camera.offset_adu)
+    return electrons
+
+
+# ---- background frames -----------------------------------------------------------------------
+
+
+@dataclass
+class _Own:
+    """The frames of one event, as they are read."""
+
+    event: Event
+    response: Response
+    sides: tuple[list[Series], list[Series]]
+
+
+def field_repeats(
+    scene: Scene, movie: Stack, camera: Camera, windows: Windows, events: Sequence[Event]
+) -> tuple[list[FloatArray], EmptySpread | None]:
+    """Compare parts of the frames before and after, at the events and where there are none.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    movie : Stack
+        Is read once more.
+    camera : Camera
+        Counts → photoelectrons.
+    windows : Windows
+        The sums, with the final laser power.
+    events : sequence of Event
+        Fitted particles.
+
+    Returns
+    -------
+    own : list of ndarray
+        From `repeats_of`, of each event.
+    empty : EmptySpread or None
+        None where the background is known, or there are no events.
+    """
+    if not events:
+        return [], None
+    shape = (windows.after_e.shape[0], windows.after_e.shape[1])
+    read = camera.read_variance_e2(shape)
+    owns: list[_Own | None] = []
+    for event in events:
+        response = _response(event, windows)
+        owns.append(None if response is None else _Own(event, response, ([], [])))
+    spans = (windows.frames_before, windows.frames_after)
+    n_before = windows.n_before
+    power = windows.power
+    if windows.before_e.sum() < _LEAST_LIGHT_E * max(n_before, 1):
+        power = np.ones_like(power)  # too dark to tell one frame's from the next's
+    powers = (power[:n_before], power[n_before:])
+    # the level of the light is the one that the fits use
+    scale = windows.power_ratio * max(powers[0].sum(), 1.0) / powers[1].sum() if n_before else 1.0
+    powers = (powers[0], powers[1] * scale)
+    field = _field_of(scene, windows, powers, read, events) if n_before > 1 else None
+    taken = _taken(
+        scene, shape,
+        [(e.candidate.x_px, e.candidate.y_px, Status.POOR_FIT not in e.fit.flags) for e in events],
+    )  # fmt: skip
+    signal = total_signal(scene, shape, events)
+    if scene.additive:  # where particles outshine the background their light has noise of its own
+        taken |= photons_scale(scene, windows) * signal > _OUTSHONE * windows.after_e.mean()
+    parts: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    lights: tuple[list[float], list[float]] = ([], [])
+    for side, (span, power) in enumerate(zip(spans, powers, strict=True)):
+        count = span[1] - span[0]
+        if not count or (side == 0 and not n_before):
+            continue
+        edges = np.linspace(0, count, min(PARTS, count) + 1).round().astype(int)
+        sums = windows.after_e if side else windows.before_e
+        mean = sums / power.sum()
+        known = None
+        if side:
+            light = windows.before_e / powers[0].sum() if n_before else windows.before_e
+            known = signal * (photons_scale(scene, windows) / power.sum()
+                              if scene.additive else light)  # fmt: skip
+        for a, b in pairwise(edges):
+            total = np.zeros(shape)
+            for start, stop in _pieces(shape, int(a), int(b)):
+                counts = movie.read(span[0] + start, span[0] + stop)
+                for own in owns:
+                    if own is not None:
+                        _append(own, side, counts, power[start:stop], mean, read, camera)
+                if field is not None:
+                    total += camera.to_electrons(counts).sum(axis=0)
+            if field is not None:
+                light_sum = float(power[a:b].sum())
+                parts[side].append(field.errors(total, light_sum, known))
+                lights[side].append(light_sum)
+    empty = None
+    if field is not None:
+        empty = field.spread(parts[0], parts[1], (np.array(lights[0]), np.array(lights[1])), taken)
+    return [
+        nothing_repeated(scene.mode) if own is None
+        else repeats_of(tuple(_joined(side) for side in own.sides if side))
+        for own in owns
+    ], empty  # fmt: skip
+
+
+def _append(
+    own: _Own,
+    side: int,
+    counts: NDArray[Any],
+    power: FloatArray,
+    mean: FloatArray,
+    read: FloatArray,
+    camera: Camera,
+) -> None:
+    here = own.event.region.slices
+    gain, offset = (
+        v[here] if isinstance(v, np.ndarray) else v
+        for v in (camera.gain_e_per_adu, camera.offset_adu)
+    )
+    own.sides[side].append(
+        series_of(
+            counts[(slice(None), *here)],
+            own.response.after if side else own.response.before,
+            power,
+            gain=gain,
+            offset=offset,
+            mean_e=mean[here],
+            read_variance_e2=read[here],
+        )
+    )
+
+
+def _joined(series: Sequence[Series]) -> Series:
+    return Series(
+        np.concatenate([s.values for s in series], axis=1),
+        np.concatenate([s.power for s in series]),
+        series[0].shot,
+        series[0].read,
+    )
+
+
+def _pieces(shape: tuple[int, int], start: int, stop: int) -> Iterator[tuple[int, int]]:
+    size = max(1, _BLOCK_BYTES // (8 * math.prod(shape)))
+    for begin in range(start, stop, size):
+        yield begin, min(begin + size, stop)
+
+
+def _field_of(
+    scene: Scene,
+    windows: Windows,
+    powers: tuple[FloatArray, FloatArray],
+    read: FloatArray,
+    events: Sequence[Event],
+) -> EmptyField:
+    mean = windows.before_e
+    if scene.additive:  # counts may be few, and weights must not follow their chance
+        mean = smooth_background(mean, windows.read_variance_before_e2, windows.masked)
+    mean = mean / powers[0].sum()
+    return _empty_field(scene, mean, read, ~windows.masked, [e.fit for e in events], level=False)
+
+
+# ---- both ------------------------------------------------------------------------------------
+
+
+def _response(event: Event, windows: Windows) -> Response | None:
+    fit = event.fit
+    before = windows.before_e
+    if before.shape != event.likelihood.grid.shape:
+        before = before[event.region.slices]
+    return response_of(event.likelihood, fit.theta, fit.box.free, before, windows.power_ratio)
+
+
+def _taken(
+    scene: Scene, shape: tuple[int, int], places: Sequence[tuple[float, float, bool]]
+) -> BoolArray:
+    """Pixels so near to a particle (x, y, described) that its fit, and not the noise, is seen."""
+    taken = np.zeros(shape, dtype=np.bool_)
+    for x, y, described in places:
+        reach = scene.roi_px * (_NEAR if described else _NEAR_POOR)
+        top, left = max(math.ceil(y - reach), 0), max(math.ceil(x - reach), 0)
+        box = taken[
+            top : max(math.floor(y + reach) + 1, 0), left : max(math.floor(x + reach) + 1, 0)
+        ]
+        i, j = np.indices(box.shape)
+        box |= np.hypot(i + top - y, j + left - x) < reach
+    return taken
+
+
+def _empty_field(
+    scene: Scene,
+    mean_e: FloatArray,
+    read: FloatArray,
+    used: BoolArray,
+    fits: Sequence[FitResult],
+    *,
+    level: bool,
+) -> EmptyField:
+    model, pixel = scene.model, scene.pixel_nm
+    theta = np.median([fit.theta for fit in fits], axis=0)
+    grid = PixelGrid.centred(scene.roi_px | 1, pixel)
+    _, first = model.amplitude_gradient(grid, 0.0, 0.0, float(theta[2]), float(theta[3]))
+    free = fits[0].box.free
+    slopes = first[np.flatnonzero(free[:LEVEL])]
+    n_free = len(slopes)
+    if level:
+        slopes = np.concatenate([slopes, np.ones((1, *grid.shape))])
+    optics = model.optics
+    spacing = max(1, round(optics.wavelength_nm / (2 * optics.na) / pixel))
+    return EmptyField(
+        mean_e, read, used, slopes, n_free,
+        additive=scene.additive, spacing_px=spacing, tile_px=max(scene.roi_px // 2, 4),
+    )  # fmt: skip

@@ -1,0 +1,147 @@
+"""What the report says of the measured spread, and of what it cannot show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from scipy.stats import binom
+
+from iscat_analysis.records import Analysis, Status
+from iscat_analysis.report.numbers import decimals_for, fixed, number
+from iscat_analysis.report.style import BLUE, GREY, INK, VERMILLION, new_figure
+
+_POOR = 0.01  # p-value that a good fit has in 1 of 100
+_CHANCE = 1e-4  # that so many fits are poor, below which the model is rejected
+
+
+def counted(table: pd.DataFrame) -> pd.DataFrame:
+    """Leave out the rows that stay in the table but are no events: side lobes of others.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        With a column ``status``.
+
+    Returns
+    -------
+    pandas.DataFrame
+        The rows that count as events.
+    """
+    return table[table["status"] != "sidelobe"]
+
+
+def rejection(table: pd.DataFrame) -> str:
+    """Say that the model of the image is rejected, where it is.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        With the columns ``p_value`` and ``status``.
+
+    Returns
+    -------
+    str
+        One sentence; empty where no more fits are poor than chance makes so.
+    """
+    table = counted(table)
+    p = table["p_value"].to_numpy(float)
+    p = p[np.isfinite(p)]
+    poor = int(np.count_nonzero(p < _POOR))
+    if not p.size or float(binom.sf(poor - 1, p.size, _POOR)) > _CHANCE:
+        return ""
+    return (
+        f"The model is rejected: {poor} of {p.size} fits have a p-value below {_POOR:g}, where "
+        f"{number(_POOR * p.size, 2)} would by chance. Errors of the model, such as a wrong focus, "
+        "aperture or pixel size, are in neither σ nor the measured spread, which is of noise; they "
+        "show in how far the species are wider than σ."
+    )
+
+
+def species_widths(summary: Mapping[str, Any]) -> list[str]:
+    """Say how much wider than σ the species are.
+
+    Parameters
+    ----------
+    summary : mapping
+        What ``summary.json`` holds.
+
+    Returns
+    -------
+    list of str
+        One sentence per species with enough events; empty without species.
+    """
+    found = summary.get("distribution") or {}
+    lines = []
+    for one in found.get("species", ()):
+        width, low, high = (one.get(f"width_{key}") for key in ("kda", "low", "high"))
+        if one.get("outlier") or width is None or low is None or high is None:
+            continue
+        if not all(math.isfinite(v) for v in (width, low, high)):
+            continue
+        decimals = decimals_for([(high - low) / 2])
+        lines.append(
+            f"Across particles: the species at {number(one['mass_kda'])} kDa is "
+            f"{fixed(width, decimals)} kDa ({fixed(low, decimals)} to {fixed(high, decimals)}) "
+            f"wide beyond the σ of its {one['count']:.0f} events."
+        )
+    return lines
+
+
+def spread_figure(analysis: Analysis, label_of: Callable[[Analysis, str], str]) -> Figure | None:
+    """Draw the measured spread over the bound against the frames averaged.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    label_of : callable
+        Says what a parameter is called.
+
+    Returns
+    -------
+    Figure or None
+        One panel for each free parameter; None where nothing was measured.
+    """
+    found = {
+        name: part
+        for name, part in analysis.summary.get("precision", {}).items()
+        if part.get("repeat_over_crb") is not None
+    }
+    if not found:
+        return None
+    good = analysis.table["status"] != Status.SIDELOBE.value
+    window = float(np.median(analysis.table.loc[good, "n_after"]))
+    figure = new_figure(3.0 * len(found), 3.0)
+    for place, (name, part) in enumerate(found.items()):
+        axes = figure.add_subplot(1, len(found), place + 1)
+        axes.axhline(1.0, color=INK, lw=1)
+        axes.errorbar(
+            part["repeat_frames"], part["repeat_over_crb_by_frames"],
+            part["repeat_over_crb_by_frames_se"], fmt="o", color=BLUE, ms=3.5, lw=1,
+            label="own frames",
+        )  # fmt: skip
+        if part["empty_over_crb"]:
+            lengths = window * np.array([1 / 8, 1 / 4, 1 / 2, 1])
+            axes.plot(
+                lengths, part["empty_over_crb"][1:], "s", color=GREY, ms=4, label="no particle"
+            )
+        ratio, (low, high) = part["repeat_over_crb"], part["repeat_over_crb_ci95"]
+        axes.errorbar(
+            [window], [ratio], [[ratio - low], [high - ratio]], fmt="D", color=VERMILLION, ms=5,
+            lw=1.2, label="estimates",
+        )  # fmt: skip
+        axes.set(title=label_of(analysis, name), xscale="log", xlabel="frames averaged")
+        if place == 0:
+            axes.set_ylabel("spread over CRB")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_locator(NullLocator())
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=3, fontsize=8)
+    return figure

@@ -1,0 +1,227 @@
+"""The spread that an estimate has where there is no particle: the noise at full length.
+
+What a fit does to noise is linear in the counts, whether or not there is a particle.  The same
+windows of frames, projected on the same derivatives of the model everywhere in the field where
+nothing landed, give errors of estimates whose truth is known, nothing, at the full length of the
+windows.  Disjoint parts of an event's own frames, which are shorter, cannot show these.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from iscat_analysis.records import BoolArray, FloatArray
+
+CONTRASTS = ("whole", "parts", "eighths", "quarters", "halves")
+"""What is compared: after with before; the parts on one side of the step; neighbours of n/8, n/4
+and n/2 frames on one side."""
+
+FEWEST_PLACES = 60
+"""Places below which nothing is said."""
+
+_TRIM = 4.0  # robust standard deviations beyond which something else than noise is there
+_KEPT_VARIANCE = 0.998929  # of a normal law inside ±_TRIM standard deviations
+_NORMAL_QUARTILE = 0.6744897501960817
+
+
+@dataclass(frozen=True)
+class EmptySpread:
+    """Squared errors at empty places over the variance that the model expects, summed.
+
+    Attributes
+    ----------
+    squares : ndarray, shape (len(CONTRASTS), n, tiles)
+        For each contrast, parameter and tile of the field.
+    counts : ndarray, shape (len(CONTRASTS), tiles)
+        What they come to under the model.
+    """
+
+    squares: FloatArray
+    counts: FloatArray
+
+    def __add__(self, other: EmptySpread) -> EmptySpread:
+        """Join what other frames of the same field say."""
+        return EmptySpread(self.squares + other.squares, self.counts + other.counts)
+
+
+class EmptyField:
+    """The linear estimator at every place of a field.
+
+    Parameters
+    ----------
+    mean_e : ndarray, shape (y, x)
+        Photoelectrons per unit of power without the particles that are sought [e].
+    read_e2 : ndarray, shape (y, x)
+        Variance of the read noise of one frame [e²].
+    used : ndarray of bool, shape (y, x)
+        Pixels in use.
+    slopes : ndarray, shape (n, k, k)
+        Derivatives of the signal by the free parameters, k odd.
+    n_free : int
+        How many of them belong to the particle; the others are nuisances.
+    additive : bool
+        Whether particles add to the light instead of multiplying it.
+    spacing_px, tile_px : int
+        From one place to the next, and side of the tiles whose errors are taken together [pixels].
+    """
+
+    def __init__(
+        self,
+        mean_e: FloatArray,
+        read_e2: FloatArray,
+        used: BoolArray,
+        slopes: FloatArray,
+        n_free: int,
+        *,
+        additive: bool,
+        spacing_px: int,
+        tile_px: int,
+    ) -> None:
+        rows, columns = mean_e.shape
+        n, k, _ = slopes.shape
+        half = k // 2
+        self._shape = (rows, columns)
+        self._size = (
+            fft.next_fast_len(rows + half, real=True), fft.next_fast_len(columns + half, real=True)
+        )  # fmt: skip
+        self._n_free = n_free
+        self._mean = mean_e
+        noise = np.maximum(mean_e, 0.0) + read_e2
+        light = np.ones_like(mean_e) if additive else mean_e
+        seen = used & (noise > 0)
+        self._weight = np.where(seen, light / np.where(seen, noise, 1.0), 0.0)
+        scale = np.sqrt(np.einsum("iyx,iyx->i", slopes, slopes))
+        unit = slopes / scale[:, None, None]
+        pairs = [(i, j) for i in range(n) for j in range(i, n)]
+        products = np.stack([unit[i] * unit[j] for i, j in pairs])
+        self._spectra = self._reversed(unit)
+        inner = (slice(0, rows, spacing_px), slice(0, columns, spacing_px))
+        self._places = inner
+        information = self._correlate(self._weight * light, self._reversed(products))
+        fisher = np.empty((*information.shape[1:], n, n))
+        for (i, j), value in zip(pairs, information, strict=True):
+            fisher[..., i, j] = fisher[..., j, i] = value
+        full = fisher[..., 0, 0] > 0.5 * np.median(fisher[..., 0, 0])
+        full &= np.linalg.cond(np.where(full[..., None, None], fisher, np.eye(n))) < 1e10
+        self._known = full & (self._weight[inner] > 0)
+        inverse = np.linalg.inv(np.where(full[..., None, None], fisher, np.eye(n)))
+        self._inverse = inverse[..., :n_free, :]
+        self._variance = np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0)[:n_free]
+        wide = math.ceil(columns / tile_px)
+        row, column = np.indices(self._shape)
+        self._tile = ((row // tile_px) * wide + column // tile_px)[inner]
+        self.tiles = math.ceil(rows / tile_px) * wide
+
+    def errors(self, sum_e: FloatArray, power: float, known: FloatArray | None) -> FloatArray:
+        """Give the errors that a sum of frames contributes everywhere.
+
+        Parameters
+        ----------
+        sum_e : ndarray, shape (y, x)
+            Photoelectrons of the frames [e].
+        power : float
+            Their light.
+        known : ndarray, shape (y, x), optional
+            What particles that were found add to the light, per unit of power [e].
+
+        Returns
+        -------
+        ndarray, shape (n, rows, columns)
+            At every place, in units of the parameters but for a factor.
+        """
+        rest = sum_e / power - self._mean
+        if known is not None:
+            rest = rest - known
+        score = self._correlate(self._weight * rest, self._spectra)
+        errors: FloatArray = np.einsum("yxij,jyx->iyx", self._inverse, score)
+        return errors
+
+    def spread(
+        self,
+        before: list[FloatArray],
+        after: list[FloatArray],
+        powers: tuple[FloatArray, FloatArray],
+        taken: BoolArray,
+    ) -> EmptySpread:
+        """Compare the parts of two windows.
+
+        Parameters
+        ----------
+        before, after : list of ndarray, shape (n, rows, columns)
+            From `errors`, of contiguous parts.
+        powers : (ndarray, ndarray)
+            Light of each part.
+        taken : ndarray of bool, shape (y, x)
+            Pixels near a particle that lands or leaves in these frames.
+
+        Returns
+        -------
+        EmptySpread
+            Zero throughout where too few places are empty.
+        """
+        kept = self._known & ~taken[self._places]
+        squares = np.zeros((len(CONTRASTS), self._n_free, self.tiles))
+        counts = np.zeros((len(CONTRASTS), self.tiles))
+        nothing = EmptySpread(squares, counts)
+        if kept.sum() < FEWEST_PLACES:
+            return nothing
+        sides = [np.stack(parts)[:, :, kept] for parts in (before, after)]
+        unit, tile = self._variance[:, kept], self._tile[kept]
+        means = [
+            np.einsum("j,jip->ip", power / power.sum(), parts)
+            for power, parts in zip(powers, sides, strict=True)
+        ]
+        noise = unit * sum(1 / power.sum() for power in powers)
+        whole = (means[1] - means[0]) / np.sqrt(noise)
+        scale = np.median(np.abs(whole), axis=1, keepdims=True) / _NORMAL_QUARTILE
+        quiet = np.all(np.abs(whole) < _TRIM * scale, axis=0)
+        if quiet.sum() < FEWEST_PLACES:
+            return nothing
+        found = [(whole**2 / _KEPT_VARIANCE, 1)]
+        parts_squares, degrees = np.zeros(unit.shape), 0
+        for power, parts, mean in zip(powers, sides, means, strict=True):
+            parts_squares += np.einsum("j,jip->ip", power, (parts - mean) ** 2) / unit
+            degrees += len(parts) - 1
+        found.append((parts_squares, degrees))
+        for joined in (1, 2, 4):
+            total, pairs = np.zeros(unit.shape), 0
+            for power, parts in zip(powers, sides, strict=True):
+                if len(parts) < 8:
+                    continue
+                light = np.add.reduceat(power, np.arange(0, len(parts), joined))
+                lit = power[:, None, None] * parts
+                blocks = np.add.reduceat(lit, np.arange(0, len(parts), joined), axis=0)
+                blocks /= light[:, None, None]
+                apart = blocks[1::2] - blocks[0::2]
+                expected = 1 / light[1::2] + 1 / light[0::2]
+                total += np.einsum("j,jip->ip", 1 / expected, apart**2) / unit
+                pairs += len(apart)
+            found.append((total, pairs))
+        for k, (square, number) in enumerate(found):
+            for i, row in enumerate(square):
+                squares[k, i] = np.bincount(tile[quiet], row[quiet], minlength=self.tiles)
+            counts[k] = number * np.bincount(tile[quiet], minlength=self.tiles)
+        return EmptySpread(squares, counts)
+
+    @property
+    def places(self) -> int:
+        """Places at which there is a linear estimate."""
+        return int(self._known.sum())
+
+    def _reversed(self, images: FloatArray) -> FloatArray:
+        """Spectra that correlate with images whose centre is at the place."""
+        half = images.shape[1] // 2
+        padded = np.zeros((len(images), *self._size))
+        padded[:, : images.shape[1], : images.shape[2]] = images[:, ::-1, ::-1]
+        rolled = np.roll(padded, (-half, -half), axis=(1, 2))
+        return np.asarray(fft.rfft2(rolled))
+
+    def _correlate(self, image: FloatArray, spectra: FloatArray) -> FloatArray:
+        padded = np.zeros(self._size)
+        padded[: self._shape[0], : self._shape[1]] = image
+        spectrum = fft.rfft2(padded)
+        return np.stack([fft.irfft2(spectrum * s, s=self._size)[self._places] for s in spectra])
