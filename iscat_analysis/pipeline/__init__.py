@@ -64,6 +64,7 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.report import EVENT_FIGURES, write_report
 from iscat_analysis.report.output import claim_output
+from iscat_analysis.report.spread import rejection
 
 DEPENDENCIES = (
     "numpy", "scipy", "numba", "tifffile", "emcee", "arviz-stats", "pandas", "pyarrow",
@@ -271,7 +272,9 @@ def analyse(
         if scaled:
             table = with_measured_sigma(table, achieved)
         noise = further.get("landing") or further.get("background") or {}
-        further["repeats"] = spread_verdict(achieved, noise, scaled=scaled)
+        further["repeats"] = spread_verdict(
+            achieved, noise, scaled=scaled, rejected=bool(rejection(found.table))
+        )
         if further["repeats"]["message"]:
             tell(further["repeats"]["message"])
         found = replace(found, table=table)

@@ -109,7 +109,11 @@ def with_measured_sigma(table: pd.DataFrame, found: Mapping[str, Achieved]) -> p
 
 
 def spread_verdict(
-    found: Mapping[str, Achieved], noise: Mapping[str, Any], *, scaled: bool
+    found: Mapping[str, Achieved],
+    noise: Mapping[str, Any],
+    *,
+    scaled: bool,
+    rejected: bool = False,
 ) -> dict[str, Any]:
     """Say whether σ is too small, by what factor, and what the noise suggests.
 
@@ -121,6 +125,8 @@ def spread_verdict(
         What the summary holds under ``landing`` or ``background``: the noise of single pixels.
     scaled : bool
         Whether σ was scaled by the measured spread.
+    rejected : bool
+        Whether the model of the image is rejected.
 
     Returns
     -------
@@ -140,7 +146,7 @@ def spread_verdict(
             )
         return {"understated": False, "message": message, "cause": ""}
     worst = max(high.values(), key=lambda a: a.significance)
-    cause = likely_noise(worst, noise)
+    cause = likely_noise(worst, noise, rejected=rejected)
     if scaled:
         message = (
             f"σ is scaled by the measured spread, {_ratios(high)} times the Cramér–Rao bound; "
@@ -154,7 +160,7 @@ def spread_verdict(
     return {"understated": not scaled, "message": message, "cause": cause}
 
 
-def likely_noise(found: Achieved, noise: Mapping[str, Any]) -> str:
+def likely_noise(found: Achieved, noise: Mapping[str, Any], *, rejected: bool = False) -> str:
     """Name what an excess of noise looks like.
 
     Parameters
@@ -163,6 +169,9 @@ def likely_noise(found: Achieved, noise: Mapping[str, Any]) -> str:
         Of one parameter.
     noise : mapping
         As in `spread_verdict`.
+    rejected : bool
+        Whether the model of the image is rejected: what it leaves over of other particles then
+        looks like slow noise.
 
     Returns
     -------
@@ -202,6 +211,11 @@ def likely_noise(found: Achieved, noise: Mapping[str, Any]) -> str:
                 else "flicker (1/f noise)"
             )
             said.append(f"it grows with the frames that are averaged, as {name}, or average fewer")
+            if rejected:
+                said.append(
+                    "or it is what a wrong model of the image leaves over of other particles: "
+                    "check focus, NA and pixel size first"
+                )
         own = found.over_crb**2 - whole
         if own > _SHARE * excess:
             said.append(

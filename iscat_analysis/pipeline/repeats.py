@@ -39,10 +39,10 @@ from iscat_analysis.records import (
 from iscat_analysis.search.empty import EmptyField, EmptySpread
 from iscat_analysis.search.sliding import Chunk
 
-PLACES = 40_000
+PLACES = 20_000
 """Places times windows at which the noise of a chunk is looked at."""
 
-MOST_WINDOWS, FEWEST_WINDOWS = 12, 2
+MOST_WINDOWS, FEWEST_WINDOWS = 8, 2
 """Windows of a chunk that are looked at."""
 
 _NEAR, _NEAR_POOR = 1 / 3, 1 / 2  # of the square's side; a poor fit leaves its rings over

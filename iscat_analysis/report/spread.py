@@ -58,8 +58,8 @@ def rejection(table: pd.DataFrame) -> str:
     return (
         f"The model is rejected: {poor} of {p.size} fits have a p-value below {_POOR:g}, where "
         f"{number(_POOR * p.size, 2)} would by chance. Errors of the model, such as a wrong focus, "
-        "aperture or pixel size, are in neither σ nor the measured spread, which is of noise; they "
-        "show in how far the species are wider than σ."
+        "aperture or pixel size, are not in σ, in the measured spread only as rings left over of "
+        "other particles; they show in how far the species are wider than σ."
     )
 
 

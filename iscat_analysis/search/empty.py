@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
 from iscat_analysis.records import BoolArray, FloatArray
@@ -98,7 +100,8 @@ class EmptyField:
         unit = slopes / scale[:, None, None]
         pairs = [(i, j) for i in range(n) for j in range(i, n)]
         products = np.stack([unit[i] * unit[j] for i, j in pairs])
-        self._spectra = self._reversed(unit)
+        # residuals are small numbers, of which single precision keeps a millionth
+        self._spectra = self._reversed(unit).astype(np.complex64)
         inner = (slice(0, rows, spacing_px), slice(0, columns, spacing_px))
         self._places = inner
         information = self._correlate(self._weight * light, self._reversed(products))
@@ -192,11 +195,10 @@ class EmptyField:
             for power, parts in zip(powers, sides, strict=True):
                 if len(parts) < 8:
                     continue
-                light = np.add.reduceat(power, np.arange(0, len(parts), joined))
-                lit = power[:, None, None] * parts
-                blocks = np.add.reduceat(lit, np.arange(0, len(parts), joined), axis=0)
-                blocks /= light[:, None, None]
-                apart = blocks[1::2] - blocks[0::2]
+                light = power.reshape(-1, joined).sum(axis=1)
+                lit = (power[:, None, None] * parts).reshape(-1, joined, *unit.shape).sum(axis=1)
+                lit /= light[:, None, None]
+                apart = lit[1::2] - lit[0::2]
                 expected = 1 / light[1::2] + 1 / light[0::2]
                 total += np.einsum("j,jip->ip", 1 / expected, apart**2) / unit
                 pairs += len(apart)
@@ -212,7 +214,7 @@ class EmptyField:
         """Places at which there is a linear estimate."""
         return int(self._known.sum())
 
-    def _reversed(self, images: FloatArray) -> FloatArray:
+    def _reversed(self, images: FloatArray) -> NDArray[Any]:
         """Spectra that correlate with images whose centre is at the place."""
         half = images.shape[1] // 2
         padded = np.zeros((len(images), *self._size))
@@ -220,8 +222,8 @@ class EmptyField:
         rolled = np.roll(padded, (-half, -half), axis=(1, 2))
         return np.asarray(fft.rfft2(rolled))
 
-    def _correlate(self, image: FloatArray, spectra: FloatArray) -> FloatArray:
-        padded = np.zeros(self._size)
+    def _correlate(self, image: FloatArray, spectra: NDArray[Any]) -> FloatArray:
+        padded = np.zeros(self._size, dtype=spectra.real.dtype)
         padded[: self._shape[0], : self._shape[1]] = image
         spectrum = fft.rfft2(padded)
         return np.stack([fft.irfft2(spectrum * s, s=self._size)[self._places] for s in spectra])

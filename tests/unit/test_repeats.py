@@ -279,9 +279,17 @@ def test_the_noise_is_named(found: Achieved, pixels: float, word: str) -> None:
     verdict = spread_verdict({"mass_kda": found}, {}, scaled=False)
     assert verdict["understated"]
     assert f"{found.over_crb:.2f} (" in verdict["message"]
+    assert "wrong model" not in verdict["message"]
     scaled = spread_verdict({"mass_kda": found}, {}, scaled=True)
     assert not scaled["understated"]
     assert "is scaled" in scaled["message"]
+
+
+def test_slow_noise_of_a_rejected_model_may_be_its_rings() -> None:
+    slow = _achieved(1.80, 1.0, (1.03, 1.0, 1.02, 1.14, 1.80))
+    assert "wrong model" in likely_noise(slow, {}, rejected=True)
+    white = _achieved(1.22, 1.22, (1.22,) * 5)
+    assert "wrong model" not in likely_noise(white, {}, rejected=True)
 
 
 def test_a_clean_movie_is_told_nothing() -> None:
