@@ -3,8 +3,8 @@
 `quantum` holds what the collected light knows, `holevo` what one measurement can take of it for
 several parameters at once, `classical` what the camera can learn of it, and `experiment` plans a
 measurement from a configuration; `shared` says what an uncertain microscope leaves in every
-particle; `scan` varies one thing, `planning` turns the question round, and `paper` reproduces Dong
-et al. (2021).
+particle; `scan` varies one thing, `planning` turns the question round, `pupil` searches the
+measurement that comes nearest to the light's own bound, and `paper` reproduces Dong et al. (2021).
 """
 
 from __future__ import annotations
@@ -39,8 +39,10 @@ from iscat_analysis.bounds.planning import (
     budget,
     effort,
     optimize,
+    parse_names,
     parse_target,
 )
+from iscat_analysis.bounds.pupil import KNOBS, PupilOptimum, optimize_pupil
 from iscat_analysis.bounds.quantum import (
     incompatible_pairs,
     quantum_bounds,
@@ -59,6 +61,7 @@ from iscat_analysis.bounds.shared import (
 
 __all__ = [
     "AXES",
+    "KNOBS",
     "Axis",
     "Best",
     "Cost",
@@ -67,6 +70,7 @@ __all__ = [
     "Experiment",
     "Goal",
     "Holevo",
+    "PupilOptimum",
     "Reproduction",
     "Scan",
     "Unidentifiable",
@@ -87,6 +91,8 @@ __all__ = [
     "mass_drift",
     "natural_bound",
     "optimize",
+    "optimize_pupil",
+    "parse_names",
     "parse_scan",
     "parse_target",
     "plan",
