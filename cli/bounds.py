@@ -216,9 +216,14 @@ def bounds(
 
             check_output(out, overwrite, known=BOUNDS_FILES)
 
-        from iscat_analysis.bounds import bounds_report
+        from iscat_analysis.bounds import bounds_report, detection_limit, plan
 
         report = bounds_report(resolved)
+        limit = detection_limit(plan(resolved))
+        if limit is not None:
+            from dataclasses import asdict
+
+            report["detection"] = asdict(limit)
         for line in report["warnings"]:
             messages.notify(f"warning: {line}")
         along: dict[str, Any] = {}
@@ -268,6 +273,8 @@ def _print(report: Mapping[str, Any]) -> None:
         at_once = {name: report["holevo"][name] for name in report["at"]["free"]}
         print_result(_bounds_table("for these photons", {**report["actual"], "holevo": at_once}))
         print_result(_information(report))
+        if "detection" in report:
+            print_result(_detection_table(report["detection"]))
     for line in report["unidentifiable"]:
         print_result(f"unidentifiable: {line}")
 
@@ -446,6 +453,19 @@ def _information(report: Mapping[str, Any]) -> Table:
 
 def _percent(share: float | None) -> str:
     return "–" if share is None or not math.isfinite(share) else f"{100 * share:.1f} %"
+
+
+def _detection_table(limit: Mapping[str, Any]) -> Table:
+    found = table(
+        f"detected but for {100 * limit['miss']:g} %, {100 * limit['false_alarm']:g} % false",
+        "threshold", "SNR", "mass_kda",
+    )  # fmt: skip
+    for label, name in (("place known", "known"), ("field searched", "searched")):
+        found.add_row(
+            label, short(limit[f"threshold_{name}"]), short(limit[f"snr_{name}"]),
+            short(limit[f"mass_{name}_kda"]),
+        )  # fmt: skip
+    return found
 
 
 def _scan_table(scanned: Mapping[str, Any], free: list[str]) -> Table:

@@ -15,6 +15,12 @@ from iscat_analysis.bounds.classical import (
     bounds_from_matrices,
     event_bounds,
 )
+from iscat_analysis.bounds.detection import (
+    DetectionLimit,
+    detection_limit,
+    power_known,
+    power_searched,
+)
 from iscat_analysis.bounds.experiment import (
     Experiment,
     bounds_report,
@@ -65,6 +71,7 @@ __all__ = [
     "Axis",
     "Best",
     "Cost",
+    "DetectionLimit",
     "Effort",
     "EventBounds",
     "Experiment",
@@ -78,6 +85,7 @@ __all__ = [
     "bounds_report",
     "budget",
     "changed",
+    "detection_limit",
     "displacement",
     "effort",
     "eliminated",
@@ -96,6 +104,8 @@ __all__ = [
     "parse_scan",
     "parse_target",
     "plan",
+    "power_known",
+    "power_searched",
     "quantum_bounds",
     "quantum_information",
     "report_of",

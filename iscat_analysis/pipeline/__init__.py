@@ -22,6 +22,7 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.achieved import Achieved
 from iscat_analysis.inference.likelihood import compile_kernels
 from iscat_analysis.inference.posterior import sample_posterior
+from iscat_analysis.inference.prior import Prior
 from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.background import measure_windows
 from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts, refuse_ratio
@@ -35,9 +36,11 @@ from iscat_analysis.pipeline.achieved import (
 )
 from iscat_analysis.pipeline.diagnosis import (
     EXCESS_NOISE,
+    allow_for_correlation,
     drift_warning,
     examine_background,
     judge_gain,
+    judge_spectrum,
     misfit_warning,
     pixel_warnings,
 )
@@ -345,13 +348,21 @@ def _measured_background(
         check=check,
         progress=progress,
     )
+    spectrum = judge_spectrum(movie, camera, windows)
+    if spectrum is not None:
+        scene = make_scene(config, shape, searches=searches, noise=spectrum)
+        if spectrum.message:
+            tell(f"{movie.name}: {spectrum.message}")
     gain = judge_gain(movie, camera, windows)
-    if gain is not None and gain.message:
-        tell(gain.message)
+    if gain is not None:
+        gain = allow_for_correlation(gain, spectrum)
+        if gain.message:
+            tell(gain.message)
     for text in pixel_warnings(windows):
         tell(text)
     if not scene.additive:
         further["background"] = examine_background(movie, camera, windows)
+        further["background"]["noise_spectrum"] = spectrum.summary if spectrum else None
         moved = drift_warning(movie.name, further["background"])
         if moved:
             tell(moved)
@@ -421,6 +432,7 @@ def _sampled(
             walkers=settings.walkers,
             steps=settings.steps,
             seed=seed + row.number,
+            prior=Prior(settings.priors),
             stopped=stop.is_set,
         )
 

@@ -18,7 +18,7 @@ from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera, check_counts
 from iscat_analysis.movie.drift import Trajectory, measure_drift
 from iscat_analysis.movie.metadata import diagnose_gain
-from iscat_analysis.pipeline.diagnosis import EXCESS_NOISE
+from iscat_analysis.pipeline.diagnosis import EXCESS_NOISE, allow_for_correlation
 from iscat_analysis.pipeline.results import table_of
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import (
@@ -40,6 +40,7 @@ from iscat_analysis.search.sliding import (
     measure_frames,
     measure_noise,
 )
+from iscat_analysis.search.spectrum import NoiseSpectrum, measure_spectrum
 
 HALO = 2
 """Windows on either side of a chunk's core: a step, its neighbours, and theirs."""
@@ -202,12 +203,15 @@ class Noise:
         One line where the noise does not agree with the configured gain, else empty.
     excess : str
         What is known of noise beyond the expected, else empty.
+    spectrum : NoiseSpectrum or None
+        Of the noise between neighbouring frames, where it is not white and of the expected size.
     """
 
     curve: NoiseCurve
     window: int
     gain_message: str
     excess: str
+    spectrum: NoiseSpectrum | None
 
 
 def judge_noise(reader: Reader, config: Config, mapper: Mapper = map) -> Noise:
@@ -249,9 +253,11 @@ def judge_noise(reader: Reader, config: Config, mapper: Mapper = map) -> Noise:
     longest = min(given or longest_window(frames), _NOISE_FRAMES // 4)
     curve = measure_noise(opening, reader.camera, longest, mapper=mapper)
     window = given or choose_window(curve, frames)
+    spectrum = measure_spectrum(opening, reader.camera, mapper=mapper)
     message, ratio = "", 1.0
     try:
         gain = diagnose_gain(opening[:_GAIN_FRAMES], reader.camera)
+        gain = allow_for_correlation(gain, spectrum)
         message, ratio = gain.message or "", gain.noise_ratio
     except DataError:  # too dark to tell
         pass
@@ -262,7 +268,7 @@ def judge_noise(reader: Reader, config: Config, mapper: Mapper = map) -> Noise:
             "times that of the light; look at the laser, set background.drift_correction = true, "
             "or lower background.window_frames"
         )
-    return Noise(curve, window, message, excess)
+    return Noise(curve, window, message, excess, spectrum)
 
 
 def counts_budget(config: Config) -> int:

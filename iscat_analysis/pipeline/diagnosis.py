@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain
 from iscat_analysis.pipeline.field import Event
 from iscat_analysis.records import Status, Windows
 from iscat_analysis.search.sliding import measure_noise
+from iscat_analysis.search.spectrum import NoiseSpectrum, measure_spectrum
 
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""
@@ -26,6 +28,7 @@ DRIFT_PX = 0.02
 _BRIGHTEST = 8  # isolated particles on which the model is judged
 _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
 _GAIN_FRAMES = 64  # on which the gain is judged
+_SPECTRUM_FRAMES = 128  # on which the noise's spectrum is measured
 _NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
 _LONGEST = 100  # average of the noise curve
 _SMALLEST_PX = 32  # side of a field in which a pattern is followed
@@ -59,6 +62,60 @@ def judge_gain(movie: Stack, camera: Camera, windows: Windows) -> GainDiagnosis 
         return diagnose_gain(_first(movie, windows, _GAIN_FRAMES), camera, masked=windows.masked)
     except DataError:  # too dark to tell
         return None
+
+
+def judge_spectrum(movie: Stack, camera: Camera, windows: Windows) -> NoiseSpectrum | None:
+    """Measure the noise of the background frames at every spatial frequency.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    camera : Camera
+        Counts → photoelectrons.
+    windows : Windows
+        The background.
+
+    Returns
+    -------
+    NoiseSpectrum or None
+        None where it is white and of the expected size, or there is no shot noise to look at.
+    """
+    if windows.n_before < 2 or not _is_lit(windows):
+        return None
+    return measure_spectrum(_first(movie, windows, _SPECTRUM_FRAMES), camera)
+
+
+def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:
+    """Judge the gain by the noise that neighbouring pixels have together.
+
+    Parameters
+    ----------
+    gain : GainDiagnosis
+        From the variance of single pixels.
+    spectrum : NoiseSpectrum or None
+        Of the same frames.
+
+    Returns
+    -------
+    GainDiagnosis
+        The same where pixels are independent.
+
+    Notes
+    -----
+    Light is Poisson before charge leaks to neighbours; leaking moves variance into covariances
+    (M. Downing et al., Proc. SPIE 6276, 627609, 2006).
+    """
+    if spectrum is None or not spectrum.correlated:
+        return gain
+    ratio, error = spectrum.summed
+    return replace(
+        gain,
+        noise_ratio=ratio,
+        noise_ratio_se=error,
+        gain_e_per_adu=gain.configured_gain / ratio,
+        gain_se=gain.configured_gain / ratio**2 * error,
+    )
 
 
 def pixel_warnings(windows: Windows) -> Iterator[str]:

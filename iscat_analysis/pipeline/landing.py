@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.posterior import sample_posterior
+from iscat_analysis.inference.prior import Prior
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.optics.forward import forward_model
@@ -61,6 +62,7 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.sliding import STRIDES, Chunk
+from iscat_analysis.search.spectrum import NoiseSpectrum
 from iscat_analysis.search.templates import LARGEST_IMAGE, make_templates
 
 POSTERIORS = 20
@@ -190,6 +192,8 @@ def analyse_landings(
     with ThreadPoolExecutor(config.compute.workers) as pool:
         noise = judge_noise(reader, config, pool.map)
     curve, window = noise.curve, noise.window
+    if noise.spectrum is not None and noise.spectrum.message:
+        tell(f"{movie.name}: {noise.spectrum.message}")
     if noise.gain_message:
         tell(noise.gain_message)
     stride = max(1, window // STRIDES)
@@ -197,7 +201,7 @@ def analyse_landings(
     posterior = config.samples_posterior
     sampling = config.posterior.model_copy(update={"enabled": posterior})
     config = config.model_copy(update={"posterior": sampling})
-    scene = make_landing_scene(config, reader.shape, searches=count)
+    scene = make_landing_scene(config, reader.shape, searches=count, noise=noise.spectrum)
     prepare(scene)
     plan = plan_chunks(reader, config, window, stride)
     store = Store(partial, config, identity, reader.shape, (first, last), camera)
@@ -245,6 +249,7 @@ def analyse_landings(
         "shot_noise_limited_frames": curve.shot_limited,
         "noise_frames": list(curve.frames),
         "noise_variance_over_shot": list(curve.variance_over_shot),
+        "noise_spectrum": noise.spectrum.summary if noise.spectrum else None,
         "frames_left_out": merged.left_out(),
         "drift_px": merged.drift(),
         **_way(merged.trajectory()),
@@ -348,7 +353,13 @@ def _unheard(text: str) -> None:
     """Say nothing: the user has been told already."""
 
 
-def make_landing_scene(config: Config, field_px: tuple[int, int], *, searches: int) -> Scene:
+def make_landing_scene(
+    config: Config,
+    field_px: tuple[int, int],
+    *,
+    searches: int,
+    noise: NoiseSpectrum | None = None,
+) -> Scene:
     """Build the models and the matched filter, at the particles' nominal height.
 
     Parameters
@@ -359,6 +370,8 @@ def make_landing_scene(config: Config, field_px: tuple[int, int], *, searches: i
         Rows and columns.
     searches : int
         Boundaries that will be searched; they share the expected false alarms.
+    noise : NoiseSpectrum, optional
+        Of the movie; without it the noise is white and of the expected size.
 
     Returns
     -------
@@ -383,6 +396,7 @@ def make_landing_scene(config: Config, field_px: tuple[int, int], *, searches: i
             roi_nm=config.fit.roi_nm,
             z_range_nm=None,
             field_px=field_px,
+            noise=noise,
         ),
         mode=config.fit.mode,
     )
@@ -413,6 +427,7 @@ def _analyse_chunk(
                 row.event.likelihood, row.event.fit,
                 walkers=settings.walkers, steps=settings.steps,
                 seed=scene.config.compute.seed + steps[i].step.at.frame,
+                prior=Prior(settings.priors),
             )  # fmt: skip
         except KeyboardInterrupt:  # the fits are done, and kept
             stopped = True

@@ -23,6 +23,7 @@ from iscat_analysis.records import (
     Windows,
     verdict,
 )
+from iscat_analysis.search.spectrum import NoiseSpectrum
 from iscat_analysis.search.templates import Templates, make_templates
 
 SPREAD_NM = 10_000.0
@@ -94,7 +95,13 @@ class Scene:
         return self.model.rho == 0
 
 
-def make_scene(config: Config, field_px: tuple[int, int], *, searches: int = 1) -> Scene:
+def make_scene(
+    config: Config,
+    field_px: tuple[int, int],
+    *,
+    searches: int = 1,
+    noise: NoiseSpectrum | None = None,
+) -> Scene:
     """Build the models and the matched filter for a field.
 
     Parameters
@@ -105,6 +112,8 @@ def make_scene(config: Config, field_px: tuple[int, int], *, searches: int = 1) 
         Rows and columns.
     searches : int
         Images that will be searched; they share the expected false alarms.
+    noise : NoiseSpectrum, optional
+        Of the movie; without it the noise is white and of the expected size.
 
     Returns
     -------
@@ -138,6 +147,7 @@ def make_scene(config: Config, field_px: tuple[int, int], *, searches: int = 1) 
             roi_nm=config.fit.roi_nm,
             z_range_nm=config.fit.z_range_nm if free_z else None,
             field_px=field_px,
+            noise=noise,
         ),
         mode=mode,
     )

@@ -165,7 +165,8 @@ class ChunkFitter:
         list of FittedStep
             In order of frame.
         """
-        matched = make_filter(self._chunk, self._scene.templates.images[0])
+        templates = self._scene.templates
+        matched = make_filter(self._chunk, templates.images[0], templates.noise)
         steps: list[Step] = []
         rejected: list[Step] = []
         for self.rounds in range(1, ROUNDS + 1):

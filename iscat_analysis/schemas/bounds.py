@@ -134,6 +134,20 @@ class Optimum(Document):
     note: str
 
 
+class DetectionLimit(Closed):
+    """The faintest particle that can be detected in all frames."""
+
+    false_alarm: float = key("Probability that noise alone is taken for a particle")
+    miss: float = key("Probability that the particle is not found")
+    threshold_known: float = key("Of the signal-to-noise ratio, where the place is known")
+    threshold_searched: float = key("The same where the field of [bounds] is searched")
+    snr_known: float = key("Signal-to-noise ratio that a particle needs, place known")
+    snr_searched: float = key("The same, field searched")
+    mass_known_kda: NotNegative = key("Its mass, place known [kDa]")
+    mass_searched_kda: NotNegative = key("Its mass, field searched [kDa]")
+    snr_per_amplitude: float = key("Square root of the empty field's Fisher information")
+
+
 class Compared(Closed):
     """A setting before and after."""
 
@@ -219,6 +233,7 @@ class Bounds(Document):
     convention: Convention = key("Formulas")
     emission: Emission = key("Emission model")
     warnings: list[str] = key("What the user should know, one line each")
+    detection: DetectionLimit = maybe("Smallest mass that is detected; not in dark field")
     scan: Scan = maybe("With --scan")
     optimum: Optimum = maybe("With --optimize focus or attenuation")
     pupil: Pupil = maybe("With --optimize pupil")

@@ -138,12 +138,24 @@ class Versions(BaseModel):
     numpy: str = key("NumPy")
 
 
+class Spectrum(Closed):
+    """Noise between neighbouring frames that is not white, or not of the expected size."""
+
+    variance_over_shot: Number = key("Of a pixel, over the expected variance")
+    neighbour_correlation: list[Number] = key("Of a pixel with the next one, in x and in y")
+    row_share: NotNegative = key("Part of the variance that a whole row has in common")
+    column_share: NotNegative = key("Part of the variance that a whole column has in common")
+
+
 class Noise(Document):
     """Noise against averaging, and the drift of the fixed pattern."""
 
     noise_frames: list[Count] = key("Frames averaged")
     noise_variance_over_shot: list[Number] = key("Variance over that of the photoelectrons")
     shot_noise_limited_frames: int | None = key("Frames that may be averaged before other noise")
+    noise_spectrum: Spectrum | None = key(
+        "Between neighbouring frames; null where it is as expected"
+    )
 
 
 class Background(Noise):
@@ -164,6 +176,7 @@ class Landing(Document):
     noise_frames: list[Count] = maybe("Frames averaged")
     noise_variance_over_shot: list[Number] = maybe("Variance over that of the photoelectrons")
     shot_noise_limited_frames: int | None = maybe("Frames that may be averaged before other noise")
+    noise_spectrum: Spectrum | None = maybe("Between neighbouring frames; null where as expected")
     stride_frames: Natural = maybe("From one searched boundary to the next")
     boundaries_searched: Count = maybe("Boundaries that share the expected false alarms")
     frames_left_out: Count = maybe("Frames that the camera dropped or repeated")

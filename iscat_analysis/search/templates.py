@@ -25,6 +25,7 @@ from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, ch
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.search.peaks import SAMPLED, vertex
 from iscat_analysis.search.residue import EXCEEDS, is_hidden, size_on_ring
+from iscat_analysis.search.spectrum import NoiseSpectrum
 
 HEIGHTS_PER_FRINGE = 8
 """Templates per interference fringe where z is free: half-way between two the match loses 4 %."""
@@ -66,6 +67,8 @@ class Templates:
         Signal-to-noise ratio that noise reaches as often as configured.
     two_sided : bool
         Whether negative amplitudes count.
+    noise : NoiseSpectrum or None
+        What the noise is where it is not white and of the expected size.
     """
 
     z_nm: FloatArray
@@ -74,6 +77,7 @@ class Templates:
     quadratic: bool
     threshold: float
     two_sided: bool
+    noise: NoiseSpectrum | None = None
 
 
 def make_templates(
@@ -84,6 +88,7 @@ def make_templates(
     roi_nm: float,
     z_range_nm: tuple[float, float] | None,
     field_px: tuple[int, int],
+    noise: NoiseSpectrum | None = None,
 ) -> Templates:
     """Prepare the matched filter for a field.
 
@@ -101,6 +106,8 @@ def make_templates(
         Heights to search; None for the nominal height alone.
     field_px : (int, int)
         Rows and columns of the field.
+    noise : NoiseSpectrum, optional
+        Of the movie; without it the noise is white and of the expected size.
 
     Returns
     -------
@@ -122,7 +129,7 @@ def make_templates(
     for z in heights:
         signal, gradient = bare.gradient(grid, 0.0, 0.0, float(z), weak)
         images.append(signal / (weak**2 if bare.rho == 0 else weak))
-        roughness.append(_roughness(signal, gradient[: 2 if z_range_nm is None else 3]))
+        roughness.append(_roughness(signal, gradient[: 2 if z_range_nm is None else 3], noise))
     stacked = np.stack(images)
     extremes = np.take_along_axis(
         stacked.reshape(heights.size, -1),
@@ -141,6 +148,7 @@ def make_templates(
             detection.false_alarms_per_movie, np.mean(roughness, axis=0), area, depth, two_sided
         ),
         two_sided=two_sided,
+        noise=noise,
     )
 
 
@@ -170,8 +178,13 @@ def signal_to_noise(
     if explained is not None:
         signal = signal - explained
     weighted = np.where(weight > 0, weight * signal, 0.0)
+    duals = templates.images if templates.noise is None else templates.noise.dual(templates.images)
+    norm = _correlate(weight, templates.images * duals)
+    if templates.noise is not None:
+        root = np.sqrt(np.maximum(weight, 0.0))
+        in_noise = np.divide(weighted, root, out=np.zeros_like(root), where=root > 0)
+        weighted = root * templates.noise.whitened(in_noise)
     overlap = _correlate(weighted, templates.images)
-    norm = _correlate(weight, templates.images**2)
     norm = np.maximum(norm, 1e-9 * norm.max() if norm.max() > 0 else 1.0)
     return overlap / np.sqrt(norm), overlap / norm
 
@@ -383,11 +396,15 @@ def _mass(model: ForwardModel, templates: Templates, strength: float) -> float:
     return float(model.scale.mass(np.asarray(amplitude)))
 
 
-def _roughness(signal: FloatArray, gradient: NDArray[np.float64]) -> FloatArray:
+def _roughness(
+    signal: FloatArray, gradient: NDArray[np.float64], noise: NoiseSpectrum | None
+) -> FloatArray:
     """Covariance of the gradient of the unit-variance field that the filter makes of noise."""
-    norm = np.sum(signal**2)
-    cross = np.einsum("iyx,jyx->ij", gradient, gradient) / norm
-    along = np.einsum("iyx,yx->i", gradient, signal) / norm
+    dual = signal if noise is None else noise.dual(signal)
+    duals = gradient if noise is None else noise.dual(gradient)
+    norm = np.sum(signal * dual)
+    cross = np.einsum("iyx,jyx->ij", gradient, duals) / norm
+    along = np.einsum("iyx,yx->i", gradient, dual) / norm
     covariance: FloatArray = cross - np.outer(along, along)
     return covariance
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.ndimage import convolve1d
 from scipy.stats import poisson
 
 from iscat_analysis.config import Config, load_config
@@ -119,6 +120,57 @@ def test_another_number_of_false_alarms_is_refused(alarms: tuple[int, int], wron
     found, movies = alarms
     with pytest.raises(AssertionError):
         _assert_expected(found, wrong * movies)
+
+
+def _with_noise(counts: np.ndarray, light: np.ndarray, kind: str, seed: int) -> np.ndarray:
+    """Give the electrons of frames a noise that no configuration tells of."""
+    rng, noise = np.random.default_rng(1000 + seed), counts - light
+    lagged, leaky = (np.array(k) / np.linalg.norm(k) for k in ((0, 3, 1), (0.1, 0.8, 0.1)))
+    if kind == "lagged":
+        return light + convolve1d(noise, lagged, axis=2)
+    if kind == "leaky":
+        return light + convolve1d(convolve1d(noise, leaky, axis=1), leaky, axis=2)
+    if kind == "read":
+        return counts + 200 * rng.standard_normal(counts.shape)
+    if kind == "gain":
+        return light + math.sqrt(1.3) * noise
+    frames, rows, columns = counts.shape
+    lines = (frames, rows, 1) if kind == "rows" else (frames, 1, columns)
+    return counts * (1 + 2e-3 * rng.standard_normal(lines))
+
+
+KINDS = ("lagged", "leaky", "read", "gain", "rows", "columns")
+
+
+def _alarms_in(kind: str, movies: int) -> int:
+    """Count events in blank movies, 1 expected in each, with a kind of noise."""
+    config, found = _config(64, 240, *BLANK), 0
+    for seed in range(movies):
+        light = np.array(list(Movie(config, seed).expected_frames()))
+        drawn = np.random.default_rng(seed).poisson(light)
+        counts = np.round(_with_noise(drawn, light, kind, seed) / 4.0)
+        found += len(
+            analyse_landings(
+                Memory(np.clip(counts, 0, 65535).astype(np.uint16)), config,
+                Camera(gain_e_per_adu=4.0), tell=lambda _: None, progress=lambda *_: None,
+            ).table
+        )  # fmt: skip
+    return found
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_unknown_noise_has_as_many_false_alarms_as_configured(kind: str) -> None:
+    _assert_expected(_alarms_in(kind, 40), 40)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_search_that_does_not_measure_the_noise_has_more(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Control: of the noise, and of the test above."""
+    monkeypatch.setattr("iscat_analysis.pipeline.chunks.measure_spectrum", lambda *_, **__: None)
+    with pytest.raises(AssertionError):
+        _assert_expected(_alarms_in(kind, 6), 6)
 
 
 # ---- isolated events -------------------------------------------------------------------------

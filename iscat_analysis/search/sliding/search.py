@@ -21,6 +21,7 @@ from iscat_analysis._kernels.sliding import contrast_map, step_peaks
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.search.peaks import SAMPLED, vertex
 from iscat_analysis.search.sliding.frames import Chunk
+from iscat_analysis.search.spectrum import NoiseSpectrum
 
 MapArray = NDArray[np.float32]
 
@@ -44,6 +45,8 @@ class Filter:
         Information of a pixel about its contrast, per frame of unit power; 0 where not used.
     norm : ndarray, shape (y, x)
         Information about the amplitude, per frame.
+    noise : NoiseSpectrum or None
+        What the noise is where it is not white and of the expected size.
     """
 
     spectrum: NDArray[np.complex64]
@@ -51,9 +54,18 @@ class Filter:
     half: int
     weight: MapArray
     norm: MapArray
+    noise: NoiseSpectrum | None
+
+    def whiten(self, weighted: MapArray) -> None:
+        """Turn weight·contrast (y, x) in place into what a template's overlap is taken with."""
+        if self.noise is None:
+            return
+        root = np.sqrt(self.weight)
+        in_noise = np.divide(weighted, root, out=np.zeros_like(root), where=root > 0)
+        weighted[:] = root * self.noise.whitened(in_noise)
 
 
-def make_filter(chunk: Chunk, template: FloatArray) -> Filter:
+def make_filter(chunk: Chunk, template: FloatArray, noise: NoiseSpectrum | None = None) -> Filter:
     """Prepare the matched filter.
 
     Parameters
@@ -62,6 +74,8 @@ def make_filter(chunk: Chunk, template: FloatArray) -> Filter:
         Gives the weights.
     template : ndarray, shape (k, k)
         Contrast per unit amplitude, k odd.
+    noise : NoiseSpectrum, optional
+        Of the movie; without it the noise is white and of the expected size.
 
     Returns
     -------
@@ -83,7 +97,8 @@ def make_filter(chunk: Chunk, template: FloatArray) -> Filter:
     k = template.shape[0]
     flipped = template[::-1, ::-1]
     reversed_[0, :k, :k] = flipped
-    reversed_[1, :k, :k] = (flipped / scale) ** 2
+    dual = template if noise is None else noise.dual(template)
+    reversed_[1, :k, :k] = (template * dual)[::-1, ::-1] / scale**2
     # the template's centre belongs at the origin, so that nothing is shifted
     spectra = fft.rfft2(np.roll(reversed_, (-half, -half), axis=(1, 2)))
     norm = fft.irfft2(fft.rfft2(weight) * spectra[1], s=size)[:rows, :columns] * scale**2
@@ -94,6 +109,7 @@ def make_filter(chunk: Chunk, template: FloatArray) -> Filter:
         half,
         weight[:rows, :columns].astype(np.float32),
         norm.astype(np.float32),
+        noise,
     )
 
 
@@ -159,6 +175,7 @@ def sliding_maps(
             )
             if known is not None:
                 image[:rows, :columns] -= (matched.weight * known).astype(np.float32)
+        matched.whiten(image[:rows, :columns])
         spectrum = fft.rfft2(image)
         spectrum *= matched.spectrum
         overlap = fft.irfft2(spectrum, s=matched.size)[:rows, :columns]

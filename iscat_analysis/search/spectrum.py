@@ -1,0 +1,254 @@
+"""The noise of ratio images at every spatial frequency, measured, and the filter that whitens it.
+
+Shot noise is alike at all frequencies, and of known size.  Charge that leaks between pixels,
+filters in the read-out, rows that flicker and read noise that nobody declared are not: a matched
+filter that takes such noise for white has more false alarms than it was asked for, or fewer.
+Neighbouring frames tell: in their difference nothing is left but noise.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.records import FloatArray, Mapper
+
+REACH_PX = 6
+"""Distance of pixels up to which their noise may be correlated, beyond what rows share."""
+
+MARGIN_PX = REACH_PX + 2
+"""Width over which images are continued by reflection before they are whitened."""
+
+_PAIRS = 64  # of frames that are compared
+_LIGHT_E = 20.0  # mean photoelectrons of a pixel and frame below which noise is far from normal
+_OUTLIER = 5.0  # robust standard deviations beyond which a pixel's change is no noise
+_SIGNIFICANT = 4.5  # standard errors beyond which a correlation is one
+_NEGLIGIBLE = 0.01  # of the expected variance, below which nothing is corrected
+_LEAST = 0.05  # of the variance, that every frequency is taken to have
+_NORMAL_QUARTILE = 0.6744897501960817
+
+
+@dataclass(frozen=True)
+class NoiseSpectrum:
+    """Variance of the noise over the expected one, at every spatial frequency.
+
+    Images are continued by reflection over `MARGIN_PX`, so that at an edge as well a pixel has
+    neighbours like those that it is correlated with.
+
+    Attributes
+    ----------
+    shape : (int, int)
+        Rows and columns of the continued images.
+    power : ndarray, shape (rows, columns // 2 + 1)
+        Variance over the expected, as `scipy.fft.rfft2` orders frequencies.
+    information : ndarray, shape (rows, columns // 2 + 1)
+        What the whitened noise tells about a signal of each frequency: 1/`power`, blurred by the
+        light, which no signal of a single frequency keeps its frequency in.
+    variance : float
+        Of one pixel, over the expected.
+    neighbours : (float, float)
+        Correlation of a pixel with the next one in x and in y.
+    shared : (float, float)
+        Part of the variance that a whole row has in common, and a whole column.
+    summed : (float, float)
+        Variance of a pixel and its covariances with all pixels near it, over the expected
+        variance, and the standard error: 1 where neighbours do nothing but exchange charge,
+        whatever that does to the variance of one.
+    """
+
+    shape: tuple[int, int]
+    power: FloatArray
+    information: FloatArray
+    variance: float
+    neighbours: tuple[float, float]
+    shared: tuple[float, float]
+    summed: tuple[float, float]
+
+    @property
+    def correlated(self) -> bool:
+        """Whether neighbouring pixels are."""
+        return max(map(abs, self.neighbours)) > _NEGLIGIBLE
+
+    def whitened(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Divide an image by the noise's power at every frequency.
+
+        Parameters
+        ----------
+        image : ndarray, shape (y, x)
+            In units of each pixel's expected noise.
+
+        Returns
+        -------
+        ndarray
+            Of the same shape and type; the inner product with another image is the one in which
+            the noise is white.
+        """
+        spectrum = fft.rfft2(np.pad(image, MARGIN_PX, mode="symmetric"))
+        spectrum /= self.power.astype(image.dtype)
+        whitened: NDArray[Any] = fft.irfft2(spectrum, s=self.shape)
+        return whitened[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
+
+    def dual(self, template: FloatArray) -> FloatArray:
+        """Give what an image's product with a template is, to the noise, as a product of numbers.
+
+        Parameters
+        ----------
+        template : ndarray, shape (…, k, k)
+            Signal per unit amplitude, or derivatives of it; what reaches beyond the field is left
+            out.
+
+        Returns
+        -------
+        ndarray, shape (…, k, k)
+            Multiplied with a template and with the information of each pixel, its sum is the
+            information about the amplitude; the template itself where the noise is as expected.
+        """
+        side = template.shape[-1]
+        high, wide = (min(side, there) for there in self.shape)
+        top, left = (side - high) // 2, (side - wide) // 2
+        rows, columns = slice(top, top + high), slice(left, left + wide)
+        field = np.zeros((*template.shape[:-2], *self.shape))
+        field[..., :high, :wide] = template[..., rows, columns]
+        seen = fft.irfft2(fft.rfft2(field) * self.information, s=self.shape)
+        out = np.zeros_like(template)
+        out[..., rows, columns] = seen[..., :high, :wide]
+        return out
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What ``summary.json`` says of the noise."""
+        return {
+            "variance_over_shot": self.variance,
+            "neighbour_correlation": list(self.neighbours),
+            "row_share": self.shared[0],
+            "column_share": self.shared[1],
+        }
+
+    @property
+    def message(self) -> str:
+        """One line about what is not as expected; empty where nothing but the variance is."""
+        parts = []
+        x, y = self.neighbours
+        if self.correlated:
+            parts.append(
+                f"the noise of neighbouring pixels is correlated ({x:+.2f} in x, {y:+.2f} in y)"
+            )
+        for part, lines in zip(self.shared, ("rows", "columns"), strict=True):
+            if part:
+                parts.append(f"whole {lines} flicker ({100 * part:.2g} % of the noise variance)")
+        if not parts:
+            return ""
+        return (
+            " and ".join(parts)
+            + ": the search allows for it, and its false alarms are as many as configured; the "
+            "fits take pixels for independent, so their σ are not right"
+        )
+
+
+def measure_spectrum(
+    counts: NDArray[Any], camera: Camera, *, mapper: Mapper = map
+) -> NoiseSpectrum | None:
+    """Measure the noise between neighbouring frames.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Consecutive good frames.
+    camera : Camera
+        Counts → photoelectrons.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    NoiseSpectrum or None
+        None where the noise is white and of the expected size, as far as one can tell, or where
+        there are too few frames, pixels or photoelectrons to tell.
+
+    Notes
+    -----
+    Covariances at distances up to `REACH_PX`, and those that a whole row or column shares, from the
+    mean periodogram (R. B. Blackman and J. W. Tukey, The Measurement of Power Spectra, 1959).
+    """
+    rows, columns = counts.shape[1:]
+    pairs = min(len(counts) // 2, _PAIRS)
+    if pairs < 4 or min(rows, columns) < 4 * REACH_PX:
+        return None
+    starts = 2 * np.linspace(0, len(counts) // 2 - 1, pairs).astype(int)
+    frames = np.concatenate([starts, starts + 1])
+    gain, offset = camera.gain_e_per_adu, camera.offset_adu
+    mean = gain * (counts[frames].mean(axis=0) - offset)
+    read = camera.read_variance_e2((rows, columns))
+    used = (mean > 0) & ~camera.saturated(counts[frames].max(axis=0))
+    if used.mean() < 0.5:
+        return None
+    light = float(mean[used].mean())
+    if light < _LIGHT_E:
+        return None
+
+    def periodogram(start: int) -> FloatArray:
+        before, after = (gain * (counts[k] - offset) for k in (start, start + 1))
+        powers = [float(frame[used].mean()) / light for frame in (before, after)]
+        if min(powers) <= 0:
+            return np.zeros((rows, columns // 2 + 1))
+        variance = sum((q * mean + read) / q**2 for q in powers)
+        z = np.where(used, (after / powers[1] - before / powers[0]), 0.0)
+        z /= np.sqrt(np.where(used, variance, 1.0))
+        limit = _OUTLIER * float(np.median(np.abs(z[used]))) / _NORMAL_QUARTILE
+        spectrum: FloatArray = np.abs(fft.rfft2(np.clip(z, -limit, limit))) ** 2
+        return spectrum
+
+    total = sum(mapper(periodogram, starts.tolist()))
+    covariance = fft.irfft2(total, s=(rows, columns)) / (pairs * np.count_nonzero(used))
+    light = np.sqrt(np.where(used, mean, np.mean(mean, where=used)))
+    return _spectrum_of(covariance, 1 / math.sqrt(pairs * np.count_nonzero(used)), light)
+
+
+def _spectrum_of(
+    covariance: FloatArray, error: float, root_light: FloatArray
+) -> NoiseSpectrum | None:
+    """Keep of a covariance (rows, columns) what is near, and what rows and columns share."""
+    here, lags = REACH_PX, np.arange(-REACH_PX, REACH_PX + 1)
+    far_y, far_x = (slice(REACH_PX + 1, n - REACH_PX) for n in covariance.shape)
+    variance = float(covariance[0, 0])
+    error *= variance
+
+    def shared(lines: FloatArray) -> FloatArray:
+        """Mean of lines (n, lags), where it is significant at lag 0."""
+        mean: FloatArray = lines.mean(axis=0)
+        return mean if mean[here] > _SIGNIFICANT * error / math.sqrt(len(lines)) else 0 * mean
+
+    by_row, by_column = shared(covariance[lags, far_x].T), shared(covariance[far_y, lags])
+    common = by_row[:, None] + by_column[None, :]
+    local = covariance[np.ix_(lags, lags)] - common
+    beside = np.abs(local)
+    beside[here, here] = 0.0
+    if beside.max() < max(_SIGNIFICANT * error, _NEGLIGIBLE * variance):
+        if abs(variance - 1) < _NEGLIGIBLE and not common.any():
+            return None
+        local = np.zeros_like(local)
+        local[here, here] = variance - common[here, here]
+    light = np.pad(root_light, MARGIN_PX, mode="symmetric")
+    whole = np.zeros(light.shape)
+    whole[lags, :] += by_row[:, None]
+    whole[:, lags] += by_column[None, :]
+    whole[np.ix_(lags, lags)] += local
+    power = np.maximum(fft.rfft2(whole).real, _LEAST * variance)
+    # signals are multiplied by the root of the light before they meet the whitening filter
+    alike = fft.irfft2(np.abs(fft.rfft2(light)) ** 2, s=light.shape)
+    kernel = fft.irfft2(1 / power, s=light.shape) * alike / alike[0, 0]
+    return NoiseSpectrum(
+        shape=(light.shape[0], light.shape[1]),
+        power=power,
+        information=fft.rfft2(kernel).real,
+        variance=variance,
+        neighbours=(local[here, here + 1] / variance, local[here + 1, here] / variance),
+        shared=(by_row[here] / variance, by_column[here] / variance),
+        summed=(float(local.sum()), error * math.sqrt(local.size)),
+    )
