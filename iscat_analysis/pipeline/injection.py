@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from iscat_analysis.bounds import power_searched
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Mover, Trajectory
 from iscat_analysis.optics.forward import PixelGrid
@@ -227,6 +228,7 @@ def recovery(
     window: int,
     *,
     sign: int = 0,
+    threshold: float | None = None,
 ) -> dict[str, Any]:
     """Compare what was found with what was added.
 
@@ -244,14 +246,18 @@ def recovery(
         Frames before and after a step.
     sign : int
         Of the steps that are looked for: 1 landings, −1 leavings, 0 both.
+    threshold : float, optional
+        Signal-to-noise ratio that a step must exceed, for ``predicted``.
 
     Returns
     -------
     dict
         ``stay_frames``, the shortest stay among the particles, ``added``, ``recovered``,
-        ``recall``, which says nothing of briefer stays; of the isolated ones ``isolated``,
-        ``recall_isolated``, ``bias_rel`` and ``bias_rel_se`` (mass), ``spread_over_crb`` with its
-        standard error, ``pull_std``, ``frame_within_1``, ``frame_in_interval``.
+        ``recall``, which says nothing of briefer stays; ``predicted``, the recall that the Fisher
+        information makes of the masses that were added, each alone; of the isolated ones
+        ``isolated``, ``recall_isolated``, ``bias_rel`` and ``bias_rel_se`` (mass),
+        ``spread_over_crb`` with its standard error, ``pull_std``, ``frame_within_1``,
+        ``frame_in_interval``.
     """
     steps = [(p.frame, 1, p) for p in particles]
     steps += [(p.leave, -1, p) for p in particles if p.leave < last]
@@ -288,6 +294,11 @@ def recovery(
         "isolated": isolated,
         "recall_isolated": len(chosen) / isolated if isolated else None,
     }
+    bounds = found["crb_mass_kda"][found["status"] == Status.OK].to_numpy(dtype=float)
+    if threshold is not None and rows and np.isfinite(bounds).any():
+        sigma = float(np.nanmedian(bounds))
+        powers = [power_searched(p.mass_kda / sigma, threshold) for *_, p in rows]
+        result["predicted"] = float(np.mean(powers))
     if len(chosen) < 2:
         return result
     index = [best for best, _, _ in chosen]

@@ -330,6 +330,7 @@ def inject_and_recover(
         result.scene.roi_px / 2,
         window,
         sign=reported_steps(result.scene),
+        threshold=result.scene.templates.threshold,
     )
 
 

@@ -298,6 +298,12 @@ def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
             f"Of {injection['added']} landings and leavings added to the movie, "
             f"{injection['recovered']} were found again."
         )
+        if injection.get("predicted") is not None:
+            share, best = (100 * injection[key] for key in ("recall", "predicted"))
+            text += (
+                f" That is {fixed(share, 0)} %; where each is alone, the Fisher information "
+                f"predicts {fixed(best, 0)} %."
+            )
         if injection.get("stay_frames"):
             text += f" Every particle stayed at least {injection['stay_frames']} frames."
         if injection.get("bias_rel") is not None:

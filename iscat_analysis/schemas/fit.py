@@ -198,6 +198,7 @@ class Injection(Closed):
     added: Count = key("Steps added: each particle lands, and leaves unless the movie ends first")
     recovered: Count = key("Steps found again")
     recall: Share = key("Their share")
+    predicted: Share = maybe("Recall that the Fisher information makes of the masses added")
     isolated: Count = key("Steps with no other one near in place and time")
     recall_isolated: Share = key("Share of these that was found")
     bias_rel: float = maybe(
