@@ -38,6 +38,10 @@ Along the focus, with a figure; the best focus for the mass; what 5 kDa takes:
 
     iscat bounds --config setup.toml --target mass=5kDa
 
+Which pupil would tell height and mass best, with optics.toml and a figure:
+
+    iscat bounds --config setup.toml --mode joint --optimize pupil --free focus,phase --out best
+
 How well 60 such particles would tell the microscope itself:
 
     iscat bounds --config setup.toml --for optics --events 60
@@ -63,16 +67,11 @@ class Optimized(StrEnum):
 
     FOCUS = "focus"
     ATTENUATION = "attenuation"
+    PUPIL = "pupil"
 
 
-class Parameter(StrEnum):
-    """What to optimise it for, or whose bounds to print."""
-
-    X = "x"
-    Y = "y"
-    Z = "z"
-    MASS = "mass"
-    OPTICS = "optics"
+OPTICS = "optics"
+"""What --for takes beside names of parameters."""
 
 
 def bounds(
@@ -92,15 +91,23 @@ def bounds(
     ] = None,
     optimize: Annotated[
         Optimized | None,
-        typer.Option("--optimize", help="Find the best focus or attenuation.", show_default=False),
+        typer.Option(
+            "--optimize",
+            help="Find the best focus, the best attenuation, or the best pupil: focus, phase and "
+            "attenuation of the reference, mask and low Zernike terms together.",
+            show_default=False,
+        ),
     ] = None,
     wanted: Annotated[
-        Parameter | None,
+        str | None,
         typer.Option(
             "--for",
-            help="What --optimize shall make precise; optics: how well particles would tell focus, "
+            metavar="NAMES",
+            help="What --optimize shall make precise: x, y, z or mass, for the pupil also several, "
+            "as in z,mass; default all that are free. optics: how well particles would tell focus, "
             "NA, phase, mask and aberrations, instead of the bounds of one particle.",
             show_default=False,
+            autocompletion=lambda: ["x", "y", "z", "mass", "z,mass", OPTICS],
         ),
     ] = None,
     events: Annotated[
@@ -119,7 +126,17 @@ def bounds(
             "--free",
             metavar="NAMES",
             help="With --for optics: what is fitted, some of "
-            "focus,na,phase,mask,zernike,polarization; default all.",
+            "focus,na,phase,mask,zernike,polarization; with --optimize pupil: what may change, "
+            "some of focus,phase,attenuation,mask,zernike; default all.",
+            show_default=False,
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            "--seed",
+            min=0,
+            help="With --optimize pupil: of the starts of the search; default 0.",
             show_default=False,
         ),
     ] = None,
@@ -161,7 +178,7 @@ def bounds(
         chosen = [o for o in (scan, optimize, target, preset) if o is not None]
         if len(chosen) > 1:
             raise ConfigError("choose one of --scan, --optimize, --target, --preset")
-        if wanted is Parameter.OPTICS:
+        if wanted == OPTICS:
             if chosen or mode is not None:
                 raise ConfigError(
                     "--for optics stands alone: leave --scan, --optimize, --target, --preset and "
@@ -172,9 +189,14 @@ def bounds(
                 overwrite=overwrite, as_json=as_json,
             )  # fmt: skip
             return
-        if events is not None or free is not None:
-            raise ConfigError("--events and --free need --for optics")
-        if (optimize is None) != (wanted is None):
+        pupil = optimize is Optimized.PUPIL
+        if events is not None or (free is not None and not pupil):
+            raise ConfigError(
+                "--events and --free need --for optics; --free also goes with --optimize pupil"
+            )
+        if seed is not None and not pupil:
+            raise ConfigError("--seed needs --optimize pupil")
+        if (optimize is None) != (wanted is None) and not pupil:
             raise ConfigError("--optimize and --for go together, as in --optimize focus --for mass")
         if preset is not None:
             if out is None:
@@ -194,16 +216,25 @@ def bounds(
 
             check_output(out, overwrite, known=BOUNDS_FILES)
 
-        from iscat_analysis.bounds import bounds_report
+        from iscat_analysis.bounds import bounds_report, detection_limit, plan
 
         report = bounds_report(resolved)
+        limit = detection_limit(plan(resolved))
+        if limit is not None:
+            from dataclasses import asdict
+
+            report["detection"] = asdict(limit)
         for line in report["warnings"]:
             messages.notify(f"warning: {line}")
         along: dict[str, Any] = {}
         if scan is not None:
             along = _scan(messages, resolved, scan, report)
+        elif pupil:
+            from iscat_cli.pupil import search_pupil
+
+            along = search_pupil(messages, resolved, wanted, free, seed or 0, report)
         elif optimize is not None and wanted is not None:
-            along = _optimize(messages, resolved, optimize.value, wanted.value, report)
+            along = _optimize(messages, resolved, optimize.value, wanted, report)
         elif target is not None:
             report |= _target(resolved, target)
         if out is not None:
@@ -228,6 +259,10 @@ def _print(report: Mapping[str, Any]) -> None:
     elif "optimum" in report:
         print_result(_optimum_table(report["optimum"]))
         print_result(report["optimum"]["note"])
+    elif "pupil" in report:
+        from iscat_cli.pupil import print_pupil
+
+        print_pupil(report["pupil"])
     elif "target" in report:
         print_result(_effort_table(report["target"]))
         print_result(_budget_table(report["target"]))
@@ -238,6 +273,8 @@ def _print(report: Mapping[str, Any]) -> None:
         at_once = {name: report["holevo"][name] for name in report["at"]["free"]}
         print_result(_bounds_table("for these photons", {**report["actual"], "holevo": at_once}))
         print_result(_information(report))
+        if "detection" in report:
+            print_result(_detection_table(report["detection"]))
     for line in report["unidentifiable"]:
         print_result(f"unidentifiable: {line}")
 
@@ -416,6 +453,19 @@ def _information(report: Mapping[str, Any]) -> Table:
 
 def _percent(share: float | None) -> str:
     return "–" if share is None or not math.isfinite(share) else f"{100 * share:.1f} %"
+
+
+def _detection_table(limit: Mapping[str, Any]) -> Table:
+    found = table(
+        f"detected but for {100 * limit['miss']:g} %, {100 * limit['false_alarm']:g} % false",
+        "threshold", "SNR", "mass_kda",
+    )  # fmt: skip
+    for label, name in (("place known", "known"), ("field searched", "searched")):
+        found.add_row(
+            label, short(limit[f"threshold_{name}"]), short(limit[f"snr_{name}"]),
+            short(limit[f"mass_{name}_kda"]),
+        )  # fmt: skip
+    return found
 
 
 def _scan_table(scanned: Mapping[str, Any], free: list[str]) -> Table:

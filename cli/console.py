@@ -328,8 +328,8 @@ def _termination_interrupts() -> Iterator[None]:
 _OPTIONS = {
     **{
         name: name
-        for name in ("dark", "inject", "landing", "maps", "optimize", "out", "overwrite", "scan",
-                     "target")
+        for name in ("dark", "free", "inject", "landing", "maps", "optimize", "out", "overwrite",
+                     "scan", "target")
     },
     "offset_adu": "offset",
     "standards_kda": "standards",

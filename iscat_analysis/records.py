@@ -349,6 +349,9 @@ class PosteriorResult:
         Whether every criterion holds; if not, the samples must not be reported as a posterior.
     message : str
         Which criterion failed, or that all hold.
+    van_trees : ndarray, shape (parameter,), or None
+        With an informative prior, the least root-mean-square error of any estimate over particles
+        of that prior [nm, kDa].
     """
 
     names: tuple[str, ...]
@@ -361,6 +364,7 @@ class PosteriorResult:
     acceptance: float
     converged: bool
     message: str
+    van_trees: FloatArray | None = None
 
 
 @dataclass(frozen=True)

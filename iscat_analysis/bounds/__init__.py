@@ -3,8 +3,8 @@
 `quantum` holds what the collected light knows, `holevo` what one measurement can take of it for
 several parameters at once, `classical` what the camera can learn of it, and `experiment` plans a
 measurement from a configuration; `shared` says what an uncertain microscope leaves in every
-particle; `scan` varies one thing, `planning` turns the question round, and `paper` reproduces Dong
-et al. (2021).
+particle; `scan` varies one thing, `planning` turns the question round, `pupil` searches the
+measurement that comes nearest to the light's own bound, and `paper` reproduces Dong et al. (2021).
 """
 
 from __future__ import annotations
@@ -14,6 +14,12 @@ from iscat_analysis.bounds.classical import (
     Unidentifiable,
     bounds_from_matrices,
     event_bounds,
+)
+from iscat_analysis.bounds.detection import (
+    DetectionLimit,
+    detection_limit,
+    power_known,
+    power_searched,
 )
 from iscat_analysis.bounds.experiment import (
     Experiment,
@@ -39,8 +45,10 @@ from iscat_analysis.bounds.planning import (
     budget,
     effort,
     optimize,
+    parse_names,
     parse_target,
 )
+from iscat_analysis.bounds.pupil import KNOBS, PupilOptimum, optimize_pupil
 from iscat_analysis.bounds.quantum import (
     incompatible_pairs,
     quantum_bounds,
@@ -59,14 +67,17 @@ from iscat_analysis.bounds.shared import (
 
 __all__ = [
     "AXES",
+    "KNOBS",
     "Axis",
     "Best",
     "Cost",
+    "DetectionLimit",
     "Effort",
     "EventBounds",
     "Experiment",
     "Goal",
     "Holevo",
+    "PupilOptimum",
     "Reproduction",
     "Scan",
     "Unidentifiable",
@@ -74,6 +85,7 @@ __all__ = [
     "bounds_report",
     "budget",
     "changed",
+    "detection_limit",
     "displacement",
     "effort",
     "eliminated",
@@ -87,9 +99,13 @@ __all__ = [
     "mass_drift",
     "natural_bound",
     "optimize",
+    "optimize_pupil",
+    "parse_names",
     "parse_scan",
     "parse_target",
     "plan",
+    "power_known",
+    "power_searched",
     "quantum_bounds",
     "quantum_information",
     "report_of",

@@ -379,6 +379,29 @@ def _bound(config: Config, goal: Goal) -> float:
     return float(plan(config).bounds(free).crb_joint[PARAMETERS.index(goal.parameter)])
 
 
+def parse_names(text: str | None, config: Config) -> list[str] | None:
+    """Read several parameters, as after ``--for``.
+
+    Parameters
+    ----------
+    text : str or None
+        ``"z,mass"``; None for all that are free.
+    config : Config
+        Its mode says which parameters are free.
+
+    Returns
+    -------
+    list of str or None
+        As in `PARAMETERS`.
+
+    Raises
+    ------
+    ConfigError
+        A parameter is unknown or not free.
+    """
+    return None if text is None else [_parameter(config, name.strip()) for name in text.split(",")]
+
+
 def _parameter(config: Config, target: str) -> str:
     parameter = TARGETS.get(target.lower())
     if parameter is None:

@@ -81,7 +81,7 @@ def quantum_information(
     if model.is_measured:
         raise ConfigError(
             'optics.psf = "measured" has no quantum bound, because a picture does not say what '
-            'light made it: use optics.psf = "model"'
+            'light made it: use optics.psf = "model", or the CRB in the table of the fits'
         )
     opening, density = _photons(model, z_nm, measure, light)
     pupil = opening.pupil

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Collection
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -133,7 +134,9 @@ def _explain(text: str, message: str) -> str:
     return message
 
 
-def config_to_toml(config: Config, *, comments: bool = True) -> str:
+def config_to_toml(
+    config: Config, *, comments: bool = True, sections: Collection[str] | None = None
+) -> str:
     """Write a configuration as TOML that `load_config` reads back to an equal object.
 
     Parameters
@@ -142,6 +145,8 @@ def config_to_toml(config: Config, *, comments: bool = True) -> str:
         What to write.
     comments : bool
         Put each key's description beside it and show unset keys commented out.
+    sections : collection of str, optional
+        Which ones to write; default all.
 
     Returns
     -------
@@ -150,6 +155,8 @@ def config_to_toml(config: Config, *, comments: bool = True) -> str:
     """
     blocks = []
     for name, field in type(config).model_fields.items():
+        if sections is not None and name not in sections:
+            continue
         model: Section | type[Section]
         section = getattr(config, name)
         model = section if section is not None else model_of(field.annotation)

@@ -482,6 +482,18 @@ class PosteriorConfig(Section):
     steps: Annotated[int, Field(ge=100, le=1_000_000)] = Field(
         2000, description="per walker, burn-in included"
     )
+    prior_mass_kda: tuple[Positive, Positive] | None = Field(
+        None, description="[mean, standard deviation] of a normal prior, as of a species"
+    )
+    prior_z_nm: tuple[NonNegative, Positive] | None = Field(
+        None, description="[mean, standard deviation] of a normal prior, as above a membrane"
+    )
+
+    @property
+    def priors(self) -> dict[str, tuple[float, float]]:
+        """Normal priors by parameter, mean and standard deviation [nm, kDa]."""
+        both = {"z_nm": self.prior_z_nm, "mass_kda": self.prior_mass_kda}
+        return {name: prior for name, prior in both.items() if prior is not None}
 
 
 class Calibration(Section):
@@ -594,6 +606,12 @@ class BoundsConfig(Section):
     )
     n_before: Annotated[int, Field(ge=0)] = Field(200, description="0: the background is known")
     n_after: Annotated[int, Field(ge=1)] = Field(200, description="frames with the particle")
+    false_alarm_probability: Annotated[float, Field(gt=0, lt=0.5)] = Field(
+        1e-3, description="of the smallest mass that is detected: that noise is taken for it"
+    )
+    miss_probability: Annotated[float, Field(gt=0, lt=0.5)] = Field(
+        0.05, description="of the smallest mass that is detected: that it is not found"
+    )
 
 
 class Compute(Section):
@@ -653,6 +671,16 @@ class Config(Section):
             raise ValueError(
                 f'fit.mode = "{self.fit.mode}" needs the picture at every height, and optics.psf = '
                 '"measured" has it at one: use fit.mode = "mass", or optics.psf = "model"'
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _priors_are_of_free_parameters(self) -> Config:
+        fixed = {"mass": "z_nm", "localize": "mass_kda"}.get(self.fit.mode)
+        if fixed in self.posterior.priors:
+            raise ValueError(
+                f"posterior.prior_{fixed} is of a parameter that is fixed: use fit.mode = "
+                '"joint", or leave the prior out'
             )
         return self
 

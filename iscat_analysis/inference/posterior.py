@@ -1,10 +1,10 @@
 """The posterior of one particle, sampled with emcee on the likelihood that was maximised.
 
-The prior is flat inside the box that the fit searched.  Half of the moves propose from a mixture of
-Student t distributions around the optima, which decorrelate in a step or two where the posterior is
-nearly normal; the other half are differential evolution (ter Braak, Stat. Comput. 16, 239, 2006),
-which need no such luck.  A chain grows until its diagnostics hold or its budget ends, and is then
-refused.
+The prior is flat inside the box that the fit searched, or normal in mass or height.  Half of the
+moves propose from a mixture of Student t distributions around the optima, which decorrelate in a
+step or two where the posterior is nearly normal; the other half are differential evolution (ter
+Braak, Stat. Comput. 16, 239, 2006), which need no such luck.  A chain grows until its diagnostics
+hold or its budget ends, and is then refused.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.prior import Prior, posterior_bound
 from iscat_analysis.records import PARAMETERS, FitResult, FloatArray, PosteriorResult
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ def sample_posterior(
     walkers: int = 32,
     steps: int = 2000,
     seed: int = 0,
+    prior: Prior | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> PosteriorResult:
     """Sample the posterior of a fitted particle.
@@ -60,6 +62,8 @@ def sample_posterior(
         Steps of each, burn-in included; up to `EXTENSIONS` times as many where the chain asks.
     seed : int
         Same seed, same samples.
+    prior : Prior, optional
+        Normal distributions of free parameters; flat without.
     stopped : callable
         Asked at every step whether to give up; a chain in another thread hears no Ctrl-C.
 
@@ -76,7 +80,16 @@ def sample_posterior(
     import emcee  # takes a third of a second, and only chains need it
 
     index = np.flatnonzero(fit.box.free)
-    proposal = _Proposal.around(likelihood, fit, index)
+    told = index < len(PARAMETERS)
+    normal = (
+        {}
+        if prior is None
+        else {
+            name: prior.normal[name] for i in index[told] if (name := PARAMETERS[i]) in prior.normal
+        }
+    )  # of what is not free nothing can be learned
+    prior = Prior(normal)
+    proposal = _Proposal.around(likelihood, fit, index, prior)
     lower, upper = fit.box.lower[index], fit.box.upper[index]
 
     def log_probability(points: FloatArray) -> FloatArray:
@@ -85,6 +98,8 @@ def sample_posterior(
         thetas = np.tile(fit.theta, (int(inside.sum()), 1))
         thetas[:, index] = points[inside]
         out[inside] = likelihood.values(thetas)
+        if normal:
+            out[inside] += prior.log_density(thetas, likelihood.model.scale)
         return out
 
     random = np.random.RandomState(np.random.SeedSequence(seed).generate_state(8))
@@ -108,11 +123,14 @@ def sample_posterior(
         verdict = _diagnose(samples)
         if verdict.converged:
             break
+    if normal:  # what is kept is the likelihood
+        thetas = np.tile(fit.theta, (values.size, 1))
+        thetas[:, index] = samples.reshape(values.size, -1)
+        values = values - prior.log_density(thetas, likelihood.model.scale).reshape(values.shape)
     amplitude = np.flatnonzero(index == 3)
     for column in amplitude:
         samples[..., column] = likelihood.model.scale.mass(samples[..., column])
     # the level of the light, where it is free, says nothing of the particle: it is integrated over
-    told = index < len(PARAMETERS)
     return PosteriorResult(
         names=tuple(PARAMETERS[i] for i in index[told]),
         samples=samples[..., told],
@@ -124,6 +142,7 @@ def sample_posterior(
         acceptance=float(np.mean(sampler.acceptance_fraction)),
         converged=verdict.converged,
         message=verdict.message,
+        van_trees=posterior_bound(likelihood, fit.theta, index, prior)[told] if normal else None,
     )
 
 
@@ -137,9 +156,15 @@ class _Proposal:
     whiten: FloatArray  # (d, d), its inverse
 
     @classmethod
-    def around(cls, likelihood: Likelihood, fit: FitResult, index: NDArray[np.intp]) -> _Proposal:
-        """Build it from the fit's covariance and its alternative heights."""
+    def around(
+        cls, likelihood: Likelihood, fit: FitResult, index: NDArray[np.intp], prior: Prior
+    ) -> _Proposal:
+        """Build it from the fit's covariance, its alternative heights and the prior."""
         fisher = likelihood.score_fisher(fit.theta)[2][np.ix_(index, index)]
+        steps = prior.steps(likelihood.model.scale)
+        known = np.diag([steps[k][1] ** -2 if k in steps else 0.0 for k in index])
+        wanted = np.array([steps[k][0] if k in steps else 0.0 for k in index])
+        fisher = fisher + known
         scale = 1 / np.sqrt(np.maximum(np.diag(fisher), 1e-300))
         values, vectors = np.linalg.eigh(fisher * np.outer(scale, scale))
         widths = 1 / np.sqrt(np.maximum(values, 1e-4))
@@ -152,8 +177,9 @@ class _Proposal:
                 centres.append(theta[index])
                 gaps.append(other.log_likelihood_gap)
         weights = -np.minimum(gaps, 3.0)
+        narrow = factor @ factor.T / _WIDEN**2  # the covariance, and the way towards the prior
         return cls(
-            np.array(centres),
+            np.array([centre + narrow @ known @ (wanted - centre) for centre in centres]),
             weights - np.logaddexp.reduce(weights),
             factor,
             np.linalg.inv(factor),

@@ -22,6 +22,7 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.achieved import Achieved
 from iscat_analysis.inference.likelihood import compile_kernels
 from iscat_analysis.inference.posterior import sample_posterior
+from iscat_analysis.inference.prior import Prior
 from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.background import measure_windows
 from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts, refuse_ratio
@@ -431,6 +432,7 @@ def _sampled(
             walkers=settings.walkers,
             steps=settings.steps,
             seed=seed + row.number,
+            prior=Prior(settings.priors),
             stopped=stop.is_set,
         )
 

@@ -39,7 +39,7 @@ from iscat_analysis.records import (
     Windows,
     silent,
 )
-from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, LISTED, is_dwarfed
+from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, Described, is_hidden
 from iscat_analysis.search.templates import LARGEST_IMAGE, find_particles
 
 MAX_ROUNDS = 8
@@ -69,6 +69,11 @@ class Event:
     def snr(self) -> float:
         """√(2 Δℓ) against no particle."""
         return self.fit.snr
+
+    @property
+    def described(self) -> Described:
+        """What the fit explains, and what it leaves over."""
+        return Described.of(self.snr, self.fit.chi2_reduced, self.likelihood.n_pixels)
 
 
 def fit_field(
@@ -200,7 +205,7 @@ def _search(
         size = max(size, EXCEEDS * candidate.beside)
         if abs(candidate.snr) > size:
             fresh.append(candidate)
-        elif abs(candidate.snr) > LISTED * size:
+        elif not is_hidden(candidate.snr, size):
             doubtful.append(candidate)
     return fresh, doubtful
 
@@ -306,18 +311,13 @@ def _judged(
             other is not event and math.hypot(other.fit.x_nm - x, other.fit.y_nm - y) < limit
             for other in events
         )
-        brightest = max(
-            (
-                other.snr
-                for other in events
-                if math.hypot(other.fit.x_nm - x, other.fit.y_nm - y)
-                < LARGEST_IMAGE * scene.roi_px * scene.pixel_nm
-            ),
-            default=0.0,
+        near = (
+            other.described
+            for other in events
+            if math.hypot(other.fit.x_nm - x, other.fit.y_nm - y)
+            < LARGEST_IMAGE * scene.roi_px * scene.pixel_nm
         )
-        lobe = number >= len(events) or is_dwarfed(
-            event.snr, event.fit.chi2_reduced, event.likelihood.n_pixels, brightest
-        )
+        lobe = number >= len(events) or event.described.is_dwarfed(near)
         fit = judge(
             scene,
             event.fit,

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.posterior import sample_posterior
+from iscat_analysis.inference.prior import Prior
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.movie.spectrum import NoiseSpectrum
@@ -426,6 +427,7 @@ def _analyse_chunk(
                 row.event.likelihood, row.event.fit,
                 walkers=settings.walkers, steps=settings.steps,
                 seed=scene.config.compute.seed + steps[i].step.at.frame,
+                prior=Prior(settings.priors),
             )  # fmt: skip
         except KeyboardInterrupt:  # the fits are done, and kept
             stopped = True

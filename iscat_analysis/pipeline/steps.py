@@ -32,6 +32,7 @@ from iscat_analysis.pipeline.neighbours import (
 from iscat_analysis.pipeline.pattern import MovingPattern
 from iscat_analysis.pipeline.repeats import step_controls, step_repeats
 from iscat_analysis.pipeline.scene import Region, Scene, judge, reported_steps
+from iscat_analysis.pipeline.sidelobes import Sieve
 from iscat_analysis.pipeline.tasks import Task, TaskBuilder
 from iscat_analysis.records import (
     FREE_PARAMETERS,
@@ -41,14 +42,7 @@ from iscat_analysis.records import (
     Windows,
 )
 from iscat_analysis.search.empty import EmptySpread
-from iscat_analysis.search.residue import (
-    EXCEEDS,
-    EXPLAINS,
-    LISTED,
-    chi2_excess,
-    is_dwarfed,
-    size_on_ring,
-)
+from iscat_analysis.search.residue import chi2_excess
 from iscat_analysis.search.sliding import (
     STRIDES,
     Chunk,
@@ -60,14 +54,12 @@ from iscat_analysis.search.sliding import (
     make_filter,
     sliding_maps,
 )
-from iscat_analysis.search.templates import FAR_LOBE, LARGEST_IMAGE, SIDELOBE, refuse_flood
+from iscat_analysis.search.templates import LARGEST_IMAGE, refuse_flood
 
 ROUNDS = 6
 """Searches at most; each takes what was found so far off the contrast."""
 
 _SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
-_RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
-_RINGS = 0.04  # the same for the rest of its region
 _EXPLAINED = 0.7  # of the threshold; a fit that reaches less is what other steps explain
 _SAME_PX = 1.5
 
@@ -152,6 +144,7 @@ class ChunkFitter:
         self._neighbours = Neighbours(scene, chunk, window, pattern)
         self._tasks = TaskBuilder(scene, chunk, window, self._neighbours, pattern)
         self._stride = int(chunk.edges[1] - chunk.edges[0])
+        self._sieve = Sieve(chunk.first, self._stride, window, scene.roi_px)
         self._maps: tuple[MapArray, FloatArray] | None = None
         self._doubtful: list[Peak] = []
         self._near: list[list[Step]] = []  # steps that each of the maps knows of
@@ -264,70 +257,8 @@ class ChunkFitter:
         refuse_flood(
             len(peaks), self._excess_noise, frames=f" in frames {chunk.first}:{chunk.stop}"
         )
-        fresh: list[Peak] = []
-        doubtful: list[Peak] = []
-        taller: list[Peak] = []
-        for peak in peaks:
-            # one that waits casts its shadow too, or its rings would be taken for particles
-            waits = any(self._shadows(p, peak) for p in taller)
-            taller.append(peak)
-            if waits or any(self._is_residue(step, peak) for step in steps):
-                continue
-            size = max((self._misfit(step, peak, steps, snr) for step in steps), default=0.0)
-            if abs(peak.snr) > size:
-                fresh.append(peak)
-            elif abs(peak.snr) > LISTED * size:
-                doubtful.append(peak)
-        self._doubtful = doubtful
+        fresh, self._doubtful = self._sieve.sift(peaks, steps, snr)
         return [self._begin(peak) for peak in fresh]
-
-    def _misfit(self, step: Step, peak: Peak, steps: Sequence[Step], snr: MapArray) -> float:
-        """Signal-to-noise ratio that a peak must exceed not to be what the fit of a step left."""
-        if not self._meet(step, peak):
-            return 0.0
-        x0, y0 = step.start.x_px, step.start.y_px
-        distance = math.hypot(peak.x_px - x0, peak.y_px - y0)
-        if distance > LARGEST_IMAGE * self._roi_px:
-            return 0.0
-        # a window that holds the step only in part sees that part of the misfit
-        part = max(1 - abs(step.at.frame - peak.frame) / self._window, 0.0)
-        whole = part * math.sqrt(EXPLAINS * step.excess) if distance < self._roi_px / 2 else 0.0
-        others = [
-            (s.start.x_px, s.start.y_px) for s in steps if s is not step and self._meet(s, peak)
-        ]
-        j = round((peak.frame - self._chunk.first) / self._stride) - 1
-        beside = size_on_ring(snr[j], (x0, y0), (peak.x_px, peak.y_px), others)
-        return max(whole, EXCEEDS * beside)
-
-    def _meet(self, step: Step, peak: Peak) -> bool:
-        """Whether a step is seen at the boundary of a peak."""
-        return abs(step.at.frame - peak.frame) <= (self._strides + 1) * self._stride
-
-    def _shadows(self, one: Peak, peak: Peak) -> bool:
-        """Whether a peak may be nothing but the side lobe of a stronger one."""
-        reach = self._strides * self._stride
-        apart = abs(one.frame - peak.frame)
-        if apart > reach + self._stride:
-            return False
-        dx, dy = abs(one.x_px - peak.x_px), abs(one.y_px - peak.y_px)
-        if apart < reach and math.hypot(dx, dy) < self._roi_px / 3:
-            return True
-        far = max(dx, dy) >= self._roi_px
-        if far and max(dx, dy) >= LARGEST_IMAGE * self._roi_px:
-            return False
-        return abs(peak.snr) < (FAR_LOBE if far else SIDELOBE) * abs(one.snr)
-
-    def _is_residue(self, step: Step, peak: Peak) -> bool:
-        """Whether a peak may be what a fitted step left over: the model is never quite right."""
-        if not self._meet(step, peak):
-            return False
-        start = step.start
-        distance = math.hypot(start.x_px - peak.x_px, start.y_px - peak.y_px)
-        on_top = distance < self._roi_px / 6
-        if on_top and abs(step.at.frame - peak.frame) > self._stride:
-            return False
-        share = _RESIDUE if on_top else _RINGS
-        return distance < 1.5 * self._roi_px and abs(peak.snr) < share * abs(start.snr)
 
     def _begin(self, peak: Peak) -> Step:
         scene = self._scene
@@ -434,20 +365,15 @@ class ChunkFitter:
         judged = []
         for lobe, one, task in finished:
             event = one.event
-            brightest = max(
-                (
-                    other.event.snr
-                    for _, other, _ in finished
-                    if _apart(other.step, one.step) < self._window
-                    and distance_px(other.step, one.step) < LARGEST_IMAGE * self._roi_px
-                ),
-                default=0.0,
+            near = (
+                other.event.described
+                for _, other, _ in finished
+                if _apart(other.step, one.step) < self._window
+                and distance_px(other.step, one.step) < LARGEST_IMAGE * self._roi_px
             )
             fit = judge(
                 self._scene, event.fit, task.region, task.windows.saturated,
-                sidelobe=lobe or is_dwarfed(
-                    event.snr, event.fit.chi2_reduced, event.likelihood.n_pixels, brightest
-                ),
+                sidelobe=lobe or event.described.is_dwarfed(near),
                 too_close=task.crowded,
                 poor_fit=task.at.p_constant < POOR_FIT_P,
             )  # fmt: skip

@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from iscat_analysis.bounds import tradeoff
+from iscat_analysis.bounds import PupilOptimum, plan, tradeoff
+from iscat_analysis.config import config_to_toml
 from iscat_analysis.records import PARAMETERS
 from iscat_analysis.report.numbers import LABELS, UNITS
 from iscat_analysis.report.output import atomic_folder
@@ -19,6 +20,7 @@ from iscat_analysis.schemas import to_json
 
 BOUNDS_FILES = frozenset(
     {"bounds.json", "scan.csv", "scan.png", "scan.svg", "tradeoff.png", "tradeoff.svg"}
+    | {"optics.toml", "pupil.png", "pupil.svg"}
 )
 """What `write_bounds` may leave in its folder."""
 
@@ -33,6 +35,7 @@ def write_bounds(
     table: pd.DataFrame | None = None,
     label: str = "",
     here: float = float("nan"),
+    design: PupilOptimum | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Write the bounds of one experiment, and of a scan through it.
@@ -51,6 +54,8 @@ def write_bounds(
         Name of the axis.
     here : float
         Where the experiment stands on it.
+    design : PupilOptimum, optional
+        The best pupil, for ``optics.toml`` and the figure ``pupil``.
     overwrite : bool
         Whether an earlier result may be replaced.
 
@@ -71,9 +76,90 @@ def write_bounds(
                 building / "scan.csv", index=False, float_format="%.9g", lineterminator="\n"
             )
             publish(scan_figures(table, label, here), building)
+        if design is not None:
+            (building / "optics.toml").write_text(design_toml(design), encoding="utf-8")
+            publish([("pupil", pupil_figure(design))], building)
         if {"z_nm", "mass_kda"} <= set(report["at"]["free"]):
             publish([("tradeoff", tradeoff_figure(report))], building)
     return folder
+
+
+def design_toml(design: PupilOptimum) -> str:
+    """Write the experiment with the best pupil.
+
+    Parameters
+    ----------
+    design : PupilOptimum
+        From `optimize_pupil`.
+
+    Returns
+    -------
+    str
+        TOML that ``--config`` takes, with the same bounds; ``optics.file`` takes its ``[optics]``.
+    """
+    config = design.config
+    maps = ("gain_e_per_adu", "offset_adu")
+    camera = {
+        key: str(Path(value).resolve())
+        for key in maps
+        if isinstance(value := getattr(config.camera, key), str)
+    }
+    config = config.model_copy(update={"camera": config.camera.model_copy(update=camera)})
+    sections = ("optics", "camera", "particle", "background", "fit", "bounds")
+    return (
+        "# The pupil with the smallest joint bound of "
+        f"{', '.join(design.chosen)}: iscat bounds --optimize pupil.\n"
+        f"# It takes {100 * design.share:.1f} % of what one measurement can take of the light.\n"
+        "# As --config it gives the same bounds; as optics.file it gives the optics alone, and\n"
+        "# bounds.photons_per_pixel must follow the attenuation squared.\n\n"
+        + config_to_toml(config, comments=False, sections=sections)
+    )
+
+
+def pupil_figure(design: PupilOptimum) -> Figure:
+    """Draw what the best pupil gives, and how a particle looks through it.
+
+    Parameters
+    ----------
+    design : PupilOptimum
+        From `optimize_pupil`.
+
+    Returns
+    -------
+    Figure
+        σ over each parameter's own quantum bound, and the contrast with the best pupil.
+    """
+    figure = new_figure(8.4, 3.6)
+    left, right = figure.subplots(1, 2, width_ratios=[1.3, 1])
+    at = np.arange(len(design.chosen))
+    own = np.array([design.sigma_quantum[name] for name in design.chosen])
+    for values, marker, color, label in (
+        (design.sigma_configured, "D", INK, "configured"),
+        (design.sigma, "D", VERMILLION, "best pupil"),
+        (design.sigma_holevo, "o", BLUE, "all at once, at best (Holevo)"),
+    ):
+        left.plot(
+            at, np.array([values[name] for name in design.chosen]) / own, marker, color=color,
+            label=label,
+        )  # fmt: skip
+    left.axhline(1.0, color=BLUE, lw=1.2, ls="--", label="quantum bound of each alone")
+    left.set_xticks(at, [LABELS[name] for name in design.chosen])
+    left.set_xlim(-0.5, at.size - 0.5)
+    left.set_ylim(bottom=0.0)
+    left.set_ylabel("σ over its own quantum bound")
+    experiment = plan(design.config)
+    x, y, z = (float(v) for v in experiment.theta[:3])
+    grid = experiment.grid
+    image = experiment.model.image(grid, x, y, z, experiment.mass_kda)
+    edge = float(np.abs(image).max())
+    side = np.array([grid.x_nm[0], grid.x_nm[-1]]) / 1e3
+    shown = right.imshow(
+        image, cmap="RdBu_r", vmin=-edge, vmax=edge, extent=(side[0], side[1], side[1], side[0])
+    )
+    figure.colorbar(shown, ax=right, label="contrast, best pupil")
+    right.set(xlabel="x [µm]", ylabel="y [µm]")
+    figure.legend(*left.get_legend_handles_labels(), loc="outside upper left", ncols=4, fontsize=8)
+    return figure
 
 
 def tradeoff_figure(report: Mapping[str, Any]) -> Figure:
@@ -103,6 +189,10 @@ def tradeoff_figure(report: Mapping[str, Any]) -> Figure:
     axes.plot(both["z_nm"], both["mass_kda"], "o", color=BLUE, ms=5, label="with equal weights")
     if np.isfinite(camera).all():
         axes.plot(*camera, "D", color=VERMILLION, ms=6, label="this microscope, joint CRB")
+    best = report.get("pupil", {}).get("sigma", {})
+    if set(names) <= set(best):
+        axes.plot(*(best[name]["best"] for name in names), "*", color=VERMILLION, ms=10,
+                  label="with the best pupil")  # fmt: skip
     wide = np.nanmax(np.vstack([camera * 1.15, own * 2.2]), axis=0)
     axes.set(xlim=(0.8 * own[0], wide[0]), ylim=(0.8 * own[1], wide[1]))
     axes.set(xlabel="σ of height [nm]", ylabel="σ of mass [kDa]")

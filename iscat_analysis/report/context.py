@@ -238,6 +238,7 @@ def _posterior_rows(views: Sequence[EventView], table: pd.DataFrame) -> Iterator
         if view.posterior is None or not view.posterior.converged:
             continue
         row = table[table["event"] == view.event].iloc[0]
+        bound = view.posterior.van_trees
         low, median, high = np.quantile(view.posterior.samples, [0.15865, 0.5, 0.84135], (0, 1))
         for k, name in enumerate(view.posterior.names):
             decimals = decimals_for([(high[k] - low[k]) / 2])
@@ -249,6 +250,8 @@ def _posterior_rows(views: Sequence[EventView], table: pd.DataFrame) -> Iterator
                 f"{fixed(row[name], decimals)} ± {number(row[f'sigma_{name}'], 2)}",
                 number(view.posterior.r_hat[k], 4),
                 number(view.posterior.ess_bulk[k]),
+                number(float(np.std(view.posterior.samples[..., k])), 3),
+                "–" if bound is None else number(bound[k], 3),
             ]
 
 

@@ -63,6 +63,10 @@ def posterior_groups(analysis: Analysis, views: Sequence[EventView]) -> dict[str
         name: (("event", "parameter"), np.stack([getattr(p, name) for p in chains]))
         for name in ("tau", "r_hat", "ess_bulk", "ess_tail")
     }
+    if all(p.van_trees is not None for p in chains):
+        by_parameter["van_trees"] = (
+            ("event", "parameter"), np.stack([np.asarray(p.van_trees) for p in chains]),
+        )  # fmt: skip
     statistics = {
         "log_likelihood": (axes, values),
         "acceptance": (("event",), np.array([p.acceptance for p in chains])),

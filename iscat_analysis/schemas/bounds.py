@@ -9,6 +9,7 @@ from pydantic import ConfigDict, Field
 from iscat_analysis.schemas.base import (
     Closed,
     Convention,
+    Count,
     Document,
     Emission,
     Matrix4,
@@ -19,6 +20,7 @@ from iscat_analysis.schemas.base import (
     Parameter,
     Positive,
     Scheme,
+    Share,
     key,
     maybe,
 )
@@ -132,6 +134,68 @@ class Optimum(Document):
     note: str
 
 
+class DetectionLimit(Closed):
+    """The faintest particle that can be detected in all frames."""
+
+    false_alarm: float = key("Probability that noise alone is taken for a particle")
+    miss: float = key("Probability that the particle is not found")
+    threshold_known: float = key("Of the signal-to-noise ratio, where the place is known")
+    threshold_searched: float = key("The same where the field of [bounds] is searched")
+    snr_known: float = key("Signal-to-noise ratio that a particle needs, place known")
+    snr_searched: float = key("The same, field searched")
+    mass_known_kda: NotNegative = key("Its mass, place known [kDa]")
+    mass_searched_kda: NotNegative = key("Its mass, field searched [kDa]")
+    snr_per_amplitude: float = key("Square root of the empty field's Fisher information")
+
+
+class Compared(Closed):
+    """A setting before and after."""
+
+    configured: float
+    best: float
+
+
+class PupilSigma(Closed):
+    """Standard deviations for the planned frames [nm, kDa]."""
+
+    configured: Positive = key("Joint CRB as configured; null where not identifiable")
+    best: Positive = key("Joint CRB with the best pupil")
+    holevo: Positive = key("What the measurement of the Holevo bound reaches together")
+    qcrb: Positive = key("Quantum, everything else known")
+
+
+class PupilSum(Closed):
+    """Sum of variances over each parameter's own quantum bound."""
+
+    configured: Number
+    best: Positive
+    holevo: Positive = key("Below which no measurement comes")
+
+
+class PupilShare(Closed):
+    """Holevo bound over the sum of variances: 1 where no measurement is better."""
+
+    configured: Share
+    best: Share
+    quiet: Share = key("Best pupil, with a known background and without read noise")
+
+
+class Pupil(Document):
+    """The pupil that comes nearest to the Holevo bound at the same light on the particle."""
+
+    for_: list[Parameter] = Field(alias="for", description="Parameters chosen")
+    settings: dict[str, Compared] = key("By key of [optics], each aberration by its own name")
+    photons_per_pixel: float = key("Background per pixel and frame that the attenuation leaves [e]")
+    peak_e: float = key("Brightest pixel in a frame [e]")
+    transmitted_over_collected: NotNegative = key("Share of the collected light that passes")
+    sigma: dict[Parameter, PupilSigma]
+    sum: PupilSum
+    share: PupilShare
+    descents: list[Share] = key("Share at the end of each descent, best first, in a smaller field")
+    near: Count = key("Descents that end within 1 % of the best")
+    evaluations: Natural = key("Pupils tried")
+
+
 class Target(Document):
     """What reaches a wanted precision."""
 
@@ -169,8 +233,10 @@ class Bounds(Document):
     convention: Convention = key("Formulas")
     emission: Emission = key("Emission model")
     warnings: list[str] = key("What the user should know, one line each")
+    detection: DetectionLimit = maybe("Smallest mass that is detected; not in dark field")
     scan: Scan = maybe("With --scan")
-    optimum: Optimum = maybe("With --optimize")
+    optimum: Optimum = maybe("With --optimize focus or attenuation")
+    pupil: Pupil = maybe("With --optimize pupil")
     target: Target = maybe("With --target")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 SAMPLED = 0.85
@@ -34,5 +33,5 @@ def vertex(line: NDArray[Any], index: int) -> tuple[float, float]:
     bend = low - 2 * mid + high
     if bend >= 0:
         return 0.0, 0.0
-    shift = float(np.clip(0.5 * (low - high) / bend, -0.5, 0.5))
+    shift = max(-0.5, min(0.5 * (low - high) / bend, 0.5))
     return shift, 0.25 * (high - low) * shift

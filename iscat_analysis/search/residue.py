@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -37,28 +38,78 @@ _HEIGHT = 0.8  # share of the ring that is lower than what counts as its height
 _PATCH_PX = 5.0  # around the candidate, which is its own
 
 
-def is_dwarfed(snr: float, chi2_reduced: float, n_pixels: int, brightest: float) -> bool:
-    """Whether a fit explains less than it leaves over, beside a particle that is far brighter.
+@dataclass(frozen=True)
+class Described:
+    """How well a fit describes its region.
+
+    Attributes
+    ----------
+    snr : float
+        Of the particle.
+    excess : float
+        χ² above its expectation; 0 where that may be noise.
+    """
+
+    snr: float
+    excess: float
+
+    @classmethod
+    def of(cls, snr: float, chi2_reduced: float, n_pixels: int) -> Described:
+        """Take it from a fit.
+
+        Parameters
+        ----------
+        snr : float
+            Of the particle.
+        chi2_reduced : float
+            Of its fit.
+        n_pixels : int
+            In its region.
+
+        Returns
+        -------
+        Described
+            The fit.
+        """
+        return cls(snr, _significant((chi2_reduced - 1) * n_pixels, n_pixels))
+
+    def is_dwarfed(self, others: Iterable[Described]) -> bool:
+        """Whether it explains less than it leaves over, beside a particle that is far brighter.
+
+        A model that is wrong leaves the same share of every particle, which the brighter one shows:
+        so much of the excess is the particle's own.
+
+        Parameters
+        ----------
+        others : iterable of Described
+            Those that reach there.
+
+        Returns
+        -------
+        bool
+            Whether it is no more than a side lobe, as far as the model can tell.
+        """
+        brightest = max(others, key=lambda other: other.snr, default=self)
+        own = brightest.excess * (self.snr / brightest.snr) ** 2 if brightest.snr else 0.0
+        return brightest.snr > DWARFS * self.snr and self.snr**2 < EXPLAINS * (self.excess - own)
+
+
+def is_hidden(snr: float, size: float) -> bool:
+    """Whether a candidate is too low to be listed, even as a side lobe.
 
     Parameters
     ----------
     snr : float
-        Of the fitted event.
-    chi2_reduced : float
-        Of its fit.
-    n_pixels : int
-        In its region.
-    brightest : float
-        Largest signal-to-noise ratio of the events that reach there.
+        Its signal-to-noise ratio.
+    size : float
+        What it must exceed to be a particle.
 
     Returns
     -------
     bool
-        Whether it is no more than a side lobe, as far as the model can tell.
+        Whether it is below `LISTED` of that.
     """
-    excess = (chi2_reduced - 1) * n_pixels
-    noise = _EXCESS_SIGMAS * math.sqrt(2 * n_pixels)
-    return excess > noise and snr**2 < EXPLAINS * excess and brightest > DWARFS * snr
+    return abs(snr) <= LISTED * size
 
 
 def chi2_excess(residuals: NDArray[Any]) -> float:
@@ -75,8 +126,12 @@ def chi2_excess(residuals: NDArray[Any]) -> float:
         χ² above its expectation; 0 where that may be noise.
     """
     n = int(np.count_nonzero(np.isfinite(residuals)))
-    excess = float(np.nansum(residuals**2)) - n
-    return excess if excess > _EXCESS_SIGMAS * math.sqrt(2 * n) else 0.0
+    return _significant(float(np.nansum(residuals**2)) - n, n)
+
+
+def _significant(excess: float, n_pixels: int) -> float:
+    """Give a χ² in excess, 0 where that may be noise."""
+    return excess if excess > _EXCESS_SIGMAS * math.sqrt(2 * n_pixels) else 0.0
 
 
 def size_on_ring(
@@ -110,14 +165,14 @@ def size_on_ring(
         (max(math.floor(c - far), 0), max(min(math.ceil(c + far) + 1, n), 0))
         for c, n in zip((y0, x0), snr.shape, strict=True)
     )
-    y, x = np.mgrid[top:bottom, left:right]
-    away = np.hypot(y - y0, x - x0)
-    ring = np.abs(away - distance) < _RING_PX
-    ring &= np.hypot(y - yc, x - xc) > _PATCH_PX
-    y, x, away = y[ring], x[ring], away[ring]
-    own = np.ones(away.shape, dtype=np.bool_)
+    rows, columns = np.arange(top, bottom), np.arange(left, right)
+    away2 = (rows - y0)[:, None] ** 2 + (columns - x0) ** 2
+    y, x = np.nonzero((away2 > (distance - _RING_PX) ** 2) & (away2 < far**2))
+    away2, y, x = away2[y, x], rows[y], columns[x]
+    own = (y - yc) ** 2 + (x - xc) ** 2 > _PATCH_PX**2
     for xo, yo in others:
-        own &= np.hypot(y - yo, x - xo) > away
+        if math.hypot(xo - x0, yo - y0) < 2 * far:  # a farther one is nearer to no pixel of it
+            own &= (y - yo) ** 2 + (x - xo) ** 2 > away2
     y, x = y[own], x[own]
     if not y.size:
         return 0.0

@@ -25,7 +25,7 @@ from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.search.peaks import SAMPLED, vertex
-from iscat_analysis.search.residue import size_on_ring
+from iscat_analysis.search.residue import EXCEEDS, is_hidden, size_on_ring
 
 HEIGHTS_PER_FRINGE = 8
 """Templates per interference fringe where z is free: half-way between two the match loses 4 %."""
@@ -37,6 +37,10 @@ unless it reaches this share of it."""
 FAR_LOBE = 0.05
 """The same beyond the region, where the rings go on: 3 % of the peak at 3 µm."""
 
+
+NEAR = 1 / 3
+"""Of a region: a peak nearer than this to a higher one waits in any case.  Where the model is
+wrong, the first ring of a bright particle can be as high as the particle."""
 
 LARGEST_IMAGE = 3.5
 """Regions from the centre to the edge of a strong particle's image; the rings go on, faintly."""
@@ -254,7 +258,7 @@ def find_particles(
             height < abs(other.snr) * (SIDELOBE if away < roi_px else FAR_LOBE)
             for height, other, away in near
         ) or any(
-            math.hypot(peak.column - other.x_px, peak.row - other.y_px) < roi_px / 6
+            math.hypot(peak.column - other.x_px, peak.row - other.y_px) < NEAR * roi_px
             for other in found
         )
         if shadowed:
@@ -268,7 +272,7 @@ def find_particles(
                 z_nm=float(templates.z_nm[peak.layer]),
                 mass_kda=_mass(likelihood.model, templates, float(strength[at]) * higher),
                 snr=float(snr[at]) * higher,
-                beside=_beside(best, (peak.x_px, peak.y_px), known, roi_px),
+                beside=_beside(best, peak, known, roi_px),
             )
         )
     return tuple(found)
@@ -301,17 +305,21 @@ def _peaks(ranked: FloatArray, best: FloatArray, threshold: float) -> list[_Peak
 
 
 def _beside(
-    best: FloatArray,
-    place: tuple[float, float],
-    known: Sequence[tuple[float, float]],
-    roi_px: float,
+    best: FloatArray, peak: _Peak, known: Sequence[tuple[float, float]], roi_px: float
 ) -> float:
-    """Size of what known particles left over, at a candidate's distance from each."""
-    reach = LARGEST_IMAGE * roi_px
-    near = [k for k in known if math.hypot(k[0] - place[0], k[1] - place[1]) < reach]
-    return max(
-        (size_on_ring(best, k, place, [o for o in near if o is not k]) for k in near), default=0.0
-    )
+    """Size of what known particles left over, at a candidate's distance from each.
+
+    The nearest come first, and the search ends with one that hides the candidate.
+    """
+    place = peak.x_px, peak.y_px
+    away = {k: math.hypot(k[0] - place[0], k[1] - place[1]) for k in known}
+    near = sorted((k for k in away if away[k] < LARGEST_IMAGE * roi_px), key=lambda k: away[k])
+    beside = 0.0
+    for k in near:
+        beside = max(beside, size_on_ring(best, k, place, [o for o in near if o is not k]))
+        if is_hidden(peak.height, EXCEEDS * beside):
+            break
+    return beside
 
 
 def refuse_flood(candidates: int, excess_noise: str, frames: str = "") -> None:

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from iscat_analysis.inference.prior import van_trees
 from iscat_analysis.study.baselines import Baselines
 from iscat_analysis.study.posteriors import PosteriorRanks, calibrate_posterior
 from iscat_analysis.study.scores import (
@@ -18,7 +19,6 @@ from iscat_analysis.study.scores import (
     share_interval,
     spread_error,
     spread_interval,
-    van_trees,
 )
 from iscat_analysis.study.setting import Setting, make_setting
 from iscat_analysis.study.study import (

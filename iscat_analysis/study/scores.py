@@ -273,38 +273,6 @@ def rank_test(ranks: NDArray[np.int64], possible: int, bins: int = 20) -> tuple[
     return float(chi2.sf(statistic, bins - 1)), counts
 
 
-def van_trees(information: FloatArray, prior: FloatArray) -> FloatArray:
-    """Bound on the error of any estimator, biased ones too, when there is prior knowledge.
-
-    Parameters
-    ----------
-    information : ndarray, shape (k, k)
-        Fisher information of the data, averaged over the prior.
-    prior : ndarray, shape (k, k)
-        Information of the prior, the mean of −∂² ln π; the inverse covariance of a normal one.
-
-    Returns
-    -------
-    ndarray, shape (k,)
-        Root-mean-square error at least.
-
-    Raises
-    ------
-    ConfigError
-        Data and prior together leave a direction undetermined.
-
-    Notes
-    -----
-    H. L. Van Trees, *Detection, Estimation, and Modulation Theory* I (1968), section 2.4.
-    """
-    total = np.asarray(information, dtype=float) + np.asarray(prior, dtype=float)
-    values, vectors = np.linalg.eigh(total)
-    if not values[0] > 1e-14 * max(values[-1], 1e-300):
-        raise ConfigError("neither the data nor the prior determine every parameter")
-    bound: FloatArray = np.sqrt(np.sum(vectors**2 / values, axis=1))
-    return bound
-
-
 def gaussian_posterior(
     estimate: FloatArray, sigma: FloatArray, centre: float, width: float
 ) -> tuple[FloatArray, FloatArray]:

@@ -65,6 +65,25 @@ def test_optimize_and_target(capsys: pytest.CaptureFixture[str]) -> None:
     assert "samples_per_pixel" in out
 
 
+def test_pupil(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / "pupil"
+    search = ("--optimize", "pupil", "--for", "z,mass", "--free", "phase", "--mode", "joint")
+    status, said, _ = run(capsys, *search, "--out", str(out))
+    assert status == 0
+    for word in ("reference_phase_deg", "Holevo", "of what one measurement can take", "descents"):
+        assert word in said
+    names = {"bounds.json", "optics.toml", *(f"{n}.{e}" for n in ("pupil", "tradeoff")
+                                             for e in ("png", "svg"))}  # fmt: skip
+    assert {p.name for p in out.iterdir()} == names
+    found = json.loads((out / "bounds.json").read_text(encoding="utf-8"))["pupil"]
+    assert main(["bounds", "--config", str(out / "optics.toml"), "--json", "--quiet"]) == 0
+    again = json.loads(capsys.readouterr().out)["actual"]["crb_joint"]
+    for name in ("z_nm", "mass_kda"):
+        assert again[name] == pytest.approx(found["sigma"][name]["best"], rel=1e-9)
+    status, said, _ = run(capsys, *search, "--json", "--quiet", "--seed", "0")
+    assert json.loads(said)["pupil"] == found  # same seed, same pupil
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -78,6 +97,16 @@ def test_optimize_and_target(capsys: pytest.CaptureFixture[str]) -> None:
         (["--scan", "z=0-100"], "start:stop:step"),
         (["--scan", "depth=0:1:1"], "NAME one of z, focus"),
         (["--optimize", "focus"], "go together"),
+        (["--optimize", "focus", "--for", "x,y"], "choose one of x, y, z, mass"),
+        (["--optimize", "pupil", "--for", "colour"], "choose one of x, y, z, mass"),
+        (["--optimize", "pupil", "--for", "z"], "z is not free in mode mass"),
+        (["--optimize", "pupil", "--free", "colour"], "--free colour: choose among focus"),
+        (
+            ["--optimize", "pupil", "--set", "optics.scheme=darkfield"],
+            "has no reference",
+        ),
+        (["--optimize", "focus", "--for", "mass", "--free", "phase"], "--free also goes with"),
+        (["--optimize", "focus", "--for", "mass", "--seed", "1"], "--seed needs --optimize pupil"),
         (["--for", "mass"], "go together"),
         (["--scan", "z=0:1:1", "--target", "mass=5"], "choose one of"),
         (["--preset", "dong2021"], "needs --out DIR"),

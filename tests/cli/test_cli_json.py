@@ -111,6 +111,7 @@ def test_landing_movies(sample_configs, capsys, tmp_path) -> None:
         ["--set", "bounds.n_before=0"],
         ["--scan", "focus=-200:200:200"],
         ["--optimize", "focus", "--for", "mass"],
+        ["--optimize", "pupil", "--free", "phase"],
         ["--target", "mass=5kDa"],
         ["--set", "optics.scheme=cobri"],
     ],

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from instruments import Instrument, InstrumentMovie, draw_landings
 
-from iscat_analysis.config import load_config
+from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.background import measure_windows
 from iscat_analysis.movie.camera import camera_from_config
+from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.landing import LandingResult, analyse_landings
-from iscat_analysis.search.residue import chi2_excess, size_on_ring
+from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.search.residue import Described, chi2_excess, size_on_ring
 
 SHAPE = (500, 128, 128)
 COUNT = 12
@@ -18,9 +23,16 @@ SEED = 11
 LANDINGS = draw_landings(SHAPE, COUNT, seed=SEED, apart_px=22.0)
 
 
-def _analysed(instrument: Instrument, gain: float = 4.0) -> tuple[LandingResult, list[str]]:
-    movie = InstrumentMovie(instrument, SHAPE, LANDINGS, seed=SEED)
-    config = load_config(
+WRONG = Instrument(
+    emission="reciprocal", circular=True, analyzer=True, focus_nm=-370.0, na=1.40, mask_na=0.6,
+    attenuation=0.3, reference_phase_deg=12.0,
+    aberrations_nm={5: 6.0, 6: -5.0, 7: 8.0, 8: -9.0, 11: 18.0},
+)  # fmt: skip
+"""What real microscopes have of everything; coma moves its pictures by more than a pixel."""
+
+
+def _configured(*settings: str, gain: float = 4.0) -> Config:
+    return load_config(
         None,
         [
             "camera.pixel_size_nm=84.0",
@@ -29,10 +41,15 @@ def _analysed(instrument: Instrument, gain: float = 4.0) -> tuple[LandingResult,
             "optics.emission=dong2021",
             "particle.mass_kda=205",
             "calibration.gradient_per_kda=-3.1e-5",
-            "background.method=sliding",
             "detection.false_alarms_per_movie=1e-3",  # those of noise are tested elsewhere
+            *settings,
         ],
     )
+
+
+def _analysed(instrument: Instrument, gain: float = 4.0) -> tuple[LandingResult, list[str]]:
+    movie = InstrumentMovie(instrument, SHAPE, LANDINGS, seed=SEED)
+    config = _configured("background.method=sliding", gain=gain)
     said: list[str] = []
     camera = camera_from_config(config.camera, (SHAPE[1], SHAPE[2]), movie.dtype)
     result = analyse_landings(movie, config, camera, tell=said.append, progress=lambda *_: None)
@@ -63,6 +80,37 @@ def test_a_wrong_model_finds_what_is_there_and_no_more(
     lines = [text for text in said if "looks most like" in text]
     assert len(lines) == (cause is not None)
     assert cause is None or cause in lines[0]
+
+
+@pytest.mark.parametrize("instrument", [Instrument(), WRONG], ids=["nominal", "wrong"])
+def test_rings_as_high_as_their_particle_are_none(instrument: Instrument) -> None:
+    shape, bound, count = (80, 140, 140), 40, 8
+    landings = draw_landings(
+        shape, count, seed=SEED, masses=(430.0,), frame=bound, apart_px=24.0, margin_px=16.0
+    )
+    movie = InstrumentMovie(instrument, shape, landings, seed=SEED)
+    config = _configured("background.method=fixed", f"background.frames=[0,{bound}]")
+    scene = make_scene(config, shape[1:])
+    camera = camera_from_config(config.camera, shape[1:], movie.dtype)
+    windows = measure_windows(movie, camera, (0, bound), (bound, shape[0]))
+    with ThreadPoolExecutor(1) as pool:
+        events, _ = fit_field(scene, windows, pool=pool)
+    kept = [e.candidate for e in events if "sidelobe" not in e.fit.flags]
+    for x, y in zip(landings.x_px, landings.y_px, strict=True):
+        assert sum(np.hypot(k.x_px - x, k.y_px - y) < 3 for k in kept) == 1, (x, y)
+    assert len(kept) == count
+
+
+def test_a_faint_particle_is_as_badly_described_as_a_bright_one() -> None:
+    bright = Described.of(snr=60.0, chi2_reduced=17.0, n_pixels=576)
+    faint = Described.of(snr=12.0, chi2_reduced=1 + 16 / 25, n_pixels=576)
+    ring = Described.of(snr=12.0, chi2_reduced=4.0, n_pixels=576)
+    good = Described.of(snr=60.0, chi2_reduced=1.05, n_pixels=576)
+    assert good.excess == 0  # as noise may have it
+    assert not faint.is_dwarfed([bright, faint])
+    assert ring.is_dwarfed([bright, ring])
+    assert faint.is_dwarfed([good, faint])  # what it leaves is not the model's
+    assert not ring.is_dwarfed([ring, Described(30.0, 0.0)])  # no brighter one explains it
 
 
 def test_noise_that_passes_the_threshold_everywhere_stops_the_search() -> None:

@@ -11,6 +11,7 @@ from scipy.stats import skew
 
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.posterior import sample_posterior
+from iscat_analysis.inference.prior import Prior
 from iscat_analysis.records import PARAMETERS, FloatArray, PosteriorResult, Status
 from iscat_analysis.study import (
     PosteriorRanks,
@@ -27,6 +28,7 @@ pytestmark = pytest.mark.large
 SEED = 12
 DRAWS = 40
 BINS = 5
+PRIOR_TRIALS = 80
 SURPRISE = 1e-4
 SMALL = {"roi_nm": 1350.0}
 
@@ -107,6 +109,39 @@ def test_a_mass_near_zero_is_skewed_against_its_bound() -> None:
     assert bright.converged, bright.message
     assert abs(skew(bright.samples[..., 3].ravel())) < 0.2
     del fit
+
+
+def _against_van_trees(experiment: Setting, width: float, believed: float) -> FloatArray:
+    """Errors of the sampled posterior's mean over its bound, masses drawn from a normal prior."""
+    found = []
+    for trial in range(PRIOR_TRIALS):
+        random = trial_generator(SEED, 5, trial)
+        truth = np.array(experiment.truth)
+        truth[3] += width * random.standard_normal()
+        likelihood = experiment.likelihood(experiment.draw(truth, random))
+        fit = fit_particle(
+            likelihood, experiment.start(truth, random), experiment.mode,
+            experiment.config.fit.z_range_nm, level=False,
+        )  # fmt: skip
+        prior = Prior({"mass_kda": (experiment.truth[3] + believed, width)})
+        chain = sample_posterior(likelihood, fit, walkers=32, steps=250, seed=trial, prior=prior)
+        assert chain.van_trees is not None
+        mean = chain.samples[..., chain.names.index("mass_kda")].mean()
+        found.append((mean - truth[3]) / chain.van_trees[chain.names.index("mass_kda")])
+    return np.array(found)
+
+
+def test_the_sampled_posterior_reaches_van_trees_and_a_wrong_prior_does_not() -> None:
+    experiment = setting("iscat", "mass", fit=SMALL)
+    crb = experiment.bounds.crb_joint[3]
+    width = 0.5 * crb
+    error = 1 / math.sqrt(2 * PRIOR_TRIALS)  # of the logarithm of a root mean square
+    right = math.log(np.sqrt(np.mean(_against_van_trees(experiment, width, 0.0) ** 2)))
+    assert abs(right) < 4 * error
+    # without the prior the error would be the Cramér–Rao bound: √5 of this one
+    assert math.log(math.sqrt(5)) > 4 * error
+    wrong = math.log(np.sqrt(np.mean(_against_van_trees(experiment, width, 3 * width) ** 2)))
+    assert wrong > 4 * error
 
 
 @pytest.mark.parametrize("relative", [0.5, 2.0])

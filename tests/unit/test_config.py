@@ -112,6 +112,8 @@ IMPOSSIBLE = [
     (["detection.false_alarms_per_movie=0"], "detection.false_alarms_per_movie"),
     (["posterior.walkers=11"], "posterior.walkers"),
     (["posterior.steps=1"], "posterior.steps"),
+    (["fit.mode=mass", "posterior.prior_z_nm=[5, 2]"], "posterior.prior_z_nm is of a parameter"),
+    (["posterior.prior_mass_kda=[66, 0]"], "posterior.prior_mass_kda"),
     (["calibration.gradient_per_kda=0"], "says nothing about mass"),
     (["calibration.offset=0.1"], "calibration.gradient_per_kda: is required"),
     (["simulation.count=3", "simulation.leavings=4"], "needs a count at least as large"),

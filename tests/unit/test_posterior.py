@@ -14,6 +14,7 @@ from iscat_analysis.inference import posterior
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.posterior import sample_posterior
+from iscat_analysis.inference.prior import Prior
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import Candidate, FitResult
 
@@ -61,6 +62,32 @@ def test_a_strong_particle_has_the_analytic_posterior(gaussian: Case) -> None:
     assert (result.r_hat < posterior.MAX_R_HAT).all()
     assert (result.ess_tail > posterior.MIN_ESS).all()
     assert (result.samples.shape[1] > posterior.MIN_TAUS * result.tau).all()
+
+
+def test_a_normal_prior_narrows_the_posterior_as_it_must(gaussian: Case) -> None:
+    """Likelihood and prior are normal: precisions add, the mean is their weighted mean."""
+    likelihood, fit = gaussian
+    width = 0.5 * fit.sigma
+    centre = np.array([0.0, 0.0, fit.z_nm + fit.sigma[2], fit.mass_kda - fit.sigma[3]])
+    prior = Prior({"z_nm": (centre[2], width[2]), "mass_kda": (centre[3], width[3])})
+    result = sample_posterior(likelihood, fit, walkers=32, steps=1500, seed=4, prior=prior)
+    assert result.converged, result.message
+    known = np.diag([0.0, 0.0, width[2] ** -2, width[3] ** -2])
+    seen = np.linalg.inv(fit.covariance)
+    total = np.linalg.inv(seen + known)
+    at = np.array([fit.x_nm, fit.y_nm, fit.z_nm, fit.mass_kda])
+    expected = total @ (seen @ at + known @ centre)
+    draws = result.samples.reshape(-1, 4)
+    sigma = np.sqrt(np.diag(total))
+    ess = result.ess_bulk.min()
+    assert np.abs((draws.mean(axis=0) - expected) / sigma).max() < SIGMAS / np.sqrt(ess) + 0.02
+    assert draws.std(axis=0) / sigma == pytest.approx([1] * 4, abs=SIGMAS / np.sqrt(2 * ess) + 0.02)
+    assert result.van_trees == pytest.approx(sigma, rel=0.02)
+    assert np.all(result.van_trees[2:] < 0.5 * fit.sigma[2:])
+    thetas = np.tile(fit.theta, (32, 1))  # what is kept is the likelihood without the prior
+    thetas[:, :3] = result.samples[:, 7, :3]
+    thetas[:, 3] = [likelihood.model.scale.amplitude(m) for m in result.samples[:, 7, 3]]
+    np.testing.assert_allclose(likelihood.values(thetas), result.log_likelihood[:, 7], rtol=1e-9)
 
 
 def test_likelihoods_belong_to_their_draws(gaussian: Case) -> None:

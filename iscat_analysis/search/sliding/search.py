@@ -239,10 +239,10 @@ def find_steps(
         With sub-pixel positions.
     """
     peaks = []
-    for k, i, j in step_peaks(snr, SAMPLED * threshold):
+    for k, i, j in step_peaks(snr, SAMPLED * threshold).tolist():
         value = float(snr[k, i, j])
-        image = snr[k] * np.sign(value)
-        (dy, above), (dx, beside) = vertex(image[:, j], int(i)), vertex(image[i], int(j))
+        sign = np.sign(value)
+        (dy, above), (dx, beside) = vertex(sign * snr[k, :, j], i), vertex(sign * snr[k, i], j)
         height = math.copysign(abs(value) + above + beside, value)
         if abs(height) <= threshold:
             continue

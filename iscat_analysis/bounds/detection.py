@@ -1,0 +1,154 @@
+"""The faintest particle that can be detected, from the Fisher information of an empty field.
+
+By the lemma of Neyman and Pearson no test of “a particle or none at this place” beats the matched
+filter, whose signal-to-noise ratio is amplitude × √J_aa, J being the Fisher information without a
+particle: normal with variance 1, so that for false alarms p and misses q
+
+    SNR = z(p) + z(q),        z(p) = Φ⁻¹(1 − p).
+
+Where the place is searched, noise has as many chances as the field has places: the threshold u is
+the height above which a smooth normal field has one maximum with probability p (R. J. Adler, *The
+Geometry of Random Fields* (1981), chapter 6), with the roughness Λ of that field from the same
+matrix.  And the particle's maximum may lie beside it: √(2Δℓ) over place and amplitude is
+χ with three degrees of freedom about SNR.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import ncx2, norm
+
+from iscat_analysis.bounds.experiment import Experiment, expected_likelihood
+
+_FAINT = 1e-6  # of the particle's amplitude: where derivatives with the place are taken
+_HIGHEST = 1e3  # no threshold or signal-to-noise ratio is larger
+
+
+@dataclass(frozen=True)
+class DetectionLimit:
+    """What can be detected; build it with `detection_limit`.
+
+    Attributes
+    ----------
+    false_alarm, miss : float
+        Probabilities: that noise alone is taken for a particle, and that a particle is not found.
+    threshold_known, threshold_searched : float
+        Of the signal-to-noise ratio, where the place is known and where the field is searched.
+    snr_known, snr_searched : float
+        That a particle needs.
+    mass_known_kda, mass_searched_kda : float
+        Its mass [kDa].
+    snr_per_amplitude : float
+        √J_aa of an empty field, for all frames.
+    """
+
+    false_alarm: float
+    miss: float
+    threshold_known: float
+    threshold_searched: float
+    snr_known: float
+    snr_searched: float
+    mass_known_kda: float
+    mass_searched_kda: float
+    snr_per_amplitude: float
+
+
+def power_known(snr: float, threshold: float) -> float:
+    """Probability to detect a particle whose place is known.
+
+    Parameters
+    ----------
+    snr : float
+        Its signal-to-noise ratio.
+    threshold : float
+        What the matched filter must exceed.
+
+    Returns
+    -------
+    float
+        Φ(snr − threshold).
+    """
+    return float(norm.sf(threshold - snr))
+
+
+def power_searched(snr: float, threshold: float) -> float:
+    """Probability to detect a particle whose place is fitted.
+
+    Parameters
+    ----------
+    snr : float
+        Its signal-to-noise ratio.
+    threshold : float
+        What √(2Δℓ) over place and amplitude must exceed.
+
+    Returns
+    -------
+    float
+        Of a χ² with three degrees of freedom and non-centrality snr².
+    """
+    return float(ncx2.sf(threshold**2, 3, snr**2))
+
+
+def detection_limit(experiment: Experiment) -> DetectionLimit | None:
+    """Tell the smallest mass that can be detected.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        From `plan`; ``bounds.false_alarm_probability`` and ``bounds.miss_probability`` say how
+        surely.
+
+    Returns
+    -------
+    DetectionLimit or None
+        For all frames; None in dark field, where the signal is not linear in the amplitude, and
+        for an image that does not change with the mass.
+    """
+    model, at = experiment.model, experiment.config.bounds
+    if not model.rho:
+        return None
+    theta = experiment.theta.copy()
+    theta[3] *= _FAINT
+    read = experiment.config.camera.read_noise_e
+    empty = expected_likelihood(
+        model, experiment.grid, theta, at.photons_per_pixel, at.photons_per_pixel,
+        n_before=at.n_before, n_after=at.n_after,
+        read_noise_e=0.0 if isinstance(read, str) else read,
+    )  # fmt: skip
+    fisher = empty.score_fisher(theta)[2]
+    if not fisher[3, 3] > 0:
+        return None
+    slope = fisher[:2, 3] / (theta[3] * fisher[3, 3])
+    rough = fisher[:2, :2] / (theta[3] ** 2 * fisher[3, 3]) - np.outer(slope, slope)
+    area = (at.pixels * experiment.grid.pixel_nm) ** 2
+    places = area * math.sqrt(max(float(np.linalg.det(rough)), 0.0)) / (2 * math.pi) ** 1.5
+    false, miss = at.false_alarm_probability, at.miss_probability
+    known = float(norm.isf(false))
+    searched = _threshold(places, -math.log1p(-false), known)
+    snr = known + float(norm.isf(miss))
+    snr_searched = float(
+        brentq(lambda s: power_searched(s, searched) - (1 - miss), 0.0, searched + 40.0)
+    )
+    root = math.sqrt(float(fisher[3, 3]))
+    sign = math.copysign(1.0, float(experiment.theta[3]))
+    masses = model.scale.mass(sign * np.array([snr, snr_searched]) / root)
+    return DetectionLimit(
+        false, miss, known, searched, snr, snr_searched,
+        max(float(masses[0]), 0.0), max(float(masses[1]), 0.0), root,
+    )  # fmt: skip
+
+
+def _threshold(places: float, alarms: float, lowest: float) -> float:
+    """Height above which noise has `alarms` maxima; never below that of a known place."""
+
+    def excess(u: float) -> float:
+        return math.log(places * u) - u**2 / 2 - math.log(alarms)
+
+    low = max(lowest, 1.0)
+    if not places > 0 or excess(low) <= 0:
+        return lowest
+    return float(brentq(excess, low, _HIGHEST))

@@ -1,0 +1,529 @@
+"""Which pupil would come nearest to what the light allows.
+
+Reference phase, attenuation, mask, focus and low Zernike terms are searched for the smallest
+
+    F = Σ_j σ_j² K_jj        over the chosen parameters j,
+
+σ_j being the joint Cramér–Rao bound over the mode's free parameters and 1/√K_jj the light's own
+bound.  The light on the particle is held and with it the number of collected photons.  None of the
+knobs touches the light before the pupil, so that the Holevo bound C_H(W) with W = diag(K_jj) on the
+chosen parameters is one number for the whole search: F ≥ C_H, and C_H/F says how near a pupil
+comes.
+
+The reference's level on the camera follows the attenuation squared.  Where the brightest pixel
+would exceed the well, the attenuation is lowered until it does not.
+
+A random sample of the round pupils finds the valleys, COBYQA (Ragonneau & Zhang 2024; no
+derivatives, so that the noise of tables does not matter) descends into the best of them, and then
+once more with the Zernike terms that are not round.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from iscat_analysis.bounds.classical import bounds_from_matrices
+from iscat_analysis.bounds.experiment import Experiment, plan
+from iscat_analysis.bounds.holevo import Holevo, holevo_bound
+from iscat_analysis.bounds.quantum import transmitted_over_collected
+from iscat_analysis.bounds.scan import calibrated_scale
+from iscat_analysis.config import Config, Optics
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.forward import MassScale
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Progress, silent
+
+FloatArray = NDArray[np.float64]
+
+ROUND_TERMS, OTHER_TERMS = ("z11",), ("z5", "z6", "z7", "z8", "z9", "z10")
+"""Low Zernike terms: spherical aberration, and astigmatism, coma and trefoil."""
+
+KNOBS: Mapping[str, tuple[str, ...]] = {
+    "focus": ("focus_nm",),
+    "phase": ("reference_phase_deg",),
+    "attenuation": ("attenuation",),
+    "mask": ("mask_na",),
+    "zernike": (*ROUND_TERMS, *OTHER_TERMS),
+}
+"""What can be searched, and the keys of ``[optics]`` it stands for."""
+
+SAMPLED = 128
+"""Random pupils for each variable, with and without mask, from which the valleys are chosen."""
+
+BUDGET = 70
+"""Evaluations that one descent may take for each of its variables."""
+
+RADII = (0.3, 2e-3)
+"""First and last step of a descent; a unit is a radian, 500 nm of focus, λ/20 rms of a Zernike
+term, a factor e of attenuation, the whole aperture for the mask."""
+
+APART = 0.5
+"""Smallest distance between starts, in these units."""
+
+FULL_WELL = 0.99
+"""Share of the well that the brightest pixel may expect."""
+
+SEARCHED_NM = 3500.0
+"""Side of the field in which valleys are searched; candidates are compared on the whole field."""
+
+SAME = 1e-4
+"""Relative change of F below which a knob returns to where it was configured: simpler is better."""
+
+HOPELESS = 50.0
+"""ln F of a pupil that does not identify the parameters or saturates the camera."""
+
+_DIGITS = {"focus_nm": 1, "reference_phase_deg": 1, "mask_na": 3}  # of what is written; others 1
+_UNIT_FOCUS_NM = 500.0
+_WAVES = 20.0  # a unit of a Zernike term is the wavelength over this
+
+
+@dataclass(frozen=True)
+class PupilOptimum:
+    """The best pupil that was found; build it with `optimize_pupil`.
+
+    Attributes
+    ----------
+    config : Config
+        The experiment with it: its optics, the background that they leave, and, where there was a
+        calibration, which belongs to other optics, a density that makes the particle scatter as
+        strongly.  `plan` of it gives the numbers below.
+    chosen : tuple of str
+        Parameters whose bounds were made small.
+    settings : dict of str to (float, float)
+        Key of ``[optics]`` → as configured, best.
+    sigma, sigma_configured, sigma_holevo, sigma_quantum : dict of str to float
+        Joint Cramér–Rao bounds of the chosen parameters with the best pupil and as configured;
+        what the measurement of the Holevo bound reaches together; each one's own quantum bound
+        [nm, kDa].
+    sum, sum_configured : float
+        F of both; NaN where a chosen parameter is unidentifiable.
+    holevo : float
+        C_H, below which no F can be.
+    share_quiet : float
+        C_H/F of the best pupil for a known background and a camera without read noise.
+    transmitted : float
+        Share of the collected light that passes the best pupil.
+    peak_e : float
+        Brightest pixel of it in a frame [e].
+    descents : tuple of float
+        C_H/F at the end of every descent, best first, in the field that was searched.
+    evaluations : int
+        Pupils that were tried.
+    """
+
+    config: Config
+    chosen: tuple[str, ...]
+    settings: Mapping[str, tuple[float, float]]
+    sigma: Mapping[str, float]
+    sigma_configured: Mapping[str, float]
+    sigma_holevo: Mapping[str, float]
+    sigma_quantum: Mapping[str, float]
+    sum: float
+    sum_configured: float
+    holevo: float
+    share_quiet: float
+    transmitted: float
+    peak_e: float
+    descents: tuple[float, ...]
+    evaluations: int
+
+    @property
+    def share(self) -> float:
+        """C_H/F: how near the best pupil comes to the Holevo bound, at most 1."""
+        return self.holevo / self.sum
+
+    @property
+    def share_configured(self) -> float:
+        """C_H/F as configured."""
+        return self.holevo / self.sum_configured
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give what ``iscat bounds --json`` has under ``pupil``."""
+        return {
+            "for": list(self.chosen),
+            "settings": {
+                key: {"configured": before, "best": best}
+                for key, (before, best) in self.settings.items()
+            },
+            "photons_per_pixel": self.config.bounds.photons_per_pixel,
+            "peak_e": self.peak_e,
+            "transmitted_over_collected": self.transmitted,
+            "sigma": {
+                name: {
+                    "configured": self.sigma_configured[name],
+                    "best": self.sigma[name],
+                    "holevo": self.sigma_holevo[name],
+                    "qcrb": self.sigma_quantum[name],
+                }
+                for name in self.chosen
+            },
+            "sum": {
+                "configured": self.sum_configured, "best": self.sum, "holevo": self.holevo,
+            },
+            "share": {
+                "configured": self.share_configured,
+                "best": self.share,
+                "quiet": self.share_quiet,
+            },
+            "descents": list(self.descents),
+            "near": sum(share > 0.99 * self.descents[0] for share in self.descents),
+            "evaluations": self.evaluations,
+        }  # fmt: skip
+
+
+def optimize_pupil(
+    config: Config,
+    chosen: Sequence[str] | None = None,
+    *,
+    free: Sequence[str] | None = None,
+    starts: int = 8,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> PupilOptimum:
+    """Search the pupil with the smallest joint bound of the chosen parameters.
+
+    Parameters
+    ----------
+    config : Config
+        The experiment.  ``bounds.photons_per_pixel`` and ``optics.attenuation`` fix the light on
+        the particle, ``camera`` its well and noise, ``fit.mode`` what is estimated together.
+    chosen : sequence of str, optional
+        Some of the mode's free parameters, as in `PARAMETERS`; default all of them.
+    free : sequence of str, optional
+        What may change, of `KNOBS`; default everything.
+    starts : int
+        Valleys that are descended into, with a mask and without.
+    seed : int
+        Of the sample.
+    progress : Progress, optional
+        Told after each descent.
+
+    Returns
+    -------
+    PupilOptimum
+        The best, beside the configured one.
+
+    Raises
+    ------
+    ConfigError
+        There is no reference or no model of the light, a name is unknown, or no pupil works.
+    """
+    chosen = _chosen(config, chosen)
+    free = _free(config, free)
+    scale = calibrated_scale(config)
+    light = _holevo(plan(config), chosen)
+    search = _Search(_cropped(config), scale, chosen, free)
+    log_holevo = math.log(light.sum)
+    others = [key for key in OTHER_TERMS if key in search.keys]
+    found: list[tuple[float, Optics]] = []
+    valleys = search.valleys(starts, seed)
+    for done, (keys, start) in enumerate(valleys):
+        found.append(search.descend(keys, start))
+        progress("pupils", done + 1, len(valleys) + bool(others))
+    found.sort(key=lambda item: item[0])
+    if others:
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
+        optics = found[0][1]
+        keys = [key for key in search.keys if key != "mask_na" or optics.mask_na]
+        start = search.encode(keys, optics)
+        start += np.where([key in others for key in keys], rng.normal(0, 0.3, len(keys)), 0.0)
+        found.append(search.descend(keys, start))
+        progress("pupils", len(valleys) + 1, len(valleys) + 1)
+        found.sort(key=lambda item: item[0])
+    whole = _Search(config, scale, chosen, free)
+    _, best = min((whole.value(optics) for _, optics in found[:3]), key=lambda item: item[0])
+    value, best = whole.simplified(best)
+    if not value < HOPELESS:
+        raise ConfigError(
+            "`optimize` = pupil: the parameters are unidentifiable or the camera saturates with "
+            "every pupil; lower bounds.photons_per_pixel, or free fewer parameters with fit.mode"
+        )
+    return _result(
+        config, whole.config_of(best), scale, chosen, search.keys,
+        descents=tuple(math.exp(log_holevo - value) for value, _ in found),
+        evaluations=search.evaluations + whole.evaluations,
+    )  # fmt: skip
+
+
+def _result(
+    config: Config,
+    best: Config,
+    scale: MassScale | None,
+    chosen: tuple[str, ...],
+    keys: Sequence[str],
+    *,
+    descents: tuple[float, ...],
+    evaluations: int,
+) -> PupilOptimum:
+    """Bounds of the configured and of the best experiment, the latter as it will be written."""
+    best = _uncalibrated(best, scale)
+    here, there = plan(_uncalibrated(config, scale)), plan(best)
+    bound = _holevo(there, chosen)
+    at = [PARAMETERS.index(name) for name in chosen]
+    sigma, own = _sigmas(there)
+    quiet, _ = _sigmas(
+        plan(
+            best.model_copy(
+                update={
+                    "camera": best.camera.model_copy(update={"read_noise_e": 0.0}),
+                    "bounds": best.bounds.model_copy(update={"n_before": 0}),
+                }
+            )
+        )
+    )
+    before, _ = _sigmas(here)
+    joint = FREE_PARAMETERS[config.fit.mode]
+    together = dict(zip(joint, bound.sigma, strict=True))
+
+    def named(values: FloatArray) -> dict[str, float]:
+        return {PARAMETERS[i]: float(values[i]) for i in at}
+
+    return PupilOptimum(
+        config=best,
+        chosen=chosen,
+        settings={key: (_setting(config.optics, key), _setting(best.optics, key)) for key in keys},
+        sigma=named(sigma),
+        sigma_configured=named(before),
+        sigma_holevo={name: float(together[name]) for name in chosen},
+        sigma_quantum=named(own),
+        sum=float(np.sum((sigma[at] / own[at]) ** 2)),
+        sum_configured=float(np.sum((before[at] / own[at]) ** 2)),
+        holevo=bound.sum,
+        share_quiet=bound.sum / float(np.sum((quiet[at] / own[at]) ** 2)),
+        transmitted=transmitted_over_collected(there.model, float(there.theta[2])),
+        peak_e=there.peak_e,
+        descents=descents,
+        evaluations=evaluations,
+    )
+
+
+@dataclass
+class _Search:
+    """F of pupils, and the descent into one valley."""
+
+    config: Config
+    scale: MassScale | None
+    chosen: tuple[str, ...]
+    free: tuple[str, ...]
+    evaluations: int = 0
+    keys: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.keys = tuple(key for name in KNOBS if name in self.free for key in KNOBS[name])
+
+    def config_of(self, optics: Optics) -> Config:
+        """Experiment with other optics and the same light on the particle."""
+        power = (optics.attenuation / self.config.optics.attenuation) ** 2
+        photons = self.config.bounds.photons_per_pixel * power
+        return self.config.model_copy(
+            update={
+                "optics": optics,
+                "bounds": self.config.bounds.model_copy(update={"photons_per_pixel": photons}),
+            }
+        )
+
+    def value(self, optics: Optics) -> tuple[float, Optics]:
+        """Tell ln F and the optics, dimmed where the well asks for it."""
+        well = FULL_WELL * (self.config.camera.well_depth_e or math.inf)
+        for _ in range(4):
+            self.evaluations += 1
+            experiment = plan(self.config_of(optics), scale=self.scale)
+            if experiment.peak_e <= well:
+                sigma, own = _sigmas(experiment)
+                at = [PARAMETERS.index(name) for name in self.chosen]
+                total = float(np.sum((sigma[at] / own[at]) ** 2))
+                return (math.log(total) if math.isfinite(total) else HOPELESS), optics
+            if "attenuation" not in self.free:
+                break
+            dimmed = optics.attenuation * math.sqrt(0.99 * well / experiment.peak_e)
+            optics = optics.model_copy(update={"attenuation": dimmed})
+        return HOPELESS, optics
+
+    def valleys(self, starts: int, seed: int) -> list[tuple[list[str], FloatArray]]:
+        """Choose starts: the configured pupil, and the best of a sample with and without mask."""
+        keys = [key for key in self.keys if key not in OTHER_TERMS]
+        bare = [key for key in keys if key != "mask_na"]
+        here = self.config.optics
+        first = keys if here.mask_na else bare
+        chosen = [(first, self.encode(first, here))]
+        for number, names in enumerate([bare] if bare == keys else [bare, keys]):
+            if not names:
+                continue
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0, number)))
+            low, high = np.array([self.range(key)[0] for key in names]).T
+            points = low + (high - low) * rng.random((SAMPLED * len(names), len(names)))
+            values = [self.value(self.decode(names, point))[0] for point in points]
+            kept: list[FloatArray] = []
+            for point in points[np.argsort(values)]:
+                if len(kept) < starts and all(np.linalg.norm(point - p) > APART for p in kept):
+                    kept.append(point)
+            chosen += [(names, point) for point in kept]
+        return chosen
+
+    def descend(self, keys: list[str], start: FloatArray) -> tuple[float, Optics]:
+        """Find the lowest point near a start: ln F and the optics."""
+        if not keys:
+            return self.value(self.decode(keys, start))
+        low, high = np.array([self.range(key)[1] for key in keys]).T
+        found = minimize(
+            lambda point: self.value(self.decode(keys, point))[0],
+            np.clip(start, low, high), bounds=list(zip(low, high, strict=True)), method="COBYQA",
+            options={
+                "maxfev": BUDGET * len(keys),
+                "initial_tr_radius": RADII[0],
+                "final_tr_radius": RADII[1],
+            },
+        )  # fmt: skip
+        return self.value(self.decode(keys, found.x))
+
+    def simplified(self, best: Optics) -> tuple[float, Optics]:
+        """Round the settings to what a laboratory can set, and undo those that change nothing."""
+        best = self._with(
+            best, {key: _rounded(key, _setting(best, key)) for key in self.keys if key != "mask_na"
+                   or best.mask_na}
+        )  # fmt: skip
+        value, best = self.value(best)
+        worst = value + SAME
+        for key in reversed(self.keys):
+            here = _setting(self.config.optics, key)
+            if _setting(best, key) != here:
+                simpler = self.value(self._with(best, {key: here}))
+                if simpler[0] <= worst and simpler[1].attenuation <= best.attenuation:
+                    value, best = simpler
+        return value, best
+
+    def range(self, key: str) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Where a knob is sampled, and how far it may go."""
+        return {
+            "focus_nm": ((-4.0, 4.0), (-4.0, 4.0)),
+            "reference_phase_deg": ((-math.pi, math.pi), (-3 * math.pi, 3 * math.pi)),
+            "attenuation": ((math.log(3e-3), 0.0), (math.log(1e-4), 0.0)),
+            "mask_na": ((0.1, 0.95), (0.05, 0.99)),
+        }.get(key, ((-2.0, 2.0), (-8.0, 8.0)))
+
+    def encode(self, keys: Sequence[str], optics: Optics) -> FloatArray:
+        """Optics → point of the search."""
+        return np.array([self._coding(key)[0](_setting(optics, key)) for key in keys])
+
+    def decode(self, keys: Sequence[str], point: FloatArray) -> Optics:
+        """Point of the search → optics; a mask that is not among the keys is taken out."""
+        changes = {key: self._coding(key)[1](float(u)) for key, u in zip(keys, point, strict=True)}
+        if "mask_na" in self.keys and "mask_na" not in keys:
+            changes["mask_na"] = 0.0
+        return self._with(self.config.optics, changes)
+
+    def _coding(self, key: str) -> tuple[Callable[[float], float], Callable[[float], float]]:
+        optics, height = self.config.optics, self.config.particle.height_nm
+        wave = optics.wavelength_nm / _WAVES
+        if key == "focus_nm":
+            return (
+                lambda v: (v - height) / _UNIT_FOCUS_NM,
+                lambda u: height + _UNIT_FOCUS_NM * u,
+            )
+        if key == "reference_phase_deg":
+            return math.radians, lambda u: math.degrees(math.remainder(u, 2 * math.pi))
+        if key == "attenuation":
+            return math.log, lambda u: math.exp(min(u, 0.0))
+        if key == "mask_na":
+            return lambda v: v / optics.na, lambda u: u * optics.na
+        return lambda v: v / wave, lambda u: u * wave
+
+    def _with(self, optics: Optics, changes: Mapping[str, float]) -> Optics:
+        terms = {k: v for k, v in changes.items() if k not in Optics.model_fields}
+        update: dict[str, Any] = {k: v for k, v in changes.items() if k not in terms}
+        if terms:
+            kept = {k: v for k, v in (optics.aberrations_nm | terms).items() if v}
+            update["aberrations_nm"] = kept
+        return optics.model_copy(update=update | {"file": None, "covariance": None})
+
+
+def _setting(optics: Optics, key: str) -> float:
+    if key in Optics.model_fields:
+        return float(getattr(optics, key))
+    return optics.aberrations_nm.get(key, 0.0)
+
+
+def _rounded(key: str, value: float) -> float:
+    if key == "attenuation":
+        return float(f"{value:.3g}")
+    return round(value, _DIGITS.get(key, 1)) + 0.0
+
+
+def _sigmas(experiment: Experiment) -> tuple[FloatArray, FloatArray]:
+    """Joint bounds over the mode's free parameters, and each one's quantum bound."""
+    free = FREE_PARAMETERS[experiment.config.fit.mode]
+    whole = experiment.bounds(PARAMETERS)
+    return bounds_from_matrices(whole.fisher, whole.quantum, free).crb_joint, whole.qcrb
+
+
+def _holevo(experiment: Experiment, chosen: tuple[str, ...]) -> Holevo:
+    """Holevo bound over the mode's free parameters, of which the chosen ones weigh."""
+    free = FREE_PARAMETERS[experiment.config.fit.mode]
+    index = [PARAMETERS.index(name) for name in free]
+    theta, scale = experiment.theta, experiment.model.scale
+    step = np.array([1.0, 1.0, 1.0, abs(theta[3]) * abs(scale.slope(theta[3]))])
+    light = (experiment.collected * experiment.quantum / np.outer(step, step))[np.ix_(index, index)]
+    weight = np.diag(light).real * [name in chosen for name in free]
+    return holevo_bound(light, np.diag(weight))
+
+
+def _uncalibrated(config: Config, scale: MassScale | None) -> Config:
+    """Let the particle itself scatter as strongly as the calibration says.
+
+    A calibration belongs to the optics it was measured with.  The field of a mass is inversely
+    proportional to the density, which does nothing else.
+    """
+    if config.calibration is None or scale is None:
+        return config
+    matter = plan(config, scale=scale).model.material
+    density = matter.density_kg_m3 * matter.mass_kda / abs(scale.amplitude(matter.mass_kda))
+    particle = config.particle.model_copy(
+        update={"density_kg_m3": density, "mass_kda": matter.mass_kda, "diameter_nm": None}
+    )
+    return config.model_copy(update={"calibration": None, "particle": particle})
+
+
+def _cropped(config: Config) -> Config:
+    """Shrink the field to what the search needs."""
+    pixel, at = config.camera.pixel_size_nm, config.bounds
+    if pixel is None:
+        return config  # `plan` says what is missing
+    needed = math.ceil((SEARCHED_NM + 2 * max(abs(at.x_nm), abs(at.y_nm))) / pixel)
+    needed += (needed - at.pixels) % 2
+    if needed >= at.pixels:
+        return config
+    return config.model_copy(update={"bounds": at.model_copy(update={"pixels": needed})})
+
+
+def _chosen(config: Config, chosen: Sequence[str] | None) -> tuple[str, ...]:
+    free = FREE_PARAMETERS[config.fit.mode]
+    for name in chosen or ():
+        if name not in free:
+            raise ConfigError(
+                f"{name} is not free in mode {config.fit.mode}: choose among {', '.join(free)}, or "
+                "another fit.mode"
+            )
+    return tuple(name for name in free if chosen is None or name in chosen)
+
+
+def _free(config: Config, free: Sequence[str] | None) -> tuple[str, ...]:
+    optics = config.optics
+    if optics.scheme == "darkfield":
+        raise ConfigError(
+            "`optimize` = pupil: dark field has no reference whose phase and strength could be "
+            'chosen; choose optics.scheme = "iscat" or "cobri"'
+        )
+    if optics.psf == "measured":
+        raise ConfigError(
+            '`optimize` = pupil: optics.psf = "measured" is a picture of one pupil; use "model"'
+        )
+    for name in free or ():
+        if name not in KNOBS:
+            raise ConfigError(f"`free` = {name}: choose among {', '.join(KNOBS)}")
+    return tuple(name for name in KNOBS if free is None or name in free)
