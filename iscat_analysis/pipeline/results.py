@@ -24,6 +24,7 @@ from iscat_analysis.records import (
     Status,
     Windows,
 )
+from iscat_analysis.report.spread import rejection
 from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.species import Efficiency, describe
 
@@ -184,6 +185,7 @@ def summary_of(
     free = FREE_PARAMETERS[scene.mode]
     conflict = {"z_nm", "mass_kda"} <= set(free) and len(good) > 0
     cost = _holevo_over_quantum(scene, good["z_nm"].to_numpy(float)) if conflict else {}
+    distribution = _distribution(scene, good)
     precision = {}
     for name in free:
         sigma, crb, qcrb = (good[f"{kind}_{name}"] for kind in ("sigma", "crb", "qcrb"))
@@ -220,7 +222,8 @@ def summary_of(
             "n_scattered": _median(good["n_scattered"]),
         },
         "precision": precision,
-        "distribution": _distribution(scene, good),
+        "distribution": distribution,
+        "across_particles": _across(scene, table, distribution),
         "seconds": {name: round(value, 3) for name, value in timings.items()},
     }
 
@@ -272,6 +275,35 @@ def _distribution(scene: Scene, good: pd.DataFrame) -> dict[str, Any] | None:
         window_frames=int(good["n_after"].max()) if len(good) else None,
     )
     return found.to_dict()
+
+
+def _across(
+    scene: Scene, table: pd.DataFrame, distribution: Mapping[str, Any] | None
+) -> list[dict[str, Any]]:
+    """Say how much wider than σ each species is; of a rejected model, poor fits are judged too."""
+    if distribution is None:
+        return []
+    species, status = distribution["species"], table["status"]
+    used = table[status == Status.OK]
+    if rejection(table):
+        used = table[status.isin([Status.OK, Status.POOR_FIT])]
+        mass, sigma = (used[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
+        found = describe(mass, sigma, seed=scene.config.compute.seed)
+        species = found.to_dict()["species"]
+    if not species:
+        return []
+    means = np.array([one["mass_kda"] for one in species])
+    sizes = used["mass_kda"].abs().to_numpy(float)
+    nearest = np.argmin(np.abs(sizes[:, None] - means), axis=1)
+    across = []
+    for k, one in enumerate(species):
+        sigma_median = _median(used["sigma_mass_kda"].to_numpy(float)[nearest == k])
+        if one["outlier"] or not sigma_median:
+            continue
+        keys = ("mass_kda", "width_kda", "width_low", "width_high", "count")
+        over = np.hypot(1.0, one["width_kda"] / sigma_median)
+        across.append({**{key: one[key] for key in keys}, "spread_over_sigma": float(over)})
+    return across
 
 
 def _scale_error(good: pd.DataFrame) -> Callable[[FloatArray], FloatArray] | None:

@@ -79,9 +79,7 @@ def report_context(
         "tiles": _tiles(analysis, table),
         "has_common": any(math.isfinite(p.systematic) for p in precision),
         "has_measured": any(p.is_measured for p in precision),
-        "spread_lines": species_widths(analysis.summary)
-        if caution(table) is None and not is_uncalibrated(analysis)
-        else [],
+        "spread_lines": species_widths(analysis.summary),
         "has_holevo": any(math.isfinite(p.holevo) for p in precision),
         "precision_rows": precision_rows(analysis, precision),
         "warnings": analysis.warnings,

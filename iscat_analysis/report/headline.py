@@ -17,7 +17,7 @@ import pandas as pd
 
 from iscat_analysis.records import FREE_PARAMETERS, Analysis, FloatArray, Status
 from iscat_analysis.report.numbers import LABELS, UNITS, count, fixed, number, percent
-from iscat_analysis.report.spread import counted, rejection
+from iscat_analysis.report.spread import counted, rejection, species_widths
 
 MOST_FLAGGED = 0.2
 """Share of flagged rows above which no headline is given."""
@@ -412,7 +412,7 @@ def spread_lines(analysis: Analysis, table: pd.DataFrame) -> list[str]:
                 "Cramér–Rao bound."
             )
     if rejected:
-        lines.append(rejected)
+        lines += [rejected, *species_widths(analysis.summary)]
     return lines
 
 

@@ -58,7 +58,7 @@ def rejection(table: pd.DataFrame) -> str:
     return (
         f"The model is rejected: {poor} of {p.size} fits have a p-value below {_POOR:g}, where "
         f"{number(_POOR * p.size, 2)} would by chance. Errors of the model, such as a wrong focus, "
-        "aperture or pixel size, are not in σ, in the measured spread only as rings left over of "
+        "aperture or pixel size, are not in σ, and in the spread only as rings left over of "
         "other particles; they show in how far the species are wider than σ."
     )
 
@@ -74,21 +74,24 @@ def species_widths(summary: Mapping[str, Any]) -> list[str]:
     Returns
     -------
     list of str
-        One sentence per species with enough events; empty without species.
+        One sentence per species; relative to its size where masses are not calibrated.
     """
-    found = summary.get("distribution") or {}
     lines = []
-    for one in found.get("species", ()):
-        width, low, high = (one.get(f"width_{key}") for key in ("kda", "low", "high"))
-        if one.get("outlier") or width is None or low is None or high is None:
+    calibrated = summary.get("mass_scale") == "calibration"
+    for one in summary.get("across_particles") or ():
+        values = [one[f"width_{key}"] for key in ("kda", "low", "high")]
+        if not all(value is not None and math.isfinite(value) for value in values):
             continue
-        if not all(math.isfinite(v) for v in (width, low, high)):
-            continue
-        decimals = decimals_for([(high - low) / 2])
+        unit, name = " kDa", f"at {number(one['mass_kda'])} kDa"
+        if not calibrated:
+            unit, name = " %", "of contrast"
+            values = [100 * value / one["mass_kda"] for value in values]
+        decimals = decimals_for([(values[2] - values[1]) / 2])
+        width, low, high = (fixed(value, decimals) for value in values)
         lines.append(
-            f"Across particles: the species at {number(one['mass_kda'])} kDa is "
-            f"{fixed(width, decimals)} kDa ({fixed(low, decimals)} to {fixed(high, decimals)}) "
-            f"wide beyond the σ of its {one['count']:.0f} events."
+            f"Across particles: beyond the σ of its {one['count']:.0f} events the species {name} "
+            f"is {width}{unit} ({low} to {high}) wide, so that its events scatter by "
+            f"{number(one['spread_over_sigma'])} times σ."
         )
     return lines
 

@@ -211,6 +211,17 @@ class Injection(Closed):
     frame_in_interval: Share = maybe("Share whose frame lies inside frame_ci95")
 
 
+class Across(Closed):
+    """How much wider than σ a species is."""
+
+    mass_kda: Number = key("Its mass [kDa]")
+    width_kda: Number = key("Its width beyond σ [kDa]")
+    width_low: Number = key("End of the 95 % interval of the width [kDa]")
+    width_high: Number = key("The other end [kDa]")
+    count: Number = key("Its events")
+    spread_over_sigma: Number = key("Scatter of its events over their median σ")
+
+
 class Repeats(Closed):
     """Whether the measured spread agrees with σ."""
 
@@ -290,6 +301,9 @@ class Summary(Document):
     background: Background = maybe("Movies with background frames: noise and drift")
     landing: Landing = maybe("Landing movies: windows, search, noise and drift")
     injection: Injection = maybe("With --inject: known particles added to the movie")
+    across_particles: list[Across] = maybe(
+        "Width of each species beyond σ; where the model is rejected, poor fits are counted too"
+    )
     repeats: Repeats = maybe("Whether the measured spread agrees with σ")
     optics: Learned = maybe("Where the optics were tested: the test, and what was learned")
     distribution: Distribution | None = maybe(

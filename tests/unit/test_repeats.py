@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from report_factory import make_analysis
 from scenes import PIXEL_NM, make_config
+from scipy.stats import norm
 
 from iscat_analysis.inference import likelihood as models
 from iscat_analysis.inference.achieved import Achieved, pooled
@@ -25,6 +27,7 @@ from iscat_analysis.inference.repeats import (
 )
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline.achieved import likely_noise, spread_verdict, with_measured_sigma
+from iscat_analysis.pipeline.results import _across
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
 from iscat_analysis.report import render_report
 from iscat_analysis.report.headline import headline
@@ -366,9 +369,26 @@ def test_a_rejected_model_is_named_where_the_spread_is() -> None:
 
 
 def test_the_width_of_a_species_is_told_with_its_interval() -> None:
-    species = {"mass_kda": 66.0, "width_kda": 3.14, "width_low": 2.5, "width_high": 3.7}
-    found = {"species": [species | {"count": 120, "outlier": False}]}
-    (line,) = species_widths({"distribution": found})
-    assert "66.0 kDa is 3.14 kDa (2.50 to 3.70)" in line
-    outlier = {"species": [species | {"count": 1, "outlier": True}]}
-    assert species_widths({"distribution": outlier}) == []
+    one = {"mass_kda": 66.0, "width_kda": 3.14, "width_low": 2.5, "width_high": 3.7, "count": 120}
+    found = {"across_particles": [one | {"spread_over_sigma": 1.25}], "mass_scale": "calibration"}
+    (line,) = species_widths(found)
+    assert "at 66.0 kDa is 3.14 kDa (2.50 to 3.70) wide" in line
+    assert "1.25 times σ" in line
+    (line,) = species_widths(found | {"mass_scale": "absolute model"})
+    assert "is 4.76 % (3.79 to 5.61) wide" in line
+    assert species_widths({}) == []
+
+
+def test_species_of_poor_fits_are_judged_where_the_model_is_rejected() -> None:
+    """Masses scatter by 5 % beyond σ = 2 kDa: the page says so though every fit is poor."""
+    rng = np.random.default_rng(10)
+    table = make_analysis(120).table
+    mass = 150.0 + np.hypot(7.5, 2.0) * norm.ppf((np.arange(120) + 0.5) / 120)
+    poor = {"status": "poor_fit", "flags": "poor_fit", "p_value": 1e-9}
+    table = table.assign(mass_kda=mass, sigma_mass_kda=2.0, **poor)
+    scene = SimpleNamespace(config=SimpleNamespace(compute=SimpleNamespace(seed=1)))
+    (one,) = _across(scene, table, {"species": []})  # type: ignore[arg-type]
+    assert one["width_low"] < 7.5 < one["width_high"]
+    assert one["spread_over_sigma"] == pytest.approx(np.hypot(1, 7.5 / 2), rel=0.2)
+    fine = table.assign(status="ok", flags="", p_value=rng.uniform(size=120))
+    assert _across(scene, fine, {"species": []}) == []  # type: ignore[arg-type]
