@@ -18,6 +18,7 @@ from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera, check_counts
 from iscat_analysis.movie.drift import Trajectory, measure_drift
 from iscat_analysis.movie.metadata import diagnose_gain
+from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.pipeline.diagnosis import EXCESS_NOISE, allow_for_correlation
 from iscat_analysis.pipeline.results import table_of
 from iscat_analysis.pipeline.scene import Scene
@@ -40,7 +41,6 @@ from iscat_analysis.search.sliding import (
     measure_frames,
     measure_noise,
 )
-from iscat_analysis.search.spectrum import NoiseSpectrum, measure_spectrum
 
 HALO = 2
 """Windows on either side of a chunk's core: a step, its neighbours, and theirs."""

@@ -17,10 +17,10 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import follow_pattern
 from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain
+from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.pipeline.field import Event
 from iscat_analysis.records import Status, Windows
 from iscat_analysis.search.sliding import measure_noise
-from iscat_analysis.search.spectrum import NoiseSpectrum, measure_spectrum
 
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""

@@ -26,6 +26,7 @@ from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.inference.prior import Prior
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
+from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.pipeline.chunks import (
     FRAME_COLUMN,
@@ -62,7 +63,6 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.sliding import STRIDES, Chunk
-from iscat_analysis.search.spectrum import NoiseSpectrum
 from iscat_analysis.search.templates import LARGEST_IMAGE, make_templates
 
 POSTERIORS = 20

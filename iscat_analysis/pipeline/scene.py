@@ -13,6 +13,7 @@ from iscat_analysis.inference.counts import KNOWN, MEAN, MEDIAN, counts_likeliho
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.movie.background import smooth_background
+from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import (
     FREE_PARAMETERS,
@@ -23,7 +24,6 @@ from iscat_analysis.records import (
     Windows,
     verdict,
 )
-from iscat_analysis.search.spectrum import NoiseSpectrum
 from iscat_analysis.search.templates import Templates, make_templates
 
 SPREAD_NM = 10_000.0

@@ -21,11 +21,11 @@ from scipy.ndimage import maximum_filter
 from iscat_analysis.config import Detection
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.search.peaks import SAMPLED, vertex
 from iscat_analysis.search.residue import EXCEEDS, is_hidden, size_on_ring
-from iscat_analysis.search.spectrum import NoiseSpectrum
 
 HEIGHTS_PER_FRINGE = 8
 """Templates per interference fringe where z is free: half-way between two the match loses 4 %."""

@@ -68,7 +68,7 @@ def test_camera_from_a_movie_and_a_dark(recordings: Path, tmp_path: Path, capsys
         ("read_noise_e", np.hypot(8, 2 / np.sqrt(12))),
     ):
         assert abs(found[key]["value"] - truth) < 4 * found[key]["se"]
-    assert found["masked_pixels"] == {"saturated": 1, "dead": 0, "hot": 0}
+    assert found["masked_pixels"] == {"saturated": 1, "clipped": 0, "dead": 0, "hot": 0}
     assert "saturated and left out" in said.err
     assert found["shot_limited_frames"] == 32
     assert sorted(path.name for path in out.iterdir()) == [

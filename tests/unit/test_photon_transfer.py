@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import convolve1d, gaussian_filter
 
 from iscat_analysis.calibration.camera import CameraCalibration, Estimate, measure_camera
 from iscat_analysis.errors import DataError
@@ -163,6 +163,72 @@ def test_a_dark_alone_gives_counts_only() -> None:
     assert abs(pull(found.read_noise_adu, READ_WITH_ROUNDING_E / GAIN)) < 4
     assert "gain" not in found.to_toml()
     assert set(found.maps) == {"offset_adu"}
+
+
+def with_noise(rng: np.random.Generator, kind: str, frames: int = 160) -> Movie:
+    """Record with pixels that leak into their neighbours, or rows or columns that flicker."""
+    light = np.broadcast_to(scene(rng), (frames, *SHAPE))
+    electrons = rng.poisson(light).astype(float)
+    if kind == "leaky":
+        kernel = (0.1, 0.8, 0.1)
+        for axis in (1, 2):
+            electrons = convolve1d(electrons, kernel, axis=axis)
+    else:
+        lines = (frames, SHAPE[0], 1) if kind == "rows" else (frames, 1, SHAPE[1])
+        electrons *= 1 + 0.01 * rng.standard_normal(lines)
+    return Movie(np.rint(electrons / GAIN + OFFSET).astype(np.uint16))
+
+
+@pytest.mark.parametrize("kind", ["leaky", "rows", "columns"])
+def test_noise_that_pixels_share_does_not_spoil_the_gain(kind: str) -> None:
+    pulls = []
+    for seed in range(SEEDS):
+        found = measure_camera([with_noise(np.random.default_rng(seed), kind)], offset_adu=OFFSET)
+        pulls.append([pull(found.gain_e_per_adu, GAIN)])
+        assert any(("correlated" if kind == "leaky" else f"whole {kind}") in n for n in found.notes)
+    check_pulls(pulls)
+
+
+@pytest.mark.parametrize("kind", ["leaky", "rows", "columns"])
+def test_control_taking_pixels_for_independent_spoils_it(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "iscat_analysis.calibration.camera.measure.measure_spectrum", lambda *_, **__: None
+    )
+    found = measure_camera([with_noise(np.random.default_rng(1), kind)], offset_adu=OFFSET)
+    assert abs(pull(found.gain_e_per_adu, GAIN)) > 20
+
+
+def test_pixels_that_reach_zero_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A third of the pixels are so dark that read noise is cut off at zero; and a control."""
+    third = np.arange(SHAPE[1]) < SHAPE[1] // 3
+
+    def pulls() -> list[list[float]]:
+        found = []
+        for seed in range(SEEDS):
+            rng = np.random.default_rng(seed)
+            light = scene(rng, level=2e4) * np.where(third, 2e-4, 1.0)
+            electrons = rng.poisson(light, (160, *SHAPE)) + 5 * rng.standard_normal((160, *SHAPE))
+            counts = np.clip(np.rint(electrons / GAIN), 0, 65535).astype(np.uint16)
+            calibration = measure_camera([Movie(counts)])
+            found.append([pull(calibration.gain_e_per_adu, GAIN)])
+            found[-1].append(pull(calibration.offset_adu, 0.0))
+        return found
+
+    check_pulls(pulls())
+    nothing = np.zeros(SHAPE, dtype=bool)
+    monkeypatch.setattr("iscat_analysis.calibration.camera.measure.clipped", lambda _: nothing)
+    with pytest.raises(AssertionError):
+        check_pulls(pulls())
+
+
+def test_a_dark_that_reaches_zero_is_noticed() -> None:
+    rng = np.random.default_rng(1)
+    dark = Movie(np.clip(np.rint(3 * rng.standard_normal((60, *SHAPE))), 0, 9).astype(np.uint16))
+    light = record(scene(rng), 60, rng)
+    notes = measure_camera([light], dark=dark).notes
+    assert any("reach zero counts" in note for note in notes)
 
 
 def test_bad_pixels_are_left_out_and_reported() -> None:

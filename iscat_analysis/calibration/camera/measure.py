@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from iscat_analysis.calibration.camera.moments import (
     robust_sigma,
 )
 from iscat_analysis.calibration.camera.pixels import (
+    KINDS,
+    clipped,
     mask_notes,
     saturated,
     stand_out,
@@ -26,8 +29,10 @@ from iscat_analysis.calibration.camera.pixels import (
 )
 from iscat_analysis.calibration.camera.regression import Solution, dark_numbers, solve
 from iscat_analysis.calibration.camera.repeats import without_repeats
-from iscat_analysis.calibration.camera.result import CameraCalibration
+from iscat_analysis.calibration.camera.result import CameraCalibration, Estimate
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress, silent
 
 LEAST_FRAMES = 8
@@ -37,6 +42,8 @@ LEAST_FRAMES_FOR_MAPS = 100
 """Fewer leave the gain of one pixel uncertain by more than 17 %."""
 
 _LEAST_PIXELS = 64
+_SPECTRUM_FRAMES = 128  # on which correlations of pixels are measured
+_CLIPPED = 0.01  # of a dark's pixels at zero that are worth a line
 _CURVED = 3.0  # reduced χ² of the photon-transfer curve
 _CURVE_COLUMNS = ["mean_adu", "variance_adu2", "variance_se", "fit_adu2", "pixels"]
 
@@ -89,12 +96,19 @@ def measure_camera(
         done += frames
         progress("photon transfer", done, total)
 
-    masked = {name: np.zeros(shape, dtype=np.bool_) for name in ("saturated", "dead", "hot")}
+    masked = {name: np.zeros(shape, dtype=np.bool_) for name in KINDS}
     dark_found = None
     if dark is not None:
         dark_found = moments_of(dark, None, advance)
         masked["hot"] |= stand_out(dark_found.mean) | stand_out(dark_found.variance)
         masked["dead"] |= dark_found.variance <= 0
+        low = float(np.mean(clipped(dark_found.lowest)))
+        if low > _CLIPPED:
+            notes.append(
+                f"{100 * low:.0f} % of the dark's pixels reach zero counts, where noise is cut "
+                "off: its offset is too high and its read noise too small; raise the camera's "
+                "offset"
+            )
         if masked["dead"].all():
             raise DataError(
                 f"{dark.name}: every frame is the same: this is not raw camera data; record a dark"
@@ -111,6 +125,7 @@ def measure_camera(
         measured = moments_of(stack, lit, advance)
         full = saturated(measured.highest, stack.name)
         masked["saturated"] |= full
+        masked["clipped"] |= clipped(measured.lowest) & (measured.variance > 0)
         masked["dead"] |= (measured.variance <= 0) & ~full
         masked["dead"] |= unlike_neighbours(measured.mean - floor, high=math.inf) & ~full
         masked["hot"] |= unlike_neighbours(measured.mean - floor, low=-math.inf) & ~full
@@ -118,16 +133,33 @@ def measure_camera(
     used = ~np.logical_or.reduce(list(masked.values()))
     if np.count_nonzero(used) < _LEAST_PIXELS:
         raise DataError(
-            f"{light[0].name}: only {np.count_nonzero(used)} pixels are lit, unsaturated and alive "
-            f"throughout, fewer than {_LEAST_PIXELS}; lower the exposure, or record a flat"
+            f"{light[0].name}: only {np.count_nonzero(used)} pixels are lit, above zero counts, "
+            f"unsaturated and alive throughout, fewer than {_LEAST_PIXELS}; change the exposure or "
+            "the camera's offset, or record a flat"
         )
     used &= ~unsteady(found, used)
-    masked["hot"] |= ~(used | masked["saturated"] | masked["dead"])
+    masked["hot"] |= ~(used | masked["saturated"] | masked["dead"] | masked["clipped"])
 
-    result = solve(found, used, dark_found, offset_adu, notes)
-    notes += mask_notes(masked)
+    said: list[str] = []
+    result = solve(found, used, dark_found, offset_adu, said)
     longest = int(np.argmax([item.n_frames for item in found]))
+    spectrum = _spectrum(light[longest], ~used, result)
+    if spectrum is not None and any(spectrum.shared):
+        lines = "rows" if spectrum.shared[0] >= spectrum.shared[1] else "columns"
+        found = [
+            replace(item, variance=moments_of(stack, used, _nothing, flickering=lines).variance)
+            for stack, item in zip(light, found, strict=True)
+        ]
+        said = [
+            f"whole {lines} flicker ({100 * max(spectrum.shared):.2g} % of the noise variance); "
+            f"the flicker of each of the {lines} was taken out"
+        ]
+        result = solve(found, used, dark_found, offset_adu, said)
+        spectrum = _spectrum(light[longest], ~used, result)
+    notes += [*said, *mask_notes(masked)]
     noise = noise_curve(light[longest], found[longest], used, result, progress)
+    if spectrum is not None and spectrum.correlated:
+        result = _with_neighbours(result, spectrum, notes)
     limit, verdict = verdict_of(noise)
     return CameraCalibration(
         gain_e_per_adu=result.gain,
@@ -144,6 +176,40 @@ def measure_camera(
         maps=_maps(found, used, dark_found, result, notes) if maps else {},
         frames=sum(item.n_frames for item in found),
         notes=tuple(notes),
+    )
+
+
+def _nothing(frames: int) -> None:
+    """Tell nobody of frames that are read once more."""
+
+
+def _spectrum(stack: FrameSource, masked: BoolArray, result: Solution) -> NoiseSpectrum | None:
+    """Measure the noise of a stack as that of the camera that was found."""
+    camera = Camera(
+        gain_e_per_adu=result.gain.value,
+        offset_adu=result.offset.value,
+        read_noise_e=result.read_e.value if result.read_e else 0.0,
+    )
+    counts = stack.read(0, min(stack.shape[0], _SPECTRUM_FRAMES))
+    return measure_spectrum(counts, camera, masked=masked)
+
+
+def _with_neighbours(result: Solution, spectrum: NoiseSpectrum, notes: list[str]) -> Solution:
+    """Judge the gain by the noise that neighbouring pixels have together."""
+    summed, error = (value / spectrum.variance for value in spectrum.summed)
+    gain, scatter = result.gain.value / summed, math.sqrt(spectrum.alike) * result.gain.se
+    x, y = spectrum.neighbours
+    notes.append(
+        f"the noise of neighbouring pixels is correlated ({x:+.2f} in x, {y:+.2f} in y): pixels "
+        f"share charge or are filtered, and one alone has {1 / summed:.3g} of the variance of its "
+        "light; the gain is from the noise that neighbours have together"
+    )
+    read = result.read_e
+    return replace(
+        result,
+        gain=Estimate(gain, math.hypot(scatter / summed, gain * error / summed)),
+        read_e=Estimate(read.value / summed, read.se / summed) if read else None,
+        read_below_e=result.read_below_e / summed if result.read_below_e else None,
     )
 
 

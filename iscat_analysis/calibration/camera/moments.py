@@ -16,6 +16,7 @@ from iscat_analysis.records import BoolArray, FloatArray, FrameSource
 _BLOCK_BYTES = 32 * 2**20
 _BINS = 32
 _MAD = 0.6744898
+_TOGETHER = {"frames": (1, 2), "rows": (2,), "columns": (1,)}  # axes of (t, y, x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +29,8 @@ class Moments:
         Over the frames; the variance without the laser's flicker where that was taken out.
     slope, slope_variance : ndarray, shape (y, x)
         Of the pixel against the mean frame, 1 on average; NaN where nothing flickers.
-    highest : ndarray, shape (y, x)
-        Largest count, of the stack's own type.
+    highest, lowest : ndarray, shape (y, x)
+        Largest and least count, of the stack's own type.
     n_frames : int
         Frames read.
     """
@@ -39,6 +40,7 @@ class Moments:
     slope: FloatArray
     slope_variance: FloatArray
     highest: NDArray[Any]
+    lowest: NDArray[Any]
     n_frames: int
 
     @property
@@ -99,9 +101,13 @@ def brightness_bins(mean: FloatArray) -> list[NDArray[np.intp]]:
 
 
 def moments_of(
-    stack: FrameSource, used: BoolArray | None, advance: Callable[[int], None]
+    stack: FrameSource,
+    used: BoolArray | None,
+    advance: Callable[[int], None],
+    *,
+    flickering: str = "frames",
 ) -> Moments:
-    """Measure mean and variance of every pixel; with `used`, the laser's flicker is taken out.
+    """Measure mean and variance of every pixel; with `used`, the light's flicker is taken out.
 
     Parameters
     ----------
@@ -111,6 +117,8 @@ def moments_of(
         Pixels whose mean is the laser's power; None for a dark.
     advance : callable
         Told how many more frames are done.
+    flickering : {"frames", "rows", "columns"}
+        Which pixels flicker together.
 
     Returns
     -------
@@ -126,13 +134,16 @@ def moments_of(
     -----
     Differences d_k of successive frames have the covariance v·(2, −1 beside the diagonal).  Their
     regression on the differences D_k of the mean over `used` takes away DᵀMD/DᵀD of the 2(K − 1)
-    squares that are expected, with M that matrix; the mean carries 1/P of each pixel's noise.
+    squares that are expected, with M that matrix; the mean carries 1/P of each pixel's noise, of
+    which a pixel that follows it s times as strongly loses s/P.
+    Where rows or columns flicker, the mean is that of each.
     """
+    together = _TOGETHER[flickering]
     frames, rows, columns = stack.shape
     total = np.zeros((rows, columns))
     squares = np.zeros((rows, columns))
     product = np.zeros((rows, columns))
-    highest = stack.read(0, 1)[0]
+    highest = lowest = stack.read(0, 1)[0]
     flicker = []
     last: FloatArray | None = None
     for start, stop in blocks(stack):
@@ -142,6 +153,7 @@ def moments_of(
                 f"{stack.name}: frames {start} to {stop - 1} hold NaN or infinity; give raw counts"
             )
         highest = np.maximum(highest, counts.max(axis=0))
+        lowest = np.minimum(lowest, counts.min(axis=0))
         block = counts.astype(np.float64)
         total += block.sum(axis=0)
         if last is not None:
@@ -149,8 +161,8 @@ def moments_of(
         steps = np.diff(block, axis=0)
         squares += np.einsum("kyx,kyx->yx", steps, steps)
         if used is not None:
-            common = steps[:, used].mean(axis=1)
-            product += np.tensordot(common, steps, axes=1)
+            common = np.mean(steps, axis=together, keepdims=True, where=used)
+            product += np.einsum("kyx,kyx->yx", np.broadcast_to(common, steps.shape), steps)
             flicker.append(common)
         last = block[-1]
         advance(stop - start)
@@ -158,19 +170,22 @@ def moments_of(
     mean = total / frames
     if used is None:
         still, certain = np.ones_like(mean), np.zeros_like(mean)
-        return Moments(mean, squares / (2 * n), still, certain, highest, frames)
+        return Moments(mean, squares / (2 * n), still, certain, highest, lowest, frames)
     common = np.concatenate(flicker)
-    power = float(common @ common)
-    spread = 2 * power - 2 * float(common[:-1] @ common[1:])
-    if power <= 0:
+    power = np.sum(common**2, axis=0)
+    spread = 2 * power - 2 * np.sum(common[:-1] * common[1:], axis=0)
+    if not power.any():
         raise DataError(
             f"{stack.name}: successive frames are identical: this is not raw camera data"
         )
-    pixels = int(np.count_nonzero(used))
-    variance = (squares - product**2 / power) / (2 * n - spread / power) / (1 - 1 / pixels)
-    own = 2 * n * variance / pixels
-    slope_power = power - float(own[used].mean())
-    usable = slope_power > 0.1 * power  # else the flicker is the frames' own noise
+    in_frame = tuple(axis - 1 for axis in together)
+    pixels = np.sum(used, axis=in_frame, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):  # lines in which no pixel is used
+        variance = (squares - product**2 / power) / (2 * n - spread / power)
+        variance /= 1 - product / power / pixels
+        own = 2 * n * variance / pixels
+    slope_power = power - np.mean(own, axis=in_frame, keepdims=True, where=used)
+    usable = bool(np.all(slope_power > 0.1 * power))  # else the flicker is the frames' own noise
     slope = (product - own) / slope_power if usable else np.full_like(mean, np.nan)
     slope_variance = variance * spread / slope_power**2 if usable else np.full_like(mean, np.nan)
-    return Moments(mean, variance, slope, slope_variance, highest, frames)
+    return Moments(mean, variance, slope, slope_variance, highest, lowest, frames)

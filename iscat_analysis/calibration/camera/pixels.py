@@ -15,6 +15,9 @@ from iscat_analysis.movie.camera import converter_ceiling
 from iscat_analysis.records import BoolArray, FloatArray
 
 _DARK, _BRIGHT = 0.2, 5.0  # of the neighbours' median, as in the stage background
+KINDS = ("saturated", "clipped", "dead", "hot")
+"""What may be wrong with a pixel."""
+
 _OUTLIER_SIGMAS = 8.0
 
 
@@ -70,6 +73,23 @@ def unlike_neighbours(light: FloatArray, *, low: float = _DARK, high: float = _B
     with np.errstate(invalid="ignore"):
         found: BoolArray = (light < low * local) | (light > high * local)
     return np.asarray(found & (local > 0), dtype=np.bool_)
+
+
+def clipped(lowest: NDArray[Any]) -> BoolArray:
+    """Find pixels that reached zero counts, below which nothing is stored.
+
+    Parameters
+    ----------
+    lowest : ndarray, shape (y, x)
+        Least count of each pixel, of the stack's own type.
+
+    Returns
+    -------
+    ndarray of bool, shape (y, x)
+        Where noise may have been cut off; nowhere in signed numbers.
+    """
+    unsigned = np.issubdtype(lowest.dtype, np.unsignedinteger)
+    return np.asarray((lowest == 0) & unsigned, dtype=np.bool_)
 
 
 def stand_out(values: FloatArray) -> BoolArray:

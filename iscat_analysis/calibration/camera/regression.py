@@ -20,6 +20,7 @@ _USABLE_SLOPE = 0.30  # relative standard error beyond which a gain is none
 _GOOD_SLOPE = 0.05
 _USABLE_OFFSET = 0.05  # standard error over the light level
 _STEADY = 2.0  # robust χ² of the flicker line beyond which the scene has moved
+_SEEN = 5.0  # standard errors of its variance from which read noise is more than chance made it
 _LEAST_RELIABILITY = 0.9  # of the spread of the means that is not their own noise
 
 
@@ -125,7 +126,7 @@ def solve(
     read = intercept + slope * offset.value
     gradient = np.array([1.0, offset.value])
     read_se = math.sqrt(gradient @ cov @ gradient + (slope * offset.se) ** 2)
-    if read > 2 * read_se:
+    if read > _SEEN * read_se:
         root = math.sqrt(read)
         adu = Estimate(root, read_se / (2 * root))
         electrons = Estimate(root / slope, math.hypot(adu.se / slope, root * relative / slope))

@@ -59,7 +59,8 @@ class CameraCalibration:
     verdict : str
         The same in one sentence.
     masked : dict of str to ndarray of bool, shape (y, x)
-        ``"saturated"``, ``"dead"``, ``"hot"`` (bright or noisy beyond its neighbours).
+        ``"saturated"``, ``"clipped"`` (at zero counts, where noise is cut off), ``"dead"``,
+        ``"hot"`` (bright or noisy beyond its neighbours).
     maps : dict of str to ndarray, shape (y, x)
         As far as the recordings give them and they were asked for: ``"gain_e_per_adu"``,
         ``"offset_adu"``, ``"read_noise_e"``.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.records import BoolArray, FloatArray, Mapper
 
 REACH_PX = 6
 """Distance of pixels up to which their noise may be correlated, beyond what rows share."""
@@ -69,6 +69,12 @@ class NoiseSpectrum:
     neighbours: tuple[float, float]
     shared: tuple[float, float]
     summed: tuple[float, float]
+
+    @property
+    def alike(self) -> float:
+        """How many times fewer pixels would tell as much of the variance, were they independent."""
+        covariance = fft.irfft2(self.power, s=self.shape)
+        return float(np.sum(np.square(covariance / covariance[0, 0])))
 
     @property
     def correlated(self) -> bool:
@@ -152,7 +158,11 @@ class NoiseSpectrum:
 
 
 def measure_spectrum(
-    counts: NDArray[Any], camera: Camera, *, mapper: Mapper = map
+    counts: NDArray[Any],
+    camera: Camera,
+    *,
+    masked: BoolArray | None = None,
+    mapper: Mapper = map,
 ) -> NoiseSpectrum | None:
     """Measure the noise between neighbouring frames.
 
@@ -162,6 +172,8 @@ def measure_spectrum(
         Consecutive good frames.
     camera : Camera
         Counts → photoelectrons.
+    masked : ndarray of bool, shape (y, x), optional
+        Pixels to leave out; saturated ones always are.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -186,6 +198,8 @@ def measure_spectrum(
     mean = gain * (counts[frames].mean(axis=0) - offset)
     read = camera.read_variance_e2((rows, columns))
     used = (mean > 0) & ~camera.saturated(counts[frames].max(axis=0))
+    if masked is not None:
+        used &= ~masked
     if used.mean() < 0.5:
         return None
     light = float(mean[used].mean())
@@ -205,7 +219,9 @@ def measure_spectrum(
         return spectrum
 
     total = sum(mapper(periodogram, starts.tolist()))
-    covariance = fft.irfft2(total, s=(rows, columns)) / (pairs * np.count_nonzero(used))
+    # in how many pairs of frames and of used pixels each distance occurs
+    alike = fft.irfft2(np.abs(fft.rfft2(used.astype(np.float64))) ** 2, s=(rows, columns))
+    covariance = fft.irfft2(total, s=(rows, columns)) / (pairs * np.maximum(np.rint(alike), 1.0))
     light = np.sqrt(np.where(used, mean, np.mean(mean, where=used)))
     return _spectrum_of(covariance, 1 / math.sqrt(pairs * np.count_nonzero(used)), light)
 
@@ -216,6 +232,8 @@ def _spectrum_of(
     """Keep of a covariance (rows, columns) what is near, and what rows and columns share."""
     here, lags = REACH_PX, np.arange(-REACH_PX, REACH_PX + 1)
     far_y, far_x = (slice(REACH_PX + 1, n - REACH_PX) for n in covariance.shape)
+    # a frame's mean was taken for its power, which takes the same from every covariance
+    covariance = covariance - covariance[far_y, far_x].mean()
     variance = float(covariance[0, 0])
     error *= variance
 
