@@ -12,7 +12,6 @@ import numpy as np
 
 from iscat_analysis.calibration.optics import LEAST_SIGHTS, Judgement, Sight, judge
 from iscat_analysis.calibration.optics.measured_picture import (
-    MARGIN_PX,
     PictureFit,
     fit_own,
     fit_picture,
@@ -38,6 +37,14 @@ from iscat_analysis.records import Mapper, Progress, silent
 HELD_OUT_P = 1e-3
 """p-value of the held-out pictures' p-values, below which the template does not describe them."""
 
+MARGINS_PX = (10, 6, 2)
+"""Pixels by which pictures may be cut larger on every side than the square that is fitted later.
+
+The farther the template reaches, the more is known of the rings of a particle's neighbours; but
+the larger a picture, the fewer hold one particle alone.
+"""
+
+_PLENTY = 18  # pictures with which a margin is good enough
 _HELD_OUT = 3  # every third picture is held out
 _CONTAMINATED_P = 1e-4  # something else happened in a picture with a smaller p-value
 _CONTAMINATED_SHARE = 0.25  # more than this is the template's fault
@@ -189,20 +196,23 @@ def measure_template(
         )
     pixel = float(config.camera.pixel_size_nm or np.nan)
     roi_nm = config.fit.roi_px(pixel) * pixel
-    larger = config.fit.model_copy(update={"roi_nm": roi_nm + 2 * MARGIN_PX * pixel})
     physics = config.optics.model_copy(update={"psf": "model", "template": None})
-    cut = config.model_copy(update={"fit": larger, "optics": physics, "calibration": None})
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     landing = has_landings(config)
     with ThreadPoolExecutor(config.compute.workers) as pool:
-        progress("particles", 0, 1)
-        sights, others = (
-            landing_sights(movie, cut, camera, pool)
-            if landing
-            else bound_sights(movie, cut, camera)
-        )
-        progress("particles", 1, 1)
-        alone = _alone(sights, others)
+        for number, margin in enumerate(MARGINS_PX):
+            progress("particles", number, len(MARGINS_PX))
+            larger = config.fit.model_copy(update={"roi_nm": roi_nm + 2 * margin * pixel})
+            cut = config.model_copy(update={"fit": larger, "optics": physics, "calibration": None})
+            found = (
+                landing_sights(movie, cut, camera, pool)
+                if landing
+                else bound_sights(movie, cut, camera)
+            )
+            alone = _alone(*found)
+            if len(alone) >= _PLENTY:
+                break
+        progress("particles", len(MARGINS_PX), len(MARGINS_PX))
         if len(alone) < LEAST_SIGHTS:
             raise DataError(
                 f"{movie.path.name}: shows {len(alone)} bright particles without another nearby, "

@@ -278,7 +278,8 @@ def _stay(events: Events, best: Mixture, window_frames: int | None) -> FloatArra
     """Frames that a particle of each species must stay to be found every other time."""
     if window_frames is None or events.efficiency is None:
         return np.full(best.mean.shape, math.nan)
-    frames = np.ceil(window_frames * events.efficiency.threshold_kda / best.mean)
+    with np.errstate(divide="ignore"):  # one of no mass is never found
+        frames = np.ceil(window_frames * events.efficiency.threshold_kda / best.mean)
     return np.where(frames <= window_frames, np.maximum(frames, 1.0), math.nan)
 
 

@@ -252,3 +252,16 @@ def test_efficiency_is_stated_for_stays_as_long_as_the_window() -> None:
     assert "480 kDa from 3 frames" in note
     without = describe(mass, np.full(200, 6.0), seed=1, draws=0, max_species=1)
     assert not any("stay" in note for note in without.notes)
+
+
+def test_events_that_only_crowd_the_threshold_stop_nothing() -> None:
+    """Noise falls off so steeply above the threshold that the likeliest species has no mass."""
+    noise = 6.0
+    mass = 5 * noise + np.random.default_rng(3).exponential(noise / 8, 200)
+    found = describe(
+        mass, np.full(200, noise), efficiency=Efficiency(5.0, noise), seed=1, draws=0,
+        max_species=1, window_frames=40,
+    )  # fmt: skip
+    (species,) = found.species.to_dict("records")
+    assert species["mass_kda"] == 0
+    assert math.isnan(species["stay_frames"])

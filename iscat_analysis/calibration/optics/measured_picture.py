@@ -28,9 +28,6 @@ from iscat_analysis.optics.forward import ForwardModel, peak_per_amplitude, with
 from iscat_analysis.optics.measured import Template
 from iscat_analysis.records import FloatArray, Mapper
 
-MARGIN_PX = 2
-"""Pixels by which pictures are cut larger on every side than the square that is fitted later."""
-
 _ROUNDS = 8
 _SETTLED = 0.1  # change of the picture, over its noise, at which rounds end
 _FADE_NM = 250.0  # beyond the pictures the template fades to nothing
