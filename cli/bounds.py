@@ -40,7 +40,7 @@ Along the focus, with a figure; the best focus for the mass; what 5 kDa takes:
 
 Which pupil would tell height and mass best, with optics.toml and a figure:
 
-    iscat bounds --config setup.toml --mode joint --optimize pupil --free focus,phase --out best
+    iscat bounds --config setup.toml --mode joint --optimize pupil --out best
 
 How well 60 such particles would tell the microscope itself:
 

@@ -21,7 +21,7 @@ from report_factory import make_analysis
 
 from iscat_analysis.config import load_config
 from iscat_analysis.errors import DataError
-from iscat_analysis.records import EVENT_COLUMNS
+from iscat_analysis.records import EVENT_COLUMNS, REPEAT_COLUMNS
 from iscat_analysis.report import write_report
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output, claim_output
 from iscat_analysis.study.simulate import write_stack
@@ -142,7 +142,7 @@ def assert_whole(result: Path, extra: tuple[str, ...] = ()) -> None:
     """Every file is there and complete; `extra` are the table's further columns."""
     assert REQUIRED <= set(names(result)) <= OUTPUT_NAMES
     table = pd.read_csv(result / "fits.csv")
-    assert tuple(table.columns) == (*EVENT_COLUMNS, *extra)
+    assert tuple(table.columns) == (*EVENT_COLUMNS, *extra, *REPEAT_COLUMNS)
     with (result / "fits.parquet").open("rb") as file:
         assert len(pd.read_parquet(file)) == len(table)
     summary = json.loads((result / "summary.json").read_text(encoding="utf-8"))
@@ -357,7 +357,7 @@ def test_a_run_that_is_under_way_is_respected(forker: Forker, place: Path) -> No
 # ---- disks ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("limit", [400, 8_000, 40_000])
+@pytest.mark.parametrize("limit", [400, 8_000, 30_000])
 def test_a_file_that_cannot_grow(forker: Forker, place: Path, limit: int) -> None:
     (answer,) = forker.run({"run": FIT, "cwd": str(place), "limit": limit})
     assert answer["status"] == 1

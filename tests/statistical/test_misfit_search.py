@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -113,7 +114,18 @@ def test_a_faint_particle_is_as_badly_described_as_a_bright_one() -> None:
     assert not ring.is_dwarfed([ring, Described(30.0, 0.0)])  # no brighter one explains it
 
 
-def test_noise_that_passes_the_threshold_everywhere_stops_the_search() -> None:
+def test_a_wrong_gain_is_said_and_invents_nothing() -> None:
+    """Seven times the noise that the camera's gain predicts: the threshold knows what it is."""
+    result, said = _analysed(Instrument(), gain=28.0)
+    assert any(re.search(r"set camera\.gain_e_per_adu = [34]\.", text) for text in said)
+    assert 0.9 * COUNT <= len(result.table) <= COUNT
+
+
+def test_noise_that_passes_the_threshold_everywhere_stops_the_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The same where the noise between neighbouring frames does not tell it."""
+    monkeypatch.setattr("iscat_analysis.pipeline.chunks.measure_spectrum", lambda *_, **__: None)
     with pytest.raises(DataError, match=r"set camera\.gain_e_per_adu = [34]\."):
         _analysed(Instrument(), gain=28.0)
 
