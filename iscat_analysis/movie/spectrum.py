@@ -81,24 +81,29 @@ class NoiseSpectrum:
         """Whether neighbouring pixels are."""
         return max(map(abs, self.neighbours)) > _NEGLIGIBLE
 
-    def whitened(self, image: NDArray[Any]) -> NDArray[Any]:
-        """Divide an image by the noise's power at every frequency.
+    def whitened(self, weighted: NDArray[Any], weight: NDArray[Any]) -> NDArray[Any]:
+        """Turn a signal, times its information, into what a template's overlap is taken with.
 
         Parameters
         ----------
-        image : ndarray, shape (y, x)
-            In units of each pixel's expected noise.
+        weighted : ndarray, shape (y, x)
+            Signal times `weight`.
+        weight : ndarray, shape (y, x)
+            Information of each pixel about its signal, as of noise that is as expected; 0 where a
+            pixel is not used.
 
         Returns
         -------
         ndarray
-            Of the same shape and type; the inner product with another image is the one in which
-            the noise is white.
+            Of the same shape and type; `weighted` itself where the noise is as expected.
         """
-        spectrum = fft.rfft2(np.pad(image, MARGIN_PX, mode="symmetric"))
-        spectrum /= self.power.astype(image.dtype)
-        whitened: NDArray[Any] = fft.irfft2(spectrum, s=self.shape)
-        return whitened[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
+        root = np.sqrt(weight)
+        in_noise = np.divide(weighted, root, out=np.zeros_like(root), where=root > 0)
+        spectrum = fft.rfft2(np.pad(in_noise, MARGIN_PX, mode="symmetric"))
+        spectrum /= self.power.astype(weighted.dtype)
+        whitened = fft.irfft2(spectrum, s=self.shape)[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
+        out: NDArray[Any] = root * whitened
+        return out
 
     def dual(self, template: FloatArray) -> FloatArray:
         """Give what an image's product with a template is, to the noise, as a product of numbers.

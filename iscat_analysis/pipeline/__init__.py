@@ -36,11 +36,9 @@ from iscat_analysis.pipeline.achieved import (
 )
 from iscat_analysis.pipeline.diagnosis import (
     EXCESS_NOISE,
-    allow_for_correlation,
     drift_warning,
     examine_background,
-    judge_gain,
-    judge_spectrum,
+    judge_background,
     misfit_warning,
     pixel_warnings,
 )
@@ -348,16 +346,13 @@ def _measured_background(
         check=check,
         progress=progress,
     )
-    spectrum = judge_spectrum(movie, camera, windows)
+    gain, spectrum = judge_background(movie, camera, windows)
     if spectrum is not None:
         scene = make_scene(config, shape, searches=searches, noise=spectrum)
         if spectrum.message:
             tell(f"{movie.name}: {spectrum.message}")
-    gain = judge_gain(movie, camera, windows)
-    if gain is not None:
-        gain = allow_for_correlation(gain, spectrum)
-        if gain.message:
-            tell(gain.message)
+    if gain is not None and gain.message:
+        tell(gain.message)
     for text in pixel_warnings(windows):
         tell(text)
     if not scene.additive:

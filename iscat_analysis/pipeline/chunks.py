@@ -214,8 +214,10 @@ class Noise:
     spectrum: NoiseSpectrum | None
 
 
-def judge_noise(reader: Reader, config: Config, mapper: Mapper = map) -> Noise:
-    """Compare the noise with the camera's, and choose how many frames around a step are summed.
+def judge_window(
+    reader: Reader, config: Config, mapper: Mapper = map
+) -> tuple[NDArray[Any], NoiseCurve, int]:
+    """Choose how many frames around a step are summed.
 
     Parameters
     ----------
@@ -228,8 +230,12 @@ def judge_noise(reader: Reader, config: Config, mapper: Mapper = map) -> Noise:
 
     Returns
     -------
-    Noise
-        Window, noise curve, and what is to be said of the gain.
+    opening : ndarray, shape (t, y, x)
+        Good frames among the first.
+    curve : NoiseCurve
+        Noise against averaging, of these.
+    window : int
+        Frames before, and as many after, each step.
 
     Raises
     ------
@@ -253,6 +259,32 @@ def judge_noise(reader: Reader, config: Config, mapper: Mapper = map) -> Noise:
     longest = min(given or longest_window(frames), _NOISE_FRAMES // 4)
     curve = measure_noise(opening, reader.camera, longest, mapper=mapper)
     window = given or choose_window(curve, frames)
+    return opening, curve, window
+
+
+def judge_noise(reader: Reader, config: Config, mapper: Mapper = map) -> Noise:
+    """Compare the noise with the camera's, and choose how many frames around a step are summed.
+
+    Parameters
+    ----------
+    reader : Reader
+        The frames.
+    config : Config
+        ``background.window_frames`` wins where it is given.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    Noise
+        Window, noise curve, and what is to be said of the gain.
+
+    Raises
+    ------
+    DataError
+        The movie is shorter than two windows, or holds no two frames that differ.
+    """
+    opening, curve, window = judge_window(reader, config, mapper)
     spectrum = measure_spectrum(opening, reader.camera, mapper=mapper)
     message, ratio = "", 1.0
     try:

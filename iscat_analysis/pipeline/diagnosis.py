@@ -39,8 +39,10 @@ EXCESS_NOISE = 1.4
 """Noise variance over the expected from which a thousand candidates are taken for noise."""
 
 
-def judge_gain(movie: Stack, camera: Camera, windows: Windows) -> GainDiagnosis | None:
-    """Compare the noise of the background frames with the gain.
+def judge_background(
+    movie: Stack, camera: Camera, windows: Windows
+) -> tuple[GainDiagnosis | None, NoiseSpectrum | None]:
+    """Compare the noise of the background frames with the camera's.
 
     Parameters
     ----------
@@ -53,37 +55,20 @@ def judge_gain(movie: Stack, camera: Camera, windows: Windows) -> GainDiagnosis 
 
     Returns
     -------
-    GainDiagnosis or None
+    gain : GainDiagnosis or None
         None where there is no shot noise to look at.
+    spectrum : NoiseSpectrum or None
+        None where the noise is white and of the expected size, or there is none to look at.
     """
     if windows.n_before < 2 or not _is_lit(windows):
-        return None
+        return None, None
+    counts = _first(movie, windows, _SPECTRUM_FRAMES)
+    spectrum = measure_spectrum(counts, camera)
     try:
-        return diagnose_gain(_first(movie, windows, _GAIN_FRAMES), camera, masked=windows.masked)
+        gain = diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=windows.masked)
     except DataError:  # too dark to tell
-        return None
-
-
-def judge_spectrum(movie: Stack, camera: Camera, windows: Windows) -> NoiseSpectrum | None:
-    """Measure the noise of the background frames at every spatial frequency.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    windows : Windows
-        The background.
-
-    Returns
-    -------
-    NoiseSpectrum or None
-        None where it is white and of the expected size, or there is no shot noise to look at.
-    """
-    if windows.n_before < 2 or not _is_lit(windows):
-        return None
-    return measure_spectrum(_first(movie, windows, _SPECTRUM_FRAMES), camera)
+        return None, spectrum
+    return allow_for_correlation(gain, spectrum), spectrum
 
 
 def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:

@@ -39,7 +39,7 @@ from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.pipeline.chunks import Reader, counts_budget, judge_noise, plan_chunks
+from iscat_analysis.pipeline.chunks import Reader, counts_budget, judge_window, plan_chunks
 from iscat_analysis.pipeline.landing import has_landings
 from iscat_analysis.pipeline.ranges import frame_ranges
 from iscat_analysis.records import Mapper, Progress, Windows, silent
@@ -302,7 +302,7 @@ def landing_sights(
     """
     first, last = config.fit.frames or (0, movie.shape[0])
     reader = Reader(movie, camera, first, min(last, movie.shape[0]), counts_budget(config))
-    window = judge_noise(reader, config, pool.map).window
+    _, _, window = judge_window(reader, config, pool.map)
     stride = max(1, window // STRIDES)
     found: list[BrightStep] = []
     rest: list[BrightStep] = []

@@ -181,9 +181,7 @@ def signal_to_noise(
     duals = templates.images if templates.noise is None else templates.noise.dual(templates.images)
     norm = _correlate(weight, templates.images * duals)
     if templates.noise is not None:
-        root = np.sqrt(np.maximum(weight, 0.0))
-        in_noise = np.divide(weighted, root, out=np.zeros_like(root), where=root > 0)
-        weighted = root * templates.noise.whitened(in_noise)
+        weighted = templates.noise.whitened(weighted, np.maximum(weight, 0.0))
     overlap = _correlate(weighted, templates.images)
     norm = np.maximum(norm, 1e-9 * norm.max() if norm.max() > 0 else 1.0)
     return overlap / np.sqrt(norm), overlap / norm

@@ -14,10 +14,10 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.camera import converter_ceiling
 from iscat_analysis.records import BoolArray, FloatArray
 
-_DARK, _BRIGHT = 0.2, 5.0  # of the neighbours' median, as in the stage background
 KINDS = ("saturated", "clipped", "dead", "hot")
 """What may be wrong with a pixel."""
 
+_DARK, _BRIGHT = 0.2, 5.0  # of the neighbours' median, as in the stage background
 _OUTLIER_SIGMAS = 8.0
 
 

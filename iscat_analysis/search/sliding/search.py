@@ -56,14 +56,6 @@ class Filter:
     norm: MapArray
     noise: NoiseSpectrum | None
 
-    def whiten(self, weighted: MapArray) -> None:
-        """Turn weight·contrast (y, x) in place into what a template's overlap is taken with."""
-        if self.noise is None:
-            return
-        root = np.sqrt(self.weight)
-        in_noise = np.divide(weighted, root, out=np.zeros_like(root), where=root > 0)
-        weighted[:] = root * self.noise.whitened(in_noise)
-
 
 def make_filter(chunk: Chunk, template: FloatArray, noise: NoiseSpectrum | None = None) -> Filter:
     """Prepare the matched filter.
@@ -175,7 +167,9 @@ def sliding_maps(
             )
             if known is not None:
                 image[:rows, :columns] -= (matched.weight * known).astype(np.float32)
-        matched.whiten(image[:rows, :columns])
+        if matched.noise is not None:
+            field = image[:rows, :columns]
+            field[:] = matched.noise.whitened(field, matched.weight)
         spectrum = fft.rfft2(image)
         spectrum *= matched.spectrum
         overlap = fft.irfft2(spectrum, s=matched.size)[:rows, :columns]
