@@ -6,6 +6,7 @@ import math
 import os
 import signal
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -67,6 +68,34 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def share(request: pytest.FixtureRequest) -> float:
     """Return the share of a large test's repetitions that is wanted, up to 1."""
     return float(request.config.getoption("--share"))
+
+
+@pytest.fixture(scope="session")
+def repetitions(share: float) -> Callable[[int, int], int]:
+    """Return how often to repeat: a few times by default, up to all where large tests are run."""
+
+    def count(few: int, all_of_them: int) -> int:
+        return max(few, round(share * all_of_them))
+
+    return count
+
+
+@pytest.fixture
+def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the figures out of reports, of which a test judges something else."""
+    from sketches import sketch_figures
+
+    sketch_figures(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def all_sketched() -> Iterator[None]:
+    """Leave the figures out of the reports of a whole module."""
+    from sketches import sketch_figures
+
+    with pytest.MonkeyPatch.context() as patch:
+        sketch_figures(patch)
+        yield
 
 
 @pytest.fixture(scope="session")
