@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -250,9 +251,13 @@ def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], Forward
         Settings → model.
     """
 
+    latest = threading.local()
+
     @lru_cache(_MODELS_KEPT)
     def model(items: tuple[tuple[str, Any], ...]) -> ForwardModel:
-        return build_microscope(config, reach_nm, dict(items))
+        like = getattr(latest, "model", None)
+        latest.model = build_microscope(config, reach_nm, dict(items), like=like)
+        return latest.model
 
     return lambda settings: model(tuple(settings.items()))
 
