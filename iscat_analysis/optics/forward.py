@@ -365,12 +365,14 @@ class ForwardModel:
             raise ConfigError('optics.psf = "measured" knows no parameters of the optics')
         lens, stack = self._sensitivities(z_nm, tuple(names))
         amplitude = self.scale.amplitude(mass_kda)
-        _, *geometry = self._geometry(grid, x_nm, y_nm, amplitude)
+        _, pixels, *_ = self._geometry(grid, x_nm, y_nm, amplitude)
         rows = np.empty((grid.shape[0], 5, grid.shape[1]))
-        signal_gradient(stack[:2].reshape(-1, *stack.shape[3:]), lens, *geometry, rows)
+        lifted = stack[:2].reshape(-1, *stack.shape[3:])
+        signal_gradient(lifted, lens, pixels, x_nm, y_nm, amplitude, rows)
         rows[:, 4] /= self.scale.slope(amplitude)
         out = np.moveaxis(rows, 1, 0)
-        return out[0], out[1:], signal_derivatives(stack, lens, *geometry)
+        shared = signal_derivatives(stack, lens, pixels, x_nm, y_nm, amplitude)
+        return out[0], out[1:], shared
 
     @cached_property
     def _sensitivities(self) -> Callable[[float, tuple[str, ...]], tuple[Lens, FloatArray]]:

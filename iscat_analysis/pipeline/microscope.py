@@ -250,14 +250,14 @@ def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], Forward
     callable
         Settings → model.
     """
-
-    latest = threading.local()
+    latest = threading.local()  # neighbours in a search often share their tables
 
     @lru_cache(_MODELS_KEPT)
     def model(items: tuple[tuple[str, Any], ...]) -> ForwardModel:
         like = getattr(latest, "model", None)
-        latest.model = build_microscope(config, reach_nm, dict(items), like=like)
-        return latest.model
+        found = build_microscope(config, reach_nm, dict(items), like=like)
+        latest.model = found
+        return found
 
     return lambda settings: model(tuple(settings.items()))
 
