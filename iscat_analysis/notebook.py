@@ -134,8 +134,9 @@ def fit_movie(
 
 
 def calibrate_optics(
-    movie: str | Path,
+    movie: str | Path | ArrayLike,
     *,
+    name: str | None = None,
     config: str | Path | Mapping[str, Any] | Config | None = None,
     settings: Mapping[str, Any] | Iterable[str] | None = None,
     free: str | Sequence[str] | None = None,
@@ -148,8 +149,11 @@ def calibrate_optics(
 
     Parameters
     ----------
-    movie : str or Path
-        A landing movie, one with background frames, or a scan of the focus.
+    movie : str, Path or array_like of shape (t, y, x)
+        A landing movie, one with background frames, or a scan of the focus: a file, or the camera's
+        counts as for `fit_movie`.
+    name : str, optional
+        What messages and the report call an array; default ``"array"``.
     config : str, Path, mapping or Config, optional
         As for `configure`: the microscope as far as it is known.
     settings : mapping of str to Any, or iterable of str, optional
@@ -177,14 +181,13 @@ def calibrate_optics(
     ConfigError
         A setting is unknown or impossible, or cannot be calibrated.
     """
-    resolved, path = configure(config, settings=settings), Path(movie)
-    folder = _path(out)
+    resolved, folder = configure(config, settings=settings), _path(out)
     if folder is not None:
         return optics_calibration(
-            path, resolved, folder, free=free, focus_step_nm=focus_step_nm, overwrite=overwrite,
-            progress=progress,
+            movie, resolved, folder, name=name, free=free, focus_step_nm=focus_step_nm,
+            overwrite=overwrite, progress=progress,
         )  # fmt: skip
-    with open_stack(path) as stack:
+    with open_stack(movie, name=name) as stack:
         return calibrate_movie(
             stack, resolved, free=free, focus_step_nm=focus_step_nm, progress=progress
         )
