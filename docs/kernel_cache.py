@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import tempfile
 from importlib.metadata import version
@@ -31,20 +33,25 @@ def compile_kernels() -> None:
     """
     from iscat_cli import main
 
-    samples = ROOT / "sample_configs"
+    def run(*arguments: str) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):
+            status = main([*arguments, "--quiet"])
+        if status:
+            raise RuntimeError(f"iscat {' '.join(arguments)} ended with status {status}")
+
     small = ("simulation.shape=[64, 64]", "posterior.steps=100", "bounds.pixels=31")
     few = ("simulation.count=6", "simulation.leavings=1", "simulation.frames=400")
     one = ("simulation.events=[{frame=200, x_px=31.2, y_px=30.8, mass_kda=900.0}]",)
-    jobs = [("landing", "mass", few), ("mass", "mass", one), ("joint", "joint", one)]
-    jobs += [("joint", "joint", (*one, f"optics.scheme={s}")) for s in ("cobri",)]
+    cobri = (*one, "optics.scheme=cobri")
+    jobs = [("landing", few), ("mass", one), ("joint", one), ("joint", cobri)]
     with tempfile.TemporaryDirectory() as name:
-        for number, (sample, mode, changes) in enumerate(jobs):
+        for number, (sample, changes) in enumerate(jobs):
             movie = f"{name}/{number}.tif"
-            options = ["--config", str(samples / f"{sample}.toml"), "--quiet"]
+            options = ["--config", str(ROOT / "sample_configs" / f"{sample}.toml")]
             options += [f"--set={change}" for change in (*small, *changes)]
-            main(["simulate", *options, "--out", movie])
-            main(["fit", movie, *options, "--mode", mode])
-            main(["bounds", *options, "--mode", mode])
+            run("simulate", *options, "--out", movie)
+            run("fit", movie, *options)
+            run("bounds", *options)
 
 
 if __name__ == "__main__":

@@ -31,8 +31,14 @@ settings.register_profile("ci", deadline=None, derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "here")
 
 
-LONGEST_FIRST = ("statistical", "hardening", "cli", "physics")
-"""Folders whose modules take longest; they are begun first, so that no worker is left with one."""
+LONGEST_FIRST = (
+    "test_report_browser", "test_output", "test_report", "test_misfit", "test_landing",
+    "test_misfit_search", "test_optics_forecast", "test_focus_scan", "test_arguments",
+    "test_mass_calibration", "test_optics_calibration", "test_cli_json", "test_bounds_laws",
+    "test_shared_errors", "test_robustness", "test_hostile_files", "test_cli_benchmark",
+    "test_public", "test_cli_contract", "test_pipeline", "test_bounds", "test_photon_transfer",
+)  # fmt: skip
+"""Modules that take longest; they are begun first, so that no worker is left with one."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -58,8 +64,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=list(left_out))
 
     def rank(item: pytest.Item) -> int:
-        folder = item.path.parent.name
-        return LONGEST_FIRST.index(folder) if folder in LONGEST_FIRST else len(LONGEST_FIRST)
+        name = item.path.stem
+        return LONGEST_FIRST.index(name) if name in LONGEST_FIRST else len(LONGEST_FIRST)
 
     items.sort(key=rank)
 
