@@ -56,7 +56,9 @@ AUTO_COUNT = 150
 RANDOM = 6
 ISOLATED_PX = 1500.0 / 84.0
 RECALL, AUTO_FALSE, LINEAR, PULL, UNIFORM_P, SIGMAS = 0.98, 0.02, 0.01, 0.1, 1e-3, 4.0
-"""Promises with ``--auto``; `LINEAR` and `PULL` are distances, relative, and of a spread from 1."""
+LEARNING_S = 20.0
+"""Promises with ``--auto``; `LINEAR` and `PULL` are distances, relative, and of a spread from 1;
+`LEARNING_S` is time on the wall of two idle cores, the kernels compiled."""
 
 MICROSCOPES: Mapping[str, Mapping[str, Any]] = {
     "as configured": {},
@@ -202,10 +204,10 @@ def learn(name: str, changes: Mapping[str, Any], seed: int) -> dict[str, Any]:
     movie = InstrumentMovie(truth, AUTO_SHAPE, landings, seed=seed + 1)
     config = nominal(learning=True)
     said: list[str] = []
-    start = time.process_time()
     camera = camera_from_config(config.camera, movie.shape[1:], movie.dtype)
+    start = time.perf_counter()
     config, found = learn_optics(movie, config, camera, tell=said.append)
-    learning = time.process_time() - start
+    learning = time.perf_counter() - start
     result = analyse(movie, config, said)
     table = counted(result)
     matched = match(landings, table)
@@ -240,7 +242,7 @@ def learn(name: str, changes: Mapping[str, Any], seed: int) -> dict[str, Any]:
         "twin": bool(found.get("twin")),
         "parameters": parameter_pulls(found, truth),
         "seconds_learning": learning,
-        "seconds": time.process_time() - start,
+        "seconds": time.perf_counter() - start,
         "said": said,
     }
 
@@ -268,6 +270,8 @@ def broken_promises(row: Mapping[str, Any]) -> Iterator[str]:
     for key, pull in row["parameters"].items():
         if abs(pull) > SIGMAS:
             yield key
+    if row["seconds_learning"] > LEARNING_S:
+        yield "time"
 
 
 def print_learned(row: Mapping[str, Any], broken: list[str]) -> None:

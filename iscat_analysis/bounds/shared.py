@@ -37,7 +37,7 @@ def joint_information(
     theta : ndarray, shape (5,)
         Where: x, y, z [nm], amplitude, level.
     names : sequence of str
-        Parameters of the optics, as in `ForwardModel.optics_gradient`.
+        Parameters of the optics, as in `ForwardModel.joint_gradient`.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def joint_information(
     rows = np.empty((len(names) + 5, signal.size))
     if names:
         place = (grid, x, y, z, float(model.scale.mass(np.array(amplitude))))
-        rows[: len(names)] = model.optics_gradient(*place, names)[1].reshape(len(names), -1)
+        rows[: len(names)] = model.joint_gradient(*place, names)[2].reshape(len(names), -1)
     rows[len(names) : -1] = own.reshape(4, -1)
     _, _, information, by_signal, by_level = pixel_terms(
         likelihood.kind, likelihood.data, signal, level
@@ -175,7 +175,7 @@ def mass_drift(model: ForwardModel, amplitude: float, names: Sequence[str]) -> F
     # where the signal is largest its place does not matter to first order
     there = PixelGrid(np.array([x]), np.array([y]), _PEAK_NM)
     plain = replace(model, scale=MassScale())  # below an offset two amplitudes have one mass
-    slopes = plain.optics_gradient(there, 0.0, 0.0, height, amplitude, names)[1]
+    *_, slopes = plain.joint_gradient(there, 0.0, 0.0, height, amplitude, names)
     return np.asarray(slopes[:, 0, 0] / line.gradient_per_kda)
 
 

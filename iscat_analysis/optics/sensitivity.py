@@ -33,7 +33,7 @@ NEGLIGIBLE_CHANGE = 1e-6
 """Share of a change of the light below which its azimuthal harmonics are left out."""
 
 COARSER = 2
-"""Radial step of the changes over that of the field: they are good to a part in 10⁶."""
+"""Radial step of these tables over that of the field's own: they are good to a part in 10⁶."""
 
 
 def check_names(optics: Optics, names: Sequence[str]) -> None:
@@ -84,7 +84,7 @@ def sensitivity_lattices(
     z_nm : float
         Height [nm].
     names : tuple of str
-        Parameters; an empty tuple for the field alone.
+        Parameters.
     rho : float
         1 with a reference, 0 in dark field.
     reach_nm : float
@@ -94,8 +94,8 @@ def sensitivity_lattices(
     -------
     lens : Lens
         How the kernels read them.
-    stack : ndarray, shape (1 + len(names), components, 2, nodes, nodes)
-        The field's lattice, then that of each derivative.
+    stack : ndarray, shape (2 + len(names), components, 2, nodes, nodes)
+        The field's lattice, that of its derivative along z, then that of each parameter.
     """
     optics = opening.optics
     rim, edge = (math.asin(na / optics.n_immersion) for na in (optics.na, optics.mask_na))
@@ -132,12 +132,13 @@ def sensitivity_lattices(
         path: FloatArray = zernike(int(name[1:]), whole.rho[:, None], phi)[0]
         return field * (1j * k * path)
 
-    waves = np.concatenate([field, *(change(name) for name in names)])
+    lift = field * (1j * axial[:, None])
+    waves = np.concatenate([field, lift, *(change(name) for name in names)])
     series = harmonics(waves, np.abs(weight), NEGLIGIBLE_CHANGE) * weight
     count = len(field)
     lattice = LatticeField(series[:count], axial, whole.pupil.transverse, k * optics.na, reach_nm)
     stack = lattice.lattices(series, whole.pupil.transverse, COARSER)
-    return lattice.lens(rho), stack.reshape(1 + len(names), count, *stack.shape[1:])
+    return lattice.lens(rho), stack.reshape(2 + len(names), count, *stack.shape[1:])
 
 
 def _log_efficiency_slope(optics: Optics) -> float:
@@ -160,7 +161,7 @@ def signal_derivatives(
 
     Parameters
     ----------
-    stack : ndarray, shape (1 + n, components, 2, nodes, nodes)
+    stack : ndarray, shape (2 + n, components, 2, nodes, nodes)
         From `sensitivity_lattices`.
     lens : Lens
         Beside them.
@@ -180,4 +181,4 @@ def signal_derivatives(
     out = np.empty((count, pixels.y.size, pixels.x.size))
     flat = stack.reshape(count * components * 2, *stack.shape[3:])
     lattice_values(flat, lens, pixels, x_nm, y_nm, amplitude, components, out)
-    return out[1:]
+    return out[2:]

@@ -187,7 +187,9 @@ def energy_of(
         About 0 where there is only noise.
     """
     excess = np.where(used, change**2 / np.where(used, variance, 1.0) - 1, 0.0)
-    coverage = np.maximum(gaussian_filter(used.astype(float), spot_px), 1e-3)
+    coverage: FloatArray | float = 1.0
+    if not used.all():
+        coverage = np.maximum(gaussian_filter(used.astype(float), spot_px), 1e-3)
     noise = math.sqrt(2 / (4 * math.pi * spot_px**2))
     return np.asarray(gaussian_filter(excess, spot_px) / coverage / noise, dtype=np.float32)
 

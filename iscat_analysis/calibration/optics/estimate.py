@@ -73,7 +73,7 @@ class Microscope(Protocol):
     ) -> tuple[FloatArray, FloatArray]:
         """Signal, and its derivatives with respect to x, y, z and mass."""
 
-    def optics_gradient(
+    def joint_gradient(
         self,
         grid: PixelGrid,
         x_nm: float,
@@ -81,8 +81,8 @@ class Microscope(Protocol):
         z_nm: float,
         mass_kda: float,
         names: Sequence[str],
-    ) -> tuple[FloatArray, FloatArray]:
-        """Signal, and its derivatives with respect to the named parameters of the optics."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Signal, and its derivatives with respect to the particle and the named optics."""
 
 
 Settings = Mapping[str, Any]
@@ -463,19 +463,15 @@ def _scores(
     k = len(names)
     if names:
         wanted = tuple(dict.fromkeys("focus_nm" if n == FOCUS_STEP else n for n in names))
-        signal, slopes = model.optics_gradient(*place, wanted)
-        shared = np.stack(
-            [
-                sight.focus_steps * slopes[wanted.index("focus_nm")]
-                if name == FOCUS_STEP
-                else slopes[wanted.index(name)]
-                for name in names
-            ]
-        )
-    signal, own = model.gradient(*place)
+        signal, own, slopes = model.joint_gradient(*place, wanted)
+    else:
+        signal, own = model.gradient(*place)
     rows = np.empty((k + PRIVATE, signal.size))
-    if names:
-        rows[:k] = shared.reshape(k, -1)
+    for row, name in zip(rows, names, strict=False):
+        if name == FOCUS_STEP:
+            row[:] = sight.focus_steps * slopes[wanted.index("focus_nm")].ravel()
+        else:
+            row[:] = slopes[wanted.index(name)].ravel()
     rows[k : k + 2] = own[:2].reshape(2, -1)
     rows[k + 2] = own[3].ravel()
     value, residual, weight, of_signal, of_level = pixel_terms(

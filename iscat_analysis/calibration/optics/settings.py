@@ -167,7 +167,9 @@ def is_term(name: str) -> bool:
     return name[0] == "z" and name[1:].isdigit()
 
 
-def build_microscope(config: Config, reach_nm: float, settings: Settings) -> ForwardModel:
+def build_microscope(
+    config: Config, reach_nm: float, settings: Settings, *, like: ForwardModel | None = None
+) -> ForwardModel:
     """Make the forward model of a configuration with other optics and the model's own mass scale.
 
     Parameters
@@ -179,6 +181,8 @@ def build_microscope(config: Config, reach_nm: float, settings: Settings) -> For
         As in `forward_model` [nm].
     settings : mapping
         Parameters of the optics.
+    like : ForwardModel, optional
+        As in `forward_model`.
 
     Returns
     -------
@@ -186,4 +190,4 @@ def build_microscope(config: Config, reach_nm: float, settings: Settings) -> For
         Ready to evaluate.
     """
     changed = with_settings(config, settings).model_copy(update={"calibration": None})
-    return forward_model(changed, reach_nm, z_max_nm=config.particle.height_nm)
+    return forward_model(changed, reach_nm, z_max_nm=config.particle.height_nm, like=like)
