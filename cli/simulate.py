@@ -62,4 +62,7 @@ def simulate(
                 {"stack": str(out), "truth": str(table), "events": truth.to_dict("records")},
             )
         else:
-            print_result(f"{len(truth)} particles in {out}, their truth in {table}")
+            from iscat_analysis.report.numbers import count
+
+            particles = count(len(truth), "particle")
+            print_result(f"{particles} in {out}, truth in {table}")

@@ -339,7 +339,7 @@ def test_simulate_makes_one_call(monkeypatch, capsys, tmp_path) -> None:
     assert path == Path("m.tif")
     assert options["seed"] == 5
     assert options["overwrite"] is False
-    assert "2 particles in m.tif, their truth in m.truth.csv" in capsys.readouterr().out
+    assert "2 particles in m.tif, truth in m.truth.csv" in capsys.readouterr().out
     main([*arguments, "--json"])
     first, second = json.loads(capsys.readouterr().out)["events"]
     assert first["x_px"] == 1.5
