@@ -182,7 +182,7 @@ def _search(
 ) -> tuple[list[Candidate], list[Candidate]]:
     """Find new particles, and what may be but the side lobe of a known one."""
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
-    explained = total_signal(scene, shape, events)
+    explained = scene.left(total_signal(scene, shape, events))
     likelihood = search_likelihood(scene, windows, explained)
     found = find_particles(
         likelihood,
@@ -239,6 +239,10 @@ def _fit_all(
     height = scene.config.particle.height_nm
     nominal = scene.model.material.mass_kda
     free = FREE_PARAMETERS[scene.mode]
+    taken: FloatArray | None = None
+    if scene.lines is not None:
+        shape = (windows.after_e.shape[0], windows.after_e.shape[1])
+        taken = scene.lines.taken(total_signal(scene, shape, events))
 
     def one(index: int) -> Event | None:
         start = candidates[index]
@@ -251,6 +255,8 @@ def _fit_all(
         for number, event in enumerate(events):
             if number != first + index:
                 _add_signal(scene, event, region, others)
+        if taken is not None:
+            others = (1 + others) / taken[region.slices] - 1
         likelihood = region_likelihood(scene, windows, region, others)
         if likelihood.n_pixels < 0.5 * others.size:
             return None
@@ -273,7 +279,7 @@ def _refined(scene: Scene, windows: Windows, events: Sequence[Event]) -> Windows
     if not scene.config.background.power_normalization:
         return windows
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
-    signal = total_signal(scene, shape, events)
+    signal = scene.left(total_signal(scene, shape, events))
     if scene.additive:
         signal = signal * photons_scale(scene, windows)
     return refine_power(windows, signal, additive=scene.additive)
