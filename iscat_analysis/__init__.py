@@ -57,8 +57,6 @@ if TYPE_CHECKING:
     from iscat_analysis.errors import IscatError as IscatError
     from iscat_analysis.movie import Stack as Stack
     from iscat_analysis.movie import open_stack as open_stack
-    from iscat_analysis.notebook import Bounds as Bounds
-    from iscat_analysis.notebook import Result as Result
     from iscat_analysis.notebook import calibrate_optics as calibrate_optics
     from iscat_analysis.notebook import compute_bounds as compute_bounds
     from iscat_analysis.notebook import fit_movie as fit_movie
@@ -76,6 +74,8 @@ if TYPE_CHECKING:
     from iscat_analysis.records import FREE_PARAMETERS as FREE_PARAMETERS
     from iscat_analysis.records import Analysis as Analysis
     from iscat_analysis.records import Status as Status
+    from iscat_analysis.result import Bounds as Bounds
+    from iscat_analysis.result import Result as Result
     from iscat_analysis.schemas import schema as schema
 
 _HOME = {

@@ -6,19 +6,13 @@ configuration are given as a mapping.
 
 from __future__ import annotations
 
-import html
-import math
-import textwrap
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
-from matplotlib.figure import Figure
 
-from iscat_analysis.bounds import bounds_report, parse_scan, scan
+from iscat_analysis.bounds import bounds_report
 from iscat_analysis.calibration.optics import OpticsCalibration, OpticsForecast
 from iscat_analysis.calibration.optics import forecast_optics as _forecast
 from iscat_analysis.calibration.optics.forecast import EVENTS
@@ -27,29 +21,10 @@ from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.pipeline.calibrations import optics_calibration
 from iscat_analysis.pipeline.microscope import calibrate_movie
-from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Progress, silent
-from iscat_analysis.report import check_output, write_report
-from iscat_analysis.report.headline import (
-    as_contrasts,
-    caution,
-    headline,
-    label_of,
-    main_quantity,
-    precision_of,
-)
-from iscat_analysis.report.numbers import UNITS, count, number
-from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
-from iscat_analysis.report.posterior import posterior_groups
-from iscat_analysis.report.tables import event_table
+from iscat_analysis.records import Progress, silent
+from iscat_analysis.report import check_output
+from iscat_analysis.result import Bounds, Result
 from iscat_analysis.study.simulate import write_stack
-
-if TYPE_CHECKING:
-    from arviz import InferenceData
-
-ROWS_SHOWN = 20
-"""Events that a `Result` shows of itself in a notebook."""
-
-_COLUMNS = ("event", "frame", "x_px", "y_px", "z_nm", "mass_kda")
 
 
 def fit_movie(
@@ -134,8 +109,9 @@ def fit_movie(
 
 
 def calibrate_optics(
-    movie: str | Path,
+    movie: str | Path | ArrayLike,
     *,
+    name: str | None = None,
     config: str | Path | Mapping[str, Any] | Config | None = None,
     settings: Mapping[str, Any] | Iterable[str] | None = None,
     free: str | Sequence[str] | None = None,
@@ -148,8 +124,11 @@ def calibrate_optics(
 
     Parameters
     ----------
-    movie : str or Path
-        A landing movie, one with background frames, or a scan of the focus.
+    movie : str, Path or array_like of shape (t, y, x)
+        A landing movie, one with background frames, or a scan of the focus: a file, or the camera's
+        counts as for `fit_movie`.
+    name : str, optional
+        What messages and the report call an array; default ``"array"``.
     config : str, Path, mapping or Config, optional
         As for `configure`: the microscope as far as it is known.
     settings : mapping of str to Any, or iterable of str, optional
@@ -177,14 +156,13 @@ def calibrate_optics(
     ConfigError
         A setting is unknown or impossible, or cannot be calibrated.
     """
-    resolved, path = configure(config, settings=settings), Path(movie)
-    folder = _path(out)
+    resolved, folder = configure(config, settings=settings), _path(out)
     if folder is not None:
         return optics_calibration(
-            path, resolved, folder, free=free, focus_step_nm=focus_step_nm, overwrite=overwrite,
-            progress=progress,
+            movie, resolved, folder, name=name, free=free, focus_step_nm=focus_step_nm,
+            overwrite=overwrite, progress=progress,
         )  # fmt: skip
-    with open_stack(path) as stack:
+    with open_stack(movie, name=name) as stack:
         return calibrate_movie(
             stack, resolved, free=free, focus_step_nm=focus_step_nm, progress=progress
         )
@@ -328,284 +306,3 @@ def _with_arguments(config: Config, given: Mapping[str, Any]) -> Config:
 
 def _path(source: str | Path | None) -> Path | None:
     return None if source is None else Path(source)
-
-
-@dataclass(frozen=True, repr=False)
-class Result:
-    """What a fit found; shows itself in a notebook.
-
-    Attributes
-    ----------
-    analysis : Analysis
-        Everything, as the stages know it.
-    """
-
-    analysis: Analysis
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """One row per event, the columns of ``fits.csv``, which carry their units."""
-        return self.analysis.table
-
-    @property
-    def summary(self) -> Mapping[str, Any]:
-        """Counts, medians, efficiency and provenance, as in ``summary.json``."""
-        return self.analysis.summary
-
-    @property
-    def mode(self) -> str:
-        """What was free: ``"mass"``, ``"localize"``, ``"joint"`` or ``"track"``."""
-        return self.analysis.mode
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What the user should know, one line each."""
-        return self.analysis.warnings
-
-    @property
-    def config_toml(self) -> str:
-        """The resolved configuration, which reruns the job."""
-        return self.analysis.config_toml
-
-    def __len__(self) -> int:
-        return len(self.analysis.table)
-
-    def images(self, event: int) -> EventView:
-        """Give the images of one event.
-
-        Parameters
-        ----------
-        event : int
-            Its number in the table.
-
-        Returns
-        -------
-        EventView
-            `contrast`, `model` and `residual`, each of shape (y, x).
-
-        Raises
-        ------
-        DataError
-            There is no such event.
-        """
-        return view_of(self.analysis, event)
-
-    def view(self, event: int) -> Figure:
-        """Draw data, model and residual of one event.
-
-        Parameters
-        ----------
-        event : int
-            Its number in the table.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            Three panels.
-
-        Raises
-        ------
-        DataError
-            There is no such event.
-        """
-        return draw_event(self.analysis, event)
-
-    def overview(self) -> Figure:
-        """Draw the field of view, its events numbered."""
-        return draw(self.analysis, "overview")
-
-    def histogram(self) -> Figure:
-        """Draw the histogram of the masses [kDa]; of the heights [nm] where the mass is fixed."""
-        return draw(self.analysis, "histogram")
-
-    def precision(self) -> Figure:
-        """Draw each event's σ and QCRB against its CRB, for every free parameter."""
-        return draw(self.analysis, "precision")
-
-    def corner(self, event: int) -> Figure:
-        """Draw the posterior of one event.
-
-        Parameters
-        ----------
-        event : int
-            Its number in the table.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            A corner plot.
-
-        Raises
-        ------
-        DataError
-            There is no such event, it was not sampled, or its chain did not converge.
-        """
-        return draw_corner(self.analysis, event)
-
-    def posterior(self, event: int) -> InferenceData:
-        """Give the posterior samples of one event.
-
-        Parameters
-        ----------
-        event : int
-            Its number in the table.
-
-        Returns
-        -------
-        arviz.InferenceData
-            Group `posterior` with one variable (chain, draw) for each free parameter [nm, kDa], and
-            `sample_stats` with the log-likelihood.
-
-        Raises
-        ------
-        DataError
-            There is no such event, it was not sampled, or its chain did not converge.
-        """
-        posterior_of(self.analysis, event)
-        with warnings.catch_warnings():
-            # ArviZ announces its next major version on import, once a day.
-            warnings.simplefilter("ignore", FutureWarning)
-            import arviz
-        groups = posterior_groups(self.analysis, [view_of(self.analysis, event)])
-        return arviz.InferenceData(**{name: group.isel(event=0) for name, group in groups.items()})
-
-    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the report, the tables and the figures into a folder.
-
-        Parameters
-        ----------
-        folder : str or Path
-            Appears complete or not at all.
-        overwrite : bool
-            Replace an earlier result.
-
-        Returns
-        -------
-        Path
-            The folder; ``report.html`` is in it.
-
-        Raises
-        ------
-        DataError
-            The folder holds something already, or cannot be written.
-        """
-        return write_report(self.analysis, Path(folder), overwrite=overwrite)
-
-    def _heading(self) -> str:
-        analysis = self.analysis
-        name = Path(analysis.provenance.input_path).name or "movie"
-        return f"{count(len(self), 'event')} in {name}, mode {analysis.mode}"
-
-    def _facts(self) -> list[tuple[str, str]]:
-        table = event_table(self.analysis)
-        facts = [("", text) for text in headline(self.analysis, table)] if len(self) else []
-        counts = table["status"].value_counts()
-        facts.append(("status", ", ".join(f"{n} {s}" for s, n in counts.items()) or "no events"))
-        for name in FREE_PARAMETERS[self.mode] if caution(table) is None else ():
-            p = precision_of(self.analysis, table, name)
-            if p.events:
-                text = f"σ {number(p.sigma)}{p.shared}, CRB {number(p.crb)}"
-                text += f", Holevo {number(p.holevo)}" if math.isfinite(p.holevo) else ""
-                text += f", QCRB {number(p.qcrb)}"
-                facts.append((label_of(self.analysis, name), f"{text} {UNITS[name]} (medians)"))
-        return facts + [("warning", text) for text in self.warnings]
-
-    def __repr__(self) -> str:
-        lines = [
-            line
-            for name, text in self._facts()
-            for line in textwrap.wrap(f"{name} {text}".strip(), 78, initial_indent="  ",
-                                      subsequent_indent="    ")
-        ]  # fmt: skip
-        hint = "  look at .table, .view(0), .histogram(), .posterior(0); keep with .save(folder)"
-        return "\n".join([f"Result: {self._heading()}", *lines, hint])
-
-    def _repr_html_(self) -> str:
-        facts = "".join(
-            f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
-            f"<td style='text-align:left'>{html.escape(text)}</td></tr>"
-            for name, text in self._facts()
-        )
-        names = [*_COLUMNS, *(f"sigma_{name}" for name in FREE_PARAMETERS[self.mode]), "status"]
-        shown = self.table.head(ROWS_SHOWN)
-        if main_quantity(self.analysis).column == "contrast":
-            shown = as_contrasts(shown)
-        shown = shown[names]
-        if main_quantity(self.analysis).column == "contrast":
-            new = {"mass_kda": "contrast", "sigma_mass_kda": "sigma_contrast"}
-            shown = shown.rename(columns=new)
-        rest = len(self) - len(shown)
-        more = f"<p>… and {rest} more in <code>.table</code></p>" if rest else ""
-        body = shown.to_html(index=False, float_format="{:.4g}".format, border=0, escape=True)
-        return (
-            f"<p><b>{html.escape(self._heading())}</b></p><table>{facts}</table>"
-            f"{body if len(self) else ''}{more}"
-        )
-
-
-@dataclass(frozen=True, repr=False)
-class Bounds:
-    """Bounds of a planned experiment; shows itself in a notebook.
-
-    Attributes
-    ----------
-    config : Config
-        The experiment.
-    report : mapping
-        Everything, as `iscat bounds --json` prints it.
-    """
-
-    config: Config
-    report: Mapping[str, Any]
-
-    @property
-    def actual(self) -> pd.DataFrame:
-        """Bounds for the planned frames [nm, kDa]: one row per parameter, one column per kind."""
-        return self._frame("actual")
-
-    @property
-    def per_photon(self) -> pd.DataFrame:
-        """Bounds for one scattered photon, on the camera (CRB) or collected [nm, relative]."""
-        return self._frame("per_photon")
-
-    def scan(self, values: str, *, progress: Progress = silent) -> pd.DataFrame:
-        """Vary one thing and compute the bounds at each step.
-
-        Parameters
-        ----------
-        values : str
-            ``"axis=start:stop:step"``, as in ``"focus=-1000:1000:50"``.
-        progress : Progress
-            Told after each step.
-
-        Returns
-        -------
-        pandas.DataFrame
-            One row per value, the axis first, then bounds [nm, kDa] and photon numbers.
-
-        Raises
-        ------
-        ConfigError
-            There is no such axis (the known ones are named), or a value is impossible.
-        """
-        axis, points = parse_scan(values)
-        return scan(self.config, axis, points, progress=progress).table
-
-    def _frame(self, which: str) -> pd.DataFrame:
-        kinds: Mapping[str, Mapping[str, float]] = self.report[which]
-        return pd.DataFrame({kind: dict(values) for kind, values in kinds.items()})
-
-    def _heading(self) -> str:
-        at, photons = self.report["at"], self.report["n_scattered"]
-        return (
-            f"{at['mass_kda']:.4g} kDa at z = {at['z_nm']:g} nm, {at['scheme']}, "
-            f"{at['n_after']} frames, {photons['collected']:.4g} scattered photons collected"
-        )
-
-    def __repr__(self) -> str:
-        text: str = self.actual.to_string(float_format="{:.4g}".format, na_rep="–")
-        return f"Bounds: {self._heading()}\n{text}"
-
-    def _repr_html_(self) -> str:
-        body = self.actual.to_html(float_format="{:.4g}".format, na_rep="–", border=0)
-        return f"<p><b>{html.escape(self._heading())}</b></p>{body}"

@@ -227,3 +227,30 @@ def aperture(optics: Optics, nodes: int, nodes_above: int) -> Aperture:
     edge = math.asin(optics.mask_na / optics.n_immersion)
     theta, weight = gauss_legendre(alpha, critical_angle(optics), nodes, nodes_above, edge)
     return aperture_on(optics, theta, weight)
+
+
+def weight_on(
+    opening: Aperture, factor: complex, oil_nm: float
+) -> tuple[ComplexArray, ComplexArray]:
+    """Weigh the components in the field's integral at z = 0, and give the phase per height.
+
+    Parameters
+    ----------
+    opening : Aperture
+        The pupil on its quadrature.
+    factor : complex
+        What multiplies the whole integral.
+    oil_nm : float
+        Excess thickness of the oil [nm].
+
+    Returns
+    -------
+    weight, axial : complex ndarray, shape (n,)
+        Factor of each direction; phase per height of the particle [rad/nm].
+    """
+    optics, pupil = opening.optics, opening.pupil
+    axial = pupil.axial
+    if optics.axial == "refocus":
+        axial = axial + (1 - optics.n_immersion / optics.n_sample) * pupil.oil
+    weight = pupil.weight * pupil.apodization * np.exp(1j * pupil.oil * oil_nm) * factor
+    return weight, axial

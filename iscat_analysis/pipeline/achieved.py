@@ -186,7 +186,7 @@ def likely_noise(found: Achieved, noise: Mapping[str, Any], *, rejected: bool = 
     """
     excess = found.over_crb**2 - 1
     single = found.by_frames[0] ** 2 if found.by_frames else 1.0
-    said = []
+    said, doubt = [], ""
     if single - 1 > _SHARE * excess:
         over_shot = [v for v in noise.get("noise_variance_over_shot", ()) if v is not None]
         pixels = over_shot[0] if over_shot else single
@@ -212,16 +212,16 @@ def likely_noise(found: Achieved, noise: Mapping[str, Any], *, rejected: bool = 
             )
             said.append(f"it grows with the frames that are averaged, as {name}, or average fewer")
             if rejected:
-                said.append(
-                    "or it is what a wrong model of the image leaves over of other particles: "
-                    "check focus, NA and pixel size first"
+                doubt = (
+                    "it may be what a wrong model of the image leaves over of other particles: "
+                    "check focus, NA and pixel size first; otherwise "
                 )
         own = found.over_crb**2 - whole
         if own > _SHARE * excess:
             said.append(
                 "it is larger at the particles than elsewhere: they move or change in the light"
             )
-    return "; ".join(said) or "its kind is not clear"
+    return doubt + ("; ".join(said) or "its kind is not clear")
 
 
 def _ratios(found: Mapping[str, Achieved]) -> str:

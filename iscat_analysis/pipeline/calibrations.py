@@ -16,7 +16,7 @@ from iscat_analysis.calibration.mass import Landing, MassCalibration, calibrate_
 from iscat_analysis.calibration.optics import OpticsCalibration
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie import open_stack
+from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.optics.measured import sha256_of
 from iscat_analysis.pipeline.microscope import calibrate_movie
@@ -124,10 +124,11 @@ def camera_calibration(
 
 
 def optics_calibration(
-    movie: Path,
+    movie: str | Path | ArrayLike,
     config: Config,
     out: Path,
     *,
+    name: str | None = None,
     free: str | Sequence[str] | None = None,
     focus_step_nm: float | None = None,
     overwrite: bool = False,
@@ -138,12 +139,14 @@ def optics_calibration(
 
     Parameters
     ----------
-    movie : Path
+    movie : str, Path or array_like of shape (t, y, x)
         A landing movie, one with background frames, or a scan of the focus.
     config : Config
         The microscope as far as it is known.
     out : Path
         Folder for optics.json, optics.html and, unless the result is refused, optics.toml.
+    name : str, optional
+        What messages and the report call an array.
     free : str or sequence of str, optional
         What may change; default everything.
     focus_step_nm : float, optional
@@ -168,7 +171,8 @@ def optics_calibration(
         The configuration cannot be calibrated.
     """
     check_output(out, overwrite, known=OPTICS_FILES)
-    with open_stack(movie) as stack:
+    with open_stack(movie, name=name) as stack:
+        title = stack.path.name
         found = calibrate_movie(
             stack, config, free=free, focus_step_nm=focus_step_nm, progress=progress, notify=notify
         )
@@ -181,7 +185,7 @@ def optics_calibration(
         (folder / "optics.json").write_text(to_json("optics", contents) + "\n", encoding="utf-8")
         if found.accepted:
             (folder / "optics.toml").write_text(toml, encoding="utf-8")
-        page = optics_page(movie.name, jsonable(contents), toml)
+        page = optics_page(title, jsonable(contents), toml)
         (folder / "optics.html").write_text(page, encoding="utf-8")
     return found
 

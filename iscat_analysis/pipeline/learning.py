@@ -26,14 +26,8 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.pipeline.landing import has_landings
-from iscat_analysis.pipeline.microscope import (
-    bound_sights,
-    calibrate_sights,
-    goodness,
-    landing_sights,
-    microscopes,
-    reach_nm,
-)
+from iscat_analysis.pipeline.microscope import calibrate_sights, goodness, microscopes
+from iscat_analysis.pipeline.sights import bound_sights, landing_sights, reach_nm
 
 REJECTED_P = 1e-3
 """Half of the brightest particles must fit worse than this before the optics are doubted: a few

@@ -25,13 +25,8 @@ from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.forward import ForwardModel, forward_model, with_template
 from iscat_analysis.optics.measured import Template, lattice_step_nm
 from iscat_analysis.pipeline.landing import has_landings
-from iscat_analysis.pipeline.microscope import (
-    bound_sights,
-    goodness,
-    landing_sights,
-    reach_nm,
-    refuse_uncalibratable,
-)
+from iscat_analysis.pipeline.microscope import goodness, refuse_uncalibratable
+from iscat_analysis.pipeline.sights import bound_sights, landing_sights, reach_nm
 from iscat_analysis.records import Mapper, Progress, silent
 
 HELD_OUT_P = 1e-3

@@ -9,7 +9,7 @@ what steps do to each other's light, `tasks` sets up the likelihood of one.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -190,6 +190,8 @@ class ChunkFitter:
                 chosen = {i for i, others in enumerate(bound) if moved.intersection(others)}
                 if not chosen:
                     break
+            if "z_nm" in FREE_PARAMETERS[self._scene.mode]:
+                steps = self._lifted(steps, set(range(known, len(steps))), seen)
             credible = self._credible(steps)
             kept = {id(s) for s in credible}
             rejected += [s for s in steps if id(s) not in kept]
@@ -279,51 +281,71 @@ class ChunkFitter:
     def _improve(
         self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
     ) -> list[Step]:
-        """Fit the chosen steps, each with the others as they were."""
+        """Fit the chosen steps at the heights that they have, each with the others as they were."""
+        z_range = self._scene.config.fit.z_range_nm
 
-        def one(index: int) -> Step:
-            step = steps[index]
-            task = self._tasks.build(index, steps, near)
-            if task is None:
-                return step
-            likelihood = task.likelihood
-            y_px, x_px = task.offset_px
-            start = _displaced(step.start, y_px, x_px)
-            box = search_box(
-                likelihood, start, self._quick_mode, self._scene.config.fit.z_range_nm, level=True
-            )
+        def fitted(step: Step, task: Task) -> Step:
+            likelihood, start = task.likelihood, _displaced(step.start, *task.offset_px)
+            box = search_box(likelihood, start, self._quick_mode, z_range, level=True)
             theta = start_theta(likelihood, start) if step.theta is None else step.theta.copy()
             theta = np.where(box.free, np.clip(theta, box.lower, box.upper), theta)
             best = likelihood.maximize(theta, box.free, box.lower, box.upper)
-            mass = float(likelihood.model.scale.mass(best.theta[3]))
-            pixel = self._scene.pixel_nm
-            if mass <= 0:
+            if likelihood.model.scale.mass(best.theta[3]) <= 0:
                 return replace(step, at=task.at, snr=0.0)
-            moved = replace(
-                start,
-                x_px=float(best.theta[0]) / pixel - x_px,
-                y_px=float(best.theta[1]) / pixel - y_px,
-                mass_kda=mass,
-            )
-            return self._neighbours.drawn(
-                replace(
-                    step,
-                    at=task.at,
-                    start=moved,
-                    theta=best.theta,
-                    snr=detection_snr(likelihood, best, box),
-                    excess=chi2_excess(likelihood.residuals(best.theta)),
-                )
-            )
+            return self._moved(step, task, best.theta, detection_snr(likelihood, best, box))
 
-        improved = list(steps)
+        return self._refitted(steps, chosen, near, fitted)
+
+    def _lifted(
+        self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
+    ) -> list[Step]:
+        """Fit the chosen steps at all heights, so that their rings are those of their own."""
+        z_range = self._scene.config.fit.z_range_nm
+
+        def fitted(step: Step, task: Task) -> Step:
+            start = _displaced(step.start, *task.offset_px)
+            fit = fit_particle(
+                task.likelihood, start, self._scene.mode, z_range, level=True, correct_bias=False
+            )
+            return self._moved(step, task, fit.theta, fit.snr) if fit.mass_kda > 0 else step
+
+        return self._refitted(steps, chosen, near, fitted)
+
+    def _refitted(
+        self,
+        steps: Sequence[Step],
+        chosen: set[int],
+        near: Sequence[Sequence[int]],
+        fitted: Callable[[Step, Task], Step],
+    ) -> list[Step]:
+        def one(index: int) -> Step:
+            task = self._tasks.build(index, steps, near)
+            return steps[index] if task is None else fitted(steps[index], task)
+
+        refitted = list(steps)
         for index, step in zip(sorted(chosen), self._pool.map(one, sorted(chosen)), strict=True):
-            improved[index] = step
-        return improved
+            refitted[index] = step
+        return refitted
+
+    def _moved(self, step: Step, task: Task, theta: FloatArray, snr: float) -> Step:
+        """Put a step where a fit found it."""
+        likelihood, (y_px, x_px) = task.likelihood, task.offset_px
+        pixel = self._scene.pixel_nm
+        start = replace(
+            step.start,
+            x_px=float(theta[0]) / pixel - x_px,
+            y_px=float(theta[1]) / pixel - y_px,
+            z_nm=float(theta[2]),
+            mass_kda=float(likelihood.model.scale.mass(theta[3])),
+        )
+        excess = chi2_excess(likelihood.residuals(theta))
+        return self._neighbours.drawn(
+            replace(step, at=task.at, start=start, theta=theta, snr=snr, excess=excess)
+        )
 
     @property
     def _quick_mode(self) -> str:
-        """Where z is free it is found last, from all heights at once."""
+        """Where z is free it is found after place and mass, from all heights at once."""
         return "mass" if "mass_kda" in FREE_PARAMETERS[self._scene.mode] else "localize"
 
     def _finish(

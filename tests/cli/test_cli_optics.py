@@ -10,7 +10,9 @@ import pytest
 import tifffile
 from scenes import OPTICS_TRUTH, write_bright_landings
 
+import iscat_analysis as ia
 from iscat_analysis.config import load_config
+from iscat_analysis.errors import DataError
 from iscat_cli import main
 
 Captured = pytest.CaptureFixture[str]
@@ -45,6 +47,17 @@ def test_a_landing_movie_tells_its_optics(movie: Path, tmp_path: Path, capsys: C
     taken = load_config(setup, [f"optics.file={out / 'optics.toml'}"]).optics
     assert taken.focus_nm == pytest.approx(found["focus_nm"]["value"], abs=1e-6)
     assert taken.na == 1.42
+
+
+def test_an_array_is_a_movie_too(movie: Path, tmp_path: Path) -> None:
+    counts, setup = tifffile.imread(movie), movie.with_name("setup.toml")
+    given = {"config": setup, "free": "focus,phase"}
+    found = ia.calibrate_optics(counts, name="mine", **given, out=tmp_path / "scope")
+    assert found.config == ia.calibrate_optics(movie, **given).config
+    assert (tmp_path / "scope" / "optics.toml").exists()
+    assert "mine" in (tmp_path / "scope" / "optics.html").read_text(encoding="utf-8")
+    with pytest.raises(DataError, match=r"^dark: shows 0 bright particles"):
+        ia.calibrate_optics(counts[:40], name="dark", **given)
 
 
 def test_a_movie_with_background_frames(movie: Path, tmp_path: Path, capsys: Captured) -> None:

@@ -23,6 +23,7 @@ SIDE = 96
 LEVEL_E = 1e6
 GAIN = 30.0
 MASS_KDA = 150.0
+HEIGHT_NM = {True: 5.0, False: 30.0}  # where it is known, and where it is fitted
 GRAIN_PX = 1.5
 DRIFT_PX = 1e-4
 PINK = 1e-4
@@ -104,10 +105,11 @@ def _counts(
 ) -> np.ndarray:
     """Draw a movie of a speckled field, 0.5 % of power noise, and noise of a kind."""
     values = config.model_dump()
+    height = HEIGHT_NM[config.fit.mode == "mass"]
     values["simulation"] |= {
         "background": "flat",
         "events": [
-            {"frame": t, "x_px": x, "y_px": y, "mass_kda": MASS_KDA, "z_nm": 5.0}
+            {"frame": t, "x_px": x, "y_px": y, "mass_kda": MASS_KDA, "z_nm": height}
             for t, x, y in places
         ],
     }
@@ -143,6 +145,7 @@ def _pulls(
         for t, x, y in places:
             if abs(row["frame"] - t) < 9 and np.hypot(row["x_px"] - x, row["y_px"] - y) < 4:
                 truth = {"x_nm": x * PIXEL_NM, "y_nm": y * PIXEL_NM, "mass_kda": MASS_KDA}
+                truth["z_nm"] = HEIGHT_NM[False]
                 rows.append([(row[n] - truth[n]) / row[f"crb_{n}"] for n in names])
     return np.array(rows).reshape(-1, len(names))
 
@@ -163,11 +166,12 @@ def _run(
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_clean_movies_reach_the_bound_as_often_as_the_interval_says(name: str) -> None:
-    """Of 200 movies and three parameters; parameters of a movie are all but independent."""
+@pytest.mark.parametrize("mode", ["mass", "localize", "joint"])
+def test_clean_movies_reach_the_bound_as_often_as_the_interval_says(mode: str, name: str) -> None:
+    """Of 200 movies and three or four parameters, which are taken for independent."""
     held, logs, exceeding, pulls = [], [], 0, []
     for seed in range(CLEAN_MOVIES):
-        analysis, pull, precision = _run(name, "clean", seed)
+        analysis, pull, precision = _run(name, "clean", seed, f'fit.mode="{mode}"')
         pulls.append(pull)
         for part in precision.values():
             low, high = part["repeat_over_crb_ci95"]
@@ -176,7 +180,7 @@ def test_clean_movies_reach_the_bound_as_often_as_the_interval_says(name: str) -
         exceeding += analysis.summary["repeats"]["understated"]
     errors = np.concatenate(pulls)
     print(
-        f"\n{name}: {np.mean(held):.3f} of {len(held)} intervals hold 1; ratio "
+        f"\n{mode} {name}: {np.mean(held):.3f} of {len(held)} intervals hold 1; ratio "
         f"{np.exp(np.mean(logs)):.4f} ± {np.std(logs) / np.sqrt(len(logs)):.4f}; true spread "
         f"{np.sqrt(np.mean(errors**2)):.4f} ± {1 / np.sqrt(2 * errors.size):.4f} of {len(errors)} "
         f"events; {exceeding} movies accused"

@@ -366,6 +366,25 @@ def test_windows_that_do_not_fit_into_memory() -> None:
         analyse_landings(large, config, Camera(), tell=lambda _: None, progress=lambda *_: None)
 
 
+@pytest.mark.parametrize("mode", ["localize", "joint"])
+def test_rings_of_neighbours_are_those_of_their_height(mode: str) -> None:
+    """Two strong particles land one after the other, 30 nm above the nominal height."""
+    events = [(60, None, 27.3, 30.2, 2000.0), (78, None, 38.4, 33.7, 2000.0)]
+    config = _config(
+        f"fit.mode={mode}", "particle.mass_kda=2000", "simulation.frames=140",
+        "simulation.photons_per_pixel=2e5", "simulation.background=flat", events=events,
+    )  # fmt: skip
+    raised = [event.model_copy(update={"z_nm": 30.0}) for event in config.simulation.events]
+    simulation = config.simulation.model_copy(update={"events": raised})
+    movie = Movie(config.model_copy(update={"simulation": simulation}), 1)
+    table = _run(np.array(list(movie.frames(2))), config)[0].table.sort_values("frame")
+    assert table["status"].tolist() == ["ok", "ok"]
+    for row, (_, _, x, y, _) in zip(table.itertuples(), events, strict=True):
+        assert abs(row.x_nm - x * PIXEL_NM) < 4.5 * row.sigma_x_nm
+        assert abs(row.y_nm - y * PIXEL_NM) < 4.5 * row.sigma_y_nm
+        assert abs(row.z_nm - 30.0) < 4.5 * row.sigma_z_nm
+
+
 @pytest.mark.parametrize(
     ("setting", "sliding"),
     [

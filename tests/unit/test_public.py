@@ -14,7 +14,7 @@ import tifffile
 from matplotlib.figure import Figure
 
 import iscat_analysis as ia
-from iscat_analysis import notebook
+from iscat_analysis import result as shown
 from iscat_analysis.records import REPEAT_COLUMNS
 from iscat_analysis.report.pictures import draw
 
@@ -166,7 +166,7 @@ def test_the_notebook_table_is_escaped_and_short(result, monkeypatch) -> None:
     page = result._repr_html_()
     assert page.count("<tr") > 4
     assert "sigma_mass_kda" in page
-    monkeypatch.setattr(notebook, "ROWS_SHOWN", 1)
+    monkeypatch.setattr(shown, "ROWS_SHOWN", 1)
     assert "and 1 more" in result._repr_html_()
 
 

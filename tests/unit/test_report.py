@@ -16,7 +16,6 @@ from markupsafe import Markup
 
 from iscat_analysis.config import load_config, parse_config
 from iscat_analysis.errors import DataError
-from iscat_analysis.notebook import Result
 from iscat_analysis.records import EVENT_COLUMNS, Analysis, Status
 from iscat_analysis.report import check_output, figures, render_page, render_report, write_report
 from iscat_analysis.report.context import measured_lines
@@ -25,6 +24,7 @@ from iscat_analysis.report.headline import NOT_A_MASS, headline, precision_of
 from iscat_analysis.report.numbers import number
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder
 from iscat_analysis.report.tables import event_table
+from iscat_analysis.result import Result
 from iscat_analysis.schemas import jsonable
 from iscat_analysis.species import describe
 

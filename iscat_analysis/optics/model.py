@@ -1,0 +1,470 @@
+"""Expected images of one particle, and their derivatives.
+
+One `ForwardModel` serves the simulator, the fits, the posterior and the bounds.  Its *signal* is
+the contrast C in the interferometric schemes and |E_sca|² for unit incident amplitude in dark field
+(D21, section II; physics.md, sections 1–3 and 8).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.hessian import signal_hessian
+from iscat_analysis._kernels.image import Lens, Pixels, signal_gradient, signal_image
+from iscat_analysis._kernels.radial import AxialTable
+from iscat_analysis.config import Optics
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.aperture import Aperture, weight_on
+from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.materials import Material
+from iscat_analysis.optics.measured import MeasuredField
+from iscat_analysis.optics.scale import MassScale
+from iscat_analysis.optics.sensitivity import (
+    check_names,
+    sensitivity_lattices,
+    signal_derivatives,
+)
+from iscat_analysis.optics.waves import Field, axial_table
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_TABLES_KEPT = 4  # heights whose derivatives or tables are at hand, some MB each
+
+
+@dataclass(frozen=True)
+class ForwardModel:
+    """Expected images of one particle in one microscope; build it with `forward_model`.
+
+    Attributes
+    ----------
+    optics : Optics
+        The ``[optics]`` section.
+    material : Material
+        Permittivity, density, nominal mass.
+    aperture : Aperture
+        The pupil on its quadrature.
+    height_nm : float
+        The height for which the focus was set [nm].
+    reference : float
+        |E_ref| for unit incident amplitude; 0 in dark field.
+    rho : float
+        1 with a reference, 0 in dark field: the reference in the unit of the field.
+    factor : complex
+        What multiplies the field's integral over the pupil, per unit amplitude and over the
+        reference.
+    oil_nm : float
+        Excess thickness of the oil that stays when the particle moves [nm].
+    wave : RadialField, LatticeField or MeasuredField
+        The scattered field, tabulated.
+    strength : complex
+        E1·e^{iψ0} per unit amplitude [nm].
+    reach_nm : float
+        Largest distance from the particle that images may have [nm].
+    z_range_nm : (float, float)
+        Heights that fits may ask for [nm].
+    samples : (ndarray, ndarray)
+        Sample offsets inside a pixel, as fractions of it, and their weights.
+    scale : MassScale
+        Mass ↔ amplitude.
+    """
+
+    optics: Optics
+    material: Material
+    aperture: Aperture
+    height_nm: float
+    reference: float
+    rho: float
+    factor: complex
+    oil_nm: float
+    wave: Field
+    strength: complex
+    reach_nm: float
+    z_range_nm: tuple[float, float]
+    samples: tuple[FloatArray, FloatArray]
+    scale: MassScale = field(default_factory=MassScale)
+
+    @property
+    def wavenumber(self) -> float:
+        """2π over the vacuum wavelength [rad/nm]."""
+        return 2 * math.pi / self.optics.wavelength_nm
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the picture was measured, so that nothing is known of the light in the pupil."""
+        return isinstance(self.wave, MeasuredField)
+
+    @property
+    def lens(self) -> Lens:
+        """What turns a profile into a signal, as the kernels take it."""
+        return self.wave.lens(self.rho)
+
+    def pixels(self, grid: PixelGrid) -> Pixels:
+        """Return a grid with the samples inside its pixels, as the kernels take them."""
+        offsets, weights = self.samples
+        return Pixels(grid.x_nm, grid.y_nm, offsets * grid.pixel_nm, weights)
+
+    @property
+    def fringe_nm(self) -> float:
+        """Period λ/(2 n_s) of the interference with height in iSCAT [nm]."""
+        return self.optics.wavelength_nm / (2 * self.optics.n_sample)
+
+    def profile(self, z_nm: float, orders: int = 2) -> FloatArray:
+        """Profile of the field at a height.
+
+        Parameters
+        ----------
+        z_nm : float
+            Height [nm].
+        orders : int
+            1, 2 or 3: fields, with ∂/∂z, with ∂²/∂z².
+
+        Returns
+        -------
+        ndarray
+            See `iscat_analysis._kernels.radial` and `iscat_analysis._kernels.lattice`.  The last
+            few are kept: not to be written to.
+        """
+        return self.wave.profile(z_nm, orders)
+
+    @cached_property
+    def axial_table(self) -> AxialTable:
+        """Profiles at the heights of `z_range_nm`, for the kernels that interpolate along z."""
+        return axial_table(self.wave, self.z_range_nm)
+
+    def height_table(self, z_nm: float) -> AxialTable:
+        """Profiles at one height, in the form of `axial_table`; the last few are kept.
+
+        Parameters
+        ----------
+        z_nm : float
+            Height [nm].
+
+        Returns
+        -------
+        AxialTable
+            For kernels that stay at this height.
+        """
+        return self._height_tables(z_nm)
+
+    @cached_property
+    def _height_tables(self) -> Callable[[float], AxialTable]:
+        return lru_cache(_TABLES_KEPT)(lambda z_nm: axial_table(self.wave, (z_nm, z_nm)))
+
+    def image(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
+    ) -> FloatArray:
+        """Signal of one particle.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        mass_kda : float
+            Mass [kDa]; negative for a field of opposite sign.
+
+        Returns
+        -------
+        ndarray, shape (ny, nx)
+            Contrast C, or |E_sca|² in dark field.
+        """
+        return self.amplitude_image(grid, x_nm, y_nm, z_nm, self.scale.amplitude(mass_kda))
+
+    def amplitude_image(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
+    ) -> FloatArray:
+        """Signal of one particle whose amplitude is known instead of its mass.
+
+        Below the offset of a calibration two amplitudes have one mass, so that what was fitted as
+        an amplitude must be drawn from it.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        ndarray, shape (ny, nx)
+            As `image` gives it.
+        """
+        out = np.empty(grid.shape)
+        signal_image(self.profile(z_nm, 1), *self._geometry(grid, x_nm, y_nm, amplitude), out)
+        return out
+
+    def gradient(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Signal and its analytic derivatives.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        mass_kda : float
+            Mass [kDa].
+
+        Returns
+        -------
+        signal : ndarray, shape (ny, nx)
+            As `image` gives it.
+        gradient : ndarray, shape (4, ny, nx)
+            Derivatives with respect to x, y, z [1/nm] and mass [1/kDa].
+        """
+        amplitude = self.scale.amplitude(mass_kda)
+        signal, gradient = self.amplitude_gradient(grid, x_nm, y_nm, z_nm, amplitude)
+        gradient[3] /= self.scale.slope(amplitude)
+        return signal, gradient
+
+    def amplitude_gradient(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Signal and its derivatives in (x, y, z, a), a the amplitude.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        signal : ndarray, shape (ny, nx)
+            As `image` gives it.
+        gradient : ndarray, shape (4, ny, nx)
+            Derivatives with respect to x, y, z [1/nm] and the amplitude.
+        """
+        rows = np.empty((grid.shape[0], 5, grid.shape[1]))
+        signal_gradient(self.profile(z_nm, 2), *self._geometry(grid, x_nm, y_nm, amplitude), rows)
+        out = np.moveaxis(rows, 1, 0)
+        return out[0], out[1:]
+
+    def amplitude_hessian(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Signal, gradient and second derivatives in (x, y, z, a), a the amplitude.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        signal : ndarray, shape (ny, nx)
+            As `image` gives it.
+        gradient : ndarray, shape (4, ny, nx)
+            First derivatives.
+        hessian : ndarray, shape (4, 4, ny, nx)
+            Second derivatives.
+        """
+        first = np.empty((5, *grid.shape))
+        second = np.empty((4, 4, *grid.shape))
+        geometry = self._geometry(grid, x_nm, y_nm, amplitude)
+        signal_hessian(self.profile(z_nm, 3), *geometry, first, second)
+        return first[0], first[1:], second
+
+    def joint_gradient(
+        self,
+        grid: PixelGrid,
+        x_nm: float,
+        y_nm: float,
+        z_nm: float,
+        mass_kda: float,
+        names: Sequence[str],
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Signal and its analytic derivatives with respect to particle and microscope.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        mass_kda : float
+            Mass [kDa].
+        names : sequence of str
+            Parameters of ``[optics]``: ``focus_nm``, ``na``, ``reference_phase_deg``, ``mask_na``,
+            ``attenuation`` and ``z5`` to ``z37`` [nm].
+
+        Returns
+        -------
+        signal : ndarray, shape (ny, nx)
+            As `image` gives it, to a part in 10⁶.
+        own : ndarray, shape (4, ny, nx)
+            As `gradient` gives it, to a part in 10⁵.
+        shared : ndarray, shape (len(names), ny, nx)
+            Per unit of each parameter, at fixed amplitude of the scattered field: where a
+            calibration ties mass to contrast, the mass of that amplitude changes with the optics.
+
+        Raises
+        ------
+        ConfigError
+            A name is unknown, or the convention is D21's.
+        """
+        check_names(self.optics, names)
+        if self.is_measured:
+            raise ConfigError('optics.psf = "measured" knows no parameters of the optics')
+        lens, stack = self._sensitivities(z_nm, tuple(names))
+        amplitude = self.scale.amplitude(mass_kda)
+        _, pixels, *_ = self._geometry(grid, x_nm, y_nm, amplitude)
+        rows = np.empty((grid.shape[0], 5, grid.shape[1]))
+        lifted = stack[:2].reshape(-1, *stack.shape[3:])
+        signal_gradient(lifted, lens, pixels, x_nm, y_nm, amplitude, rows)
+        rows[:, 4] /= self.scale.slope(amplitude)
+        out = np.moveaxis(rows, 1, 0)
+        shared = signal_derivatives(stack, lens, pixels, x_nm, y_nm, amplitude)
+        return out[0], out[1:], shared
+
+    @cached_property
+    def _sensitivities(self) -> Callable[[float, tuple[str, ...]], tuple[Lens, FloatArray]]:
+        def at(z_nm: float, names: tuple[str, ...]) -> tuple[Lens, FloatArray]:
+            return sensitivity_lattices(
+                self.aperture,
+                lambda opening: weight_on(opening, self.factor, self.oil_nm),
+                z_nm, names, rho=self.rho, reach_nm=self.reach_nm,
+            )  # fmt: skip
+
+        return lru_cache(_TABLES_KEPT)(at)
+
+    def field(
+        self, dx_nm: FloatArray, dy_nm: FloatArray, z_nm: float, mass_kda: float
+    ) -> ComplexArray:
+        """Scattered field over the reference (dark field: over the incident amplitude).
+
+        Parameters
+        ----------
+        dx_nm, dy_nm : ndarray
+            Camera position minus the particle's [nm], same shape.
+        z_nm : float
+            Height [nm].
+        mass_kda : float
+            Mass [kDa].
+
+        Returns
+        -------
+        complex ndarray, shape (1 or 2, *dx_nm.shape)
+            Component along the reference's polarisation p, and, without an analyser, the other:
+            across it where p is linear, along p* where it is circular.
+        """
+        amplitude = self.scale.amplitude(mass_kda)
+        return amplitude * self.wave.components(dx_nm, dy_nm, z_nm)
+
+    def peak_contrast(self, z_nm: float, mass_kda: float) -> float:
+        """Signal of largest magnitude over the plane, with its sign.
+
+        Parameters
+        ----------
+        z_nm : float
+            Height [nm].
+        mass_kda : float
+            Mass [kDa].
+
+        Returns
+        -------
+        float
+            Peak contrast, or the peak of |E_sca|² in dark field.
+        """
+        return self.amplitude_contrast(z_nm, self.scale.amplitude(mass_kda))
+
+    def amplitude_contrast(self, z_nm: float, amplitude: float) -> float:
+        """Peak contrast of an amplitude; see `peak_contrast` and `amplitude_image`.
+
+        Parameters
+        ----------
+        z_nm : float
+            Height [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+
+        Returns
+        -------
+        float
+            Peak contrast, or the peak of |E_sca|² in dark field.
+        """
+        return sum(self.wave.peak(z_nm, amplitude, self.rho))
+
+    def collected_area_nm2(self, z_nm: float, mass_kda: float) -> float:
+        """Scattered light that the pupil collects, as an equivalent area of reference.
+
+        Before mask and analyser; aberrations do not matter.
+
+        Multiplied by the background per area it gives the collected scattered photons
+        (physics.md, section 1).
+
+        Parameters
+        ----------
+        z_nm : float
+            Height [nm]; evanescent waves weaken with it.
+        mass_kda : float
+            Mass [kDa].
+
+        Returns
+        -------
+        float
+            Area [nm²]; in dark field per unit incident intensity; NaN where the picture was
+            measured.
+        """
+        if self.is_measured:
+            return math.nan
+        p = self.aperture.pupil
+        decay = np.exp(-2 * p.axial.imag * z_nm)
+        density = (np.abs(p.t_p_cos) ** 2 + np.abs(p.t_s) ** 2) * np.sin(p.theta) * decay
+        pupil_integral = math.pi * float(np.sum(p.weight * density))
+        medium = 1.0 if self.optics.emission == "reciprocal" else 1 / self.optics.n_immersion**2
+        over = self.reference**2 if self.rho else 1.0
+        e1 = abs(self.strength) * self.scale.amplitude(mass_kda)
+        return e1**2 * medium * pupil_integral / over
+
+    def photons_per_intensity(self, photons_per_frame: float, pixel_nm: float) -> float:
+        """Dark field's scale s: photoelectrons per pixel and frame for unit |E_sca|².
+
+        Parameters
+        ----------
+        photons_per_frame : float
+            Scattered photons collected per frame from a particle of the nominal mass.
+        pixel_nm : float
+            Pixel side [nm].
+
+        Returns
+        -------
+        float
+            s.
+        """
+        area = self.collected_area_nm2(self.height_nm, self.material.mass_kda)
+        return photons_per_frame * pixel_nm**2 / area
+
+    def _geometry(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, amplitude: float
+    ) -> tuple[Lens, Pixels, float, float, float]:
+        """Arguments every image kernel takes after the profile."""
+        half = grid.pixel_nm / 2
+        far_x = max(abs(grid.x_nm[0] - x_nm), abs(grid.x_nm[-1] - x_nm)) + half
+        far_y = max(abs(grid.y_nm[0] - y_nm), abs(grid.y_nm[-1] - y_nm)) + half
+        if math.hypot(far_x, far_y) > self.reach_nm:
+            raise ConfigError(
+                f"the grid extends {math.hypot(far_x, far_y):.0f} nm from the particle, the model "
+                f"was built for {self.reach_nm:.0f} nm: give forward_model a larger reach_nm"
+            )
+        return self.lens, self.pixels(grid), x_nm, y_nm, amplitude

@@ -1,0 +1,372 @@
+"""Pictures of the bright particles of a movie, from which its microscope is measured.
+
+No microscope takes part in finding them: not where they are, and not what they look like.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.calibration.optics import (
+    FAINTEST,
+    MOST_SIGHTS,
+    Sight,
+    build_microscope,
+    settings_of,
+)
+from iscat_analysis.config import Config
+from iscat_analysis.inference.likelihood import Likelihood, conditional, poisson
+from iscat_analysis.movie.background import measure_windows
+from iscat_analysis.movie.camera import Camera, check_counts
+from iscat_analysis.movie.stack import Stack
+from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.pipeline.chunks import Reader, counts_budget, judge_window, plan_chunks
+from iscat_analysis.pipeline.ranges import frame_ranges
+from iscat_analysis.records import Windows
+from iscat_analysis.search.bright import (
+    ALONE_NM,
+    BrightStep,
+    centre_of_energy,
+    energy_of,
+    find_bright_places,
+    find_bright_steps,
+)
+from iscat_analysis.search.sliding import STRIDES
+
+RINGS_NM = 9000.0
+"""Farther than this from a particle its rings are left out."""
+
+APART_NM = 2000.0
+"""Particles that all bound at once are used if no other is nearer; the rings are accounted for."""
+
+OTHERS_NM = 1700.0
+"""Side of the region on which a neighbour is fitted."""
+
+SAME_NM = 800.0
+"""Nearer than this, and at the same time, two steps are one."""
+
+_SHIFT_NM = 450.0  # how far a particle may lie from the centre of its picture
+
+
+def landing_sights(
+    movie: Stack, config: Config, camera: Camera, pool: ThreadPoolExecutor
+) -> tuple[list[Sight], list[Sight]]:
+    """Find bright steps of a landing movie, chunk by chunk until there are enough.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        Resolved.
+    camera : Camera
+        Counts → photoelectrons.
+    pool : ThreadPoolExecutor
+        Runs the search.
+
+    Returns
+    -------
+    sights : list of Sight
+        At most `MOST_SIGHTS`, the brightest first.
+    others : list of Sight
+        Every bright step, on small regions.
+    """
+    first, last = config.fit.frames or (0, movie.shape[0])
+    reader = Reader(movie, camera, first, min(last, movie.shape[0]), counts_budget(config))
+    _, _, window = judge_window(reader, config, pool.map)
+    stride = max(1, window // STRIDES)
+    found: list[BrightStep] = []
+    rest: list[BrightStep] = []
+    for _, span in plan_chunks(reader, config, window, stride):
+        chunk = reader.chunk(span, stride, pool)
+        alone, every = find_bright_steps(
+            chunk,
+            window,
+            pixel_nm=_pixel_nm(config),
+            resolution_nm=config.optics.wavelength_nm / config.optics.na,
+            roi_px=_roi_px(config),
+            most=MOST_SIGHTS,
+            mapper=pool.map,
+        )
+        found += alone
+        rest += every
+        bright = [step for step in found if step.snr > FAINTEST]
+        if len(bright) >= MOST_SIGHTS:
+            break
+    bright.sort(key=lambda step: -step.snr)
+    unique = _without_repeats(bright)
+    others = _without_repeats(rest)
+    sights = [
+        [
+            replace(_sight_of(step, config), neighbours=_neighbours(step, others, config))
+            for step in steps
+        ]
+        for steps in (unique[:MOST_SIGHTS], others)
+    ]
+    return sights[0], sights[1]
+
+
+def _neighbours(
+    step: BrightStep, others: Sequence[BrightStep], config: Config
+) -> tuple[tuple[int, float], ...]:
+    """List the steps whose rings change while a step's frames are summed, and by what share."""
+    found = []
+    for number, other in enumerate(others):
+        apart = math.hypot(step.x_px - other.x_px, step.y_px - other.y_px) * _pixel_nm(config)
+        if apart > RINGS_NM or (abs(step.frame - other.frame) < 5 and apart < SAME_NM):
+            continue
+        shares = [
+            (stop - min(max(other.frame, start), stop)) / max(stop - start, 1)
+            for start, stop in (step.frames_before, step.frames_after)
+        ]
+        if shares[1] > shares[0]:
+            found.append((number, shares[1] - shares[0]))
+    return tuple(found)
+
+
+def _without_repeats(steps: Iterable[BrightStep]) -> list[BrightStep]:
+    """Leave out the second of two that chunks with common frames have both found."""
+    kept: list[BrightStep] = []
+    for step in steps:
+        if not any(
+            abs(step.frame - other.frame) < 5
+            and math.hypot(step.x_px - other.x_px, step.y_px - other.y_px) < 5
+            for other in kept
+        ):
+            kept.append(step)
+    return kept
+
+
+def bound_sights(movie: Stack, config: Config, camera: Camera) -> tuple[list[Sight], list[Sight]]:
+    """Find bright particles that bound between two ranges of frames.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        Resolved, with background frames or a known level.
+    camera : Camera
+        Counts → photoelectrons.
+
+    Returns
+    -------
+    sights : list of Sight
+        At most `MOST_SIGHTS`, the brightest first.
+    others : list of Sight
+        Every bright particle, on small regions.
+    """
+    before, after = frame_ranges(movie, config)
+    windows = _windows(movie, config, camera, before, after)
+    ratio = windows.power_ratio
+    # the noise of a known background is none
+    noise_before = windows.before_e + windows.read_variance_before_e2 if windows.n_before else 0.0
+    variance = windows.after_e + windows.read_variance_after_e2 + ratio**2 * noise_before
+    used = ~windows.masked & (windows.before_e > 0) & (windows.after_e > 0)
+    energy = energy_of(windows.after_e - ratio * windows.before_e, variance, used, _spot_px(config))
+    model = build_microscope(config, 1000.0, settings_of(config))
+
+    def cut_out(row: int, column: int, side: int) -> Sight:
+        region = _region(row, column, side)
+        grid = PixelGrid.region(*region, _pixel_nm(config))
+        cut = slice(*region[0]), slice(*region[1])
+        if windows.n_before:
+            likelihood = conditional(
+                model, grid, windows.before_e[cut], windows.after_e[cut], ratio,
+                read_variance_before_e2=windows.read_variance_before_e2[cut],
+                read_variance_after_e2=windows.read_variance_after_e2[cut],
+                masked=windows.masked[cut],
+            )  # fmt: skip
+        else:
+            level = ratio * windows.before_e[cut]
+            likelihood = poisson(
+                model, grid, windows.after_e[cut], level, level,
+                extra_variance_e2=windows.read_variance_after_e2[cut], masked=windows.masked[cut],
+            )  # fmt: skip
+        return _centred(likelihood, config, frame=after[0])
+
+    pixel = _pixel_nm(config)
+    sights, others = (
+        [
+            cut_out(row, column, side)
+            for row, column in find_bright_places(
+                energy, pixel_nm=pixel, alone_nm=alone_nm, roi_px=side
+            )
+        ]
+        for alone_nm, side in ((APART_NM, _roi_px(config)), (0.0, round(OTHERS_NM / pixel)))
+    )
+
+    def with_neighbours(sight: Sight) -> Sight:
+        apart = [math.hypot(sight.x_nm - o.x_nm, sight.y_nm - o.y_nm) for o in others]
+        near = [(k, 1.0) for k, d in enumerate(apart) if SAME_NM < d < RINGS_NM]
+        return replace(sight, neighbours=tuple(near))
+
+    return _bright(map(with_neighbours, sights)), [with_neighbours(o) for o in others]
+
+
+def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
+    """Cut the particles of a scan of the focus out of its frames.
+
+    The particles stay where they are, so that no frame shows the background alone.  It comes from
+    ``background.frames`` where the movie has some; otherwise it is taken for even around each
+    particle, at a level that is fitted in every picture.
+
+    Parameters
+    ----------
+    movie : Stack
+        The scan.
+    config : Config
+        Resolved; ``optics.focus_nm`` is that of the first frame that is fitted.
+    camera : Camera
+        Counts → photoelectrons.
+
+    Returns
+    -------
+    list of Sight
+        At most `MOST_SIGHTS`, spread evenly over the frames.
+    """
+    known = config.background.frames
+    start = known[1] if known else 0
+    first, last = config.fit.frames or (start, movie.shape[0])
+    counts = movie.read(first, last)
+    check_counts(counts, first, movie.name, camera=camera)
+    frames = camera.to_electrons(counts)
+    read = camera.read_variance_e2((movie.shape[1], movie.shape[2]))
+    background, n_before = np.ones(read.shape), 0
+    if known:
+        n_before = known[1] - known[0]
+        background = camera.to_electrons(movie.read(*known)).sum(axis=0)
+    ratios = np.array([np.median(frame / background) for frame in frames])
+    energies = []
+    for frame, ratio in zip(frames, ratios, strict=True):
+        noise = ratio**2 * (background + n_before * read) if n_before else 0.0
+        energies.append(
+            energy_of(frame - ratio * background, frame + read + noise, frame > 0, _spot_px(config))
+        )
+    energy = np.mean(energies, axis=0) * math.sqrt(len(energies))
+    places = find_bright_places(
+        energy, pixel_nm=_pixel_nm(config), alone_nm=ALONE_NM, roi_px=_roi_px(config)
+    )
+    model = build_microscope(config, 1000.0, settings_of(config))
+    saturated = np.any(camera.saturated(counts), axis=0)
+    sights: list[Sight] = []
+    per_place = max(1, MOST_SIGHTS // max(len(places), 1))
+    taken = np.unique(np.linspace(0, len(frames) - 1, min(per_place, len(frames))).round())
+    for row, column in places[:MOST_SIGHTS]:
+        region = _region(row, column, _roi_px(config))
+        grid = PixelGrid.region(*region, _pixel_nm(config))
+        cut = slice(*region[0]), slice(*region[1])
+        masked = np.asarray(saturated)[cut]
+        seen: list[Sight] = []
+        for index in taken.astype(int):
+            frame, ratio = frames[index][cut], float(ratios[index])
+            if n_before:
+                likelihood = conditional(
+                    model, grid, background[cut], frame, ratio,
+                    read_variance_before_e2=n_before * read[cut],
+                    read_variance_after_e2=read[cut], masked=masked,
+                )  # fmt: skip
+            else:
+                level = np.full(frame.shape, float(np.median(frame)))
+                likelihood = poisson(
+                    model, grid, frame, level, level, extra_variance_e2=read[cut], masked=masked
+                )
+            sight = _centred(likelihood, config, frame=first + int(index))
+            seen.append(replace(sight, focus_steps=float(index)))
+        weights = [sight.snr**2 for sight in seen]
+        x_nm, y_nm = (
+            float(np.average([getattr(sight, key) for sight in seen], weights=weights))
+            for key in ("x_nm", "y_nm")
+        )
+        sights += [replace(sight, x_nm=x_nm, y_nm=y_nm) for sight in seen]
+    return _bright(sights)
+
+
+def _windows(
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    before: tuple[int, int] | None,
+    after: tuple[int, int],
+) -> Windows:
+    def check(counts: NDArray[Any], first: int) -> None:
+        check_counts(counts, first, movie.name, camera=camera)
+
+    return measure_windows(
+        movie, camera, before, after, median=config.background.method == "median",
+        level_e=config.background.level_e,
+        power_normalization=config.background.power_normalization, check=check,
+    )  # fmt: skip
+
+
+def _centred(likelihood: Likelihood, config: Config, *, frame: int) -> Sight:
+    """Make a sight of a picture, from the centre of its energy."""
+    grid = likelihood.grid
+    information = likelihood.signal_information()
+    contrast = np.nan_to_num(likelihood.measured_signal())
+    used = information > 0
+    contrast = np.where(used, contrast - np.average(contrast, weights=information), 0.0)
+    variance = 1 / np.where(used, information, 1e-6)
+    y, x, snr = centre_of_energy(contrast, variance, grid.pixel_nm)
+    return Sight(
+        grid=grid, kind=likelihood.kind, data=likelihood.data,
+        x_nm=float(grid.x_nm[0] + x * grid.pixel_nm), y_nm=float(grid.y_nm[0] + y * grid.pixel_nm),
+        z_nm=config.particle.height_nm, frame=frame, snr=snr,
+    )  # fmt: skip
+
+
+def _bright(sights: Iterable[Sight]) -> list[Sight]:
+    """Keep the pictures that are bright enough, the brightest first."""
+    return sorted((s for s in sights if s.snr > FAINTEST), key=lambda s: -s.snr)[:MOST_SIGHTS]
+
+
+def _sight_of(step: BrightStep, config: Config) -> Sight:
+    """Make a sight of a step."""
+    grid = PixelGrid.region(step.rows, step.columns, _pixel_nm(config))
+    model = build_microscope(config, 1000.0, settings_of(config))
+    likelihood = conditional(
+        model, grid, step.before_e, step.after_e, step.power_ratio,
+        read_variance_before_e2=step.n_before * step.read_variance_e2,
+        read_variance_after_e2=step.n_after * step.read_variance_e2, masked=~step.usable,
+    )  # fmt: skip
+    return _centred(likelihood, config, frame=step.frame)
+
+
+def _pixel_nm(config: Config) -> float:
+    return float(config.camera.pixel_size_nm or math.nan)
+
+
+def _roi_px(config: Config) -> int:
+    return config.fit.roi_px(_pixel_nm(config))
+
+
+def _spot_px(config: Config) -> float:
+    return config.optics.wavelength_nm / config.optics.na / _pixel_nm(config)
+
+
+def _region(row: int, column: int, side: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    first, left = row - side // 2, column - side // 2
+    return (first, first + side), (left, left + side)
+
+
+def reach_nm(sight: Sight) -> float:
+    """Distance from a particle, which may move in its picture, to the farthest pixel.
+
+    Parameters
+    ----------
+    sight : Sight
+        The picture.
+
+    Returns
+    -------
+    float
+        Distance [nm].
+    """
+    return sight.grid.diagonal_nm / 2 + _SHIFT_NM
