@@ -23,7 +23,7 @@ from scipy.optimize import brentq
 from scipy.stats import ncx2, norm
 
 from iscat_analysis.bounds.experiment import Experiment, expected_likelihood
-from iscat_analysis.inference.random_field import curvatures, height_reached
+from iscat_analysis.inference.random_field import extent, height_reached
 
 _FAINT = 1e-6  # of the particle's amplitude: where derivatives with the place are taken
 
@@ -124,10 +124,10 @@ def detection_limit(experiment: Experiment) -> DetectionLimit | None:
         return None
     slope = fisher[:2, 3] / (theta[3] * fisher[3, 3])
     rough = fisher[:2, :2] / (theta[3] ** 2 * fisher[3, 3]) - np.outer(slope, slope)
-    box = curvatures((at.pixels * experiment.grid.pixel_nm,) * 2, rough)
+    area = extent(rough, (at.pixels * experiment.grid.pixel_nm) ** 2)
     false, miss = at.false_alarm_probability, at.miss_probability
     known = float(norm.isf(false))
-    searched = height_reached(-math.log1p(-false), box, lowest=known)
+    searched = height_reached(-math.log1p(-false), area, lowest=known)
     snr = known + float(norm.isf(miss))
     snr_searched = float(
         brentq(lambda s: power_searched(s, searched) - (1 - miss), 0.0, searched + 40.0)

@@ -70,7 +70,7 @@ class Lines:
     @property
     def summary(self) -> dict[str, float]:
         """What ``summary.json`` says of it."""
-        return {"row_share": self.shares[0], "column_share": self.shares[1]}
+        return {"row_share": float(self.shares[0]), "column_share": float(self.shares[1])}
 
     def factors(self, electrons: FloatArray) -> FloatArray:
         """Measure the light of the lines over that of the frame.
@@ -96,8 +96,8 @@ class Lines:
                     continue
                 line = self.light_e.sum(axis=axis, keepdims=True)
                 factor = seen.sum(axis=axis, keepdims=True) / line / frame
-                lit = used.mean(axis=axis, keepdims=True) > _LEAST_LIT
-                out = out * np.where(lit & np.isfinite(factor) & (factor > 0), factor, 1.0)
+                lit = (used.mean(axis=axis, keepdims=True) > _LEAST_LIT) & (frame > 0)
+                out = out * np.where(lit & (factor > 0), factor, 1.0)
         return out
 
     def taken(self, signal: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ SAMPLED = 0.85
 
 _ORDER = 5  # of the spline: a parabola misses 1 % of the height of a peak between four pixels
 _REACH_PX = 6  # of the pixels that the spline goes through
-_FINE = np.linspace(-0.5, 0.5, 9)
+_FINE = np.linspace(-0.625, 0.625, 11)
 
 
 def summit(field: NDArray[Any], row: int, column: int) -> tuple[float, float, float]:
@@ -29,7 +29,7 @@ def summit(field: NDArray[Any], row: int, column: int) -> tuple[float, float, fl
     Returns
     -------
     dy, dx : float
-        From the pixel to the top, at most half a pixel; never out of the field.
+        From the pixel to the top; never out of the field.
     above : float
         Height of the top above the pixel, ≥ 0.
     """

@@ -21,7 +21,7 @@ from scipy.ndimage import maximum_filter
 from iscat_analysis.config import Detection
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.random_field import curvatures, height_reached
+from iscat_analysis.inference.random_field import extent, height_reached
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
@@ -141,17 +141,18 @@ def make_templates(
         axis=1,
     )[:, 0]
     two_sided = z_range_nm is None and model.rho > 0 and detection.polarity == "both"
-    lengths = [field_px[1] * pixel_nm, field_px[0] * pixel_nm]
+    rough = np.mean(roughness, axis=0)
+    size = field_px[0] * field_px[1] * pixel_nm**2
+    area, volume = extent(rough[:2, :2], size), 0.0
     if z_range_nm is not None:
-        lengths.append(float(heights[-1] - heights[0]))
-    box = curvatures(lengths, np.mean(roughness, axis=0))
-    alarms, sides = detection.false_alarms_per_movie, 2 if two_sided else 1
+        volume = extent(rough, size * float(heights[-1] - heights[0]))
+    alarms = detection.false_alarms_per_movie / (2 if two_sided else 1)
     return Templates(
         z_nm=heights,
         images=stacked,
         signs=np.sign(extremes),
         quadratic=model.rho == 0,
-        threshold=height_reached(alarms / sides, box, correlation=correlation),
+        threshold=height_reached(alarms, area, volume, correlation=correlation),
         two_sided=two_sided,
         noise=noise,
     )
