@@ -4,8 +4,11 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
-DOCS_STAMP := $(VENV)/.installed-docs
+KERNELS := .kernels/.compiled
 LOWEST := $(VENV)/lowest
+
+# Tests and pages start hundreds of processes, none of which should compile the package anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 # Of the large tests: how much of them `make test-all` runs.
 SHARE  ?= 1
@@ -15,7 +18,7 @@ PYTEST := pytest -n auto --dist loadscope --no-loadscope-reorder
 DEMO_CONFIG := sample_configs/landing.toml
 DEMO        := demo
 
-.PHONY: help install demo test test-all test-lowest lint bench docs clean
+.PHONY: help install demo test test-all test-lowest lint kernels lint-and-kernels bench docs clean
 
 help:
 	@echo "make demo         simulate a landing movie, analyse it, say where the report is"
@@ -23,6 +26,7 @@ help:
 	@echo "make test-all     the same with coverage, and the large tests: statistics, random kills"
 	@echo "make test-lowest  unit and physics tests with the lowest versions that pyproject.toml admits"
 	@echo "make lint         style, types, architecture, docstrings"
+	@echo "make kernels      compile the kernels that tests and manual share, in .kernels"
 	@echo "make bench        speed and efficiency, against peers"
 	@echo "make docs         the manual, in docs/_build/html; runs all of its code blocks"
 	@echo "make clean        remove what these made, the environment included"
@@ -33,11 +37,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(STAMP): pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable ".[test,lint]"
-	@touch $@
-
-$(DOCS_STAMP): pyproject.toml $(STAMP)
-	$(BIN)/python -m pip install --quiet --editable ".[docs]"
+	$(BIN)/python -m pip install --quiet $(PIP_OPTIONS) --editable ".[test,lint,docs]"
 	@touch $@
 
 demo: $(STAMP)
@@ -53,10 +53,20 @@ lint: $(STAMP)
 	$(BIN)/lint-imports
 	$(BIN)/numpydoc lint $$(find iscat_analysis -name '*.py' -not -path '*/_*')
 
-test: lint
+kernels: $(KERNELS)
+
+# Compiled once, while the style is judged, and not by every worker and every page.
+$(KERNELS): $(STAMP) docs/kernel_cache.py $(wildcard iscat_analysis/_kernels/*.py)
+	$(BIN)/python docs/kernel_cache.py
+	@mkdir -p $(@D) && touch $@
+
+lint-and-kernels: $(STAMP)
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint kernels
+
+test: lint-and-kernels
 	$(BIN)/$(PYTEST)
 
-test-all: lint
+test-all: lint-and-kernels
 	$(BIN)/$(PYTEST) --share=$(SHARE) --cov --cov-fail-under=90
 
 # Old libraries may use what new ones deprecate, so that warnings are errors above but not here.
@@ -74,7 +84,7 @@ $(LOWEST)/.installed: pyproject.toml .ci/lowest.py
 bench: $(STAMP)
 	$(BIN)/python benchmarks/run.py
 
-docs: $(DOCS_STAMP)
+docs: $(KERNELS)
 	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
 	@echo "The manual: docs/_build/html/index.html"
 

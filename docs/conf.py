@@ -143,14 +143,23 @@ def _write_schemas() -> None:
 
 
 def _run_pages() -> None:
-    """Run every block of the manual and of README, as many pages at a time as there are cores."""
+    """Run every block of the manual and of README, as many pages at a time as there are cores.
+
+    Pages of many commands come first, so that no core is left with one.
+    """
     pages = [
         page
         for page in sorted([HERE.parent / "README.md", *HERE.rglob("*.md")])
         if "_build" not in page.parts and any(block.not_run is None for block in blocks_of(page))
     ]
+    pages.sort(key=_commands_of, reverse=True)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(_run_one_page, pages))
+
+
+def _commands_of(page: Path) -> int:
+    run = [block for block in blocks_of(page) if block.not_run is None]
+    return sum(len(block.first) + max(1, len(block.commands)) for block in run)
 
 
 def _run_one_page(page: Path) -> None:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
+import tempfile
 from importlib.metadata import version
 from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def share_kernels(root: Path) -> None:
@@ -19,3 +24,36 @@ def share_kernels(root: Path) -> None:
     """
     names = (f"{name}-{version(name)}" for name in ("numba", "numpy"))
     os.environ.setdefault("NUMBA_CACHE_DIR", str(root / ".kernels" / "_".join(names)))
+
+
+def compile_kernels() -> None:
+    """Do small jobs of every kind, so that no two processes compile the same kernel later.
+
+    What this leaves out is compiled where it is first needed.
+    """
+    from iscat_cli import main
+
+    def run(*arguments: str) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):
+            status = main([*arguments, "--quiet"])
+        if status:
+            raise RuntimeError(f"iscat {' '.join(arguments)} ended with status {status}")
+
+    small = ("simulation.shape=[64, 64]", "posterior.steps=100", "bounds.pixels=31")
+    few = ("simulation.count=6", "simulation.leavings=1", "simulation.frames=400")
+    one = ("simulation.events=[{frame=200, x_px=31.2, y_px=30.8, mass_kda=900.0}]",)
+    cobri = (*one, "optics.scheme=cobri")
+    jobs = [("landing", few), ("mass", one), ("joint", one), ("joint", cobri)]
+    with tempfile.TemporaryDirectory() as name:
+        for number, (sample, changes) in enumerate(jobs):
+            movie = f"{name}/{number}.tif"
+            options = ["--config", str(ROOT / "sample_configs" / f"{sample}.toml")]
+            options += [f"--set={change}" for change in (*small, *changes)]
+            run("simulate", *options, "--out", movie)
+            run("fit", movie, *options)
+            run("bounds", *options)
+
+
+if __name__ == "__main__":
+    share_kernels(ROOT)
+    compile_kernels()

@@ -6,6 +6,7 @@ import math
 import os
 import signal
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -30,8 +31,14 @@ settings.register_profile("ci", deadline=None, derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "here")
 
 
-LONGEST_FIRST = ("statistical", "hardening", "cli", "physics")
-"""Folders whose modules take longest; they are begun first, so that no worker is left with one."""
+LONGEST_FIRST = (
+    "test_report_browser", "test_output", "test_report", "test_misfit", "test_landing",
+    "test_misfit_search", "test_optics_forecast", "test_focus_scan", "test_arguments",
+    "test_mass_calibration", "test_optics_calibration", "test_cli_json", "test_bounds_laws",
+    "test_shared_errors", "test_robustness", "test_hostile_files", "test_cli_benchmark",
+    "test_public", "test_cli_contract", "test_pipeline", "test_bounds", "test_photon_transfer",
+)  # fmt: skip
+"""Modules that take longest; they are begun first, so that no worker is left with one."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -57,8 +64,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=list(left_out))
 
     def rank(item: pytest.Item) -> int:
-        folder = item.path.parent.name
-        return LONGEST_FIRST.index(folder) if folder in LONGEST_FIRST else len(LONGEST_FIRST)
+        name = item.path.stem
+        return LONGEST_FIRST.index(name) if name in LONGEST_FIRST else len(LONGEST_FIRST)
 
     items.sort(key=rank)
 
@@ -67,6 +74,34 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def share(request: pytest.FixtureRequest) -> float:
     """Return the share of a large test's repetitions that is wanted, up to 1."""
     return float(request.config.getoption("--share"))
+
+
+@pytest.fixture(scope="session")
+def repetitions(share: float) -> Callable[[int, int], int]:
+    """Return how often to repeat: a few times by default, up to all where large tests are run."""
+
+    def count(few: int, all_of_them: int) -> int:
+        return max(few, round(share * all_of_them))
+
+    return count
+
+
+@pytest.fixture
+def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the figures out of reports, of which a test judges something else."""
+    from sketches import sketch_figures
+
+    sketch_figures(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def all_sketched() -> Iterator[None]:
+    """Leave the figures out of the reports of a whole module."""
+    from sketches import sketch_figures
+
+    with pytest.MonkeyPatch.context() as patch:
+        sketch_figures(patch)
+        yield
 
 
 @pytest.fixture(scope="session")

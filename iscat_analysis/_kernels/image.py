@@ -102,19 +102,19 @@ def _row_fields(
     if with_gradient:
         for j in range(x.size):
             t = f[12, j]
-            i = np.uintp(t)
-            t -= i
+            n = int(t)
+            t -= n
+            i = np.uintp(n)
             for k in range(4):
-                v = profile[k, i, 5]
-                d = 5 * v
-                v = v * t + profile[k, i, 4]
-                d = d * t + 4 * profile[k, i, 4]
+                d = profile[k, i, 5]
+                v = d * t + profile[k, i, 4]
+                d = d * t + v
                 v = v * t + profile[k, i, 3]
-                d = d * t + 3 * profile[k, i, 3]
+                d = d * t + v
                 v = v * t + profile[k, i, 2]
-                d = d * t + 2 * profile[k, i, 2]
+                d = d * t + v
                 v = v * t + profile[k, i, 1]
-                f[8 + k, j] = d * t + profile[k, i, 1]
+                f[8 + k, j] = d * t + v
                 f[k, j] = v * t + profile[k, i, 0]
             for k in range(4, 8):
                 v = profile[k, i, 5]
@@ -126,8 +126,9 @@ def _row_fields(
     else:
         for j in range(x.size):
             t = f[12, j]
-            i = np.uintp(t)
-            t -= i
+            n = int(t)
+            t -= n
+            i = np.uintp(n)
             for k in range(4):
                 v = profile[k, i, 5]
                 v = v * t + profile[k, i, 4]

@@ -22,6 +22,7 @@ log-likelihood is −∞ and what has no limit there is refused.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -494,7 +495,7 @@ class Likelihood:
         at_it = bool(np.all(heights_nm == fixed))
         return self.model.height_table(fixed) if at_it else self.model.axial_table
 
-    @property
+    @cached_property
     def _arguments(self) -> tuple[Lens, Pixels, int, FloatArray]:
         """What every scoring kernel takes after the profiles."""
         return self.model.lens, self.model.pixels(self.grid), self.kind, self.data

@@ -6,10 +6,14 @@ import json
 import math
 from pathlib import Path
 
+import jsonschema
 import pytest
 
+from iscat_analysis.schemas import schema
 from iscat_cli import main
 from iscat_cli.benchmark import benchmark_table
+
+pytestmark = pytest.mark.usefixtures("sketched")
 
 SMALL = ["--set", "fit.roi_nm=900", "--set", "fit.z_range_nm=[0,300]", "--no-posterior"]
 
@@ -37,8 +41,11 @@ def test_benchmark(
         assert json.loads(printed) == written
     else:
         assert "spread/CRB" in printed
+    jsonschema.Draft202012Validator(schema("benchmark")).validate(written)
     assert written["scheme"] == scheme
-    assert (out / "benchmark.html").stat().st_size > 10_000
+    page = (out / "benchmark.html").read_text(encoding="utf-8")
+    assert page.count("<svg") >= 9
+    assert page.rstrip().endswith("</html>")
     assert main(arguments) == 1
     assert "--overwrite" in capsys.readouterr().err
 

@@ -1,4 +1,7 @@
-"""What the commands print with --json, and the JSON they write, against the published schemas."""
+"""What the commands print with --json, and the JSON they write, against the published schemas.
+
+Those of `iscat benchmark` are checked in test_cli_benchmark, where it runs.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,8 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.records import EVENT_COLUMNS, PARAMETERS, Status
 from iscat_analysis.schemas import schema, schema_names
 from iscat_cli import main, main_fit
+
+pytestmark = pytest.mark.usefixtures("sketched")
 
 SMALL = [
     "simulation.frames=60",
@@ -118,14 +123,6 @@ def test_landing_movies(sample_configs, capsys, tmp_path) -> None:
 )
 def test_bounds(options: list[str], setup, capsys) -> None:
     _check(_printed(capsys, "bounds", "--config", str(setup), *options), "bounds")
-
-
-def test_benchmark(setup, capsys, tmp_path) -> None:
-    arguments = ["benchmark", "--config", str(setup), "--out", str(tmp_path / "study")]
-    printed = _printed(capsys, *arguments, "--trials", "20", "--no-posterior")
-    _check(printed, "benchmark")
-    written = json.loads((tmp_path / "study" / "benchmark.json").read_text(encoding="utf-8"))
-    _check(written, "benchmark")
 
 
 def test_camera(setup, capsys, tmp_path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scenes import OPTICS_TRUTH, write_bright_landings
+from sketches import sketch_figures
 
 from iscat_cli import main, main_fit
 
@@ -43,7 +44,9 @@ def test_what_was_learned_is_not_learned_again(movie: Path, tmp_path: Path) -> N
         assert abs(values[name]["value"] - true) < 4 * values[name]["sigma"]
 
 
-def test_a_measured_template_serves_a_fit(movie: Path, tmp_path: Path, capsys: Captured) -> None:
+def test_a_measured_template_serves_a_fit(
+    movie: Path, tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out, setup = tmp_path / "picture", str(movie.with_name("setup.toml"))
     given = ["calibrate", "optics", str(movie), "--config", setup, "--measured"]
     assert main([*given, "--free", "focus", "--out", str(out)]) == 2
@@ -53,6 +56,7 @@ def test_a_measured_template_serves_a_fit(movie: Path, tmp_path: Path, capsys: C
     assert {path.name for path in out.iterdir()} == {
         "optics.toml", "template.npz", "template.json", "template.html",
     }  # fmt: skip
+    sketch_figures(monkeypatch)
     with_it = ["--config", setup, "--set", f"optics.file={out / 'optics.toml'}"]
     assert main_fit([str(movie), *with_it, "--out", str(tmp_path / "fits")]) == 0
     table = pd.read_csv(tmp_path / "fits" / "fits.csv")

@@ -14,6 +14,8 @@ from iscat_analysis.config import load_config
 from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, REPEAT_COLUMNS
 from iscat_cli import main, main_fit
 
+pytestmark = pytest.mark.usefixtures("all_sketched")
+
 MODES = ["mass", "localize", "joint"]
 
 # Standard errors: of 8 events times 4 parameters, one beyond 5σ has a probability below 2e-5.

@@ -27,23 +27,25 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from markupsafe import Markup
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
+
+from sketches import PAGES, sketch
 
 from iscat_analysis import report
 from iscat_analysis.pipeline import chunks
-from iscat_analysis.report import page
 from iscat_cli import main
 
-_PAGES = (report, page)
 _publish = report.publish
+_SKETCH = partial(sketch, pause_s=0.01)  # a moment to be killed in, at each figure
 
 
 def _run(order: dict[str, Any]) -> int:
     os.chdir(order["cwd"])
-    for module in _PAGES:
-        module.publish = _publish if order.get("figures") else _sketch_figures
+    for module in PAGES:
+        module.publish = _publish if order.get("figures") else _SKETCH
     if "limit" in order:
         resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
     if "memory_share" in order:
@@ -54,14 +56,6 @@ def _run(order: dict[str, Any]) -> int:
     sys.stdout.flush()
     sys.stderr.flush()
     return status
-
-
-def _sketch_figures(figures: Any, folder: pathlib.Path | None = None) -> dict[str, Markup]:
-    names = [name for name, _ in figures]
-    for name in names if folder is not None else ():
-        (folder / f"{name}.svg").write_bytes(b"<svg/>\n" * 150)
-        time.sleep(0.01)  # a moment to be killed in
-    return dict.fromkeys(names, Markup("<svg/>"))
 
 
 def _die_while_renaming(word: str, number: int) -> None:

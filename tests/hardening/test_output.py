@@ -508,6 +508,7 @@ def test_neighbours_with_similar_names_are_left_alone(tmp_path: Path) -> None:
 # ---- read back -----------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize("mode", ["mass", "localize", "joint", "track"])
 def test_tables_read_back_by_their_own_libraries(tmp_path: Path, mode: str) -> None:
     out = write_report(make_analysis(7, mode), tmp_path / "out")
@@ -523,6 +524,7 @@ def test_tables_read_back_by_their_own_libraries(tmp_path: Path, mode: str) -> N
     assert text["flags"].fillna("").tolist() == frame["flags"].tolist()
 
 
+@pytest.mark.usefixtures("sketched")
 def test_posteriors_read_back_by_arviz(tmp_path: Path) -> None:
     import warnings
 

@@ -69,9 +69,20 @@ def set_ups(draw: st.DrawFn) -> Config:
     )  # fmt: skip
 
 
-@settings(max_examples=2500)
+@settings(max_examples=300)
 @given(config=set_ups())
 def test_no_camera_beats_the_light(config: Config) -> None:
+    _light_tells_more(config)
+
+
+@pytest.mark.large
+@settings(max_examples=2500)
+@given(config=set_ups())
+def test_no_camera_beats_the_light_anywhere(config: Config) -> None:
+    _light_tells_more(config)
+
+
+def _light_tells_more(config: Config) -> None:
     """N K − J is positive: in every direction, so for every parameter alone and for all jointly."""
     experiment = plan(config)
     found = experiment.bounds(PARAMETERS)

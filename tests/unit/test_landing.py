@@ -411,6 +411,7 @@ def movie(counts: np.ndarray, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("sketched")
 def test_an_interrupted_run_resumes_to_the_same_result(
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -571,6 +572,7 @@ def test_an_interrupt_of_the_chains_keeps_the_fits(
     pd.testing.assert_frame_equal(result.table, plain[0].table)
 
 
+@pytest.mark.usefixtures("sketched")
 def test_an_interrupted_injection_keeps_what_the_movie_gave(
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

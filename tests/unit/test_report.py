@@ -115,10 +115,12 @@ class TestPosterior:
         )
         data.close()
 
+    @pytest.mark.usefixtures("sketched")
     def test_is_absent_when_no_chain_converged(self, tmp_path: Path) -> None:
         out = write_report(make_analysis(2, refused=2), tmp_path / "out")
         assert not (out / "posterior.nc").exists()
 
+    @pytest.mark.usefixtures("sketched")
     def test_a_refused_chain_shows_its_message_and_no_number(self) -> None:
         analysis = make_analysis(3, "joint", refused=1)
         page = render_report(analysis)
@@ -126,6 +128,7 @@ class TestPosterior:
         assert "fit ± σ" not in page  # the table of posteriors
 
 
+@pytest.mark.usefixtures("sketched")
 class TestOverwrite:
     def test_an_earlier_result_stays_without_permission(self, tmp_path: Path) -> None:
         out = write_report(without_events(make_analysis(1)), tmp_path / "out")
@@ -232,6 +235,7 @@ def with_flagged(analysis: Analysis, flagged: int) -> Analysis:
     return replace(analysis, table=table)
 
 
+@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize(("flagged", "silent"), [(0, False), (8, False), (9, True), (40, True)])
 def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: bool) -> None:
     analysis = with_flagged(make_analysis(40), flagged)
@@ -265,6 +269,7 @@ def test_side_lobes_are_no_events() -> None:
     assert "×10⁹" not in headline(analysis, table)[0]
 
 
+@pytest.mark.usefixtures("sketched")
 def test_without_calibration_the_headline_is_a_contrast() -> None:
     analysis = make_analysis(40)
     bare = replace(analysis, summary={**analysis.summary, "mass_scale": "absolute model"})
@@ -278,6 +283,7 @@ def test_without_calibration_the_headline_is_a_contrast() -> None:
     assert "iscat calibrate mass" in page
 
 
+@pytest.mark.usefixtures("sketched")
 def test_optional_columns_stand_beside_sigma() -> None:
     analysis = make_analysis(12)
     table = analysis.table.assign(systematic_mass_kda=7.0, repeat_mass_kda=np.nan, track=1)

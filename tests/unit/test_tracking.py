@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import tifffile
 from scenes import PIXEL_NM, make_config
 
@@ -15,6 +16,8 @@ from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.records import Analysis
+
+pytestmark = pytest.mark.usefixtures("sketched")
 
 BEFORE, FRAMES, LEVEL_E, SIGMAS = 60, 30, 1e5, 4.0
 SHAPE = (60, 76)

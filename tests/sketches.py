@@ -1,0 +1,55 @@
+"""Reports whose figures are not written, which takes most of the time of a small run."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from iscat_analysis import report
+
+PAGES = (
+    report,
+    *(
+        importlib.import_module(f"iscat_analysis.report.{name}")
+        for name in ("benchmark", "bounds", "calibration", "optics", "page", "paper", "template")
+    ),
+)
+"""Modules that publish figures."""
+
+
+def sketch(
+    figures: Iterable[tuple[str, Figure]], folder: Path | None = None, *, pause_s: float = 0.0
+) -> dict[str, Markup]:
+    """Take the place of `publish`: files of a kilobyte stand for the figures.
+
+    Parameters
+    ----------
+    figures : iterable of (str, Figure)
+        As `publish` is given them; a generator draws each.
+    folder : Path, optional
+        Where the files go.
+    pause_s : float
+        A moment after each file, in which a process can be killed.
+
+    Returns
+    -------
+    dict of str to Markup
+        An empty SVG element for each.
+    """
+    names = [name for name, _ in figures]
+    for name in names if folder is not None else ():
+        (folder / f"{name}.svg").write_bytes(b"<svg/>\n" * 150)
+        time.sleep(pause_s)
+    return dict.fromkeys(names, Markup("<svg/>"))
+
+
+def sketch_figures(patch: pytest.MonkeyPatch) -> None:
+    """Let every report be written without its figures."""
+    for module in PAGES:
+        patch.setattr(module, "publish", sketch)
