@@ -81,12 +81,46 @@ def expected_maxima(
     return total * (1 - both)
 
 
+def companions(u: float, ring: FloatArray, cell: float) -> float:
+    """Count the maxima of the other sign that a maximum brings with it.
+
+    Where the field is correlated by r < 0 with that at a maximum of height v = u + 1/u, its mean is
+    −|r| v, and it passes −u more often there.  Once the maximum is fitted and taken off, it does
+    no more.
+
+    Parameters
+    ----------
+    u : float
+        The level.
+    ring : ndarray
+        Correlation of the field with itself, at every distance in a grid.
+    cell : float
+        `extent` of one cell of that grid.
+
+    Returns
+    -------
+    float
+        Expected number for each maximum above the level.
+    """
+    near = ring[ring < 0]
+    spread = np.sqrt(1 - near**2)
+
+    def density(h: FloatArray) -> FloatArray:
+        out: FloatArray = h * np.exp(-(h**2) / 2)
+        return out
+
+    more = density((u + near * (u + 1 / u)) / spread) - density(u / spread)
+    return float(cell / (2 * math.pi) ** 1.5 * np.sum(more))
+
+
 def height_reached(
     alarms: float,
     area: float,
     volume: float = 0.0,
     *,
     correlation: float = 0.0,
+    ring: FloatArray | None = None,
+    cell: float = 0.0,
     lowest: float = _LOWEST,
 ) -> float:
     """Find the level above which noise has a given expected number of maxima.
@@ -97,6 +131,9 @@ def height_reached(
         That number.
     area, volume, correlation
         As in `expected_maxima`.
+    ring, cell
+        As in `companions`, where maxima of both signs count and the higher of two is taken off
+        before the other is looked at.
     lowest : float
         The answer where noise has fewer maxima even there.
 
@@ -107,7 +144,10 @@ def height_reached(
     """
 
     def excess(u: float) -> float:
-        return math.log(expected_maxima(u, area, volume, correlation=correlation) / alarms)
+        found = expected_maxima(u, area, volume, correlation=correlation)
+        if ring is not None:  # of each pair one is left
+            found *= 1 - min(companions(u, ring, cell), 1.0) / 2
+        return math.log(found / alarms)
 
     low = max(lowest, _LOWEST if volume else 1.0)
     if not area > 0 or excess(low) <= 0:

@@ -46,6 +46,7 @@ MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""
 
 _SWEEPS = 2  # fits of everything with everything else in place, after the last round
+_AS_FOUND = 0.95  # of the threshold; what was found is dropped only where others explain it
 _DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
 
 
@@ -124,13 +125,14 @@ def fit_field(
         events = _without_doubles(events, scene)
         events = _fit_all(scene, windows, [e.candidate for e in events], events, pool)
         windows = _refined(scene, windows, events)
-    kept = [e for e in events if e.snr > scene.templates.threshold and _wanted(scene, e)]
+    least = _AS_FOUND * scene.templates.threshold
+    kept = [e for e in events if e.snr > least and _wanted(scene, e)]
     if 0 < len(kept) < len(events):  # what is dropped must leave its neighbours' background too
         kept = _fit_all(scene, windows, [e.candidate for e in kept], kept, pool)
     lobes: list[Event] = []
     if doubtful and not starts:
         lobes = _fit_all(scene, windows, doubtful, kept, pool, first=len(kept))
-        lobes = [e for e in lobes if e.snr > scene.templates.threshold and _wanted(scene, e)]
+        lobes = [e for e in lobes if e.snr > least and _wanted(scene, e)]
     events = _judged(scene, windows, kept, lobes)
     progress("detect", MAX_ROUNDS, MAX_ROUNDS)
     return tuple(sorted(events, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows

@@ -170,6 +170,7 @@ def make_scene(
             z_range_nm=config.fit.z_range_nm if free_z else None,
             field_px=field_px,
             noise=noise,
+            in_turn=True,
         ),
         mode=mode,
         lines=lines,

@@ -91,6 +91,7 @@ def make_templates(
     field_px: tuple[int, int],
     noise: NoiseSpectrum | None = None,
     correlation: float = 0.0,
+    in_turn: bool = False,
 ) -> Templates:
     """Prepare the matched filter for a field.
 
@@ -112,6 +113,8 @@ def make_templates(
         Of the movie; without it the noise is white and of the expected size.
     correlation : float
         Of the noise with that of the next image that is searched; what both see is one false alarm.
+    in_turn : bool
+        Whether what is found is fitted and taken off before what is near is looked at.
 
     Returns
     -------
@@ -152,7 +155,14 @@ def make_templates(
         images=stacked,
         signs=np.sign(extremes),
         quadratic=model.rho == 0,
-        threshold=height_reached(alarms, area, volume, correlation=correlation),
+        threshold=height_reached(
+            alarms,
+            area,
+            volume,
+            correlation=correlation,
+            cell=extent(rough[:2, :2], pixel_nm**2),
+            ring=_autocorrelation(stacked[0], noise) if in_turn and two_sided else None,
+        ),
         two_sided=two_sided,
         noise=noise,
     )
@@ -380,6 +390,15 @@ def _lift(
         u + skew * (u**2 - 1) / 6 + tails * (u**3 - 3 * u) / 24 - skew**2 * (2 * u**3 - 5 * u) / 36
     )
     return np.maximum(quantile / u, 1.0)
+
+
+def _autocorrelation(template: FloatArray, noise: NoiseSpectrum | None) -> FloatArray:
+    """Correlation of the filtered noise with itself at every distance, shape (2k, 2k)."""
+    dual = template if noise is None else noise.dual(template)
+    size = [2 * side for side in template.shape]
+    overlap = irfft2(rfft2(template, size) * np.conj(rfft2(dual, size)), size)
+    out: FloatArray = overlap / overlap[0, 0]
+    return np.clip(out, -0.99, 1.0)
 
 
 def _correlate(image: FloatArray, kernels: FloatArray) -> FloatArray:
