@@ -129,11 +129,15 @@ def height_reached(
     ----------
     alarms : float
         That number.
-    area, volume, correlation
+    area, volume : float
+        From `extent`.
+    correlation : float
         As in `expected_maxima`.
-    ring, cell
+    ring : ndarray, optional
         As in `companions`, where maxima of both signs count and the higher of two is taken off
         before the other is looked at.
+    cell : float
+        As in `companions`.
     lowest : float
         The answer where noise has fewer maxima even there.
 

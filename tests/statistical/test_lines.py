@@ -19,7 +19,9 @@ PIXEL_NM, SIDE, LEVEL_E, GAIN = 84.0, 88, 1e5, 4.0
 FLICKER = 2e-3
 """Of each line of each frame: 0.4 of the variance of shot noise, and 1.1 of what a mass sees."""
 
-MASSES, GRID = (180.0, 300.0, 480.0), (16, 43, 70)
+MASSES, GRID = (300.0, 400.0, 480.0), (16, 43, 70)
+"""None waits for another: two faint ones at one distance from a third are taken for its ring."""
+
 SIGMAS, TAIL = 4.0, 1e-4
 UNBIASED = 0.01
 
