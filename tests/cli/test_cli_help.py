@@ -16,6 +16,7 @@ import pandas as pd
 import pytest
 import tifffile
 from scenes import write_bright_landings
+from sketches import sketch_figures
 
 from iscat_analysis.config import Config, config_to_toml, load_config
 from iscat_analysis.records import EVENT_COLUMNS
@@ -105,9 +106,12 @@ def test_every_example_runs(
     if "simulate" in arguments:
         arguments += [f"--set={change}" for change in SMALL]
     if "benchmark" in arguments:
-        arguments.append("--no-posterior")
+        sketch_figures(monkeypatch)
+        arguments += ["--no-posterior", "--set", "fit.roi_nm=900"]
         if "--trials" in arguments:  # fewer, and no posterior: the shape stays the same
             arguments[arguments.index("--trials") + 1] = "20"
+    if "pupil" in arguments:  # test_pupil_search goes the whole way
+        arguments += ["--free", "focus,phase", "--set", "bounds.pixels=25"]
     capsys.readouterr()
     assert PROGRAMS[program](arguments) == 0
     out = capsys.readouterr().out

@@ -250,6 +250,7 @@ def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
     assert f"[{low}, {high}]" in page
 
 
+@pytest.mark.usefixtures("sketched")
 def test_page_shows_how_sure_each_spread_is(study: dict[str, dict[str, object]]) -> None:
     """The bars of the figure end where the intervals do."""
     ends = np.array(study["curves"]["z"]["joint"]["z_nm"]["spread_ci95"])  # type: ignore[index]
@@ -260,6 +261,7 @@ def test_page_shows_how_sure_each_spread_is(study: dict[str, dict[str, object]])
     assert 'id="joint-heights"' in render_benchmark(study)
 
 
+@pytest.mark.usefixtures("sketched")
 def test_page_of_a_study_without_usable_fits(study: dict[str, dict[str, object]]) -> None:
     none = math.nan, math.nan
     nothing = {
