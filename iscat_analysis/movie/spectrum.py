@@ -256,7 +256,9 @@ def _spectrum_of(
     common = by_row[:, None] + by_column[None, :]
     local = covariance[np.ix_(lags, lags)] - common
     # no signal is left either of what was divided out, so that nothing is to be whitened there
-    by_row, by_column = (line * (line[here] > 0) for line in (by_row, by_column))
+    by_row, by_column = (
+        line if line[here] > 0 else np.zeros_like(line) for line in (by_row, by_column)
+    )
     common = by_row[:, None] + by_column[None, :]
     beside = np.abs(local)
     beside[here, here] = 0.0
