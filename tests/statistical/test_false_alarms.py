@@ -70,7 +70,6 @@ def _assert_exact(found: list[int], allowed: float = ALLOWED) -> None:
 @pytest.mark.parametrize("kind", ["landing", "fixed"])
 def test_as_many_as_allowed_are_found(kind: str) -> None:
     found = _landing(60) if kind == "landing" else _fixed(60)
-    print(kind, np.mean(found), np.std(found, ddof=1) / math.sqrt(len(found)))
     _assert_exact(found)
 
 

@@ -392,7 +392,7 @@ def check_unselected(found: NDArray[Any], truth_e: float) -> None:
 @pytest.mark.large
 def test_read_noise_that_is_reported_is_not_selected(monkeypatch: pytest.MonkeyPatch) -> None:
     """Near where it is just seen; and the control, the rule that decides on what it reports."""
-    truth_e = 37.0
+    truth_e = 42.0
     check_unselected(reported_read_noise(truth_e, 300), truth_e)
 
     def whole(found: Any, used: Any, given: float) -> Estimate:
@@ -403,4 +403,4 @@ def test_read_noise_that_is_reported_is_not_selected(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(regression, "_SEEN", 5.0)
     monkeypatch.setattr(regression, "_unselected", lambda read, *_: read.e2)
     with pytest.raises(AssertionError):
-        check_unselected(reported_read_noise(truth_e, 200), truth_e)
+        check_unselected(reported_read_noise(truth_e, 300), truth_e)
