@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Of the large tests: how much of them `make test-all` runs.
 SHARE  ?= 1
 # Module by module, so that a module's fixtures are made once; in the order of tests/conftest.py.
-PYTEST := pytest -n auto --dist loadscope --no-loadscope-reorder
+PYTEST := pytest -n auto --dist loadfile --no-loadscope-reorder
 
 DEMO_CONFIG := sample_configs/landing.toml
 DEMO        := demo

@@ -23,9 +23,9 @@ from scipy.optimize import brentq
 from scipy.stats import ncx2, norm
 
 from iscat_analysis.bounds.experiment import Experiment, expected_likelihood
+from iscat_analysis.inference.random_field import extent, height_reached
 
 _FAINT = 1e-6  # of the particle's amplitude: where derivatives with the place are taken
-_HIGHEST = 1e3  # no threshold or signal-to-noise ratio is larger
 
 
 @dataclass(frozen=True)
@@ -124,11 +124,10 @@ def detection_limit(experiment: Experiment) -> DetectionLimit | None:
         return None
     slope = fisher[:2, 3] / (theta[3] * fisher[3, 3])
     rough = fisher[:2, :2] / (theta[3] ** 2 * fisher[3, 3]) - np.outer(slope, slope)
-    area = (at.pixels * experiment.grid.pixel_nm) ** 2
-    places = area * math.sqrt(max(float(np.linalg.det(rough)), 0.0)) / (2 * math.pi) ** 1.5
+    area = extent(rough, (at.pixels * experiment.grid.pixel_nm) ** 2)
     false, miss = at.false_alarm_probability, at.miss_probability
     known = float(norm.isf(false))
-    searched = _threshold(places, -math.log1p(-false), known)
+    searched = height_reached(-math.log1p(-false), area, lowest=known)
     snr = known + float(norm.isf(miss))
     snr_searched = float(
         brentq(lambda s: power_searched(s, searched) - (1 - miss), 0.0, searched + 40.0)
@@ -140,15 +139,3 @@ def detection_limit(experiment: Experiment) -> DetectionLimit | None:
         false, miss, known, searched, snr, snr_searched,
         max(float(masses[0]), 0.0), max(float(masses[1]), 0.0), root,
     )  # fmt: skip
-
-
-def _threshold(places: float, alarms: float, lowest: float) -> float:
-    """Height above which noise has `alarms` maxima; never below that of a known place."""
-
-    def excess(u: float) -> float:
-        return math.log(places * u) - u**2 / 2 - math.log(alarms)
-
-    low = max(lowest, 1.0)
-    if not places > 0 or excess(low) <= 0:
-        return lowest
-    return float(brentq(excess, low, _HIGHEST))

@@ -402,7 +402,9 @@ class BackgroundConfig(Section):
         None, description="known level per pixel and frame, for method known"
     )
     power_normalization: bool = Field(
-        True, description="divide out the laser power, estimated with the particles excluded"
+        True,
+        description="divide out the laser power, estimated with the particles excluded, and its "
+        "flicker along rows or columns where they show one",
     )
     drift_correction: bool = Field(
         False, description="landing movies: divide out the motion of the fixed pattern"

@@ -243,13 +243,23 @@ def _spectrum_of(
     error *= variance
 
     def shared(lines: FloatArray) -> FloatArray:
-        """Mean of lines (n, lags), where it is significant at lag 0."""
+        """Mean of lines (n, lags), where it is significant at lag 0.
+
+        It is negative where each line was divided by its own light.
+        """
         mean: FloatArray = lines.mean(axis=0)
-        return mean if mean[here] > _SIGNIFICANT * error / math.sqrt(len(lines)) else 0 * mean
+        # a distance and its opposite have the same covariance: half as many are independent
+        limit = _SIGNIFICANT * error * math.sqrt(2 / len(lines))
+        return mean if abs(mean[here]) > limit else 0 * mean
 
     by_row, by_column = shared(covariance[lags, far_x].T), shared(covariance[far_y, lags])
     common = by_row[:, None] + by_column[None, :]
     local = covariance[np.ix_(lags, lags)] - common
+    # no signal is left either of what was divided out, so that nothing is to be whitened there
+    by_row, by_column = (
+        line if line[here] > 0 else np.zeros_like(line) for line in (by_row, by_column)
+    )
+    common = by_row[:, None] + by_column[None, :]
     beside = np.abs(local)
     beside[here, here] = 0.0
     if beside.max() < max(_SIGNIFICANT * error, _NEGLIGIBLE * variance):

@@ -26,6 +26,7 @@ from iscat_analysis.inference.prior import Prior
 from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.background import measure_windows
 from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts, refuse_ratio
+from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.movie.stack import printable
 from iscat_analysis.pipeline.achieved import (
@@ -39,6 +40,7 @@ from iscat_analysis.pipeline.diagnosis import (
     drift_warning,
     examine_background,
     judge_background,
+    judge_lines,
     misfit_warning,
     pixel_warnings,
 )
@@ -218,7 +220,13 @@ def analyse(
     digest = hashing.submit(movie.sha256)
     hashing.shutdown(wait=False)
     further: dict[str, Any] = {}
-    config, learned = learn_optics(movie, config, camera, tell=tell)
+    lines = judge_lines(movie, config, camera)
+    steady = movie
+    if lines is not None:
+        tell(f"{movie.name}: {lines.message}")
+        further["lines"] = lines.summary
+        steady = Stack(movie.path, SteadyFrames(movie, lines, camera))
+    config, learned = learn_optics(steady, config, camera, tell=tell)
     if learned:
         further["optics"] = learned
     clock.lap("optics")
@@ -232,6 +240,7 @@ def analyse(
             prepare=lambda scene: _warm_up(scene, notify),
             partial=partial,
             identity=fingerprint(movie.path) if partial else "",
+            lines=lines,
         )
         scene, image = result.scene, result.image
         further["landing"] = result.summary
@@ -256,7 +265,7 @@ def analyse(
                 'interferometric scheme and background.method = "sliding"; leave it out'
             )
         scene, found, image, measured = _measured_background(
-            movie, config, camera, clock, tell=tell, notify=notify, progress=progress
+            steady, config, camera, clock, lines=lines, tell=tell, notify=notify, progress=progress
         )
         further |= measured
     windows = found.windows
@@ -319,6 +328,7 @@ def _measured_background(
     camera: Camera,
     clock: _Clock,
     *,
+    lines: Lines | None,
     tell: Notify,
     notify: Notify,
     progress: Progress,
@@ -328,7 +338,7 @@ def _measured_background(
     shape = (movie.shape[1], movie.shape[2])
     before, after = frame_ranges(movie, config)
     searches = after[1] - after[0] if config.fit.mode == "track" else 1
-    scene = make_scene(config, shape, searches=searches)
+    scene = make_scene(config, shape, searches=searches, lines=lines)
     _warm_up(scene, notify)
     clock.lap("model")
 
@@ -348,7 +358,7 @@ def _measured_background(
     )
     gain, spectrum = judge_background(movie, camera, windows)
     if spectrum is not None:
-        scene = make_scene(config, shape, searches=searches, noise=spectrum)
+        scene = make_scene(config, shape, searches=searches, noise=spectrum, lines=lines)
         if spectrum.message:
             tell(f"{movie.name}: {spectrum.message}")
     if gain is not None and gain.message:

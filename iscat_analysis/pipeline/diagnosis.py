@@ -16,6 +16,7 @@ from iscat_analysis.inference.cause import likely_cause
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import follow_pattern
+from iscat_analysis.movie.lines import Lines, find_lines
 from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain
 from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.pipeline.field import Event
@@ -69,6 +70,40 @@ def judge_background(
     except DataError:  # too dark to tell
         return None, spectrum
     return allow_for_correlation(gain, spectrum), spectrum
+
+
+def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
+    """Look for rows and columns that flicker, where their light may be divided out.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        Its background frames, or the first that are analysed, are looked at; nothing is where
+        ``background.power_normalization`` is false, or the background is dark or known.
+    camera : Camera
+        Counts → photoelectrons.
+
+    Returns
+    -------
+    Lines or None
+        None where there is nothing to correct.
+    """
+    background = config.background
+    if (
+        not background.power_normalization
+        or background.method == "known"
+        or config.optics.scheme == "darkfield"
+    ):
+        return None
+    first, last = background.frames or config.fit.frames or (0, movie.shape[0])
+    counts = movie.read(first, max(first, min(last, movie.shape[0], first + _SPECTRUM_FRAMES)))
+    if not len(counts):
+        return None
+    good = np.asarray(counts.any(axis=(1, 2)))
+    good[1:] &= np.asarray((counts[1:] != counts[:-1]).any(axis=(1, 2)))
+    return find_lines(counts[good], camera)
 
 
 def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:

@@ -46,6 +46,7 @@ MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""
 
 _SWEEPS = 2  # fits of everything with everything else in place, after the last round
+_AS_FOUND = 0.95  # of the threshold; what was found is dropped only where others explain it
 _DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
 
 
@@ -124,13 +125,14 @@ def fit_field(
         events = _without_doubles(events, scene)
         events = _fit_all(scene, windows, [e.candidate for e in events], events, pool)
         windows = _refined(scene, windows, events)
-    kept = [e for e in events if e.snr > scene.templates.threshold and _wanted(scene, e)]
+    least = _AS_FOUND * scene.templates.threshold
+    kept = [e for e in events if e.snr > least and _wanted(scene, e)]
     if 0 < len(kept) < len(events):  # what is dropped must leave its neighbours' background too
         kept = _fit_all(scene, windows, [e.candidate for e in kept], kept, pool)
     lobes: list[Event] = []
     if doubtful and not starts:
         lobes = _fit_all(scene, windows, doubtful, kept, pool, first=len(kept))
-        lobes = [e for e in lobes if e.snr > scene.templates.threshold and _wanted(scene, e)]
+        lobes = [e for e in lobes if e.snr > least and _wanted(scene, e)]
     events = _judged(scene, windows, kept, lobes)
     progress("detect", MAX_ROUNDS, MAX_ROUNDS)
     return tuple(sorted(events, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
@@ -182,7 +184,7 @@ def _search(
 ) -> tuple[list[Candidate], list[Candidate]]:
     """Find new particles, and what may be but the side lobe of a known one."""
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
-    explained = total_signal(scene, shape, events)
+    explained = scene.left(total_signal(scene, shape, events))
     likelihood = search_likelihood(scene, windows, explained)
     found = find_particles(
         likelihood,
@@ -239,6 +241,10 @@ def _fit_all(
     height = scene.config.particle.height_nm
     nominal = scene.model.material.mass_kda
     free = FREE_PARAMETERS[scene.mode]
+    taken: FloatArray | None = None
+    if scene.lines is not None:
+        shape = (windows.after_e.shape[0], windows.after_e.shape[1])
+        taken = scene.lines.taken(total_signal(scene, shape, events))
 
     def one(index: int) -> Event | None:
         start = candidates[index]
@@ -251,6 +257,8 @@ def _fit_all(
         for number, event in enumerate(events):
             if number != first + index:
                 _add_signal(scene, event, region, others)
+        if taken is not None:
+            others = (1 + others) / taken[region.slices] - 1
         likelihood = region_likelihood(scene, windows, region, others)
         if likelihood.n_pixels < 0.5 * others.size:
             return None
@@ -273,7 +281,7 @@ def _refined(scene: Scene, windows: Windows, events: Sequence[Event]) -> Windows
     if not scene.config.background.power_normalization:
         return windows
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
-    signal = total_signal(scene, shape, events)
+    signal = scene.left(total_signal(scene, shape, events))
     if scene.additive:
         signal = signal * photons_scale(scene, windows)
     return refine_power(windows, signal, additive=scene.additive)

@@ -26,6 +26,7 @@ from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.inference.prior import Prior
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
+from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.pipeline.chunks import (
@@ -62,7 +63,7 @@ from iscat_analysis.records import (
     Windows,
 )
 from iscat_analysis.search.empty import EmptySpread
-from iscat_analysis.search.sliding import STRIDES, Chunk
+from iscat_analysis.search.sliding import CORRELATION, STRIDES, Chunk
 from iscat_analysis.search.templates import LARGEST_IMAGE, make_templates
 
 POSTERIORS = 20
@@ -149,6 +150,7 @@ def analyse_landings(
     prepare: Callable[[Scene], None] = _nothing,
     partial: Path | None = None,
     identity: str = "",
+    lines: Lines | None = None,
 ) -> LandingResult:
     """Find and fit every particle that lands or leaves.
 
@@ -170,6 +172,8 @@ def analyse_landings(
         Folder that keeps finished chunks; who gave it removes it once the result is safe.
     identity : str
         What tells the movie's content from another's; finished chunks of another are not used.
+    lines : Lines, optional
+        Rows and columns that flicker; they are divided by their light as frames are read.
 
     Returns
     -------
@@ -188,7 +192,8 @@ def analyse_landings(
             f"{movie.name}: has {movie.shape[0]} frames, but fit.frames asks for {first}:{last}; "
             "change fit.frames"
         )
-    reader = Reader(movie, camera, first, last, counts_budget(config))
+    frames = movie if lines is None else SteadyFrames(movie, lines, camera)
+    reader = Reader(frames, camera, first, last, counts_budget(config))
     with ThreadPoolExecutor(config.compute.workers) as pool:
         noise = judge_noise(reader, config, pool.map)
     curve, window = noise.curve, noise.window
@@ -201,7 +206,9 @@ def analyse_landings(
     posterior = config.samples_posterior
     sampling = config.posterior.model_copy(update={"enabled": posterior})
     config = config.model_copy(update={"posterior": sampling})
-    scene = make_landing_scene(config, reader.shape, searches=count, noise=noise.spectrum)
+    scene = make_landing_scene(
+        config, reader.shape, searches=count, noise=noise.spectrum, lines=lines
+    )
     prepare(scene)
     plan = plan_chunks(reader, config, window, stride)
     store = Store(partial, config, identity, reader.shape, (first, last), camera)
@@ -320,6 +327,7 @@ def inject_and_recover(
         camera,
         tell=_unheard,
         progress=progress,
+        lines=result.scene.lines,
     )
     if again.interrupted:
         raise KeyboardInterrupt
@@ -360,6 +368,7 @@ def make_landing_scene(
     *,
     searches: int,
     noise: NoiseSpectrum | None = None,
+    lines: Lines | None = None,
 ) -> Scene:
     """Build the models and the matched filter, at the particles' nominal height.
 
@@ -373,6 +382,8 @@ def make_landing_scene(
         Boundaries that will be searched; they share the expected false alarms.
     noise : NoiseSpectrum, optional
         Of the movie; without it the noise is white and of the expected size.
+    lines : Lines, optional
+        What was divided out of the frames.
 
     Returns
     -------
@@ -398,8 +409,10 @@ def make_landing_scene(
             z_range_nm=None,
             field_px=field_px,
             noise=noise,
+            correlation=CORRELATION if searches > 1 else 0.0,
         ),
         mode=config.fit.mode,
+        lines=lines,
     )
 
 

@@ -216,6 +216,15 @@ class Neighbours:
             bound.append([int(k) for k in np.flatnonzero(near)])
         return seen, bound
 
+    def shown(self, step: Step, region: Region) -> tuple[tuple[slice, slice], FloatArray] | None:
+        """Which pixels of a region show a step, and its contrast there, as frames are corrected."""
+        shared = self.shared(step, region)
+        if self._scene.lines is None:
+            return None if shared is None else (shared[0], step.image[shared[1]])
+        total = np.zeros(self._chunk.shape)
+        total[self.box(step)] = step.image
+        return WHOLE, self._scene.left(total)[region.slices]
+
     def shared(
         self, step: Step, region: Region
     ) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:

@@ -127,12 +127,13 @@ def step_repeats(
         light = patch.mean_e
         frames = np.arange(patch.first, patch.first + len(patch.power))[patch.power > 0]
         for other in others:
-            shared = neighbours.shared(other, region)
-            if shared is None or not span[0] < other.at.frame < span[1]:
+            if not span[0] < other.at.frame < span[1]:
                 continue
-            here, inside = shared
-            height = np.einsum("iyx,yx->i", weights[(slice(None), *here)],
-                               light[here] * other.image[inside])  # fmt: skip
+            shown = neighbours.shown(other, region)
+            if shown is None:
+                continue
+            here, image = shown
+            height = np.einsum("iyx,yx->i", weights[(slice(None), *here)], light[here] * image)
             known += np.outer(other.sign * height, frames >= other.at.frame)
         if pattern and local:
             known += _moved(chunk, step, region, weights, light, frames, pattern, local, neighbours)
@@ -228,6 +229,7 @@ def step_controls(
                 for s in near:
                     box = neighbours.box(s)
                     known[box] += neighbours.presence(s, cut) * s.image
+                known = scene.left(known)
                 parts.append(field.errors(sum_e, power, known * chunk.mean_e))
                 light.append(power)
             sides.append(parts)
@@ -318,7 +320,7 @@ def field_repeats(
         scene, shape,
         [(e.candidate.x_px, e.candidate.y_px, Status.POOR_FIT not in e.fit.flags) for e in events],
     )  # fmt: skip
-    signal = total_signal(scene, shape, events)
+    signal = scene.left(total_signal(scene, shape, events))
     if scene.additive:  # where particles outshine the background their light has noise of its own
         taken |= photons_scale(scene, windows) * signal > _OUTSHONE * windows.after_e.mean()
     parts: tuple[list[FloatArray], list[FloatArray]] = ([], [])

@@ -13,6 +13,7 @@ from iscat_analysis.inference.counts import KNOWN, MEAN, MEDIAN, counts_likeliho
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.movie.background import smooth_background
+from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import (
@@ -71,6 +72,8 @@ class Scene:
         Matched filter.
     mode : str
         Key of `FREE_PARAMETERS`.
+    lines : Lines or None
+        Rows and columns whose flicker is divided out of the frames.
     """
 
     config: Config
@@ -78,6 +81,7 @@ class Scene:
     wide: ForwardModel
     templates: Templates
     mode: str
+    lines: Lines | None = None
 
     @property
     def pixel_nm(self) -> float:
@@ -88,6 +92,21 @@ class Scene:
     def roi_px(self) -> int:
         """Side of the fitted square [pixels]."""
         return self.config.fit.roi_px(self.pixel_nm)
+
+    def left(self, signal: FloatArray) -> FloatArray:
+        """Give what the frames, as they are corrected, show of a signal over the field.
+
+        Parameters
+        ----------
+        signal : ndarray, shape (y, x)
+            Contrast.
+
+        Returns
+        -------
+        ndarray, shape (y, x)
+            The signal itself where no line flickers.
+        """
+        return signal if self.lines is None else self.lines.left(signal)
 
     @property
     def additive(self) -> bool:
@@ -101,6 +120,7 @@ def make_scene(
     *,
     searches: int = 1,
     noise: NoiseSpectrum | None = None,
+    lines: Lines | None = None,
 ) -> Scene:
     """Build the models and the matched filter for a field.
 
@@ -114,6 +134,8 @@ def make_scene(
         Images that will be searched; they share the expected false alarms.
     noise : NoiseSpectrum, optional
         Of the movie; without it the noise is white and of the expected size.
+    lines : Lines, optional
+        What was divided out of the frames.
 
     Returns
     -------
@@ -148,8 +170,10 @@ def make_scene(
             z_range_nm=config.fit.z_range_nm if free_z else None,
             field_px=field_px,
             noise=noise,
+            in_turn=True,
         ),
         mode=mode,
+        lines=lines,
     )
 
 

@@ -240,6 +240,7 @@ class ChunkFitter:
             total = np.zeros(chunk.shape)
             for step in near[j]:
                 total[self._neighbours.box(step)] += self._neighbours.change(step, before, after)
+            total = scene.left(total)
             return total + moving.contrast[j] * (1 + total) if moving else total
 
         self._maps = snr, effective = sliding_maps(
@@ -373,9 +374,10 @@ class ChunkFitter:
         if event.snr < _EXPLAINED * scene.templates.threshold:
             return None
         step = replace(step, at=task.at)
+        seen = set(near[index]) if scene.lines is None else set(range(len(steps))) - {index}
         repeats = step_repeats(
             self._chunk, event, task.region, task.windows, step,
-            [steps[i] for i in near[index]], self._neighbours, self._pattern,
+            [s for i, s in enumerate(steps) if i in seen], self._neighbours, self._pattern,
         )  # fmt: skip
         fitted = FittedStep(
             step, event, task.region, task.windows, task.n_before, task.n_after, repeats

@@ -127,6 +127,10 @@ class TaskBuilder:
             if shared is not None:
                 here, inside = shared
                 ratio[here] *= self._neighbours.factor(other, *cuts, inside)
+        if scene.lines is not None:
+            there = [self._present(steps, span, cut) for cut in cuts]
+            taken = [scene.lines.taken(signal)[region.slices] for signal in there]
+            ratio *= taken[0] / taken[1]
         offset = np.zeros(2)
         if moving and local:
             seen = [moving.seen(local, cut) for cut in cuts]
@@ -166,6 +170,16 @@ class TaskBuilder:
             power=np.empty(0),
         )
         return Task(likelihood, region, windows, at, n_before, n_after, crowded, offset)
+
+    def _present(self, steps: Sequence[Step], span: tuple[int, int], cut: slice) -> FloatArray:
+        """Contrast over the field, in some frames, of what lands or leaves in a span of them."""
+        total = np.zeros(self._chunk.shape)
+        for step in steps:
+            if span[0] < step.at.frame < span[1]:
+                total[self._neighbours.box(step)] += (
+                    self._neighbours.presence(step, cut) * step.image
+                )
+        return total
 
     def _span(self, step: Step, close: Sequence[Step]) -> tuple[tuple[int, int], bool]:
         """Frames used around a step, and whether another one could not be kept out of them."""

@@ -278,6 +278,13 @@ def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
         One sentence or two.
     """
     landing, injection = summary.get("landing"), summary.get("injection")
+    for name, lines in (("row", "rows"), ("column", "columns")):
+        share = summary.get("lines", {}).get(f"{name}_share")
+        if share:
+            yield (
+                f"Whole {lines} flickered ({percent(share)} of the noise variance); each {name} of "
+                "each frame was divided by its own light."
+            )
     background = summary.get("background")
     if background and background["drift_px"] is not None:
         (y, x), (y_se, x_se) = background["drift_px"], background["drift_error_px"]

@@ -147,6 +147,13 @@ class Spectrum(Closed):
     column_share: NotNegative = key("Part of the variance that a whole column has in common")
 
 
+class Lines(Closed):
+    """Rows or columns that flickered, and were divided by their own light."""
+
+    row_share: NotNegative = key("Part of the noise variance that each row had in common")
+    column_share: NotNegative = key("Part of the noise variance that each column had in common")
+
+
 class Noise(Document):
     """Noise against averaging, and the drift of the fixed pattern."""
 
@@ -306,6 +313,7 @@ class Summary(Document):
         "Width of each species beyond σ; where the model is rejected, poor fits are counted too"
     )
     repeats: Repeats = maybe("Whether the measured spread agrees with σ")
+    lines: Lines = maybe("Where rows or columns flickered, and were corrected")
     optics: Learned = maybe("Where the optics were tested: the test, and what was learned")
     distribution: Distribution | None = maybe(
         "Species; null where masses are not fitted once per event"

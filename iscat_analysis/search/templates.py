@@ -21,10 +21,11 @@ from scipy.ndimage import maximum_filter
 from iscat_analysis.config import Detection
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.random_field import extent, height_reached
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
-from iscat_analysis.search.peaks import SAMPLED, vertex
+from iscat_analysis.search.peaks import SAMPLED, summit, vertex
 from iscat_analysis.search.residue import EXCEEDS, is_hidden, size_on_ring
 
 HEIGHTS_PER_FRINGE = 8
@@ -89,6 +90,8 @@ def make_templates(
     z_range_nm: tuple[float, float] | None,
     field_px: tuple[int, int],
     noise: NoiseSpectrum | None = None,
+    correlation: float = 0.0,
+    in_turn: bool = False,
 ) -> Templates:
     """Prepare the matched filter for a field.
 
@@ -108,6 +111,10 @@ def make_templates(
         Rows and columns of the field.
     noise : NoiseSpectrum, optional
         Of the movie; without it the noise is white and of the expected size.
+    correlation : float
+        Of the noise with that of the next image that is searched; what both see is one false alarm.
+    in_turn : bool
+        Whether what is found is fitted and taken off before what is near is looked at.
 
     Returns
     -------
@@ -137,15 +144,24 @@ def make_templates(
         axis=1,
     )[:, 0]
     two_sided = z_range_nm is None and model.rho > 0 and detection.polarity == "both"
-    area = field_px[0] * field_px[1] * pixel_nm**2
-    depth = float(heights[-1] - heights[0])
+    rough = np.mean(roughness, axis=0)
+    size = field_px[0] * field_px[1] * pixel_nm**2
+    area, volume = extent(rough[:2, :2], size), 0.0
+    if z_range_nm is not None:
+        volume = extent(rough, size * float(heights[-1] - heights[0]))
+    alarms = detection.false_alarms_per_movie / (2 if two_sided else 1)
     return Templates(
         z_nm=heights,
         images=stacked,
         signs=np.sign(extremes),
         quadratic=model.rho == 0,
-        threshold=_threshold(
-            detection.false_alarms_per_movie, np.mean(roughness, axis=0), area, depth, two_sided
+        threshold=height_reached(
+            alarms,
+            area,
+            volume,
+            correlation=correlation,
+            cell=extent(rough[:2, :2], pixel_nm**2),
+            ring=_autocorrelation(stacked[0], noise) if in_turn and two_sided else None,
         ),
         two_sided=two_sided,
         noise=noise,
@@ -241,10 +257,12 @@ def find_particles(
         ranked = np.where(signs == wanted, np.abs(snr) if not templates.quadratic else snr, 0.0)
         if not templates.two_sided and templates.z_nm.size > 1:
             ranked = np.where(snr > 0, ranked, 0.0)
+    signed = snr
     if cumulants is not None:
-        ranked = ranked / _lift(likelihood, templates, explained, cumulants)
+        lift = _lift(likelihood, templates, explained, cumulants)
+        ranked, signed = ranked / lift, snr / lift
     best = ranked.max(axis=0)
-    peaks = sorted(_peaks(ranked, best, templates.threshold), key=lambda p: -p.height)
+    peaks = sorted(_peaks(ranked, best, signed, templates.threshold), key=lambda p: -p.height)
     refuse_flood(len(peaks), excess_noise)
     found: list[Candidate] = []
     for peak in peaks:
@@ -288,14 +306,20 @@ class _Peak:
     height: float
 
 
-def _peaks(ranked: FloatArray, best: FloatArray, threshold: float) -> list[_Peak]:
-    """Maxima above the threshold; the field between pixels and heights is what exceeds it."""
+def _peaks(
+    ranked: FloatArray, best: FloatArray, signed: FloatArray, threshold: float
+) -> list[_Peak]:
+    """Maxima above the threshold; the field between pixels and heights is what exceeds it.
+
+    The field that is smooth is the one with its sign.
+    """
     sampled = (best == maximum_filter(best, size=3)) & (best > SAMPLED * threshold)
     found = []
     for row, column in np.argwhere(sampled).tolist():
         layer = int(ranked[:, row, column].argmax())
-        (dy, above), (dx, beside) = vertex(best[:, column], row), vertex(best[row], column)
-        height = float(best[row, column]) + above + beside
+        here = signed[layer]
+        dy, dx, above = summit(math.copysign(1.0, here[row, column]) * here, row, column)
+        height = float(best[row, column]) + above
         height += vertex(ranked[:, row, column], layer)[1]
         if height > threshold:
             found.append(_Peak(layer, row, column, row + dy, column + dx, height))
@@ -368,6 +392,15 @@ def _lift(
     return np.maximum(quantile / u, 1.0)
 
 
+def _autocorrelation(template: FloatArray, noise: NoiseSpectrum | None) -> FloatArray:
+    """Correlation of the filtered noise with itself at every distance, shape (2k, 2k)."""
+    dual = template if noise is None else noise.dual(template)
+    size = [2 * side for side in template.shape]
+    overlap = irfft2(rfft2(template, size) * np.conj(rfft2(dual, size)), size)
+    out: FloatArray = overlap / overlap[0, 0]
+    return np.clip(out, -0.99, 1.0)
+
+
 def _correlate(image: FloatArray, kernels: FloatArray) -> FloatArray:
     """Cross-correlation of an image with centred kernels (n, k, k), shape (n, y, x)."""
     rows, columns = image.shape
@@ -405,20 +438,3 @@ def _roughness(
     along = np.einsum("iyx,yx->i", gradient, dual) / norm
     covariance: FloatArray = cross - np.outer(along, along)
     return covariance
-
-
-def _threshold(
-    alarms: float, roughness: FloatArray, area: float, depth: float, two_sided: bool
-) -> float:
-    """Height u at which the expected number of noise peaks is `alarms`."""
-    plane = area * math.sqrt(np.linalg.det(roughness[:2, :2])) / (2 * math.pi) ** 1.5
-    volume = 0.0
-    if roughness.shape[0] == 3:
-        determinant = max(float(np.linalg.det(roughness)), 0.0)
-        volume = area * depth * math.sqrt(determinant) / (2 * math.pi) ** 2
-    sides = 2 if two_sided else 1
-
-    heights = np.linspace(2.0, 30.0, 28001)
-    polynomial = sides * (plane * heights + volume * (heights**2 - 1))
-    expected = np.log(polynomial) - heights**2 / 2
-    return float(np.interp(-math.log(alarms), -expected, heights))

@@ -262,7 +262,7 @@ def test_strongest_first() -> None:
 
 
 def test_masked_pixels_are_no_particles() -> None:
-    config = _at([])
+    config = _at([], detection={"false_alarms_per_movie": 1e-3})
     scene = make_scene(config, config.simulation.shape)
     windows = Light.of(Movie(config, seed=1), 200).draw(np.random.default_rng(1))
     windows = blank(windows, np.random.default_rng(2))

@@ -11,7 +11,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d, gaussian_filter
 
-from iscat_analysis.calibration.camera import CameraCalibration, Estimate, measure_camera
+from iscat_analysis.calibration.camera import (
+    CameraCalibration,
+    Estimate,
+    measure_camera,
+    regression,
+)
 from iscat_analysis.errors import DataError
 
 GAIN, OFFSET, READ_E = 4.0, 100.0, 20.0
@@ -363,3 +368,39 @@ def test_stacks_must_agree_in_shape() -> None:
         measure_camera([movie], dark=other)
     with pytest.raises(DataError, match="no recording"):
         measure_camera([])
+
+
+def reported_read_noise(truth_e: float, trials: int) -> NDArray[Any]:
+    """Give the read noise of recordings without a dark, where any is reported."""
+    found = []
+    for seed in range(trials):
+        rng = np.random.default_rng(7000 + seed)
+        light = np.maximum(scene(rng), 0.0)
+        movie = record(light, 60, rng, power=0.0, read_e=truth_e)
+        read = measure_camera([movie], offset_adu=OFFSET).read_noise_e
+        if read is not None:
+            found.append(read.value)
+    return np.array(found)
+
+
+def check_unselected(found: NDArray[Any], truth_e: float) -> None:
+    assert found.size >= 100
+    truth = math.hypot(truth_e, GAIN / math.sqrt(12))
+    assert abs(found.mean() - truth) < 3 * found.std(ddof=1) / math.sqrt(found.size)
+
+
+@pytest.mark.large
+def test_read_noise_that_is_reported_is_not_selected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near where it is just seen; and the control, the rule that decides on what it reports."""
+    truth_e = 42.0
+    check_unselected(reported_read_noise(truth_e, 300), truth_e)
+
+    def whole(found: Any, used: Any, given: float) -> Estimate:
+        line = regression._line(*regression._pooled(found, used))
+        return regression._read_variance((*line[0], line[1]), Estimate(given, 0.0)).adu2
+
+    monkeypatch.setattr(regression, "_half", whole)
+    monkeypatch.setattr(regression, "_SEEN", 5.0)
+    monkeypatch.setattr(regression, "_unselected", lambda read, *_: read.e2)
+    with pytest.raises(AssertionError):
+        check_unselected(reported_read_noise(truth_e, 300), truth_e)

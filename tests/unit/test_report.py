@@ -248,6 +248,7 @@ def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: boo
     assert "×10⁹" not in " ".join(headline(analysis, event_table(analysis)))
 
 
+@pytest.mark.usefixtures("sketched")
 def test_species_are_shown_for_fair_samples_only() -> None:
     table = make_analysis(40).table
     found = describe(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.stats import norm
 
 from iscat_analysis.calibration.camera.moments import Moments, robust_sigma
 from iscat_analysis.calibration.camera.result import Estimate
@@ -20,7 +21,9 @@ _USABLE_SLOPE = 0.30  # relative standard error beyond which a gain is none
 _GOOD_SLOPE = 0.05
 _USABLE_OFFSET = 0.05  # standard error over the light level
 _STEADY = 2.0  # robust χ² of the flicker line beyond which the scene has moved
-_SEEN = 5.0  # standard errors of its variance from which read noise is more than chance made it
+_SEEN = 3.5  # of half of the pixels, standard errors from which read noise is not chance
+_LEAST_HALF = 32  # pixels
+_TILE_PX = 8  # side of the tiles that the halves are made of; noise is correlated less far
 _LEAST_RELIABILITY = 0.9  # of the spread of the means that is not their own noise
 
 
@@ -84,9 +87,7 @@ def solve(
     DataError
         The noise does not grow with the light, or the recordings leave the gain open.
     """
-    mean = np.concatenate([item.mean[used] for item in found])
-    variance = np.concatenate([item.variance[used] for item in found])
-    frames = np.concatenate([np.full(used.sum(), item.n_frames - 1.0) for item in found])
+    mean, variance, frames = _pooled(found, used)
     if dark is not None:
         return _with_dark(mean, variance, frames, dark, used, len(found))
 
@@ -123,20 +124,116 @@ def solve(
             "read_noise_e = 0 predicts the noise that was measured"
         )
         return Solution(gain, offset, "line", None, None, None, intercept, slope)
-    read = intercept + slope * offset.value
-    gradient = np.array([1.0, offset.value])
-    read_se = math.sqrt(gradient @ cov @ gradient + (slope * offset.se) ** 2)
-    if read > _SEEN * read_se:
-        root = math.sqrt(read)
-        adu = Estimate(root, read_se / (2 * root))
-        electrons = Estimate(root / slope, math.hypot(adu.se / slope, root * relative / slope))
+    read = _read_variance(line, offset)
+    half = _half(found, used, given)
+    if half is not None and half.value > _SEEN * half.se:
+        electrons = _root(_unselected(read, half, _SEEN * half.se))
+        # in counts the gain has no part in the error
+        narrower = read.adu2.se / (slope**2 * read.e2.se)
+        adu = Estimate(electrons.value * slope, electrons.se * slope * narrower)
         return Solution(gain, offset, source, adu, electrons, None, intercept, slope)
-    below = math.sqrt(max(read, 0.0) + _Z95_ONE_SIDED * read_se) / slope
+    below = math.sqrt(max(read.e2.value, 0.0) + _Z95_ONE_SIDED * read.e2.se)
     notes.append(
         f"the read noise is too small beside the shot noise to be seen: below {below:.3g} e "
         "(95 %); a dark would measure it"
     )
     return Solution(gain, offset, source, None, None, below, intercept, slope)
+
+
+@dataclass(frozen=True)
+class _ReadVariance:
+    """Variance of the read noise [counts²] and [e²], and the covariance of the two estimates."""
+
+    adu2: Estimate
+    e2: Estimate
+    covariance: float
+
+
+def _read_variance(line: tuple[float, float, FloatArray], offset: Estimate) -> _ReadVariance:
+    """Give the variance of the line at the offset, where there is no light.
+
+    It and the slope have errors of opposite sign, which in electrons add up; the bias of second
+    order is taken off.
+    """
+    intercept, slope, cov = line
+    dark = intercept + slope * offset.value
+    counts = np.array([1.0, offset.value])
+    electrons = np.array([1.0, offset.value - 2 * dark / slope]) / slope**2
+    bias = (3 * dark * cov[1, 1] / slope - 2 * float(counts @ cov[1])) / slope**3
+    return _ReadVariance(
+        Estimate(dark, math.hypot(math.sqrt(counts @ cov @ counts), slope * offset.se)),
+        Estimate(
+            dark / slope**2 - bias,
+            math.hypot(math.sqrt(electrons @ cov @ electrons), offset.se / slope),
+        ),
+        float(counts @ cov @ electrons) + offset.se**2,
+    )
+
+
+def _half(found: Sequence[Moments], used: BoolArray, given: float | None) -> Estimate | None:
+    """Give the variance of the read noise of every other tile of the sensor [counts²]."""
+    y, x = np.indices(used.shape) // _TILE_PX
+    part = used & ((y + x) % 2 == 0)
+    if np.count_nonzero(part) < _LEAST_HALF:
+        return None
+    offset, _ = _offset(found, part, given, [])
+    if offset is None:
+        return None
+    (intercept, slope), cov = _line(*_pooled(found, part))
+    return _read_variance((intercept, slope, cov), offset).adu2 if slope > 0 else None
+
+
+def _unselected(whole: _ReadVariance, half: Estimate, threshold: float) -> Estimate:
+    """Estimate without bias what is reported only where half of the data exceed a threshold.
+
+    Parameters
+    ----------
+    whole : _ReadVariance
+        From all data: M ± τ [counts²], and what is wanted [e²].
+    half : Estimate
+        A ± a, from those that decide [counts²].
+    threshold : float
+        c, which A has exceeded.
+
+    Returns
+    -------
+    Estimate
+        The other half's estimate, averaged over all halves that give the same whole [e²].
+
+    Notes
+    -----
+    The other half knows nothing of the decision, so that its estimate has no bias, and by the
+    theorem of Rao and Blackwell its mean given the whole has a smaller error.  A − M is normal and
+    independent of M, of variance δ² = a² − τ²; so that mean is E − κ/δ · λ((c − M)/δ), with E the
+    estimate in electrons, κ its covariance with M, and λ the inverse Mills ratio.  Far above the
+    threshold it is E.
+    """
+    mean, error = whole.adu2.value, whole.adu2.se
+    delta = math.sqrt(max(half.se**2 - error**2, 0.01 * half.se**2))
+    at = (threshold - mean) / delta
+    mills = math.exp(float(norm.logpdf(at) - norm.logsf(at)))
+    slope = whole.covariance / delta**2 * mills * (mills - at)
+    se = math.sqrt(whole.e2.se**2 + 2 * slope * whole.covariance + (slope * error) ** 2)
+    other = whole.e2.se * half.se / delta  # the error of the other half by itself
+    return Estimate(
+        whole.e2.value - whole.covariance / delta * mills, min(se, max(other, whole.e2.se))
+    )
+
+
+def _root(variance: Estimate) -> Estimate:
+    """Take the root of a variance, and off it that the mean of a root is below its own."""
+    root = math.sqrt(max(variance.value, variance.se / 4))
+    relative = variance.se / root**2
+    return Estimate(root * (1 + min(relative, 1.0) ** 2 / 8), root * relative / 2)
+
+
+def _pooled(found: Sequence[Moments], used: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean and variance of all pixels in all stacks, and the degrees of freedom of each."""
+    return (
+        np.concatenate([item.mean[used] for item in found]),
+        np.concatenate([item.variance[used] for item in found]),
+        np.concatenate([np.full(used.sum(), item.n_frames - 1.0) for item in found]),
+    )
 
 
 def _with_dark(

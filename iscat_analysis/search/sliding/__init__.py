@@ -21,6 +21,7 @@ from iscat_analysis.search.sliding.noise import (
     measure_noise,
 )
 from iscat_analysis.search.sliding.search import (
+    CORRELATION,
     STRIDES,
     Filter,
     MapArray,
@@ -31,6 +32,7 @@ from iscat_analysis.search.sliding.search import (
 )
 
 __all__ = [
+    "CORRELATION",
     "CREDIBLE",
     "LONGEST_WINDOW",
     "MOVIE_SHARE",

@@ -3,8 +3,8 @@
 The w frames after a boundary are set against the w before it; a particle that lands or leaves
 shows as a contrast that rises and falls linearly within w frames of its step.  The statistic is
 the matched filter's signal-to-noise ratio with the model's image, the root of twice the gain in
-log-likelihood.  Noise of neighbouring boundaries is correlated by 5/8 only, so above any useful
-threshold each boundary counts as an independent search.
+log-likelihood.  Noise of neighbouring boundaries is correlated by `CORRELATION`, which the
+threshold allows for: what exceeds it at both is one false alarm.
 """
 
 from __future__ import annotations
@@ -20,13 +20,16 @@ from scipy import fft
 from iscat_analysis._kernels.sliding import contrast_map, step_peaks
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.records import FloatArray, Mapper
-from iscat_analysis.search.peaks import SAMPLED, vertex
+from iscat_analysis.search.peaks import SAMPLED, summit
 from iscat_analysis.search.sliding.frames import Chunk
 
 MapArray = NDArray[np.float32]
 
 STRIDES = 4
 """Boundaries searched per window: a step midway between two loses an eighth of its height."""
+
+CORRELATION = 1 - 3 / (2 * STRIDES)
+"""Of the noise at a boundary with that at the next, of w frames after less w frames before."""
 
 
 @dataclass(frozen=True)
@@ -236,8 +239,8 @@ def find_steps(
     for k, i, j in step_peaks(snr, SAMPLED * threshold).tolist():
         value = float(snr[k, i, j])
         sign = np.sign(value)
-        (dy, above), (dx, beside) = vertex(sign * snr[k, :, j], i), vertex(sign * snr[k, i], j)
-        height = math.copysign(abs(value) + above + beside, value)
+        dy, dx, above = summit(sign * snr[k], i, j)
+        height = math.copysign(abs(value) + above, value)
         if abs(height) <= threshold:
             continue
         amplitude = height / math.sqrt(float(effective[k]) * float(matched.norm[i, j]))

@@ -1,0 +1,162 @@
+"""How high noise rises somewhere in a field that is searched.
+
+The signal-to-noise ratio of a matched filter over pure noise is a smooth Gaussian field of unit
+variance.  Above a high level u it has as many maxima as the expected Euler characteristic of what
+exceeds that level (R. J. Adler and J. E. Taylor, *Random Fields and Geometry*, 2007, section 12.4):
+
+    N(u) = [A u/(2π)^{3/2} + V (u² − 1)/(2π)²] e^{−u²/2},
+
+A the area and V the volume, lengths measured by the gradient of the field: √det Λ times those in
+space, Λ the covariance of the gradient.  The terms of the edges are left out, because there the
+filter is cut, and maxima are not more frequent than elsewhere.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import norm
+
+from iscat_analysis.records import FloatArray
+
+_HIGHEST = 40.0  # no threshold is larger
+_LOWEST = 2.0  # from where on both terms of N fall as the level rises
+
+
+def extent(roughness: FloatArray, size: float) -> float:
+    """Measure an area or a volume by the gradient of the field in it.
+
+    Parameters
+    ----------
+    roughness : ndarray, shape (n, n)
+        Covariance of the gradient of the field, of unit variance [nm⁻²].
+    size : float
+        Area or volume [nmⁿ].
+
+    Returns
+    -------
+    float
+        √det Λ times `size`.
+    """
+    return size * math.sqrt(max(float(np.linalg.det(roughness)), 0.0))
+
+
+def expected_maxima(
+    u: float, area: float, volume: float = 0.0, *, correlation: float = 0.0
+) -> float:
+    """Count the maxima of noise above a level.
+
+    Parameters
+    ----------
+    u : float
+        The level.
+    area, volume : float
+        From `extent`; the volume where the height above the coverslip is searched too.
+    correlation : float
+        Of the noise of this search with that of the next one, where what exceeds the level in both
+        counts once.
+
+    Returns
+    -------
+    float
+        Expected number.
+
+    Notes
+    -----
+    What exceeds the level in two correlated fields is a wedge in the plane of both, of angle
+    θ = arccos(correlation) between the normals of its sides.  By the Gaussian kinematic formula
+    (ibid., chapter 15), this share q of the maxima in a plane is in both:
+
+        q = 2 (1 − Φ(t)) + θ e^{−t²/2}/(√(2π) u),   t = u tan(θ/2).
+    """
+    total = area * u / (2 * math.pi) ** 1.5 + volume * (u**2 - 1) / (2 * math.pi) ** 2
+    total = float(total * math.exp(-(u**2) / 2))
+    if correlation <= 0:
+        return total
+    angle = math.acos(correlation)
+    t = u * math.tan(angle / 2)
+    both = 2 * float(norm.sf(t)) + angle * math.exp(-(t**2) / 2) / (math.sqrt(2 * math.pi) * u)
+    return total * (1 - both)
+
+
+def companions(u: float, ring: FloatArray, cell: float) -> float:
+    """Count the maxima of the other sign that a maximum brings with it.
+
+    Where the field is correlated by r < 0 with that at a maximum of height v = u + 1/u, its mean is
+    −|r| v, and it passes −u more often there.  Once the maximum is fitted and taken off, it does
+    no more.
+
+    Parameters
+    ----------
+    u : float
+        The level.
+    ring : ndarray
+        Correlation of the field with itself, at every distance in a grid.
+    cell : float
+        `extent` of one cell of that grid.
+
+    Returns
+    -------
+    float
+        Expected number for each maximum above the level.
+    """
+    near = ring[ring < 0]
+    spread = np.sqrt(1 - near**2)
+
+    def density(h: FloatArray) -> FloatArray:
+        out: FloatArray = h * np.exp(-(h**2) / 2)
+        return out
+
+    more = density((u + near * (u + 1 / u)) / spread) - density(u / spread)
+    return float(cell / (2 * math.pi) ** 1.5 * np.sum(more))
+
+
+def height_reached(
+    alarms: float,
+    area: float,
+    volume: float = 0.0,
+    *,
+    correlation: float = 0.0,
+    ring: FloatArray | None = None,
+    cell: float = 0.0,
+    lowest: float = _LOWEST,
+) -> float:
+    """Find the level above which noise has a given expected number of maxima.
+
+    Parameters
+    ----------
+    alarms : float
+        That number.
+    area, volume : float
+        From `extent`.
+    correlation : float
+        As in `expected_maxima`.
+    ring : ndarray, optional
+        As in `companions`, where maxima of both signs count and the higher of two is taken off
+        before the other is looked at.
+    cell : float
+        As in `companions`.
+    lowest : float
+        The answer where noise has fewer maxima even there.
+
+    Returns
+    -------
+    float
+        The level, not below `lowest`.
+    """
+
+    def excess(u: float) -> float:
+        found = expected_maxima(u, area, volume, correlation=correlation)
+        if ring is not None:  # of each pair one is left
+            found *= 1 - min(companions(u, ring, cell), 1.0) / 2
+        return math.log(found / alarms)
+
+    low = max(lowest, _LOWEST if volume else 1.0)
+    if not area > 0 or excess(low) <= 0:
+        return lowest
+    high = low
+    while excess(high) > 0 and high < _HIGHEST:
+        high = min(high + 1.0, _HIGHEST)
+    return float(brentq(excess, low, high, xtol=1e-10))

@@ -1,0 +1,222 @@
+"""Rows and columns that flicker: measured in every frame, and divided out.
+
+Where a shutter rolls, every row sees the laser at its own moment, and where columns have their own
+amplifiers each may drift: all pixels of a line share a factor f that no other frame has.  It is
+measured by the light of the line over that of the same line in the mean frame, both over the whole
+frame's, with an error of 1/√(C N) for C pixels of N photoelectrons.
+
+A particle of contrast c is part of that light.  In a single frame it is far below the noise, so
+that a median is moved by it as a mean is, and is noisier; but what it does to a mean is known: it
+lowers its line by the line's mean contrast, of a diffraction-limited spot 2λ/(π NA C a) of its
+height, with pixels of side a, as much as 2 % where C = 128.  `Lines.left` says what the correction
+leaves of a signal, and searches and fits expect that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.movie.background import find_defects
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.spectrum import measure_spectrum
+from iscat_analysis.records import FloatArray, StackMetadata
+
+_LEAST_LIT = 0.25  # of a line's pixels that must be usable
+
+
+class _Movie(Protocol):
+    @property
+    def shape(self) -> tuple[int, int, int]: ...
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def dtype(self) -> np.dtype[Any]: ...
+
+    def read(self, start: int, stop: int) -> NDArray[Any]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Which lines flicker together; `find_lines` makes it.
+
+    Attributes
+    ----------
+    light_e : ndarray, shape (y, x)
+        Mean photoelectrons of a frame [e]; 0 in pixels that say nothing of a line.
+    shares : (float, float)
+        Part of the variance of a pixel's noise that its whole row has in common, and its column;
+        0 where there is none, and nothing is corrected.
+    """
+
+    light_e: FloatArray
+    shares: tuple[float, float]
+
+    @property
+    def message(self) -> str:
+        """One line for the user."""
+        names = [n for n, share in zip(("rows", "columns"), self.shares, strict=True) if share]
+        parts = " and ".join(f"{100 * share:.2g} %" for share in self.shares if share)
+        return (
+            f"whole {' and '.join(names)} flicker ({parts} of the noise variance): each of the "
+            f"{' and '.join(names)} of each frame was divided by its own light"
+        )
+
+    @property
+    def summary(self) -> dict[str, float]:
+        """What ``summary.json`` says of it."""
+        return {"row_share": float(self.shares[0]), "column_share": float(self.shares[1])}
+
+    def factors(self, electrons: FloatArray) -> FloatArray:
+        """Measure the light of the lines over that of the frame.
+
+        Parameters
+        ----------
+        electrons : ndarray, shape (…, y, x)
+            Frames [e].
+
+        Returns
+        -------
+        ndarray, shape (…, y, x) or one that is broadcast to it
+            1 where a line or the frame has too little light.
+        """
+        used = self.light_e > 0
+        seen = np.where(used, electrons, 0.0)
+        both = tuple(range(-2, 0))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            frame = seen.sum(axis=both, keepdims=True) / self.light_e.sum()
+            out = np.ones((*electrons.shape[:-2], 1, 1))
+            for axis, share in zip((-1, -2), self.shares, strict=True):
+                if not share:
+                    continue
+                line = self.light_e.sum(axis=axis, keepdims=True)
+                factor = seen.sum(axis=axis, keepdims=True) / line / frame
+                lit = (used.mean(axis=axis, keepdims=True) > _LEAST_LIT) & (frame > 0)
+                out = out * np.where(lit & (factor > 0), factor, 1.0)
+        return out
+
+    def taken(self, signal: FloatArray) -> FloatArray:
+        """Give what frames are divided by because of a signal.
+
+        Parameters
+        ----------
+        signal : ndarray, shape (y, x)
+            Contrast.
+
+        Returns
+        -------
+        ndarray, shape (y, x)
+            Factor.
+        """
+        return np.broadcast_to(self.factors(self.light_e * (1 + signal)), signal.shape)
+
+    def left(self, signal: FloatArray) -> FloatArray:
+        """Give what is left of a signal.
+
+        Parameters
+        ----------
+        signal : ndarray, shape (y, x)
+            Contrast.
+
+        Returns
+        -------
+        ndarray, shape (y, x)
+            Contrast in corrected frames.
+        """
+        return (1 + signal) / self.taken(signal) - 1
+
+
+class SteadyFrames:
+    """Frames of a movie, each line divided by its own light.
+
+    Parameters
+    ----------
+    movie : Stack, or anything with its ``shape``, ``name``, ``dtype`` and ``read``
+        As it was recorded.
+    lines : Lines
+        What flickers.
+    camera : Camera
+        Counts → photoelectrons.
+
+    Attributes
+    ----------
+    shape : (int, int, int)
+        Frames, rows, columns.
+    dtype : dtype
+        Of floats.
+    name : str
+        What messages call the movie.
+    notes : tuple of str
+        Empty: what there was to say of the file was said of the file.
+    metadata : StackMetadata
+        Empty as well.
+    """
+
+    notes: tuple[str, ...] = ()
+    metadata = StackMetadata()
+
+    def __init__(self, movie: _Movie, lines: Lines, camera: Camera) -> None:
+        self._movie, self._lines, self._camera = movie, lines, camera
+        self.shape = movie.shape
+        self.name = movie.name
+        self.dtype = np.dtype(np.float32 if movie.dtype.itemsize <= 2 else np.float64)
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames.
+
+        Parameters
+        ----------
+        start, stop : int
+            Half-open range inside the movie.
+
+        Returns
+        -------
+        ndarray, shape (stop − start, y, x)
+            Corrected counts; saturated pixels keep theirs, at the camera's full scale.
+        """
+        counts = self._movie.read(start, stop)
+        camera = self._camera
+        offset = np.asarray(camera.offset_adu)
+        steady = counts - offset
+        steady /= self._lines.factors(steady * camera.gain_e_per_adu)
+        steady += offset
+        full = camera.saturated(counts)
+        if full.any():
+            limit = camera.full_scale_adu
+            steady[full] = counts[full] if limit is None else limit
+        out: NDArray[Any] = steady.astype(self.dtype)
+        return out
+
+    def close(self) -> None:
+        """Leave the movie open; it belongs to the caller."""
+
+
+def find_lines(counts: NDArray[Any], camera: Camera) -> Lines | None:
+    """Look for rows and columns that flicker.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Consecutive good frames.
+    camera : Camera
+        Counts → photoelectrons.
+
+    Returns
+    -------
+    Lines or None
+        None where no line has noise of its own beyond 4.5 standard errors of it.
+    """
+    spectrum = measure_spectrum(counts, camera)
+    if spectrum is None or not any(spectrum.shared):
+        return None
+    mean = camera.to_electrons(counts.mean(axis=0))
+    shape = (counts.shape[1], counts.shape[2])
+    read = camera.read_variance_e2(shape)
+    off = find_defects(len(counts) * mean, len(counts) * read)
+    off |= camera.saturated(counts.max(axis=0))
+    return Lines(np.where(off, 0.0, np.maximum(mean, 0.0)), spectrum.shared)
