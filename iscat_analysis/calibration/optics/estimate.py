@@ -57,6 +57,7 @@ _ROAM_NM = 300.0  # along x and y, from the centre of a picture
 _DAMPING = (1e-3, 1e8)  # first, and where the search gives up
 _LOWEST_NA = 0.3
 _NA_ROOM = 2e-3  # below the index of the oil
+_TOGETHER = 5  # sights of one task; a millisecond each
 _MASK_NA = 0.02  # smallest mask, and the narrowest ring around it
 
 
@@ -386,11 +387,16 @@ class _Point:
             if sight.focus_steps not in models:
                 models[sight.focus_steps] = build(sight.seen_with(values))
 
-        def one(index: int) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-            sight = sights[index]
-            return _scores(sight, models[sight.focus_steps], names, private[index])
+        def some(first: int) -> list[tuple[float, FloatArray, FloatArray, FloatArray]]:
+            return [
+                _scores(sight, models[sight.focus_steps], names, own)
+                for sight, own in zip(
+                    sights[first : first + _TOGETHER], private[first:], strict=False
+                )
+            ]
 
-        found = list(mapper(one, range(len(sights))))
+        parts = mapper(some, range(0, len(sights), _TOGETHER))
+        found = [each for part in parts for each in part]
         value = math.fsum(each[0] for each in found)
         return cls(
             value if math.isfinite(value) else -math.inf,
