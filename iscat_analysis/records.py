@@ -164,6 +164,14 @@ class FrameSource(Protocol):
         """Frames ``[start, stop)`` as stored, shape (stop − start, y, x) [counts]."""
 
 
+class CountSource(FrameSource, Protocol):
+    """A movie and the type of its numbers."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored counts."""
+
+
 @dataclass(frozen=True)
 class Windows:
     """Photoelectrons summed before and after the particles bound.

@@ -15,7 +15,7 @@ leaves of a signal, and searches and fits expect that.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,22 +23,9 @@ from numpy.typing import NDArray
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.spectrum import measure_spectrum
-from iscat_analysis.records import FloatArray, StackMetadata
+from iscat_analysis.records import CountSource, FloatArray, StackMetadata
 
 _LEAST_LIT = 0.25  # of a line's pixels that must be usable
-
-
-class _Movie(Protocol):
-    @property
-    def shape(self) -> tuple[int, int, int]: ...
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def dtype(self) -> np.dtype[Any]: ...
-
-    def read(self, start: int, stop: int) -> NDArray[Any]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +74,8 @@ class Lines:
         """
         used = self.light_e > 0
         seen = np.where(used, electrons, 0.0)
-        both = tuple(range(-2, 0))
         with np.errstate(divide="ignore", invalid="ignore"):
-            frame = seen.sum(axis=both, keepdims=True) / self.light_e.sum()
+            frame = seen.sum(axis=(-2, -1), keepdims=True) / self.light_e.sum()
             out = np.ones((*electrons.shape[:-2], 1, 1))
             for axis, share in zip((-1, -2), self.shares, strict=True):
                 if not share:
@@ -136,7 +122,7 @@ class SteadyFrames:
 
     Parameters
     ----------
-    movie : Stack, or anything with its ``shape``, ``name``, ``dtype`` and ``read``
+    movie : CountSource
         As it was recorded.
     lines : Lines
         What flickers.
@@ -160,7 +146,7 @@ class SteadyFrames:
     notes: tuple[str, ...] = ()
     metadata = StackMetadata()
 
-    def __init__(self, movie: _Movie, lines: Lines, camera: Camera) -> None:
+    def __init__(self, movie: CountSource, lines: Lines, camera: Camera) -> None:
         self._movie, self._lines, self._camera = movie, lines, camera
         self.shape = movie.shape
         self.name = movie.name

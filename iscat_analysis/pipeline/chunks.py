@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -24,9 +24,9 @@ from iscat_analysis.pipeline.results import table_of
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import (
     BoolArray,
+    CountSource,
     EventView,
     FloatArray,
-    FrameSource,
     Mapper,
     Windows,
 )
@@ -61,20 +61,12 @@ _GAIN_FRAMES = 64  # on which the gain is judged
 _SEAM_PX = 2.0  # two chunks' estimates of one step are nearer than this
 
 
-class Frames(FrameSource, Protocol):
-    """A movie and the type of its numbers."""
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the stored counts."""
-
-
 class Reader:
     """Frames in memory, from one chunk to the next without reading any twice.
 
     Parameters
     ----------
-    movie : Frames
+    movie : CountSource
         The movie.
     camera : Camera
         Counts → photoelectrons.
@@ -85,7 +77,7 @@ class Reader:
     """
 
     def __init__(
-        self, movie: Frames, camera: Camera, first: int, last: int, room_bytes: int
+        self, movie: CountSource, camera: Camera, first: int, last: int, room_bytes: int
     ) -> None:
         self._movie = movie
         self.camera = camera

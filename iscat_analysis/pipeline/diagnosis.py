@@ -21,7 +21,7 @@ from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain
 from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.pipeline.field import Event
 from iscat_analysis.records import Status, Windows
-from iscat_analysis.search.sliding import measure_noise
+from iscat_analysis.search.sliding import measure_frames, measure_noise
 
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""
@@ -101,9 +101,8 @@ def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
     counts = movie.read(first, max(first, min(last, movie.shape[0], first + _SPECTRUM_FRAMES)))
     if not len(counts):
         return None
-    good = np.asarray(counts.any(axis=(1, 2)))
-    good[1:] &= np.asarray((counts[1:] != counts[:-1]).any(axis=(1, 2)))
-    return find_lines(counts[good], camera)
+    light, repeats = measure_frames(counts, camera)
+    return find_lines(counts[np.isfinite(light) & ~repeats], camera)
 
 
 def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:

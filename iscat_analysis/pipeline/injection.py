@@ -23,9 +23,9 @@ from iscat_analysis.bounds import power_searched
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Mover, Trajectory
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.chunks import FRAME_COLUMN, Frames
+from iscat_analysis.pipeline.chunks import FRAME_COLUMN
 from iscat_analysis.pipeline.scene import Scene
-from iscat_analysis.records import FloatArray, Status
+from iscat_analysis.records import CountSource, FloatArray, Status
 from iscat_analysis.search.templates import LARGEST_IMAGE
 
 STAY = 3
@@ -67,7 +67,7 @@ class InjectedMovie:
 
     Parameters
     ----------
-    movie : Frames
+    movie : CountSource
         The measured one.
     camera : Camera
         Counts → photoelectrons.
@@ -81,7 +81,7 @@ class InjectedMovie:
 
     def __init__(
         self,
-        movie: Frames,
+        movie: CountSource,
         camera: Camera,
         particles: list[Injected],
         seed: int,

@@ -34,7 +34,6 @@ from iscat_analysis.pipeline.chunks import (
     REPEATS_COLUMN,
     VIEWS,
     Done,
-    Frames,
     Merged,
     Reader,
     counts_budget,
@@ -56,6 +55,7 @@ from iscat_analysis.pipeline.scene import (
 from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
 from iscat_analysis.records import (
     FREE_PARAMETERS,
+    CountSource,
     EventView,
     FloatArray,
     Progress,
@@ -141,7 +141,7 @@ def has_landings(config: Config) -> bool:
 
 
 def analyse_landings(
-    movie: Frames,
+    movie: CountSource,
     config: Config,
     camera: Camera,
     *,
@@ -156,7 +156,7 @@ def analyse_landings(
 
     Parameters
     ----------
-    movie : Frames
+    movie : CountSource
         The movie.
     config : Config
         Resolved; `has_landings` holds.
@@ -279,7 +279,7 @@ def analyse_landings(
 
 
 def inject_and_recover(
-    movie: Frames,
+    movie: CountSource,
     config: Config,
     camera: Camera,
     result: LandingResult,
@@ -291,7 +291,7 @@ def inject_and_recover(
 
     Parameters
     ----------
-    movie : Frames
+    movie : CountSource
         The movie.
     config : Config
         As it was analysed.

@@ -374,10 +374,10 @@ class ChunkFitter:
         if event.snr < _EXPLAINED * scene.templates.threshold:
             return None
         step = replace(step, at=task.at)
-        seen = set(near[index]) if scene.lines is None else set(range(len(steps))) - {index}
+        seen = near[index] if scene.lines is None else [i for i in range(len(steps)) if i != index]
         repeats = step_repeats(
             self._chunk, event, task.region, task.windows, step,
-            [s for i, s in enumerate(steps) if i in seen], self._neighbours, self._pattern,
+            [steps[i] for i in seen], self._neighbours, self._pattern,
         )  # fmt: skip
         fitted = FittedStep(
             step, event, task.region, task.windows, task.n_before, task.n_after, repeats

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -17,25 +18,27 @@ _FINE = np.linspace(-0.625, 0.625, 11)
 
 
 def summit(field: NDArray[Any], row: int, column: int) -> tuple[float, float, float]:
-    """Find the top of a smooth field between its pixels.
+    """Find the top of a smooth field, or its bottom, between its pixels.
 
     Parameters
     ----------
     field : ndarray, shape (y, x)
         The field.
     row, column : int
-        A pixel that no neighbour exceeds.
+        A pixel that no neighbour of its sign exceeds in magnitude.
 
     Returns
     -------
     dy, dx : float
-        From the pixel to the top; never out of the field.
+        From the pixel to there; never out of the field.
     above : float
-        Height of the top above the pixel, ≥ 0.
+        Magnitude there above that at the pixel, ≥ 0.
     """
     high, wide = field.shape
     top, left = max(row - _REACH_PX, 0), max(column - _REACH_PX, 0)
+    value = float(field[row, column])
     patch = field[top : row + _REACH_PX + 1, left : column + _REACH_PX + 1].astype(np.float64)
+    patch *= math.copysign(1.0, value)
     y = np.clip(row + _FINE, 0, high - 1) - top
     x = np.clip(column + _FINE, 0, wide - 1) - left
     fine = map_coordinates(patch, np.meshgrid(y, x, indexing="ij"), order=_ORDER, mode="mirror")
@@ -46,7 +49,7 @@ def summit(field: NDArray[Any], row: int, column: int) -> tuple[float, float, fl
     return (
         float(y[i]) + top - row + spacing * dy,
         float(x[j]) + left - column + spacing * dx,
-        max(height - float(field[row, column]), 0.0),
+        max(height - abs(value), 0.0),
     )
 
 

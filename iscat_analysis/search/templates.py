@@ -317,8 +317,7 @@ def _peaks(
     found = []
     for row, column in np.argwhere(sampled).tolist():
         layer = int(ranked[:, row, column].argmax())
-        here = signed[layer]
-        dy, dx, above = summit(math.copysign(1.0, here[row, column]) * here, row, column)
+        dy, dx, above = summit(signed[layer], row, column)
         height = float(best[row, column]) + above
         height += vertex(ranked[:, row, column], layer)[1]
         if height > threshold:

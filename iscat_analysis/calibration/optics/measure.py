@@ -62,7 +62,7 @@ _RUNG_PASSES = 12
 _TOO_FEW = 20.0  # log-likelihood that fewer aberrations lose where still fewer cannot be better
 _CONTAMINATED_SHARE = 0.25  # more than this is the model's fault
 _TRIAL_PASSES = 12  # of a second microscope on all pictures
-_TWIN_PASSES = 4  # a twin is within a part in a thousand after two
+_TWIN_PASSES = 4  # after which a twin is far nearer than _CLOSE
 _CLOSE = 0.01  # states whose average is explained this much worse are tried on all pictures
 
 Judge = Callable[[Sight, Settings], tuple[float, float]]

@@ -238,8 +238,7 @@ def find_steps(
     peaks = []
     for k, i, j in step_peaks(snr, SAMPLED * threshold).tolist():
         value = float(snr[k, i, j])
-        sign = np.sign(value)
-        dy, dx, above = summit(sign * snr[k], i, j)
+        dy, dx, above = summit(snr[k], i, j)
         height = math.copysign(abs(value) + above, value)
         if abs(height) <= threshold:
             continue
