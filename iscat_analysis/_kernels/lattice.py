@@ -21,12 +21,12 @@ of each component, followed by the same for ∂/∂z, and for ∂²/∂z² where
 from __future__ import annotations
 
 import math
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import convolve1d
+from scipy.linalg import toeplitz
 from scipy.special import i0
 
 FloatArray = NDArray[np.float64]
@@ -82,6 +82,13 @@ def window() -> tuple[FloatArray, FloatArray]:
     return np.ascontiguousarray(weights.T), np.concatenate([undo[:0:-1], undo])
 
 
+@lru_cache(8)
+def undoing(half: int) -> FloatArray:
+    """Write the filter of `window` as a matrix, shape (2·half + 1, 2·(half + FILTER) + 1)."""
+    undo = window()[1]
+    return np.asarray(toeplitz(np.pad(undo[:1], (0, 2 * half)), np.pad(undo, (0, 2 * half))))
+
+
 def lattice_half(reach_nm: float, step_nm: float) -> int:
     """Nodes on either side of the particle that images out to a distance need."""
     return math.ceil(reach_nm / step_nm) + TAPS // 2 + 1
@@ -134,20 +141,25 @@ def radial_waves(
                 scaled = value * (turn**order)[:, None]
                 found = scaled.T @ columns[m]
                 nodes[order, start : start + r.size, m] = found.reshape(-1, 4, fields)
-    f, d, s = nodes
-    rise = f[1:] - f[:-1]
-    d0, d1, s0, s1 = d[:-1], d[1:], s[:-1], s[1:]
-    return np.stack(
-        [
-            f[:-1],
-            d0,
-            0.5 * s0,
-            10 * rise - 6 * d0 - 4 * d1 - 1.5 * s0 + 0.5 * s1,
-            -15 * rise + 8 * d0 + 7 * d1 + 1.5 * s0 - s1,
-            6 * rise - 3 * d0 - 3 * d1 - 0.5 * s0 + 0.5 * s1,
-        ],
-        axis=1,
-    )
+    powers = np.empty((intervals, 6, largest + 1, 4, fields))
+    _fill_quintics(nodes.reshape(3, intervals + 1, -1), powers.reshape(intervals, 6, -1))
+    return powers
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _fill_quintics(nodes: FloatArray, powers: FloatArray) -> None:
+    """Fill `powers` (n, 6, k) from value, slope and bend (3, n + 1, k) at the nodes."""
+    for i in range(powers.shape[0]):
+        for j in range(powers.shape[2]):
+            f, d0, s0 = nodes[0, i, j], nodes[1, i, j], nodes[2, i, j]
+            d1, s1 = nodes[1, i + 1, j], nodes[2, i + 1, j]
+            rise = nodes[0, i + 1, j] - f
+            powers[i, 0, j] = f
+            powers[i, 1, j] = d0
+            powers[i, 2, j] = 0.5 * s0
+            powers[i, 3, j] = 10 * rise - 6 * d0 - 4 * d1 - 1.5 * s0 + 0.5 * s1
+            powers[i, 4, j] = -15 * rise + 8 * d0 + 7 * d1 + 1.5 * s0 - s1
+            powers[i, 5, j] = 6 * rise - 3 * d0 - 3 * d1 - 0.5 * s0 + 0.5 * s1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -296,10 +308,8 @@ def spread(waves: FloatArray, radial_step_nm: float, step_nm: float, half: int) 
     side = 2 * (half + FILTER) + 1
     fields = np.empty((waves.shape[4], 2, side, side))
     _sample(waves, 1 / radial_step_nm, step_nm, fields)
-    _, undo = window()
-    inner = slice(FILTER, -FILTER)
-    along_x = convolve1d(fields, undo, axis=2, mode="constant")[:, :, inner]
-    return np.ascontiguousarray(convolve1d(along_x, undo, axis=3, mode="constant")[..., inner])
+    undo = undoing(half)
+    return np.asarray(undo @ (fields @ undo.T))
 
 
 def reach_of_samples(reach_nm: float, step_nm: float) -> float:

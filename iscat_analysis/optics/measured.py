@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import io
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -20,11 +21,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve1d
 
 from iscat_analysis._kernels.image import Lens
-from iscat_analysis._kernels.lattice import FILTER, LATTICE_STEP, lattice_half, window
+from iscat_analysis._kernels.lattice import FILTER, LATTICE_STEP, lattice_half, undoing, window
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.kept import kept
 
 FloatArray = NDArray[np.float64]
 
@@ -195,8 +196,7 @@ class MeasuredField:
 
     def profile(self, _z_nm: float, orders: int) -> FloatArray:
         """Profile at any height, shape (2·orders, nodes, nodes)."""
-        profile: FloatArray = self._profiles(orders)
-        return profile
+        return self._profiles(orders)
 
     def profiles(self, heights_nm: FloatArray, _kappa: float) -> FloatArray:
         """Profiles with ∂/∂z and ∂²/∂z², shape (n, 3, channels, width)."""
@@ -204,14 +204,14 @@ class MeasuredField:
         return np.repeat(one, heights_nm.size, axis=0)
 
     @cached_property
-    def _profiles(self):  # type: ignore[no-untyped-def]
+    def _profiles(self) -> Callable[[int], FloatArray]:
         def with_orders(orders: int) -> FloatArray:
             side = 2 * self.half + 1
             out = np.zeros((2 * orders, side, side))
             out[0] = self._coefficients()
             return out
 
-        return lru_cache(_KEPT)(with_orders)
+        return kept(_KEPT, with_orders)
 
     def _coefficients(self) -> FloatArray:
         """Sample Re e on the lattice of the reach, and undo the smoothing of its window."""
@@ -220,12 +220,10 @@ class MeasuredField:
         known = self.template.contrast.T * (self.gain / 2)
         have = (known.shape[0] - 1) // 2
         half = min(have, self.half + FILTER)
-        inner, kept = (slice(c - half, c + half + 1) for c in (self.half + FILTER, have))
-        samples[inner, inner] = known[kept, kept]
-        _, undo = window()
-        for axis in (0, 1):
-            samples = convolve1d(samples, undo, axis=axis, mode="constant")
-        return np.ascontiguousarray(samples[FILTER:-FILTER, FILTER:-FILTER])
+        inner, there = (slice(c - half, c + half + 1) for c in (self.half + FILTER, have))
+        samples[inner, inner] = known[there, there]
+        undo = undoing(self.half)
+        return np.asarray(undo @ samples @ undo.T)
 
     def components(
         self, dx_nm: FloatArray, dy_nm: FloatArray, _z_nm: float

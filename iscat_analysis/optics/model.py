@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.aperture import Aperture, weight_on
 from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.kept import kept
 from iscat_analysis.optics.materials import Material
 from iscat_analysis.optics.measured import MeasuredField
 from iscat_analysis.optics.scale import MassScale
@@ -155,7 +156,7 @@ class ForwardModel:
 
     @cached_property
     def _height_tables(self) -> Callable[[float], AxialTable]:
-        return lru_cache(_TABLES_KEPT)(lambda z_nm: axial_table(self.wave, (z_nm, z_nm)))
+        return kept(_TABLES_KEPT, lambda z_nm: axial_table(self.wave, (z_nm, z_nm)))
 
     def image(
         self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
@@ -346,7 +347,7 @@ class ForwardModel:
                 z_nm, names, rho=self.rho, reach_nm=self.reach_nm,
             )  # fmt: skip
 
-        return lru_cache(_TABLES_KEPT)(at)
+        return kept(_TABLES_KEPT, at)
 
     def field(
         self, dx_nm: FloatArray, dy_nm: FloatArray, z_nm: float, mass_kda: float

@@ -8,8 +8,9 @@ at a height, a table of profiles along z, and the field at any point.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from iscat_analysis._kernels.lattice import (
 )
 from iscat_analysis._kernels.radial import STEP, AxialTable, bessel_table, radial_profile
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.kept import kept
 from iscat_analysis.optics.measured import MeasuredField
 
 FloatArray = NDArray[np.float64]
@@ -118,12 +120,11 @@ class RadialField:
 
     def profile(self, z_nm: float, orders: int) -> FloatArray:
         """Profile at a height, shape (4·orders, intervals, 6); the last few are kept."""
-        profile: FloatArray = self._profiles(z_nm, orders)
-        return profile
+        return self._profiles(z_nm, orders)
 
     @cached_property
-    def _profiles(self):  # type: ignore[no-untyped-def]
-        return lru_cache(_HEIGHTS_KEPT)(lambda z, orders: self._profile(z, orders, 0.0))
+    def _profiles(self) -> Callable[[float, int], FloatArray]:
+        return kept(_HEIGHTS_KEPT, lambda z, orders: self._profile(z, orders, 0.0))
 
     def _profile(self, z_nm: float, orders: int, kappa: float) -> FloatArray:
         points = self.table.shape[3]
@@ -182,14 +183,14 @@ class RadialField:
         return 2 * rho * a * along.real, a**2 * np.abs(along) ** 2
 
     @cached_property
-    def _line(self):  # type: ignore[no-untyped-def]
+    def _line(self) -> Callable[[float], tuple[FloatArray, ComplexArray, ComplexArray]]:
         r = np.linspace(0, self.reach_nm, 8 * (self.table.shape[3] - 1), endpoint=False)
 
         def at(z_nm: float) -> tuple[FloatArray, ComplexArray, ComplexArray]:
             f0, f2 = self._radial(r, z_nm)
             return r, f0, f2 * r**2
 
-        return lru_cache(_HEIGHTS_KEPT)(at)
+        return kept(_HEIGHTS_KEPT, at)
 
     def _radial(self, r: FloatArray, z_nm: float) -> tuple[ComplexArray, ComplexArray]:
         """F0 and F2 at distances r, from the table."""
@@ -254,17 +255,16 @@ class LatticeField:
 
     def profile(self, z_nm: float, orders: int) -> FloatArray:
         """Profile at a height, shape (channels, nodes, nodes); the last few are kept."""
-        profile: FloatArray = self._profiles(z_nm, orders)
-        return profile
+        return self._profiles(z_nm, orders)
 
     @cached_property
-    def _profiles(self):  # type: ignore[no-untyped-def]
+    def _profiles(self) -> Callable[[float, int], FloatArray]:
         def at(z_nm: float, orders: int) -> FloatArray:
             side = 2 * self.half + 1
             check_table("the field around a particle", orders * self.width)
             return self._stack(np.array([z_nm]), orders, 0.0).reshape(-1, side, side)
 
-        return lru_cache(_HEIGHTS_KEPT)(at)
+        return kept(_HEIGHTS_KEPT, at)
 
     def profiles(self, heights_nm: FloatArray, kappa: float) -> FloatArray:
         """Profiles with ∂/∂z and ∂²/∂z² without exp(iκz), shape (n, 3, channels, width)."""
@@ -310,12 +310,12 @@ class LatticeField:
         return (out[:, 0] + 1j * out[:, 1]).T.reshape(-1, *np.shape(dx_nm))
 
     @cached_property
-    def _waves_at(self):  # type: ignore[no-untyped-def]
+    def _waves_at(self) -> Callable[[float], FloatArray]:
         def at(z_nm: float) -> FloatArray:
             weights = self._weights(np.array([z_nm]), 1, 0.0)[0, 0]
             return self._waves(weights, self.transverse, self.radial_step_nm)
 
-        return lru_cache(_HEIGHTS_KEPT)(at)
+        return kept(_HEIGHTS_KEPT, at)
 
     def peak(self, z_nm: float, amplitude: float, rho: float) -> tuple[float, float]:
         """Parts of the signal of largest magnitude that are linear and quadratic in a.
@@ -347,7 +347,7 @@ class LatticeField:
         )
 
     @cached_property
-    def _plane(self):  # type: ignore[no-untyped-def]
+    def _plane(self) -> Callable[[float], tuple[Pixels, FloatArray, FloatArray]]:
         half = int(self.reach_nm / math.sqrt(2) / (self.step_nm * _PEAK_STEP))
         axis = self.step_nm * _PEAK_STEP * np.arange(-half, half + 1, dtype=np.float64)
         pixels = Pixels(axis, axis, np.zeros(1), np.ones(1))
@@ -359,7 +359,7 @@ class LatticeField:
             signal_image(profile, lens, pixels, 0.0, 0.0, -1.0, below)
             return pixels, (above - below) / 4, (above + below) / 2
 
-        return lru_cache(_HEIGHTS_KEPT)(at)
+        return kept(_HEIGHTS_KEPT, at)
 
 
 Field = RadialField | LatticeField | MeasuredField

@@ -6,7 +6,6 @@ import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
 from importlib.metadata import version
 from typing import Any
 
@@ -34,6 +33,7 @@ from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.forward import ForwardModel
+from iscat_analysis.optics.kept import kept
 from iscat_analysis.pipeline.landing import has_landings
 from iscat_analysis.pipeline.sights import (
     RINGS_NM,
@@ -229,14 +229,14 @@ def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], Forward
     """
     latest = threading.local()  # neighbours in a search often share their tables
 
-    @lru_cache(_MODELS_KEPT)
     def model(items: tuple[tuple[str, Any], ...]) -> ForwardModel:
         like = getattr(latest, "model", None)
         found = build_microscope(config, reach_nm, dict(items), like=like)
         latest.model = found
         return found
 
-    return lambda settings: model(tuple(settings.items()))
+    at_hand = kept(_MODELS_KEPT, model)
+    return lambda settings: at_hand(tuple(settings.items()))
 
 
 def goodness(sight: Sight, model: ForwardModel) -> tuple[float, float]:

@@ -17,12 +17,13 @@ from iscat_analysis.calibration.optics import (
     settings_of,
     with_settings,
 )
-from iscat_analysis.calibration.optics.estimate import _Point
+from iscat_analysis.calibration.optics.estimate import _Point, _walls
 from iscat_analysis.calibration.optics.starts import average_sights, search_starts
 from iscat_analysis.config import config_to_toml, parse_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.pixels import pixel_terms
+from iscat_analysis.optics.grid import PixelGrid
 
 NAMES = ("focus_nm", "na", "reference_phase_deg", "z7", "z11")
 
@@ -70,7 +71,7 @@ def test_private_unknowns_are_eliminated_exactly() -> None:
     settings = settings_of(configuration())
     private = np.array([sight.private for sight in sights])
     private[:, 2] = 6000.0
-    at = _Point.evaluate(sights, build, settings, NAMES, private, map)
+    at = _Point.evaluate(sights, build, settings, NAMES, private, _walls(sights), map)
     k, n = len(NAMES), len(sights)
     whole = np.zeros((k + 4 * n, k + 4 * n))
     whole[:k, :k] = at.fisher[:, :k, :k].sum(axis=0)
@@ -93,13 +94,29 @@ def test_score_is_the_slope_of_the_joint_likelihood() -> None:
 
     def at(name: str, change: float) -> _Point:
         moved = {**settings, name: settings[name] + change}
-        return _Point.evaluate(sights, build, moved, NAMES, private, map)
+        return _Point.evaluate(sights, build, moved, NAMES, private, _walls(sights), map)
 
     middle = at("z7", 0.0)
     for index, name in enumerate(NAMES):
         step = {"na": 1e-5}.get(name, 1e-2)
         slope = (at(name, step).value - at(name, -step).value) / (2 * step)
         assert slope == pytest.approx(middle.score[:, index].sum(), rel=2e-4), name
+
+
+def test_a_particle_beyond_its_wall_does_not_keep_the_others_from_converging() -> None:
+    """Held where its wall is, it counts as known; what it still wants is no gain to wait for."""
+    _, truth, build = make_sights({"z11": 8.0}, 6, seed=10)
+    lost = truth[0]
+    cut = 12  # columns: the particle stands six pixels, 500 nm, left of the new centre
+    grid = PixelGrid(lost.grid.x_nm[cut:], lost.grid.y_nm, lost.grid.pixel_nm)
+    lost = replace(lost, grid=grid, data=np.ascontiguousarray(lost.data[:, :, cut:]))
+    start = settings_of(configuration())
+    found = maximise([lost, *truth[1:]], build, start, NAMES)
+    wall = grid.x_nm.mean() - 300.0
+    assert lost.x_nm < wall - 100.0  # the trap is set
+    assert found.sights[0].x_nm == pytest.approx(wall)
+    assert found.converged
+    assert found.values["z11"] == pytest.approx(8.0, abs=4 * found.bound[4, 4] ** 0.5)
 
 
 def test_the_average_of_shifted_pictures() -> None:

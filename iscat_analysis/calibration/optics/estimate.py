@@ -289,7 +289,7 @@ def maximise(
     values = dict(start)
     walls = _walls(sights)
     private = np.clip([sight.private for sight in sights], *walls)
-    at = _Point.evaluate(sights, build, values, names, private, mapper)
+    at = _Point.evaluate(sights, build, values, names, private, walls, mapper)
     damping, used, converged = _DAMPING[0], 1, False
     while used < passes and damping < _DAMPING[1]:
         if at.gain(names) < tolerance:
@@ -298,7 +298,7 @@ def maximise(
         shared, own = at.step(names, damping)
         trial_values = _limited(values, names, shared, limits or {})
         moved = np.clip(private + own, *walls)
-        trial = _Point.evaluate(sights, build, trial_values, names, moved, mapper)
+        trial = _Point.evaluate(sights, build, trial_values, names, moved, walls, mapper)
         used += 1
         if trial.value > at.value:
             values, private, at = trial_values, moved, trial
@@ -380,8 +380,10 @@ class _Point:
         values: Settings,
         names: tuple[str, ...],
         private: FloatArray,
+        walls: FloatArray,
         mapper: Mapper,
     ) -> _Point:
+        """Evaluate all sights; an unknown that its wall stops counts as known."""
         models: dict[float, Microscope] = {}
         for sight in sights:
             if sight.focus_steps not in models:
@@ -398,9 +400,17 @@ class _Point:
         parts = mapper(some, range(0, len(sights), _TOGETHER))
         found = [each for part in parts for each in part]
         value = math.fsum(each[0] for each in found)
+        score, fisher, squares = (np.array([each[part] for each in found]) for part in (1, 2, 3))
+        own = score[:, len(names) :]
+        stopped = (private <= walls[0]) & (own < 0) | (private >= walls[1]) & (own > 0)
+        free = np.pad(~stopped, ((0, 0), (len(names), 0)), constant_values=True)
+        both = free[:, :, None] & free[:, None, :]
+        alone = np.eye(free.shape[1]) * ~free[:, None, :]
         return cls(
             value if math.isfinite(value) else -math.inf,
-            *(np.array([each[part] for each in found]) for part in (1, 2, 3)),
+            np.where(free, score, 0.0),
+            np.where(both, fisher, alone),
+            np.where(both, squares, 0.0),
         )
 
     def scatter(self) -> FloatArray:
