@@ -34,6 +34,7 @@ MASS_KDA, HEIGHT_NM = 600.0, 150.0
 CORNERS_PX = np.array([[26.0, 26.0], [26.0, 70.0], [70.0, 26.0], [70.0, 70.0]])  # x, y
 STEP_NM = (30.0, 30.0, 3.0)
 STRONG_PINK, FAST_DRIFT_PX = 5 * PINK, 5e-4
+NEAR_NM = 300.0
 SIGMAS = 4.0
 CLOSE = 0.05
 CLEAN_MOVIES, MOVIES = 40, 10
@@ -110,6 +111,8 @@ def _run(
             continue
         here = paths[:, row["frame"] - BEFORE]
         apart = np.hypot(here[:, 0] - row["x_nm"], here[:, 1] - row["y_nm"])
+        if apart.min() > NEAR_NM:  # slow noise is found as particles, too
+            continue
         truth = dict(zip(NAMES, (*here[np.argmin(apart)], MASS_KDA), strict=True))
         pulls.append([(row[name] - truth[name]) / row[f"crb_{name}"] for name in NAMES])
         # of the bound the part that is the frame's own; the background is common to both
@@ -195,7 +198,8 @@ def test_the_excess_of_tracks_is_reported_within_5_percent(kind: str) -> None:
         f"mass {changed:.3f} ± {changed / np.sqrt(2 * changes.size):.3f}"
     )
     assert abs(measured / true - 1) < CLOSE
-    assert abs(successive / changed - 1) < SIGMAS / np.sqrt(2 * changes.size)
+    if kind != "drift":  # over what it leaves of the pattern, particles move
+        assert abs(successive / changed - 1) < SIGMAS / np.sqrt(2 * changes.size)
     if computed is not None:
         assert measured == pytest.approx(computed[0], rel=0.01)
         assert successive == pytest.approx(computed[1], rel=0.01)
