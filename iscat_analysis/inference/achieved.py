@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtr, stdtrit
 
 from iscat_analysis.inference.repeats import LENGTHS
 
@@ -133,10 +133,10 @@ def pooled(
     ratio2 = max(ratio2, 1e-6)
     error = math.sqrt(variance) / (2 * ratio2)  # of ln ratio
     ratio = math.sqrt(ratio2)
-    reach = min(float(student.ppf(0.975, max(degrees, 2))) * error, _WIDEST)
+    reach = min(float(stdtrit(max(degrees, 2), 0.975)) * error, _WIDEST)
     # what Student's law makes of the error, in normal standard errors
-    chance = float(student.sf(abs(math.log(ratio)) / error, max(degrees, 2)))
-    significance = math.copysign(_normal_quantile(chance), math.log(ratio))
+    chance = float(stdtr(max(degrees, 2), -abs(math.log(ratio)) / error))
+    significance = math.copysign(-float(ndtri(max(chance, 1e-300))), math.log(ratio))
     return Achieved(
         over_crb=ratio,
         ci95=(ratio * math.exp(-reach), ratio * math.exp(reach)),
@@ -162,9 +162,3 @@ def _mean_square(squares: FloatArray, counts: FloatArray, excess: float) -> tupl
         return mean, chi2
     between = float(np.sum((squares - mean * counts) ** 2)) / total**2 * events / (events - 1)
     return mean, max(chi2, between)
-
-
-def _normal_quantile(chance: float) -> float:
-    from scipy.stats import norm
-
-    return float(norm.isf(max(chance, 1e-300)))

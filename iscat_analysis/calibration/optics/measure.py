@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import kstest
 
 from iscat_analysis.calibration.optics.estimate import (
     Build,
@@ -171,6 +170,8 @@ def judge(
     Judgement
         See there.
     """
+    from scipy.stats import kstest  # a second to load, for those who learn optics
+
     found = np.array(list(mapper(lambda sight: judge_one(sight, settings), sights)))
     p_values = found[:, 1]
     return Judgement(p_values, found[:, 0], float(kstest(p_values, "uniform").pvalue))
