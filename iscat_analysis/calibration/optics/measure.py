@@ -169,7 +169,7 @@ def judge(
     Returns
     -------
     Judgement
-        See there.
+        The p-value and χ² of each, and whether all p-values together are uniform.
     """
     found = np.array(list(mapper(lambda sight: judge_one(sight, settings), sights)))
     p_values = found[:, 1]
