@@ -168,7 +168,7 @@ def judge(
     Returns
     -------
     Judgement
-        See there.
+        The p-value and χ² of each, and whether all p-values together are uniform.
     """
     from scipy.stats import kstest  # a second to load, for those who learn optics
 
