@@ -13,6 +13,7 @@ Pieces, which take arrays and a microscope, and need neither a file nor a movie:
     ia.log_likelihood(...)                                      # of θ in nm and kDa, with gradient
     ia.crb(optics, protein, camera, photons_per_pixel=1e4)      # what no estimate can beat
     ia.qcrb(...)                                                # whatever the camera
+    ia.fit_diffusion(frames, positions_nm, sigma_nm, frame_rate_hz=331)  # of a track, with its CRB
 
 Whole jobs, from a movie to a report::
 
@@ -77,6 +78,13 @@ if TYPE_CHECKING:
     from iscat_analysis.result import Bounds as Bounds
     from iscat_analysis.result import Result as Result
     from iscat_analysis.schemas import schema as schema
+    from iscat_analysis.species import AnomalousTest as AnomalousTest
+    from iscat_analysis.species import ConfinementTest as ConfinementTest
+    from iscat_analysis.species import Diffusion as Diffusion
+    from iscat_analysis.species import anomalous_test as anomalous_test
+    from iscat_analysis.species import confinement_test as confinement_test
+    from iscat_analysis.species import fit_diffusion as fit_diffusion
+    from iscat_analysis.species import hydrodynamic_diameter as hydrodynamic_diameter
 
 _HOME = {
     "Optics": "config",
@@ -89,6 +97,13 @@ _HOME = {
     "LogLikelihood": "pieces",
     "crb": "pieces",
     "qcrb": "pieces",
+    "fit_diffusion": "species",
+    "Diffusion": "species",
+    "anomalous_test": "species",
+    "AnomalousTest": "species",
+    "confinement_test": "species",
+    "ConfinementTest": "species",
+    "hydrodynamic_diameter": "species",
     "configure": "config",
     "fit_movie": "notebook",
     "Result": "notebook",
@@ -117,12 +132,15 @@ __all__ = [
     "EVENT_COLUMNS",
     "FREE_PARAMETERS",
     "Analysis",
+    "AnomalousTest",
     "Bounds",
     "Calibration",
     "Camera",
     "Config",
     "ConfigError",
+    "ConfinementTest",
     "DataError",
+    "Diffusion",
     "IscatError",
     "LogLikelihood",
     "Optics",
@@ -130,15 +148,19 @@ __all__ = [
     "Result",
     "Stack",
     "Status",
+    "anomalous_test",
     "calibrate_optics",
     "compute_bounds",
     "config_to_toml",
     "configure",
+    "confinement_test",
     "crb",
+    "fit_diffusion",
     "fit_movie",
     "fit_rois",
     "fit_stack",
     "forecast_optics",
+    "hydrodynamic_diameter",
     "load_config",
     "log_likelihood",
     "open_stack",

@@ -1,6 +1,7 @@
-"""What species there are: a mixture fitted to the events themselves, each with its own error.
+"""What is in the sample: species of mass, and how fast particles diffuse.
 
-An event of measured mass x_i and standard deviation σ_i comes from species k with
+Species are a mixture fitted to the events themselves, each with its own error.  An event of
+measured mass x_i and standard deviation σ_i comes from species k with
 
     x_i ~ N(μ_k, τ_k² + σ_i²),
 
@@ -21,6 +22,10 @@ often it would choose that number again.
 `describe` is the whole of it.  `events` says what is seen and what is missed, `mixture` maximises
 the likelihood above, `search` tries numbers of species, `bootstrap` repeats the measurement, and
 `curves` holds what is drawn.
+
+A track tells a diffusion coefficient: `displacements` has the likelihood of its steps, with errors
+and motion blur, `diffusion` the estimate and the size that follows, and `motion` asks whether the
+particle diffuses freely.
 """
 
 from __future__ import annotations
@@ -32,13 +37,27 @@ from iscat_analysis.species.describe import (
     Distribution,
     describe,
 )
+from iscat_analysis.species.diffusion import Diffusion, fit_diffusion, hydrodynamic_diameter
 from iscat_analysis.species.events import Efficiency
+from iscat_analysis.species.motion import (
+    AnomalousTest,
+    ConfinementTest,
+    anomalous_test,
+    confinement_test,
+)
 
 __all__ = [
     "LEAST_EVENTS",
     "LEAST_SPECIES",
     "SPECIES_COLUMNS",
+    "AnomalousTest",
+    "ConfinementTest",
+    "Diffusion",
     "Distribution",
     "Efficiency",
+    "anomalous_test",
+    "confinement_test",
     "describe",
+    "fit_diffusion",
+    "hydrodynamic_diameter",
 ]

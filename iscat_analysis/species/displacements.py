@@ -1,0 +1,215 @@
+"""What a track tells of its diffusion: displacements, their errors and their blur.
+
+The camera shows a particle's place averaged over the exposure e, with an error ε_k of its own in
+each frame.  Free diffusion gives the displacement d_k over a gap of g_k frames of length Δ
+
+    Var d_k = 2D (g_k Δ − e/3) + σ_k² + σ_{k+1}²,      Cov(d_k, d_{k+1}) = D e/3 − σ_{k+1}²,
+
+and nothing between others (Berglund, Phys. Rev. E 82, 011917, 2010, equations 6 and 12, for gaps
+of one frame and equal errors).  So Σ(D) = E + D·A with three bands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from iscat_analysis._kernels.diffusion import displacement_likelihood
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import real_array
+from iscat_analysis.records import FloatArray
+
+LEAST_POSITIONS = 4
+"""A shorter track says too little: of its displacements, at least one must have two neighbours."""
+
+_RATES_HZ = (1e-6, 1e9)
+_LENGTHS_NM = (1e-6, 1e9)  # the smallest error and the largest place
+_MOST_FRAMES = 2**53  # beyond, not every frame has a number of its own
+_ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
+
+
+class Likelihood(NamedTuple):
+    """Log-likelihood of a diffusion coefficient D [nm²/s].
+
+    Attributes
+    ----------
+    value, slope, curvature : float
+        Log-likelihood and its derivatives with respect to D.
+    information : float
+        Fisher information on D.
+    log_determinant, log_determinant_slope : float
+        Of the covariance.
+    """
+
+    value: float
+    slope: float
+    curvature: float
+    information: float
+    log_determinant: float
+    log_determinant_slope: float
+
+
+@dataclass(frozen=True, eq=False)
+class Displacements:
+    """A track, checked; build it with `gather`.
+
+    Attributes
+    ----------
+    positions_nm : ndarray, shape (c, n)
+        Along each axis.
+    variance_nm2 : ndarray, shape (c, n)
+        Of the error of each.
+    frames : ndarray of int, shape (n,)
+        When.
+    interval_s : float
+        Δ, from frame to frame.
+    exposure_s : float
+        e.
+    """
+
+    positions_nm: FloatArray
+    variance_nm2: FloatArray
+    frames: NDArray[np.int64]
+    interval_s: float
+    exposure_s: float
+
+    @cached_property
+    def gaps_s(self) -> FloatArray:
+        """Time from each position to the next, shape (n − 1,) [s]."""
+        return np.asarray(np.diff(self.frames) * self.interval_s)
+
+    @cached_property
+    def steps_nm(self) -> FloatArray:
+        """Displacements, shape (c, n − 1)."""
+        return np.ascontiguousarray(np.diff(self.positions_nm, axis=1))
+
+    @cached_property
+    def error(self) -> tuple[FloatArray, FloatArray]:
+        """E: its diagonal, shape (c, n − 1), and the band beside it, (c, n − 2) [nm²]."""
+        variance = self.variance_nm2
+        return variance[:, :-1] + variance[:, 1:], np.ascontiguousarray(-variance[:, 1:-1])
+
+    @cached_property
+    def rate(self) -> tuple[FloatArray, FloatArray]:
+        """A: its diagonal, shape (n − 1,), and the band beside it, (n − 2,) [s]."""
+        blur = self.exposure_s / 3
+        return 2 * (self.gaps_s - blur), np.full(self.gaps_s.size - 1, blur)
+
+    def likelihood(self, d_nm2_s: float) -> Likelihood:
+        """Log-likelihood of free diffusion.
+
+        Parameters
+        ----------
+        d_nm2_s : float
+            D, at least 0.
+
+        Returns
+        -------
+        Likelihood
+            With derivatives and Fisher information.
+        """
+        return Likelihood(*displacement_likelihood(self.steps_nm, *self.error, *self.rate, d_nm2_s))
+
+
+def gather(
+    frames: ArrayLike,
+    positions_nm: ArrayLike,
+    sigma_nm: ArrayLike,
+    *,
+    frame_rate_hz: float,
+    exposure_ms: float | None,
+) -> Displacements:
+    """Check a track.
+
+    Parameters
+    ----------
+    frames : array_like of int, shape (n,)
+        As in `fit_diffusion`.
+    positions_nm : array_like, shape (n,) or (n, c)
+        As in `fit_diffusion`.
+    sigma_nm : array_like
+        As in `fit_diffusion`.
+    frame_rate_hz : float
+        As in `fit_diffusion`.
+    exposure_ms : float, optional
+        As in `fit_diffusion`.
+
+    Returns
+    -------
+    Displacements
+        Ready for a likelihood.
+
+    Raises
+    ------
+    ConfigError, DataError
+        As in `fit_diffusion`.
+    """
+    rate = real_array("frame_rate_hz", frame_rate_hz)
+    if rate.ndim or not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
+        raise ConfigError(
+            f"frame_rate_hz = {frame_rate_hz!r}: give one number of frames per second between "
+            f"{_RATES_HZ[0]:g} and {_RATES_HZ[1]:g}"
+        )
+    interval = 1 / float(rate)
+    exposure = interval
+    if exposure_ms is not None:
+        given = real_array("exposure_ms", exposure_ms)
+        if given.ndim or not (np.isfinite(given) and given >= 0):
+            raise ConfigError(f"exposure_ms = {exposure_ms!r}: give one number of at least 0")
+        exposure = float(given) / 1e3
+        if exposure > interval * (1 + _ROUNDING):
+            raise ConfigError(
+                f"exposure_ms = {exposure_ms:g} is longer than the {1e3 * interval:g} ms from "
+                f"frame to frame at frame_rate_hz = {frame_rate_hz:g}: correct one of them"
+            )
+    when = real_array("frames", frames)
+    if when.ndim != 1 or when.size < LEAST_POSITIONS:
+        raise DataError(
+            f"frames: has shape {when.shape}; give the frame number of each of at least "
+            f"{LEAST_POSITIONS} positions"
+        )
+    whole = np.isfinite(when).all() and (np.abs(when) < _MOST_FRAMES).all()
+    whole = whole and (when == np.round(when)).all()
+    if not whole or not (np.diff(when) > 0).all():
+        raise DataError(
+            "frames: give whole numbers that increase, each frame once; frames without a position "
+            "are left out"
+        )
+    places = real_array("positions_nm", positions_nm)
+    places = places[:, np.newaxis] if places.ndim == 1 else places
+    if places.ndim != 2 or places.shape[0] != when.size or not places.shape[1]:
+        raise DataError(
+            f"positions_nm: has shape {np.shape(positions_nm)}; give ({when.size},) or "
+            f"({when.size}, axes), one row for each of frames"
+        )
+    errors = real_array("sigma_nm", sigma_nm)
+    columns = errors[:, np.newaxis] if errors.shape == when.shape else errors
+    if columns.shape not in ((), (when.size, 1), places.shape):
+        raise DataError(
+            f"sigma_nm: has shape {errors.shape}; give one number, ({when.size},) or "
+            f"{places.shape} as positions_nm has"
+        )
+    for name, array in (("positions_nm", places), ("sigma_nm", columns)):
+        if not np.isfinite(array).all():
+            raise DataError(f"{name}: is not finite everywhere; leave such frames out")
+    least, most = _LENGTHS_NM
+    if np.abs(places).max() > most:
+        raise DataError(f"positions_nm = {places.flat[np.abs(places).argmax()]:g}: give nanometres")
+    wrong = (columns < least) | (columns > most)
+    if wrong.any():
+        raise DataError(
+            f"sigma_nm = {columns[wrong].flat[0]:g}: give the standard error of each position in "
+            f"nanometres, at least {least:g}"
+        )
+    variance = np.broadcast_to(columns**2, places.shape).T
+    return Displacements(
+        positions_nm=np.ascontiguousarray(places.T),
+        variance_nm2=np.ascontiguousarray(variance),
+        frames=when.astype(np.int64),
+        interval_s=interval,
+        exposure_s=min(exposure, interval),
+    )

@@ -1,0 +1,336 @@
+"""Is the motion of a track free?  Tests against an anomalous exponent and against confinement.
+
+Both compare the highest likelihood of a wider model with that of free diffusion.  An anomalous
+exponent lies inside its range when the motion is free, so that twice the difference is χ² with one
+degree of freedom.  A well of vanishing stiffness is a unit root, for which no such law holds; what
+the difference comes to without a well is therefore found from tracks drawn with the same frames,
+errors and D (Davison & Hinkley, Bootstrap Methods, 1997, section 4.2).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import LinAlgError, cho_solve, cholesky
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from iscat_analysis._kernels.diffusion import harmonic_likelihood
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.records import FloatArray
+from iscat_analysis.species.diffusion import most_likely
+from iscat_analysis.species.displacements import Displacements, gather
+
+_UM2 = 1e6  # nm²
+MOST_POSITIONS = 4000
+"""Of a track whose exponent is tested."""
+
+_EXPONENTS = (0.02, 1.98)
+_FLASH = 1e-2  # an exposure this small a part of a lag blurs by a series; the closed form cancels
+_STIFFEST = 3.0  # times the frame rate: there a well is flat noise within one frame
+_SOFTEST = 0.3  # per length of the track: there a well is not felt
+_RUNGS = 10
+_SETTLED = 1e-4  # of a log-likelihood, in the search for its maximum
+_PART = 1e-4  # of an exponent, for the derivative of the covariance
+
+
+@dataclass(frozen=True)
+class AnomalousTest:
+    """Whether the mean-squared displacement grows as time to the power 1.
+
+    Attributes
+    ----------
+    p_value : float
+        Chance of a likelihood ratio at least this large if the motion is free.
+    ratio : float
+        Twice the difference of the log-likelihoods.
+    exponent : float
+        α of highest likelihood; NaN for a track that does not move.
+    sigma_exponent : float
+        Its standard error, from the Fisher information of α and D together.
+    d_um2_s : float
+        D with that exponent: the mean-squared displacement of a frame is 2 D Δ along each axis
+        [µm²/s].
+    """
+
+    p_value: float
+    ratio: float
+    exponent: float
+    sigma_exponent: float
+    d_um2_s: float
+
+
+@dataclass(frozen=True)
+class ConfinementTest:
+    """Whether a track stays in a harmonic well.
+
+    Attributes
+    ----------
+    p_value : float
+        Share of tracks without a well, this one included, whose likelihood ratio is at least as
+        large.
+    ratio : float
+        Twice the difference of the log-likelihoods.
+    confinement_nm : float
+        Standard deviation of the place in the well, along each axis; infinite where no well is
+        better than free diffusion.
+    d_um2_s : float
+        D inside the well [µm²/s].
+    """
+
+    p_value: float
+    ratio: float
+    confinement_nm: float
+    d_um2_s: float
+
+
+def anomalous_test(
+    frames: ArrayLike,
+    positions_nm: ArrayLike,
+    sigma_nm: ArrayLike,
+    *,
+    frame_rate_hz: float,
+    exposure_ms: float | None = None,
+) -> AnomalousTest:
+    """Test free diffusion against fractional Brownian motion, MSD = 2 D Δ (t/Δ)^α along each axis.
+
+    An exponent below 1 is subdiffusion; above 1 it is motion with a direction, as a drift of the
+    stage makes it.  Errors of the positions and blur are in both likelihoods.  The time taken
+    grows with the cube of the track's length: seconds for 1000 positions.
+
+    Parameters
+    ----------
+    frames : array_like of int, shape (n,)
+        As in `fit_diffusion`.
+    positions_nm : array_like, shape (n,) or (n, c)
+        As in `fit_diffusion` [nm].
+    sigma_nm : array_like
+        As in `fit_diffusion` [nm].
+    frame_rate_hz : float
+        As in `fit_diffusion`.
+    exposure_ms : float, optional
+        As in `fit_diffusion` [ms].
+
+    Returns
+    -------
+    AnomalousTest
+        The exponent and how surprising it is.
+
+    Raises
+    ------
+    ConfigError
+        The frame rate or exposure is impossible.
+    DataError
+        The arrays are not those of a track, or it has more than `MOST_POSITIONS`.
+
+    References
+    ----------
+    Mandelbrot & Van Ness, SIAM Rev. 10, 422 (1968).
+    """
+    track = gather(
+        frames, positions_nm, sigma_nm, frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms
+    )
+    if track.frames.size > MOST_POSITIONS:
+        raise DataError(
+            f"frames: {track.frames.size} positions are more than the {MOST_POSITIONS} whose "
+            "covariance fits into memory; give a part of the track"
+        )
+    free = most_likely(track)
+    if not free > 0:
+        return AnomalousTest(1.0, 0.0, math.nan, math.nan, 0.0)
+    lags = _Lags.of(track)
+
+    def lost(theta: FloatArray) -> float:
+        return -_dense(track, free * math.exp(theta[0]) * _covariance(track, lags, float(theta[1])))
+
+    found = minimize(
+        lost, [0.0, 1.0], method="L-BFGS-B", jac="3-point", bounds=[(-20.0, 20.0), _EXPONENTS],
+        options={"ftol": 1e-10, "finite_diff_rel_step": _PART},
+    )  # fmt: skip
+    d, exponent = free * math.exp(found.x[0]), float(found.x[1])
+    ratio = max(2 * (-float(found.fun) - track.likelihood(free).value), 0.0)
+    return AnomalousTest(
+        p_value=float(chi2.sf(ratio, 1)),
+        ratio=ratio,
+        exponent=exponent,
+        sigma_exponent=_exponent_error(track, lags, d, exponent),
+        d_um2_s=d / _UM2,
+    )
+
+
+def confinement_test(
+    frames: ArrayLike,
+    positions_nm: ArrayLike,
+    sigma_nm: ArrayLike,
+    *,
+    frame_rate_hz: float,
+    exposure_ms: float | None = None,
+    resamples: int = 199,
+    rng: np.random.Generator | None = None,
+) -> ConfinementTest:
+    """Test free diffusion against diffusion in a harmonic well of unknown place.
+
+    Errors of the positions and blur are in both likelihoods.
+
+    Parameters
+    ----------
+    frames : array_like of int, shape (n,)
+        As in `fit_diffusion`.
+    positions_nm : array_like, shape (n,) or (n, c)
+        As in `fit_diffusion` [nm].
+    sigma_nm : array_like
+        As in `fit_diffusion` [nm].
+    frame_rate_hz : float
+        As in `fit_diffusion`.
+    exposure_ms : float, optional
+        As in `fit_diffusion` [ms].
+    resamples : int
+        Free tracks that are drawn; the smallest p-value is 1/(resamples + 1).
+    rng : numpy.random.Generator, optional
+        Draws them; absent, one with seed 1.
+
+    Returns
+    -------
+    ConfinementTest
+        The size of the well and how surprising it is.
+
+    Raises
+    ------
+    ConfigError
+        The frame rate or exposure is impossible, or `resamples` is not a positive number.
+    DataError
+        The arrays are not those of a track.
+
+    References
+    ----------
+    Uhlenbeck & Ornstein, Phys. Rev. 36, 823 (1930).
+    """
+    track = gather(
+        frames, positions_nm, sigma_nm, frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms
+    )
+    if isinstance(resamples, bool) or not isinstance(resamples, int) or resamples < 1:
+        raise ConfigError(f"resamples = {resamples!r}: give a whole number of at least 1")
+    draw = np.random.default_rng(1) if rng is None else rng
+    free = most_likely(track)
+    if not free > 0:
+        return ConfinementTest(1.0, 0.0, math.inf, 0.0)
+    ratio, d, stiffness = _well(track, free)
+    larger = 1
+    for _ in range(resamples):
+        drawn = _free_track(track, free, draw)
+        larger += _well(drawn, most_likely(drawn))[0] >= ratio
+    size = math.sqrt(d / stiffness) if ratio > 0 else math.inf
+    return ConfinementTest(larger / (resamples + 1), ratio, size, d / _UM2)
+
+
+class _Lags(NamedTuple):
+    """Every distance in time between two frames, in frames, and which pair has which."""
+
+    distinct: FloatArray
+    which: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, track: Displacements) -> _Lags:
+        pairs = np.abs(np.subtract.outer(track.frames, track.frames))
+        distinct, which = np.unique(pairs, return_inverse=True)
+        return cls(distinct.astype(float), which.reshape(pairs.shape))
+
+
+def _covariance(track: Displacements, lags: _Lags, exponent: float) -> FloatArray:
+    """Covariance of displacements for D = 1: −½ of the second difference of the MSD of averages.
+
+    |t|^α averaged over two exposures is [(t+e)^(α+2) + |t−e|^(α+2) − 2 t^(α+2)]/[e² (α+1)(α+2)].
+    """
+    e, t = track.exposure_s / track.interval_s, lags.distinct
+    smooth = t**exponent
+    if e > 0:
+        high = exponent + 2
+        closed = (t + e) ** high + np.abs(t - e) ** high - 2 * t**high
+        closed /= e**2 * (exponent + 1) * high
+        far = t * _FLASH > e
+        series = 1 + exponent * (exponent - 1) / 12 * (e / np.where(far, t, 1.0)) ** 2
+        smooth = np.where(far, smooth * series, closed)
+    msd = 2 * track.interval_s * (smooth - smooth[0])
+    return np.asarray(-0.5 * np.diff(np.diff(msd[lags.which], axis=0), axis=1))
+
+
+def _with_errors(track: Displacements, motion: FloatArray, axis: int) -> FloatArray:
+    sigma = motion.copy()
+    main, beside = (band[axis] for band in track.error)
+    i = np.arange(main.size)
+    sigma[i, i] += main
+    sigma[i[:-1], i[1:]] += beside
+    sigma[i[1:], i[:-1]] += beside
+    return sigma
+
+
+def _dense(track: Displacements, motion: FloatArray) -> float:
+    """Log-likelihood with any covariance of the motion; −∞ where rounding spoils it."""
+    value = 0.0
+    for axis, steps in enumerate(track.steps_nm):
+        try:
+            factor = cholesky(_with_errors(track, motion, axis), lower=True)
+        except LinAlgError:
+            return -math.inf
+        inside = float(steps @ cho_solve((factor, True), steps))
+        value -= inside / 2 + float(np.log(np.diag(factor)).sum())
+    return value - track.steps_nm.size * math.log(2 * math.pi) / 2
+
+
+def _exponent_error(track: Displacements, lags: _Lags, d: float, exponent: float) -> float:
+    """Give the standard error of α, D being unknown as well."""
+    there = d * _covariance(track, lags, exponent)
+    sides = [d * _covariance(track, lags, exponent + s) for s in (-_PART, _PART)]
+    slope = (sides[1] - sides[0]) / (2 * _PART)
+    information = np.zeros((2, 2))
+    for axis in range(len(track.steps_nm)):
+        factor = cholesky(_with_errors(track, there, axis), lower=True)
+        parts = [cho_solve((factor, True), part) for part in (there, slope)]
+        information += [[0.5 * np.sum(a * b.T) for a in parts] for b in parts]
+    return float(math.sqrt(np.linalg.inv(information)[1, 1]))
+
+
+def _well(track: Displacements, free: float) -> tuple[float, float, float]:
+    """Find the well of highest likelihood: the ratio, D [nm²/s] and κ [1/s]."""
+    none = track.likelihood(free).value
+    scale = free or float(np.mean(track.steps_nm**2 / track.rate[0]))
+    softest = _SOFTEST / float(track.gaps_s.sum())
+    stiffest = _STIFFEST / track.interval_s
+
+    def lost(theta: FloatArray) -> float:
+        value = harmonic_likelihood(
+            track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s,
+            scale * math.exp(theta[0]), math.exp(theta[1]),
+        )  # fmt: skip
+        return -float(value)
+
+    rungs = np.log(np.geomspace(softest, stiffest, _RUNGS))
+    d, k = min(((d, k) for k in rungs for d in (0.0, 0.5)), key=lambda at: lost(np.array(at)))
+    beside = k - 0.6 if k > rungs[0] else k + 0.6
+    found = minimize(
+        lost, (d, k), method="Nelder-Mead", bounds=[(-10, 10), (rungs[0], rungs[-1])],
+        options={"fatol": _SETTLED, "xatol": 1e-2,
+                 "initial_simplex": [(d, k), (d + 0.3, k), (d, beside)]},
+    )  # fmt: skip
+    ratio = 2 * (-float(found.fun) - none)
+    return max(ratio, 0.0), scale * math.exp(found.x[0]), math.exp(found.x[1])
+
+
+def _free_track(track: Displacements, d: float, rng: np.random.Generator) -> Displacements:
+    """Draw a free track with the same frames and errors.
+
+    The mean over an exposure is halfway between its ends, with the variance D e/6 of a bridge.
+    """
+    shape, e = track.positions_nm.shape, track.exposure_s
+    during = math.sqrt(2 * d * e) * rng.standard_normal(shape)
+    dark = np.maximum(np.append(0.0, track.gaps_s - e), 0.0)
+    between = np.sqrt(2 * d * dark) * rng.standard_normal(shape)
+    between[:, 1:] += during[:, :-1]
+    mean = np.cumsum(between, axis=1) + during / 2
+    mean += math.sqrt(d * e / 6) * rng.standard_normal(shape)
+    mean += np.sqrt(track.variance_nm2) * rng.standard_normal(shape)
+    return replace(track, positions_nm=mean)
