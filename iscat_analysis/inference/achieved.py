@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtr, stdtrit
 
 from iscat_analysis.inference.repeats import LENGTHS
 
@@ -158,10 +158,10 @@ def pooled(
     ratio2 = max(found.ratio2, 1e-6)
     error = math.sqrt(found.variance) / (2 * ratio2)  # of ln ratio
     ratio, degrees = math.sqrt(ratio2), max(found.degrees, 2)
-    reach = min(float(student.ppf(0.975, degrees)) * error, _WIDEST)
+    reach = min(float(stdtrit(degrees, 0.975)) * error, _WIDEST)
     # what Student's law makes of the error, in normal standard errors
-    chance = float(student.sf(abs(math.log(ratio)) / error, degrees))
-    significance = math.copysign(_normal_quantile(chance), math.log(ratio))
+    chance = float(stdtr(degrees, -abs(math.log(ratio)) / error))
+    significance = math.copysign(-float(ndtri(max(chance, 1e-300))), math.log(ratio))
     return Achieved(
         over_crb=ratio,
         ci95=(ratio * math.exp(-reach), ratio * math.exp(reach)),
@@ -269,9 +269,3 @@ def _mean_square(squares: FloatArray, counts: FloatArray, excess: float) -> tupl
         return mean, chi2
     between = float(np.sum((squares - mean * counts) ** 2)) / total**2 * events / (events - 1)
     return mean, max(chi2, between)
-
-
-def _normal_quantile(chance: float) -> float:
-    from scipy.stats import norm
-
-    return float(norm.isf(max(chance, 1e-300)))

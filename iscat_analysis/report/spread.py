@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from iscat_analysis.records import Analysis, Status
 from iscat_analysis.report.numbers import decimals_for, fixed, number
@@ -54,7 +54,7 @@ def rejection(table: pd.DataFrame) -> str:
     p = table["p_value"].to_numpy(float)
     p = p[np.isfinite(p)]
     poor = int(np.count_nonzero(p < _POOR))
-    if not p.size or float(binom.sf(poor - 1, p.size, _POOR)) > _CHANCE:
+    if not p.size or float(bdtrc(poor - 1, p.size, _POOR)) > _CHANCE:
         return ""
     return (
         f"The model is rejected: {poor} of {p.size} fits have a p-value below {_POOR:g}, where "

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.signal import fftconvolve
 
 from iscat_analysis.records import BoolArray, FloatArray
 
@@ -286,7 +285,10 @@ class EmptyField:
     def _related(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """F⁻¹, F, and the covariance of estimates at every distance of two places."""
         unit = self._unit
-        common = np.stack([[fftconvolve(a, b[::-1, ::-1]) for b in unit] for a in unit])
+        size = (2 * unit.shape[-1] - 1,) * 2
+        spectra = fft.rfft2(unit, size)
+        common = fft.irfft2(spectra[:, None] * spectra.conj(), size)
+        common = fft.fftshift(common, axes=(-2, -1))
         middle = common[..., common.shape[-2] // 2, common.shape[-1] // 2]
         inverse = np.linalg.inv(middle)
         return inverse, middle, np.einsum("ij,jkyx,kl->ilyx", inverse, common, inverse)
