@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import LinAlgError, cho_solve, cholesky
 from scipy.optimize import minimize
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from iscat_analysis._kernels.diffusion import harmonic_likelihood
 from iscat_analysis.errors import ConfigError, DataError
@@ -154,7 +154,7 @@ def anomalous_test(
     d, exponent = free * math.exp(found.x[0]), float(found.x[1])
     ratio = max(2 * (-float(found.fun) - track.likelihood(free).value), 0.0)
     return AnomalousTest(
-        p_value=float(chi2.sf(ratio, 1)),
+        p_value=float(chdtrc(1, ratio)),
         ratio=ratio,
         exponent=exponent,
         sigma_exponent=_exponent_error(track, lags, d, exponent),
