@@ -29,7 +29,8 @@ from _peer import peer_python  # noqa: E402
 
 from iscat_analysis.config import parse_config  # noqa: E402
 from iscat_analysis.inference.fit import fit_particle, search_box, start_theta  # noqa: E402
-from iscat_analysis.inference.likelihood import Likelihood, compile_kernels  # noqa: E402
+from iscat_analysis.inference.likelihood import Likelihood  # noqa: E402
+from iscat_analysis.inference.noise import compile_kernels  # noqa: E402
 from iscat_analysis.records import Box, Candidate, FloatArray  # noqa: E402
 from iscat_analysis.study import Setting, make_setting, trial_generator  # noqa: E402
 

@@ -37,8 +37,8 @@ EVENT_COLUMNS = (
 """The columns of ``fits.csv``, in order."""
 
 REPEAT_COLUMNS = ("repeat_x_nm", "repeat_y_nm", "repeat_z_nm", "repeat_mass_kda")
-"""Columns of ``fits.csv`` where an event has several frames: its standard errors as disjoint parts
-of its own frames show them."""
+"""Columns of ``fits.csv``: standard errors of an event as disjoint parts of its own frames show
+them; of a single frame, as the empty places of that frame do."""
 
 
 class Progress(Protocol):

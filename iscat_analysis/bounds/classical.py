@@ -163,7 +163,7 @@ def bounds_from_matrices(
     Returns
     -------
     EventBounds
-        See there.
+        Cramér–Rao and quantum Cramér–Rao bounds of the free parameters.
     """
     index = [i for i, name in enumerate(PARAMETERS) if name in free]
     seen = np.diag(fisher).copy()

@@ -20,11 +20,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import ncx2, norm
+from scipy.special import ndtr, ndtri
 
 from iscat_analysis.bounds.experiment import Experiment, expected_likelihood
 from iscat_analysis.inference.random_field import extent, height_reached
 
+_NO_PARTICLE = 1e-4  # a signal-to-noise ratio that changes nothing, to 1e-8
 _FAINT = 1e-6  # of the particle's amplitude: where derivatives with the place are taken
 
 
@@ -72,7 +73,7 @@ def power_known(snr: float, threshold: float) -> float:
     float
         Φ(snr − threshold).
     """
-    return float(norm.sf(threshold - snr))
+    return float(ndtr(snr - threshold))
 
 
 def power_searched(snr: float, threshold: float) -> float:
@@ -90,7 +91,13 @@ def power_searched(snr: float, threshold: float) -> float:
     float
         Of a χ² with three degrees of freedom and non-centrality snr².
     """
-    return float(ncx2.sf(threshold**2, 3, snr**2))
+    # the length of a normal vector in space whose mean lies snr from the origin
+    far, near = threshold + snr, threshold - snr
+    if snr < _NO_PARTICLE:
+        rim = 2 * threshold * math.exp(-(threshold**2) / 2)
+    else:
+        rim = (math.exp(-(near**2) / 2) - math.exp(-(far**2) / 2)) / snr
+    return float(ndtr(-near) + ndtr(-far)) + rim / math.sqrt(2 * math.pi)
 
 
 def detection_limit(experiment: Experiment) -> DetectionLimit | None:
@@ -126,9 +133,9 @@ def detection_limit(experiment: Experiment) -> DetectionLimit | None:
     rough = fisher[:2, :2] / (theta[3] ** 2 * fisher[3, 3]) - np.outer(slope, slope)
     area = extent(rough, (at.pixels * experiment.grid.pixel_nm) ** 2)
     false, miss = at.false_alarm_probability, at.miss_probability
-    known = float(norm.isf(false))
+    known = -float(ndtri(false))
     searched = height_reached(-math.log1p(-false), area, lowest=known)
-    snr = known + float(norm.isf(miss))
+    snr = known + -float(ndtri(miss))
     snr_searched = float(
         brentq(lambda s: power_searched(s, searched) - (1 - miss), 0.0, searched + 40.0)
     )

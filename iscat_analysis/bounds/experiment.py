@@ -21,7 +21,8 @@ from iscat_analysis.bounds.quantum import (
 )
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference.likelihood import Likelihood, asimov_conditional, asimov_poisson
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
 

@@ -4,7 +4,8 @@ Disjoint parts of the events' own frames show the noise up to half a window, and
 itself adds.  Empty places show the noise of whole windows.  With A the mean square of normalised
 differences between the parts of events, B the same at empty places and W that of whole windows
 there, the squared spread of the estimates is W + A − B: the noise at full length, and what the
-particles' own frames show beyond the others'.
+particles' own frames show beyond the others'.  Where every estimate is of a single frame, it has no
+parts, and W stands alone.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtr, stdtrit
 
 from iscat_analysis.inference.repeats import LENGTHS
 
@@ -26,6 +27,7 @@ SIGNIFICANT = 3.0
 LEAST_EXCESS = 0.02
 """Relative excess below which nothing is said."""
 
+_DRIFTS = 4.0  # growth of the excess from half a window to a whole one, above which it is a drift
 _WIDEST = 5.0  # half-width of an interval of ln ratio, beyond which nothing is known
 _FEWEST_TILES = 6
 _FEWEST_COUNTS = 200
@@ -48,15 +50,19 @@ class Achieved:
         an eighth to a half of it.
     significance : float
         ln of the ratio in its standard errors.
-    frames : tuple of int
-        Frames averaged.
+    frames : tuple of float
+        Frames averaged; where estimates are of single frames, those from each to the middle of the
+        background.
     by_frames : tuple of float
-        Spread of such averages over their bound, within the events' own frames.
+        Spread of such averages over their bound, within the events' own frames; of single frames,
+        at empty places.
     by_frames_se : tuple of float
         Its standard errors.
     empty : tuple of float
-        The same at empty places: parts, eighths, quarters and halves of a window, the whole; empty
-        where there are none.
+        The same at empty places: parts, eighths, quarters and halves of a window, the whole; of
+        single frames, successive ones, and all against the background; empty where there are none.
+    single : bool
+        Whether estimates are of single frames.
     """
 
     over_crb: float
@@ -64,10 +70,36 @@ class Achieved:
     events: int
     whole: bool
     significance: float
-    frames: tuple[int, ...]
+    frames: tuple[float, ...]
     by_frames: tuple[float, ...]
     by_frames_se: tuple[float, ...]
     empty: tuple[float, ...]
+    single: bool = False
+
+    @property
+    def fast2(self) -> float:
+        """Squared spread from one frame to the next."""
+        if self.single:
+            return self.empty[0] ** 2
+        return self.by_frames[0] ** 2 if self.by_frames else 1.0
+
+    @property
+    def slow2(self) -> float:
+        """What the squared spread has beyond that of parts, where there are no particles."""
+        return self.empty[-1] ** 2 - self.empty[0] ** 2 if self.empty else 0.0
+
+    @property
+    def drifts(self) -> bool:
+        """Whether slow noise grows as a drift at constant speed makes it, rather than flicker.
+
+        Flicker doubles from half a window to a whole one, a drift grows eightfold; single frames
+        see a drift as the square of their distance from the background, flicker as its logarithm.
+        """
+        if self.single:
+            near, far = (max(self.by_frames[k] ** 2 - self.fast2, 1e-3) for k in (0, -1))
+            return far / near > self.frames[-1] / self.frames[0] > 1
+        halves, whole = (self.empty[k] ** 2 for k in (-2, -1))
+        return (whole - self.fast2) / max(halves - self.fast2, 1e-3) > _DRIFTS
 
     @property
     def exceeds(self) -> bool:
@@ -81,7 +113,12 @@ class Achieved:
 
 
 def pooled(
-    own: FloatArray, empty: FloatArray | None, empty_counts: FloatArray | None
+    own: FloatArray,
+    empty: FloatArray | None,
+    empty_counts: FloatArray | None,
+    *,
+    shared: float = 1.0,
+    distances: tuple[float, ...] | None = None,
 ) -> Achieved | None:
     """Pool the repeats of one parameter.
 
@@ -91,6 +128,11 @@ def pooled(
         Squares over expected variance, and how many; from `repeats_of`.
     empty, empty_counts : ndarray, shape (contrasts, tiles), optional
         Of `EmptySpread`, this parameter's.
+    shared : float
+        Of `EmptySpread`, this parameter's.
+    distances : tuple of float, optional
+        Of `EmptySpread`, where estimates are of single frames; `own` is then that of their frames
+        elsewhere, and says nothing that `empty` does not.
 
     Returns
     -------
@@ -100,56 +142,121 @@ def pooled(
     Notes
     -----
     The interval is Student's, on the logarithm, its variance that between events and between tiles
-    of the field, which noise that is common to neighbours does not make too small; at least that of
-    χ².
+    of the field with what these have in common, which noise of neighbours does not make too small;
+    at least that of χ².
     """
-    squares, counts = own[:, :, 0], own[:, :, 1]
-    used = counts[:, 0] > 0
-    squares, counts = squares[used], counts[used]
-    if not len(squares):
+    own = own[own[:, 0, 1] > 0]
+    if not len(own):
         return None
-    between, variance = _mean_square(squares[:, 0], counts[:, 0], 2.0)
-    degrees = max(len(squares), counts[:, 0].sum() / 4)
-    total = counts.sum(axis=0)[1:]
-    kept = [k for k, number in enumerate(total) if number >= 2]
-    curve = [_mean_square(squares[:, k + 1], counts[:, k + 1], 2.0) for k in kept]
-    ratio2, whole = between, False
-    levels: tuple[float, ...] = ()
-    if empty is not None and empty_counts is not None:
-        held = empty_counts[0] > 0
-        if held.sum() >= _FEWEST_TILES and empty_counts[0].sum() >= _FEWEST_COUNTS:
-            whole = True
-            n, s = empty_counts[:, held], empty[:, held]
-            mean = s.sum(axis=1) / np.maximum(n.sum(axis=1), 1e-300)
-            # the difference of whole windows and their parts, tile by tile
-            influence = [(s[k] - mean[k] * n[k]) / n[k].sum() for k in (0, 1)]
-            difference = influence[0] - influence[1]
-            tiles = int(held.sum())
-            slow = float(np.sum(difference**2)) * tiles / (tiles - 1)
-            ratio2 = between + mean[0] - mean[1]
-            variance += slow
-            degrees = min(degrees, tiles - 1)
-            levels = tuple(float(math.sqrt(m)) for m in (*mean[1:], mean[0]))
-    ratio2 = max(ratio2, 1e-6)
-    error = math.sqrt(variance) / (2 * ratio2)  # of ln ratio
-    ratio = math.sqrt(ratio2)
-    reach = min(float(student.ppf(0.975, max(degrees, 2))) * error, _WIDEST)
+    tiles = _Tiles.of(empty, empty_counts, shared)
+    if distances is None:
+        found = _of_windows(own, tiles)
+    elif tiles is not None:
+        found = _of_frames(tiles, distances)
+    else:
+        return None
+    ratio2 = max(found.ratio2, 1e-6)
+    error = math.sqrt(found.variance) / (2 * ratio2)  # of ln ratio
+    ratio, degrees = math.sqrt(ratio2), max(found.degrees, 2)
+    reach = min(float(stdtrit(degrees, 0.975)) * error, _WIDEST)
     # what Student's law makes of the error, in normal standard errors
-    chance = float(student.sf(abs(math.log(ratio)) / error, max(degrees, 2)))
-    significance = math.copysign(_normal_quantile(chance), math.log(ratio))
+    chance = float(stdtr(degrees, -abs(math.log(ratio)) / error))
+    significance = math.copysign(-float(ndtri(max(chance, 1e-300))), math.log(ratio))
     return Achieved(
         over_crb=ratio,
         ci95=(ratio * math.exp(-reach), ratio * math.exp(reach)),
-        events=len(squares),
-        whole=whole,
+        events=len(own),
+        whole=tiles is not None,
         significance=significance,
-        frames=tuple(LENGTHS[k] for k in kept),
-        by_frames=tuple(math.sqrt(value) for value, _ in curve),
+        frames=found.frames,
+        by_frames=tuple(math.sqrt(value) for value, _ in found.curve),
         by_frames_se=tuple(
-            math.sqrt(spread) / (2 * math.sqrt(max(value, 1e-12))) for value, spread in curve
+            math.sqrt(spread) / (2 * math.sqrt(max(value, 1e-12))) for value, spread in found.curve
         ),
-        empty=levels,
+        empty=found.levels,
+        single=distances is not None,
     )
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Squared ratio, its variance and degrees of freedom, and the same against frames."""
+
+    ratio2: float
+    variance: float
+    degrees: float
+    frames: tuple[float, ...]
+    curve: tuple[tuple[float, float], ...]
+    levels: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Tiles:
+    """What each tile of the field says, shape (contrasts, tiles)."""
+
+    squares: FloatArray
+    counts: FloatArray
+    shared: float
+
+    @classmethod
+    def of(
+        cls, squares: FloatArray | None, counts: FloatArray | None, shared: float
+    ) -> _Tiles | None:
+        """Keep the tiles with empty places; None where they are too few."""
+        if squares is None or counts is None:
+            return None
+        held = counts[0] > 0
+        if held.sum() < _FEWEST_TILES or counts[0].sum() < _FEWEST_COUNTS:
+            return None
+        return cls(squares[:, held], counts[:, held], shared)
+
+    @property
+    def number(self) -> int:
+        """How many there are."""
+        return int(self.counts.shape[1])
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean square of each contrast."""
+        return np.asarray(self.squares.sum(axis=1) / np.maximum(self.counts.sum(axis=1), 1e-300))
+
+    def influence(self, k: int) -> FloatArray:
+        """Give what each tile contributes to the error of a mean square."""
+        n, s = self.counts[k], self.squares[k]
+        return np.asarray((s - self.mean[k] * n) / n.sum())
+
+    def variance(self, influence: FloatArray) -> float:
+        """Give the variance of what tiles add up to."""
+        return self.shared * float(np.sum(influence**2)) * self.number / (self.number - 1)
+
+
+def _of_windows(own: FloatArray, tiles: _Tiles | None) -> _Found:
+    """Gather what parts of windows say, at the events and where there are none."""
+    squares, counts = own[:, :, 0], own[:, :, 1]
+    ratio2, variance = _mean_square(squares[:, 0], counts[:, 0], 2.0)
+    degrees = max(len(own), counts[:, 0].sum() / 4)
+    total = counts.sum(axis=0)[1:]
+    kept = [k for k, number in enumerate(total) if number >= 2]
+    curve = tuple(_mean_square(squares[:, k + 1], counts[:, k + 1], 2.0) for k in kept)
+    levels: tuple[float, ...] = ()
+    if tiles is not None:
+        whole, parts, *others = tiles.mean
+        # the difference of whole windows and their parts, tile by tile
+        variance += tiles.variance(tiles.influence(0) - tiles.influence(1))
+        ratio2 += whole - parts
+        degrees = min(degrees, tiles.number - 1)
+        levels = tuple(math.sqrt(m) for m in (parts, *others, whole))
+    return _Found(ratio2, variance, degrees, tuple(LENGTHS[k] for k in kept), curve, levels)
+
+
+def _of_frames(tiles: _Tiles, distances: tuple[float, ...]) -> _Found:
+    """Gather what single frames say where there are no particles."""
+    whole, successive, *at = tiles.mean
+    curve = tuple((m, tiles.variance(tiles.influence(2 + k))) for k, m in enumerate(at))
+    return _Found(
+        whole, tiles.variance(tiles.influence(0)), tiles.number - 1, distances, curve,
+        (math.sqrt(successive), math.sqrt(whole)),
+    )  # fmt: skip
 
 
 def _mean_square(squares: FloatArray, counts: FloatArray, excess: float) -> tuple[float, float]:
@@ -162,9 +269,3 @@ def _mean_square(squares: FloatArray, counts: FloatArray, excess: float) -> tupl
         return mean, chi2
     between = float(np.sum((squares - mean * counts) ** 2)) / total**2 * events / (events - 1)
     return mean, max(chi2, between)
-
-
-def _normal_quantile(chance: float) -> float:
-    from scipy.stats import norm
-
-    return float(norm.isf(max(chance, 1e-300)))

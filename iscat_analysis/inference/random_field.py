@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from iscat_analysis.records import FloatArray
 
@@ -77,7 +77,7 @@ def expected_maxima(
         return total
     angle = math.acos(correlation)
     t = u * math.tan(angle / 2)
-    both = 2 * float(norm.sf(t)) + angle * math.exp(-(t**2) / 2) / (math.sqrt(2 * math.pi) * u)
+    both = 2 * float(ndtr(-t)) + angle * math.exp(-(t**2) / 2) / (math.sqrt(2 * math.pi) * u)
     return total * (1 - both)
 
 

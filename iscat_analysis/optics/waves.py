@@ -378,7 +378,7 @@ def axial_table(field: Field, z_range_nm: tuple[float, float]) -> AxialTable:
     Returns
     -------
     AxialTable
-        See there.
+        Profiles on a grid of heights, with what turns them into any height between.
     """
     low, high = z_range_nm
     kappa = float(field.axial.real.min() + field.axial.real.max()) / 2

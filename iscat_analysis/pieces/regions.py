@@ -17,7 +17,8 @@ from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import real_array
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.likelihood import LEVEL, Likelihood, compile_kernels
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.noise import compile_kernels
 from iscat_analysis.pieces.counts import Counts, gather
 from iscat_analysis.pieces.setups import config_of, number_in
 from iscat_analysis.records import (

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.achieved import Achieved
-from iscat_analysis.inference.likelihood import compile_kernels
+from iscat_analysis.inference.noise import compile_kernels
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.inference.prior import Prior
 from iscat_analysis.movie import Stack, open_stack

@@ -17,7 +17,6 @@ _NOISE_SHOWS = frozenset({Status.OK.value, Status.POOR_FIT.value})
 
 
 _SHARE = 0.3  # of an excess that is worth naming
-_DRIFTS = 4.0  # growth of the excess from half a window to a whole one, above which it is a drift
 
 
 def measure_spread(
@@ -32,9 +31,10 @@ def measure_spread(
     table : pandas.DataFrame
         Columns `EVENT_COLUMNS`.
     repeats : sequence of ndarray
-        Of each row, from `iscat_analysis.inference.repeats.repeats_of`.
+        Of each row, from `iscat_analysis.inference.repeats.repeats_of`; of single frames, from
+        `iscat_analysis.pipeline.blank.FrameNoise`.
     empty : EmptySpread or None
-        The noise of whole windows, where it was looked at.
+        The noise of whole windows or single frames, where it was looked at.
 
     Returns
     -------
@@ -51,18 +51,20 @@ def measure_spread(
     own = np.stack(kept)
     found: dict[str, Achieved] = {}
     for k, name in enumerate(FREE_PARAMETERS[mode]):
-        one = pooled(
-            own[:, :, [k, -1]],
-            None if empty is None else empty.squares[:, k],
-            None if empty is None else empty.counts,
-        )
+        if empty is None:
+            one = pooled(own[:, :, [k, -1]], None, None)
+        else:
+            one = pooled(
+                own[:, :, [k, -1]], empty.squares[:, k], empty.counts,
+                shared=float(empty.shared[k]), distances=empty.distances,
+            )  # fmt: skip
         if one is not None:
             found[name] = one
     return found
 
 
 def with_repeats(mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray]) -> pd.DataFrame:
-    """Add the columns ``repeat_*``: the error of each event as parts of its own frames show it.
+    """Add the columns ``repeat_*``: the error of each event as its own frames show it.
 
     Parameters
     ----------
@@ -180,12 +182,11 @@ def likely_noise(found: Achieved, noise: Mapping[str, Any], *, rejected: bool = 
 
     Notes
     -----
-    In units of the bound's variance, noise from frame to frame is the same at every length; that of
-    constant power per octave (flicker) doubles with the length, a drift at constant speed grows
-    eightfold.
+    In units of the bound's variance, noise from frame to frame is the same at every length, and
+    slower noise grows with it; that of single frames grows with the time since the background.
     """
     excess = found.over_crb**2 - 1
-    single = found.by_frames[0] ** 2 if found.by_frames else 1.0
+    single = found.fast2
     said, doubt = [], ""
     if single - 1 > _SHARE * excess:
         over_shot = [v for v in noise.get("noise_variance_over_shot", ()) if v is not None]
@@ -201,27 +202,34 @@ def likely_noise(found: Achieved, noise: Mapping[str, Any], *, rejected: bool = 
                 "neighbouring pixels are correlated, by crosstalk or a filter in the camera"
             )
     if found.empty:
-        halves, whole = (found.empty[k] ** 2 for k in (-2, -1))
-        slow = whole - found.empty[0] ** 2
-        if slow > _SHARE * excess:
-            growth = (whole - single) / max(halves - single, 1e-3)
-            name = (
-                "a drift of the fixed pattern (speckle): set background.drift_correction = true"
-                if growth > _DRIFTS
-                else "flicker (1/f noise)"
-            )
-            said.append(f"it grows with the frames that are averaged, as {name}, or average fewer")
+        if found.slow2 > _SHARE * excess:
+            said.append(_slow(found))
             if rejected:
                 doubt = (
                     "it may be what a wrong model of the image leaves over of other particles: "
                     "check focus, NA and pixel size first; otherwise "
                 )
-        own = found.over_crb**2 - whole
+        own = found.over_crb**2 - found.empty[-1] ** 2
         if own > _SHARE * excess:
             said.append(
                 "it is larger at the particles than elsewhere: they move or change in the light"
             )
     return doubt + ("; ".join(said) or "its kind is not clear")
+
+
+def _slow(found: Achieved) -> str:
+    if found.single:
+        name = "a drift of the fixed pattern (speckle)" if found.drifts else "flicker (1/f noise)"
+        return (
+            f"it grows with the time since the background, as {name}: take background frames "
+            "nearer to the others (background.frames), or fewer of these (fit.frames)"
+        )
+    name = (
+        "a drift of the fixed pattern (speckle): set background.drift_correction = true"
+        if found.drifts
+        else "flicker (1/f noise)"
+    )
+    return f"it grows with the frames that are averaged, as {name}, or average fewer"
 
 
 def _ratios(found: Mapping[str, Achieved]) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.inference.likelihood import LEVEL
 from iscat_analysis.inference.repeats import (
     PARTS,
     Response,
@@ -21,22 +20,14 @@ from iscat_analysis.inference.repeats import (
     series_of,
 )
 from iscat_analysis.movie import Stack
-from iscat_analysis.movie.background import smooth_background
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.pipeline.blank import background_field, empty_field, taken_by, taken_places
 from iscat_analysis.pipeline.field import Event, total_signal
 from iscat_analysis.pipeline.neighbours import Neighbours, Step
 from iscat_analysis.pipeline.pattern import LocalPattern, MovingPattern
 from iscat_analysis.pipeline.scene import Region, Scene, photons_scale
-from iscat_analysis.records import (
-    FREE_PARAMETERS,
-    BoolArray,
-    FitResult,
-    FloatArray,
-    Status,
-    Windows,
-)
-from iscat_analysis.search.empty import EmptyField, EmptySpread
+from iscat_analysis.records import FREE_PARAMETERS, FitResult, FloatArray, Windows
+from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.sliding import Chunk
 
 PLACES = 20_000
@@ -45,9 +36,7 @@ PLACES = 20_000
 MOST_WINDOWS, FEWEST_WINDOWS = 8, 2
 """Windows of a chunk that are looked at."""
 
-_NEAR, _NEAR_POOR = 1 / 3, 1 / 2  # of the square's side; a poor fit leaves its rings over
 _LEAST_LIGHT_E = 1e4  # of a frame, whose power is then known to 1 %
-_OUTSHONE = 0.1
 _BLOCK_BYTES = 16 * 2**20
 
 
@@ -203,7 +192,7 @@ def step_controls(
     times = [t for t in times if chunk.first <= t - window and t + window <= chunk.stop]
     if not times:
         return None
-    field = _empty_field(
+    field = empty_field(
         scene, chunk.mean_e, chunk.camera.read_variance_e2(chunk.shape), chunk.usable,
         [fit for _, fit in fits], level=True,
     )  # fmt: skip
@@ -216,7 +205,7 @@ def step_controls(
     total: EmptySpread | None = None
     for turn in chosen:
         near = [s for s in steps if abs(s.at.frame - turn) <= window]
-        taken = _taken(
+        taken = taken_places(
             scene, chunk.shape, [(s.start.x_px, s.start.y_px, s.excess == 0) for s in near]
         )
         sides, powers = [], []
@@ -315,14 +304,10 @@ def field_repeats(
     # the level of the light is the one that the fits use
     scale = windows.power_ratio * max(powers[0].sum(), 1.0) / powers[1].sum() if n_before else 1.0
     powers = (powers[0], powers[1] * scale)
-    field = _field_of(scene, windows, powers, read, events) if n_before > 1 else None
-    taken = _taken(
-        scene, shape,
-        [(e.candidate.x_px, e.candidate.y_px, Status.POOR_FIT not in e.fit.flags) for e in events],
-    )  # fmt: skip
+    fits = [event.fit for event in events]
+    field = background_field(scene, windows, powers[0].sum(), read, fits) if n_before > 1 else None
     signal = scene.left(total_signal(scene, shape, events))
-    if scene.additive:  # where particles outshine the background their light has noise of its own
-        taken |= photons_scale(scene, windows) * signal > _OUTSHONE * windows.after_e.mean()
+    taken = taken_by(scene, windows, events, signal)
     parts: tuple[list[FloatArray], list[FloatArray]] = ([], [])
     lights: tuple[list[float], list[float]] = ([], [])
     for side, (span, power) in enumerate(zip(spans, powers, strict=True)):
@@ -352,7 +337,9 @@ def field_repeats(
                 lights[side].append(light_sum)
     empty = None
     if field is not None:
-        empty = field.spread(parts[0], parts[1], (np.array(lights[0]), np.array(lights[1])), taken)
+        light = np.array(lights[0]), np.array(lights[1])
+        left = field.left([(event.candidate.x_px, event.candidate.y_px) for event in events])
+        empty = field.spread(parts[0], parts[1], light, taken, left)
     return [
         nothing_repeated(scene.mode) if own is None
         else repeats_of(tuple(_joined(side) for side in own.sides if side))
@@ -402,20 +389,6 @@ def _pieces(shape: tuple[int, int], start: int, stop: int) -> Iterator[tuple[int
         yield begin, min(begin + size, stop)
 
 
-def _field_of(
-    scene: Scene,
-    windows: Windows,
-    powers: tuple[FloatArray, FloatArray],
-    read: FloatArray,
-    events: Sequence[Event],
-) -> EmptyField:
-    mean = windows.before_e
-    if scene.additive:  # counts may be few, and weights must not follow their chance
-        mean = smooth_background(mean, windows.read_variance_before_e2, windows.masked)
-    mean = mean / powers[0].sum()
-    return _empty_field(scene, mean, read, ~windows.masked, [e.fit for e in events], level=False)
-
-
 # ---- both ------------------------------------------------------------------------------------
 
 
@@ -425,45 +398,3 @@ def _response(event: Event, windows: Windows) -> Response | None:
     if before.shape != event.likelihood.grid.shape:
         before = before[event.region.slices]
     return response_of(event.likelihood, fit.theta, fit.box.free, before, windows.power_ratio)
-
-
-def _taken(
-    scene: Scene, shape: tuple[int, int], places: Sequence[tuple[float, float, bool]]
-) -> BoolArray:
-    """Pixels so near to a particle (x, y, described) that its fit, and not the noise, is seen."""
-    taken = np.zeros(shape, dtype=np.bool_)
-    for x, y, described in places:
-        reach = scene.roi_px * (_NEAR if described else _NEAR_POOR)
-        top, left = max(math.ceil(y - reach), 0), max(math.ceil(x - reach), 0)
-        box = taken[
-            top : max(math.floor(y + reach) + 1, 0), left : max(math.floor(x + reach) + 1, 0)
-        ]
-        i, j = np.indices(box.shape)
-        box |= np.hypot(i + top - y, j + left - x) < reach
-    return taken
-
-
-def _empty_field(
-    scene: Scene,
-    mean_e: FloatArray,
-    read: FloatArray,
-    used: BoolArray,
-    fits: Sequence[FitResult],
-    *,
-    level: bool,
-) -> EmptyField:
-    model, pixel = scene.model, scene.pixel_nm
-    theta = np.median([fit.theta for fit in fits], axis=0)
-    grid = PixelGrid.centred(scene.roi_px | 1, pixel)
-    _, first = model.amplitude_gradient(grid, 0.0, 0.0, float(theta[2]), float(theta[3]))
-    free = fits[0].box.free
-    slopes = first[np.flatnonzero(free[:LEVEL])]
-    n_free = len(slopes)
-    if level:
-        slopes = np.concatenate([slopes, np.ones((1, *grid.shape))])
-    optics = model.optics
-    spacing = max(1, round(optics.wavelength_nm / (2 * optics.na) / pixel))
-    return EmptyField(
-        mean_e, read, used, slopes, n_free,
-        additive=scene.additive, spacing_px=spacing, tile_px=max(scene.roi_px // 2, 4),
-    )  # fmt: skip

@@ -57,10 +57,10 @@ class Found:
     interrupted : bool
         Whether the user stopped it; what was finished is kept.
     repeats : tuple of ndarray
-        What parts of the frames of each row say, from `iscat_analysis.inference.repeats`; empty
-        where every row has a single frame.
+        What parts of the frames of each row say, from `iscat_analysis.inference.repeats`; of
+        single frames, what they say where there is no particle.
     empty : EmptySpread or None
-        The noise of whole windows where there is no particle.
+        The noise of whole windows, or of single frames, where there is no particle.
     """
 
     table: pd.DataFrame

@@ -91,7 +91,7 @@ class Store:
                     ends_e=data["ends_e"],
                     trajectory=_trajectory(data["trajectory"]),
                     cause=str(data["cause"]),
-                    empty=_empty(data["squares"], data["number"]),
+                    empty=_empty(data["squares"], data["number"], data["shared"]),
                 )
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
             return None  # never finished, or cut short
@@ -125,6 +125,7 @@ class Store:
                     cause=np.array(done.cause),
                     squares=np.empty(0) if done.empty is None else done.empty.squares,
                     number=np.empty(0) if done.empty is None else done.empty.counts,
+                    shared=np.empty(0) if done.empty is None else done.empty.shared,
                 )
             building.replace(path)
         except OSError:
@@ -142,8 +143,8 @@ def _columns(way: Trajectory | None) -> FloatArray:
     return np.column_stack([way.frames, way.shift_px, way.error_px])
 
 
-def _empty(squares: FloatArray, counts: FloatArray) -> EmptySpread | None:
-    return EmptySpread(squares, counts) if counts.size else None
+def _empty(squares: FloatArray, counts: FloatArray, shared: FloatArray) -> EmptySpread | None:
+    return EmptySpread(squares, counts, shared) if counts.size else None
 
 
 def _trajectory(columns: FloatArray) -> Trajectory | None:

@@ -109,6 +109,11 @@ class Scene:
         return signal if self.lines is None else self.lines.left(signal)
 
     @property
+    def background_variance(self) -> float:
+        """Variance of the background over that of the mean of its frames."""
+        return _VARIANCE_OF_BACKGROUND[self.config.background.method or "fixed"]
+
+    @property
     def additive(self) -> bool:
         """Whether particles add to the background instead of multiplying it."""
         return self.model.rho == 0
@@ -280,7 +285,7 @@ def search_likelihood(scene: Scene, windows: Windows, explained: FloatArray) -> 
     both = windows.before_e + (counts - extra) - scale * explained
     noise = (read[0] + read[1]) / (1 + ratio) ** 2
     steady = smooth_background(both / (1 + ratio), noise, windows.masked)
-    factor = _VARIANCE_OF_BACKGROUND[scene.config.background.method or "fixed"]
+    factor = scene.background_variance
     variance = steady * ratio * (1 + ratio * factor) + read[0] + ratio**2 * read[1]
     other = np.where(whole.used, variance - level, 0.0)
     return replace(whole, data=np.stack([counts - extra + other, level, scale, other]))
@@ -314,7 +319,7 @@ def region_likelihood(
     before, after, masked = windows.before_e[cut], windows.after_e[cut], windows.masked[cut]
     return counts_likelihood(
         model, grid, before, after, windows.power_ratio,
-        background=_VARIANCE_OF_BACKGROUND[config.background.method or "fixed"],
+        background=scene.background_variance,
         use_conditional=_uses_conditional(config),
         scale_e=photons_scale(scene, windows) if scene.additive else None,
         others=others,
@@ -351,7 +356,7 @@ def noise_cumulants(
     if not scene.additive:
         return None
     _, level, _, extra = likelihood.data
-    factor = _VARIANCE_OF_BACKGROUND[scene.config.background.method or "fixed"]
+    factor = scene.background_variance
     ratio = windows.power_ratio
     read = windows.read_variance_after_e2 + ratio**2 * windows.read_variance_before_e2
     light = np.maximum(level + extra - read, 0.0) / (1 + ratio * factor)

@@ -22,7 +22,8 @@ from iscat_analysis.calibration.optics import (
     settings_of,
 )
 from iscat_analysis.config import Config
-from iscat_analysis.inference.likelihood import Likelihood, conditional, poisson
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise import conditional, poisson
 from iscat_analysis.movie.background import measure_windows
 from iscat_analysis.movie.camera import Camera, check_counts
 from iscat_analysis.movie.stack import Stack

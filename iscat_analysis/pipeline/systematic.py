@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from iscat_analysis.bounds import imitation, joint_information, mass_drift
 from iscat_analysis.calibration.mass import line_sigma_kda
 from iscat_analysis.config import Config
-from iscat_analysis.inference.likelihood import LEVEL, asimov_conditional, asimov_poisson
+from iscat_analysis.inference.likelihood import LEVEL
+from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.optics.measured import Template
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Status

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.inference.likelihood import Likelihood, conditional
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise import conditional
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.neighbours import Neighbours, Step, distance_px, region_around
 from iscat_analysis.pipeline.pattern import LocalPattern, MovingPattern

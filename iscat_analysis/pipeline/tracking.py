@@ -11,10 +11,11 @@ import pandas as pd
 
 from iscat_analysis.movie.background import Check, add_frames, start_power
 from iscat_analysis.movie.camera import Camera
+from iscat_analysis.pipeline.blank import FrameNoise
 from iscat_analysis.pipeline.field import Event, fit_field
 from iscat_analysis.pipeline.results import Found, Row, table_of, view_of
 from iscat_analysis.pipeline.scene import Scene
-from iscat_analysis.records import EventView, FrameSource, Progress, Windows
+from iscat_analysis.records import EventView, FloatArray, FrameSource, Progress, Windows
 
 MEMORY = 3
 """Frames a particle may be missed in without losing its track."""
@@ -58,6 +59,8 @@ def track_particles(
     first, last = windows.frames_after
     tables: list[pd.DataFrame] = []
     views: list[EventView] = []
+    repeats: list[FloatArray] = []
+    noise: FrameNoise | None = None
     events: tuple[Event, ...] = ()
     interrupted = False
     try:
@@ -66,13 +69,18 @@ def track_particles(
             starts = [event.candidate for event in events]
             events, here = fit_field(scene, here, starts=starts, pool=pool)
             rows = [Row(number, event, here) for number, event in enumerate(events)]
-            tables.append(table_of(scene, rows))
+            if events and noise is None:
+                read = camera.read_variance_e2((here.after_e.shape[0], here.after_e.shape[1]))
+                noise = FrameNoise(scene, windows, read, [event.fit for event in events])
+            if events and noise is not None:
+                repeats += [noise.look(here, events)] * len(events)
             views += [view_of(row) for row in rows]
+            tables.append(table_of(scene, rows))  # last: of what an interrupt cuts off, no row is
             progress("track", frame + 1 - first, last - first)
     except KeyboardInterrupt:
         interrupted = True
     table = pd.concat(tables, ignore_index=True) if tables else table_of(scene, [])
-    views = views[: len(table)]
+    views, repeats = views[: len(table)], repeats[: len(table)]
     table["event"] = _link(table, scene.config.detection.min_separation_nm)
     seen: dict[int, EventView] = {}
     for track, view in zip(table["event"], views, strict=True):
@@ -83,6 +91,8 @@ def track_particles(
         views=tuple(seen[track] for track in sorted(seen)),
         windows=windows,
         interrupted=interrupted,
+        repeats=tuple(repeats[row] for row in order),
+        empty=noise.spread if noise else None,
     )
 
 

@@ -79,6 +79,7 @@ def report_context(
         "tiles": _tiles(analysis, table),
         "has_common": any(math.isfinite(p.systematic) for p in precision),
         "has_measured": any(p.is_measured for p in precision),
+        "single_frames": analysis.mode == "track",
         "spread_lines": species_widths(analysis.summary),
         "has_holevo": any(math.isfinite(p.holevo) for p in precision),
         "precision_rows": precision_rows(analysis, precision),

@@ -400,12 +400,14 @@ def spread_lines(analysis: Analysis, table: pd.DataFrame) -> list[str]:
         name = "mass_kda" if "mass_kda" in free else "z_nm"
         p = precision_of(analysis, table, name)
         if p.is_measured:
-            where = (
-                "between parts of each event's frames and, at full length, where there is no "
-                "particle"
-                if p.whole
-                else "between parts of each event's frames; slower noise does not show there"
-            )
+            where = "between parts of each event's frames; slower noise does not show there"
+            if p.whole:
+                where = (
+                    "between parts of each event's frames and, at full length, where there is no "
+                    "particle"
+                )
+            if analysis.mode == "track":
+                where = "of single frames where there is no particle"
             of_it = "contrast" if is_uncalibrated(analysis) else LABELS[name]
             lines.append(
                 f"The measured spread of the {of_it}, {where}, is {p.measured_text} times the "

@@ -30,7 +30,10 @@ _SIGMA = "Standard deviation from the observed information [{}]; null where it i
 _CRB = "Joint Cramér–Rao bound at the estimate [{}]; null where the parameter is not free"
 _QCRB = "Quantum Cramér–Rao bound for the collected photons [{}]"
 _SYSTEMATIC = "Error common to the movie, from calibrations of optics and mass [{}]"
-_REPEAT = "Standard error from eight disjoint parts of the event's own frames, itself to 19 % [{}]"
+_REPEAT = (
+    "Standard error from eight disjoint parts of the event's own frames, itself to 19 %; in mode "
+    "track, from the empty places of its frame [{}]"
+)
 
 
 class Event(Closed):
@@ -101,7 +104,7 @@ class Medians(Document):
     systematic_median: Number = maybe("Error common to the movie, from calibrations [nm or kDa]")
     repeat_over_crb: Number = maybe(
         "Measured spread over the Cramér–Rao bound: from parts of the events' own frames and, at "
-        "full length, from places without a particle"
+        "full length, from places without a particle; in mode track from these alone"
     )
     repeat_over_crb_ci95: tuple[Number, Number] = maybe("Its 95 % interval")
     repeat_significance: Number = maybe("Its difference from 1, in standard errors")
@@ -109,14 +112,18 @@ class Medians(Document):
     repeat_whole: bool = maybe(
         "Whether the noise was seen at the full length of the windows; otherwise in parts of them"
     )
-    repeat_frames: list[Count] = maybe("Frames averaged")
+    repeat_frames: list[Number] = maybe(
+        "Frames averaged; in mode track those from a frame to the middle of the background"
+    )
     repeat_over_crb_by_frames: list[Number] = maybe(
-        "Spread of averages of so many of the events' own frames over their bound"
+        "Spread of averages of so many of the events' own frames over their bound; in mode track "
+        "that of single frames so far from the background, where there is no particle"
     )
     repeat_over_crb_by_frames_se: list[Number] = maybe("Its standard errors")
     empty_over_crb: list[Number] = maybe(
         "The same without a particle: between eight parts of a window, neighbouring eighths, "
-        "quarters, halves, and whole windows; empty where there is no room"
+        "quarters, halves, and whole windows; in mode track between successive frames, and of all "
+        "against the background; empty where there is no room"
     )
 
 

@@ -9,7 +9,9 @@ windows.  Disjoint parts of an event's own frames, which are shorter, cannot sho
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,6 +30,7 @@ FEWEST_PLACES = 60
 _TRIM = 4.0  # robust standard deviations beyond which something else than noise is there
 _KEPT_VARIANCE = 0.998929  # of a normal law inside ±_TRIM standard deviations
 _NORMAL_QUARTILE = 0.6744897501960817
+_LEAST_LEFT = 0.5  # of a variance; less is left only where fits reach, and nothing is looked at
 
 
 @dataclass(frozen=True)
@@ -36,18 +39,27 @@ class EmptySpread:
 
     Attributes
     ----------
-    squares : ndarray, shape (len(CONTRASTS), n, tiles)
-        For each contrast, parameter and tile of the field.
-    counts : ndarray, shape (len(CONTRASTS), tiles)
+    squares : ndarray, shape (contrasts, n, tiles)
+        For each contrast, parameter and tile of the field: `CONTRASTS` where windows are compared;
+        where single frames are, all with the background, successive ones with each other, and with
+        the background those at each of `distances`.
+    counts : ndarray, shape (contrasts, tiles)
         What they come to under the model.
+    shared : ndarray, shape (n,)
+        Variance of a mean over all tiles, over what it were if no two had noise in common.
+    distances : tuple of float, optional
+        Of single frames from the middle of the background [frames].
     """
 
     squares: FloatArray
     counts: FloatArray
+    shared: FloatArray
+    distances: tuple[float, ...] | None = None
 
     def __add__(self, other: EmptySpread) -> EmptySpread:
         """Join what other frames of the same field say."""
-        return EmptySpread(self.squares + other.squares, self.counts + other.counts)
+        squares, counts = self.squares + other.squares, self.counts + other.counts
+        return EmptySpread(squares, counts, self.shared, self.distances)
 
 
 class EmptyField:
@@ -91,6 +103,7 @@ class EmptyField:
             fft.next_fast_len(rows + half, real=True), fft.next_fast_len(columns + half, real=True)
         )  # fmt: skip
         self._n_free = n_free
+        self._spacing, self._tile_px = spacing_px, tile_px
         self._mean = mean_e
         noise = np.maximum(mean_e, 0.0) + read_e2
         light = np.ones_like(mean_e) if additive else mean_e
@@ -118,6 +131,7 @@ class EmptyField:
         row, column = np.indices(self._shape)
         self._tile = ((row // tile_px) * wide + column // tile_px)[inner]
         self.tiles = math.ceil(rows / tile_px) * wide
+        self._unit = unit
 
     def errors(self, sum_e: FloatArray, power: float, known: FloatArray | None) -> FloatArray:
         """Give the errors that a sum of frames contributes everywhere.
@@ -143,12 +157,48 @@ class EmptyField:
         errors: FloatArray = np.einsum("yxij,jyx->iyx", self._inverse, score)
         return errors
 
+    def left(self, particles: Sequence[tuple[float, float]]) -> FloatArray:
+        """Give what fitted particles, which are taken off, leave of the variance around them.
+
+        A fit follows the noise, also of pixels that matter to its neighbourhood.
+
+        Parameters
+        ----------
+        particles : sequence of (float, float)
+            x and y [pixels] of all that were fitted.
+
+        Returns
+        -------
+        ndarray, shape (n, rows, columns)
+            Share at every place, 1 far from all of them.
+
+        Notes
+        -----
+        With the information M(Δ) that places Δ apart have in common, F = M(0), and C = F⁻¹ M F⁻¹
+        the covariance of what is estimated at both, the residuals of a fit hold F⁻¹ − C F Cᵀ of the
+        variance F⁻¹, on a background that is even.
+        """
+        inverse, middle, covariance = self._related
+        followed = np.einsum("ilyx,lm,imyx->iyx", covariance, middle, covariance)
+        followed /= np.diag(inverse)[:, None, None]
+        side = followed.shape[1]
+        taken = np.zeros((self._n_free, *self._shape))
+        for x, y in particles:
+            top, left = round(y) - side // 2, round(x) - side // 2
+            low, high = max(top, 0), max(left, 0)
+            near = taken[:, low : max(top + side, 0), high : max(left + side, 0)]
+            there = followed[: self._n_free, low - top :, high - left :]
+            near += there[:, : near.shape[1], : near.shape[2]]
+        inner = (slice(None), *self._places)
+        return np.maximum(1 - taken[inner], _LEAST_LEFT)
+
     def spread(
         self,
         before: list[FloatArray],
         after: list[FloatArray],
         powers: tuple[FloatArray, FloatArray],
         taken: BoolArray,
+        left: FloatArray | None = None,
     ) -> EmptySpread:
         """Compare the parts of two windows.
 
@@ -160,6 +210,8 @@ class EmptyField:
             Light of each part.
         taken : ndarray of bool, shape (y, x)
             Pixels near a particle that lands or leaves in these frames.
+        left : ndarray, shape (n, rows, columns), optional
+            What the fits of particles leave of the variance between the windows; from `left`.
 
         Returns
         -------
@@ -169,7 +221,7 @@ class EmptyField:
         kept = self._known & ~taken[self._places]
         squares = np.zeros((len(CONTRASTS), self._n_free, self.tiles))
         counts = np.zeros((len(CONTRASTS), self.tiles))
-        nothing = EmptySpread(squares, counts)
+        nothing = EmptySpread(squares, counts, self.shared)
         if kept.sum() < FEWEST_PLACES:
             return nothing
         sides = [np.stack(parts)[:, :, kept] for parts in (before, after)]
@@ -179,6 +231,8 @@ class EmptyField:
             for power, parts in zip(powers, sides, strict=True)
         ]
         noise = unit * sum(1 / power.sum() for power in powers)
+        if left is not None:
+            noise = noise * left[:, kept]
         whole = (means[1] - means[0]) / np.sqrt(noise)
         scale = np.median(np.abs(whole), axis=1, keepdims=True) / _NORMAL_QUARTILE
         quiet = np.all(np.abs(whole) < _TRIM * scale, axis=0)
@@ -207,7 +261,37 @@ class EmptyField:
             for i, row in enumerate(square):
                 squares[k, i] = np.bincount(tile[quiet], row[quiet], minlength=self.tiles)
             counts[k] = number * np.bincount(tile[quiet], minlength=self.tiles)
-        return EmptySpread(squares, counts)
+        return EmptySpread(squares, counts, self.shared)
+
+    @cached_property
+    def shared(self) -> FloatArray:
+        """Variance of a mean over all tiles, over what it were if no two had noise in common.
+
+        Notes
+        -----
+        Squares of estimates with the correlation r have the correlation r².  Of the pairs of places
+        that are (j, i) apart, (1 − |j|/T)(1 − |i|/T) lie in one tile of side T.
+        """
+        inverse, _, covariance = self._related
+        same = np.einsum("iiyx->iyx", covariance) / np.diag(inverse)[:, None, None]
+        half = same.shape[1] // 2
+        start, step = half % self._spacing, self._spacing
+        pairs = same[: self._n_free, start::step, start::step] ** 2
+        within = np.maximum(1 - np.abs(np.arange(-half, half + 1)[start::step]) / self._tile_px, 0)
+        held = np.einsum("iyx,y,x->i", pairs, within, within)
+        return np.asarray(pairs.sum(axis=(1, 2)) / held)
+
+    @cached_property
+    def _related(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """F⁻¹, F, and the covariance of estimates at every distance of two places."""
+        unit = self._unit
+        size = (2 * unit.shape[-1] - 1,) * 2
+        spectra = fft.rfft2(unit, size)
+        common = fft.irfft2(spectra[:, None] * spectra.conj(), size)
+        common = fft.fftshift(common, axes=(-2, -1))
+        middle = common[..., common.shape[-2] // 2, common.shape[-1] // 2]
+        inverse = np.linalg.inv(middle)
+        return inverse, middle, np.einsum("ij,jkyx,kl->ilyx", inverse, common, inverse)
 
     @property
     def places(self) -> int:

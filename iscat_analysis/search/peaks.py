@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -34,22 +35,43 @@ def summit(field: NDArray[Any], row: int, column: int) -> tuple[float, float, fl
     above : float
         Magnitude there above that at the pixel, ≥ 0.
     """
-    high, wide = field.shape
-    top, left = max(row - _REACH_PX, 0), max(column - _REACH_PX, 0)
     value = float(field[row, column])
-    patch = field[top : row + _REACH_PX + 1, left : column + _REACH_PX + 1].astype(np.float64)
-    patch *= math.copysign(1.0, value)
-    y = np.clip(row + _FINE, 0, high - 1) - top
-    x = np.clip(column + _FINE, 0, wide - 1) - left
-    fine = map_coordinates(patch, np.meshgrid(y, x, indexing="ij"), order=_ORDER, mode="mirror")
+    around = np.arange(-_REACH_PX, _REACH_PX + 1)
+    patch = field[
+        np.ix_(*(_mirrored(c + around, n) for c, n in zip((row, column), field.shape, strict=True)))
+    ]
+    spline = _spline()
+    fine = math.copysign(1.0, value) * (spline @ patch @ spline.T)
+    y, x = (
+        np.flatnonzero((c + _FINE >= 0) & (c + _FINE <= n - 1))
+        for c, n in zip((row, column), field.shape, strict=True)
+    )
+    fine = fine[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
     i, j = (int(k) for k in np.unravel_index(int(fine.argmax()), fine.shape))
     (dy, above), (dx, beside) = vertex(fine[:, j], i), vertex(fine[i], j)
     spacing = float(_FINE[1] - _FINE[0])
     height = float(fine[i, j]) + above + beside
     return (
-        float(y[i]) + top - row + spacing * dy,
-        float(x[j]) + left - column + spacing * dx,
+        float(_FINE[y[i]]) + spacing * dy,
+        float(_FINE[x[j]]) + spacing * dx,
         max(height - abs(value), 0.0),
+    )
+
+
+def _mirrored(places: NDArray[np.int64], size: int) -> NDArray[np.int64]:
+    """Fold indices that lie outside back into an axis, at its first and last pixel."""
+    period = max(2 * (size - 1), 1)
+    folded = places % period
+    return np.minimum(folded, period - folded) if size > 1 else np.zeros_like(places)
+
+
+@cache
+def _spline() -> NDArray[np.float64]:
+    """Weights of the pixels at the places of `_FINE`, shape (len(_FINE), 2·_REACH_PX + 1)."""
+    pixels = np.eye(2 * _REACH_PX + 1)
+    places = [_REACH_PX + _FINE]
+    return np.stack(
+        [map_coordinates(one, places, order=_ORDER, mode="mirror") for one in pixels], axis=1
     )
 
 

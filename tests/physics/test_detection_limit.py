@@ -16,8 +16,9 @@ from iscat_analysis.bounds import (
     power_searched,
 )
 from iscat_analysis.config import parse_config
-from iscat_analysis.inference import likelihood as models
+from iscat_analysis.inference import noise
 from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.records import Candidate, FloatArray
 
@@ -43,11 +44,11 @@ def _setup(n_after: int = 100, false: float = 0.02) -> tuple[Experiment, Detecti
     return experiment, limit
 
 
-def _drawn(experiment: Experiment, mass: float, seed: int) -> models.Likelihood:
+def _drawn(experiment: Experiment, mass: float, seed: int) -> Likelihood:
     rng = np.random.default_rng([31, seed])
     signal = experiment.model.image(experiment.grid, 0.0, 0.0, 5.0, mass)
     before, after = (rng.poisson(1e6 * (1 + s)).astype(float) for s in (0 * signal, signal))
-    return models.conditional(experiment.model, experiment.grid, before, after, 1.0)
+    return noise.conditional(experiment.model, experiment.grid, before, after, 1.0)
 
 
 def _known(experiment: Experiment, mass: float) -> FloatArray:

@@ -102,7 +102,8 @@ def test_a_fit_of_pictures_has_the_errors_that_were_foreseen() -> None:
 def test_masses_of_other_particles_err_by_what_was_foreseen() -> None:
     """Microscopes drawn from the forecast's covariance, and one particle fitted in each."""
     from iscat_analysis.calibration.optics.settings import with_settings
-    from iscat_analysis.inference.likelihood import Likelihood, asimov_conditional
+    from iscat_analysis.inference.likelihood import Likelihood
+    from iscat_analysis.inference.noise import asimov_conditional
     from iscat_analysis.optics.forward import forward_model
 
     config = ia.configure(settings=REALISTIC | {"fit.roi_nm": 2700.0})

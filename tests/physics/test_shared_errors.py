@@ -17,7 +17,8 @@ from iscat_analysis.bounds.shared import (
     shared_sigma,
 )
 from iscat_analysis.config import Config, parse_config
-from iscat_analysis.inference.likelihood import Likelihood, asimov_conditional, asimov_poisson
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.grid import PixelGrid
 

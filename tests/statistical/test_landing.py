@@ -13,7 +13,7 @@ from scipy.stats import poisson
 
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.likelihood import conditional
+from iscat_analysis.inference.noise import conditional
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.chunks import FRAME_COLUMN

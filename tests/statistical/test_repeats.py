@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.ndimage import gaussian_filter
+from noisy import GAIN, PIXEL_NM, SIDE, WRONG_GAIN, speckled_counts
 
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.movie import open_stack
@@ -18,15 +18,8 @@ from iscat_analysis.study.simulate import Movie
 
 pytestmark = pytest.mark.large
 
-PIXEL_NM = 84.0
-SIDE = 96
-LEVEL_E = 1e6
-GAIN = 30.0
 MASS_KDA = 150.0
 HEIGHT_NM = {True: 5.0, False: 30.0}  # where it is known, and where it is fitted
-GRAIN_PX = 1.5
-DRIFT_PX = 1e-4
-PINK = 1e-4
 CLOSE = 0.05
 SIGMAS = 4.0
 MOVIES = 40
@@ -86,16 +79,6 @@ def _places(layout: Layout, rng: np.random.Generator) -> list[tuple[int, float, 
     return found
 
 
-def _pink(frames: int, rng: np.random.Generator) -> np.ndarray:
-    """Noise of every pixel whose one-sided spectral density is PINK²/f per frame."""
-    f = np.fft.rfftfreq(2 * frames)
-    shape = np.zeros(f.size)
-    shape[1:] = 1 / np.sqrt(f[1:])
-    spectrum = np.fft.rfft(rng.standard_normal((2 * frames, SIDE, SIDE)), axis=0)
-    noise = np.fft.irfft(spectrum * shape[:, None, None], 2 * frames, axis=0)[:frames]
-    return np.asarray(PINK / np.sqrt(2) * noise)
-
-
 def _counts(
     config: Config,
     layout: Layout,
@@ -103,7 +86,7 @@ def _counts(
     kind: str,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Draw a movie of a speckled field, 0.5 % of power noise, and noise of a kind."""
+    """Draw a movie with particles that appear."""
     values = config.model_dump()
     height = HEIGHT_NM[config.fit.mode == "mass"]
     values["simulation"] |= {
@@ -114,23 +97,7 @@ def _counts(
         ],
     }
     movie = Movie(Config.model_validate(values), 0)
-    speckle = gaussian_filter(rng.standard_normal((SIDE, SIDE)), GRAIN_PX, mode="wrap")
-    spectrum = np.fft.rfft2((speckle - speckle.mean()) / speckle.std())
-    fy, fx = np.fft.fftfreq(SIDE)[:, None], np.fft.rfftfreq(SIDE)
-    angle = rng.uniform(0, 2 * np.pi)
-    turn = -2j * np.pi * DRIFT_PX * (np.cos(angle) * fx + np.sin(angle) * fy)
-    flicker = _pink(layout.frames, rng) if kind == "flicker" else None
-    out = np.empty((layout.frames, SIDE, SIDE), dtype=np.uint16)
-    for t, signal in enumerate(movie.expected_frames()):
-        moved = spectrum * np.exp(turn * t) if kind == "drift" else spectrum
-        light = LEVEL_E * np.maximum(1 + 0.1 * np.fft.irfft2(moved, s=(SIDE, SIDE)), 0.05)
-        light = light * signal * (1 + 0.005 * rng.standard_normal())
-        if flicker is not None:
-            light = light * (1 + flicker[t])
-        excess = 1.5 if kind == "excess" else 1.0
-        counts = light + np.sqrt(excess * light) * rng.standard_normal(light.shape)
-        out[t] = np.rint(np.clip(counts / GAIN, 0, 65535))
-    return out
+    return speckled_counts(movie.expected_frames(), layout.frames, kind, rng)
 
 
 def _pulls(
@@ -156,7 +123,7 @@ def _run(
     """Analyse one movie: the analysis, its pulls, and what its summary says of precision."""
     layout = LAYOUTS[name]
     rng = np.random.default_rng([seed, *name.encode(), *kind.encode()])
-    config = _config(layout, 1.3 * GAIN if kind == "gain" else GAIN, *settings)
+    config = _config(layout, WRONG_GAIN * GAIN if kind == "gain" else GAIN, *settings)
     places = _places(layout, rng)
     counts = _counts(config, layout, places, kind, rng)
     analysis = analyse(open_stack(counts, name="movie"), config)

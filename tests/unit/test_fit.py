@@ -10,7 +10,7 @@ import pytest
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.config import Config
-from iscat_analysis.inference import likelihood as models
+from iscat_analysis.inference import noise
 from iscat_analysis.inference.fit import AMBIGUITY_ODDS, fit_particle, search_box
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
@@ -44,9 +44,9 @@ def _data(
         signal += model.image(GRID, x * PIXEL_NM, y * PIXEL_NM, z, mass)
     after = light * (1 + signal)
     if asimov:
-        return models.conditional(model, GRID, np.full(GRID.shape, light), after, 1.0)
+        return noise.conditional(model, GRID, np.full(GRID.shape, light), after, 1.0)
     before, counts = rng.poisson(light, GRID.shape), rng.poisson(after)
-    return models.conditional(model, GRID, before.astype(float), counts.astype(float), 1.0)
+    return noise.conditional(model, GRID, before.astype(float), counts.astype(float), 1.0)
 
 
 def _start(x: float = X, y: float = Y, z: float = 5.0, mass: float = 1000.0) -> Candidate:
@@ -115,11 +115,11 @@ def test_a_level_is_fitted_where_asked() -> None:
     config = make_config()
     exact = _data(config, (X, Y, 5.0, 1000.0), asimov=True)
     before = exact.data[1] - exact.data[0]
-    brighter = models.conditional(exact.model, GRID, before, 1.01 * exact.data[0], 1.0)
+    brighter = noise.conditional(exact.model, GRID, before, 1.01 * exact.data[0], 1.0)
     told = fit_particle(brighter, _start(), "mass", (0, 1000), level=True)
     assert told.mass_kda == pytest.approx(1000.0, abs=0.05 * told.sigma[3])
     assert math.exp(told.theta[4]) == pytest.approx(1.01, rel=1e-5)
-    still = models.conditional(exact.model, GRID, before, exact.data[0], 1.0)
+    still = noise.conditional(exact.model, GRID, before, exact.data[0], 1.0)
     usual = fit_particle(still, _start(), "mass", (0, 1000), level=True)
     assert told.snr == pytest.approx(usual.snr, rel=0.01)  # more light is no more of a particle
     assert told.snr < 0.5 * math.sqrt(2 * told.log_likelihood)
@@ -254,7 +254,7 @@ def test_right_and_down_are_larger() -> None:
     for name, (down, right) in {"here": (0, 0), "down": (4, 0), "right": (0, 4)}.items():
         moved = np.roll(signal, (down, right), axis=(0, 1))  # numpy's rows, numpy's columns
         after = np.random.default_rng(1).poisson(light * (1 + moved)).astype(float)
-        likelihood = models.conditional(model, GRID, light, after, 1.0)
+        likelihood = noise.conditional(model, GRID, light, after, 1.0)
         row, column = np.unravel_index(np.argmin(moved), moved.shape)
         fit = fit_particle(
             likelihood, _start(column, row, mass=3000.0), "mass", (0, 100), level=False

@@ -10,7 +10,8 @@ from scenes import PIXEL_NM, gold, make_config
 from scipy.stats import binom, poisson
 
 from iscat_analysis._kernels.radial import profile_at
-from iscat_analysis.inference import likelihood as models
+from iscat_analysis._kernels.scoring import CONDITIONAL
+from iscat_analysis.inference import noise
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 
@@ -72,7 +73,7 @@ def _conditional(case: Case, seed: int = 1, *, per_pixel: float = 1e5, **options
     signal = case.model.image(GRID, *case.theta[:4])
     before = rng.poisson(light).astype(float)
     after = rng.poisson(ratio * light * np.exp(case.theta[LEVEL]) * (1 + signal)).astype(float)
-    return models.conditional(case.model, GRID, before, after, ratio, **options)
+    return noise.conditional(case.model, GRID, before, after, ratio, **options)
 
 
 def _poisson(case: Case, seed: int = 1, *, per_pixel: float = 1e5, **options) -> Likelihood:
@@ -84,7 +85,7 @@ def _poisson(case: Case, seed: int = 1, *, per_pixel: float = 1e5, **options) ->
         background, scale = 30 * _level(), per_pixel / signal.max() * np.ones(GRID.shape)
     rate = np.exp(case.theta[LEVEL]) * (background + scale * signal)
     counts = rng.poisson(rate).astype(float)
-    return models.poisson(case.model, GRID, counts, background, scale, **options)
+    return noise.poisson(case.model, GRID, counts, background, scale, **options)
 
 
 def _any(kind: str, case: Case, seed: int = 1, **options) -> Likelihood:
@@ -103,7 +104,7 @@ def _log_pmf(which: Likelihood, theta: np.ndarray) -> float:
     data0, data1, data2, _ = which.data
     level = np.exp(theta[LEVEL])
     signal = which.model.image(which.grid, *theta[:4])
-    if which.kind == models.CONDITIONAL:
+    if which.kind == CONDITIONAL:
         q = data2 * level * (1 + signal)
         return float(binom.logpmf(data0, data1, q / (1 + q)).sum())
     return float(poisson.logpmf(data0, level * (data1 + data2 * signal)).sum())
@@ -180,8 +181,8 @@ def test_score_is_the_gradient(kind: str, name: str, read: float, request) -> No
             step[i] = h
             values = [which.score_fisher(theta + k * step)[0] for k in (-2, -1, 1, 2)]
             slope = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * h)
-            noise = 1e-9 / h  # rounding of the sum
-            assert abs(slope - score[i]) < noise + NUMERICAL * (
+            rounding = 1e-9 / h  # rounding of the sum
+            assert abs(slope - score[i]) < rounding + NUMERICAL * (
                 abs(score[i]) + np.sqrt(fisher[i, i])
             )
 
@@ -212,11 +213,11 @@ def test_observed_equals_expected_on_expected_counts(kind: str, name: str, reque
     case = request.getfixturevalue(name)
     theta = case.theta * np.array([1, 1, 1, 1, 0])
     if kind == "conditional":
-        asimov = models.asimov_conditional(case.model, GRID, theta, 1e4 * _level(), 150, 200)
+        asimov = noise.asimov_conditional(case.model, GRID, theta, 1e4 * _level(), 150, 200)
     else:
         background = (1e6 if case.model.rho else 30) * _level()
         scale = background if case.model.rho else 1e3
-        asimov = models.asimov_poisson(case.model, GRID, theta, background, scale)
+        asimov = noise.asimov_poisson(case.model, GRID, theta, background, scale)
     _, score, fisher = asimov.score_fisher(theta)
     size = np.sqrt(np.diag(fisher))
     np.testing.assert_allclose(score / size, 0, atol=1e-6)
@@ -229,7 +230,7 @@ def test_fisher_is_the_written_sum(strong: Case) -> None:
     """physics.md, section 4, written out."""
     theta = strong.theta * np.array([1, 1, 1, 1, 0])
     n_before, n_after, light = 150, 220, 1e4 * _level()
-    asimov = models.asimov_conditional(strong.model, GRID, theta, light, n_before, n_after)
+    asimov = noise.asimov_conditional(strong.model, GRID, theta, light, n_before, n_after)
     signal, gradient = strong.model.gradient(GRID, *theta[:4])
     rho = n_after / n_before
     weight = n_after * light / (1 + signal) / (1 + rho * (1 + signal))
@@ -274,13 +275,13 @@ def _score_pulls(
             n_after
         ) * read_noise_e * rng.standard_normal(GRID.shape)
         if kind == "conditional":
-            which = models.conditional(
+            which = noise.conditional(
                 case.model, GRID, before, after, n_after / n_before,
                 read_variance_before_e2=n_before * told**2,
                 read_variance_after_e2=n_after * told**2,
             )  # fmt: skip
         else:
-            which = models.poisson(
+            which = noise.poisson(
                 case.model, GRID, after, n_after * light, n_after * light,
                 extra_variance_e2=n_after * told**2,
             )  # fmt: skip
@@ -305,10 +306,10 @@ def _assert_standard(pulls: np.ndarray) -> None:
 def test_a_long_background_is_a_known_one(weak: Case) -> None:
     theta = weak.theta
     light = 1e4 * _level()
-    known = models.asimov_poisson(weak.model, GRID, theta, 200 * light, 200 * light)
+    known = noise.asimov_poisson(weak.model, GRID, theta, 200 * light, 200 * light)
     expected = known.score_fisher(theta)[2]
     for n_before in (10**6, 10**8):
-        measured = models.asimov_conditional(weak.model, GRID, theta, light, n_before, 200)
+        measured = noise.asimov_conditional(weak.model, GRID, theta, light, n_before, 200)
         ratio = measured.score_fisher(theta)[2] / expected
         np.testing.assert_allclose(ratio, 1, atol=3 * 200 / n_before)
 
@@ -317,8 +318,8 @@ def test_as_many_frames_before_as_after_cost_the_root_of_two() -> None:
     case = _case(amplitude=1e-4)
     theta = case.theta
     light = 1e4 * _level()
-    known = models.asimov_poisson(case.model, GRID, theta, 200 * light, 200 * light)
-    measured = models.asimov_conditional(case.model, GRID, theta, light, 200, 200)
+    known = noise.asimov_poisson(case.model, GRID, theta, 200 * light, 200 * light)
+    measured = noise.asimov_conditional(case.model, GRID, theta, light, 200, 200)
     sigma = [1 / np.sqrt(np.diag(m.score_fisher(theta)[2])) for m in (measured, known)]
     np.testing.assert_allclose(sigma[0] / sigma[1], np.sqrt(2), rtol=1e-5)
 
@@ -330,7 +331,7 @@ def test_dark_field_with_nothing_behind_it(dark: Case) -> None:
     scale = 8.0 / signal.max()
     counts = np.random.default_rng(4).poisson(scale * signal).astype(float)
     assert (counts == 0).any()
-    which = models.poisson(dark.model, GRID, counts, 0.0, scale)
+    which = noise.poisson(dark.model, GRID, counts, 0.0, scale)
     value, score, fisher = which.score_fisher(theta)
     for i, h in enumerate(_steps(dark)[:4]):
         step = np.zeros(5)
@@ -389,12 +390,12 @@ def test_residuals_and_information_are_standardised(
             for rate in (light, light * (1 + signal))
         )
         if kind == "conditional":
-            which = models.conditional(
+            which = noise.conditional(
                 weak.model, GRID, before, after, 1.0,
                 read_variance_before_e2=read_noise_e**2, read_variance_after_e2=read_noise_e**2,
             )  # fmt: skip
         else:
-            which = models.poisson(
+            which = noise.poisson(
                 weak.model, GRID, after, light, light, extra_variance_e2=read_noise_e**2
             )
         squares.append(which.residuals(weak.theta) ** 2)

@@ -13,7 +13,8 @@ from iscat_analysis.calibration.optics import Sight
 from iscat_analysis.calibration.optics.measured_picture import fit_own, fit_picture, place_sights
 from iscat_analysis.config import Config, config_to_toml, configure, load_config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference.likelihood import Likelihood, conditional
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise import conditional
 from iscat_analysis.optics.forward import (
     ForwardModel,
     PixelGrid,

@@ -9,8 +9,7 @@ import pytest
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.config import Config
-from iscat_analysis.inference import likelihood as models
-from iscat_analysis.inference import posterior
+from iscat_analysis.inference import noise, posterior
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.posterior import sample_posterior
@@ -34,7 +33,7 @@ def _case(
     signal = model.image(GRID, X * PIXEL_NM, Y * PIXEL_NM, z_nm, mass)
     rng = np.random.default_rng(2)
     before, after = (rng.poisson(2e6 * s).astype(float) for s in (1 + 0 * signal, 1 + signal))
-    likelihood = models.conditional(model, GRID, before, after, 1.0)
+    likelihood = noise.conditional(model, GRID, before, after, 1.0)
     fit = fit_particle(likelihood, Candidate(X, Y, z_nm, mass, 10.0), mode, z_range, level=False)
     return likelihood, fit
 
@@ -162,7 +161,7 @@ def test_a_chain_that_is_interrupted_prints_nothing(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(models.Likelihood, "values", interrupt)
+    monkeypatch.setattr(Likelihood, "values", interrupt)
     with pytest.raises(KeyboardInterrupt):
         sample_posterior(*gaussian, walkers=10, steps=10, seed=1)
     assert capfd.readouterr() == ("", "")

@@ -11,7 +11,7 @@ from report_factory import make_analysis
 from scenes import PIXEL_NM, make_config
 from scipy.stats import norm
 
-from iscat_analysis.inference import likelihood as models
+from iscat_analysis.inference import noise
 from iscat_analysis.inference.achieved import Achieved, pooled
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
@@ -55,7 +55,7 @@ def _likelihood(before: np.ndarray, after: np.ndarray, mode: str = "mass") -> Li
     focus = {"optics": {"focus_nm": -500.0}} if mode == "joint" else {}
     model = forward_model(make_config(**focus), 4000.0)
     sums = (frames.sum(axis=0).astype(float) for frames in (before, after))
-    return models.conditional(model, GRID, *sums, len(after) / len(before))
+    return noise.conditional(model, GRID, *sums, len(after) / len(before))
 
 
 @pytest.mark.parametrize("mode", ["mass", "joint"])

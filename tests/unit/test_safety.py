@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scenes import PIXEL_NM, make_config
 
+from iscat_analysis._kernels.scoring import POISSON
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference import likelihood as models
+from iscat_analysis.inference import noise
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
@@ -36,9 +37,9 @@ def which(request: pytest.FixtureRequest, model: ForwardModel, theta: np.ndarray
     rng = np.random.default_rng(1)
     after = rng.poisson(LIGHT * (1 + model.amplitude_image(GRID, *theta[:4]))).astype(float)
     if request.param == "poisson":
-        return models.poisson(model, GRID, after, LIGHT, LIGHT)
+        return noise.poisson(model, GRID, after, LIGHT, LIGHT)
     before = rng.poisson(LIGHT, GRID.shape).astype(float)
-    return models.conditional(model, GRID, before, after, 1.0)
+    return noise.conditional(model, GRID, before, after, 1.0)
 
 
 # ---- outside the support -----------------------------------------------------------------------
@@ -163,8 +164,8 @@ def test_counts_of_any_type_mean_the_same(kind: type, model: ForwardModel) -> No
     before, after = rng.poisson(0.95 * most, (2, *GRID.shape)).clip(1, most).astype(kind)
     exact = before.astype(float), after.astype(float)
     for make in (
-        lambda b, a: models.conditional(model, GRID, b, a, 1),
-        lambda b, a: models.poisson(model, GRID, a, b, b),
+        lambda b, a: noise.conditional(model, GRID, b, a, 1),
+        lambda b, a: noise.poisson(model, GRID, a, b, b),
     ):
         np.testing.assert_array_equal(make(before, after).data, make(*exact).data)
 
@@ -192,7 +193,7 @@ COUNTS = np.full(GRID.shape, 100.0)
 def test_bad_arrays_are_named(changed: dict, message: str, model: ForwardModel) -> None:
     given = {"before_e": COUNTS, "after_e": COUNTS, "power_ratio": 1.0, **changed}
     with pytest.raises(DataError, match=message):
-        models.conditional(model, GRID, **given)
+        noise.conditional(model, GRID, **given)
 
 
 @pytest.mark.parametrize(
@@ -209,15 +210,15 @@ def test_bad_arrays_of_a_known_background_are_named(
 ) -> None:
     given = {"counts_e": COUNTS, "background_e": 100.0, "scale_e": 100.0, **changed}
     with pytest.raises(DataError, match=message):
-        models.poisson(model, GRID, **given)
+        noise.poisson(model, GRID, **given)
 
 
 def test_a_pixel_that_is_no_number_may_be_masked(model: ForwardModel, theta: np.ndarray) -> None:
     dead = np.eye(15, 17, dtype=bool)
     after = np.where(dead, np.nan, 100.0)
     for which in (
-        models.conditional(model, GRID, COUNTS, after, 1.0, masked=dead),
-        models.poisson(model, GRID, after, 100.0, 100.0, masked=dead),
+        noise.conditional(model, GRID, COUNTS, after, 1.0, masked=dead),
+        noise.poisson(model, GRID, after, 100.0, 100.0, masked=dead),
     ):
         assert which.n_pixels == dead.size - dead.sum()
         assert np.isfinite(which.values(theta[None])).all()
@@ -229,7 +230,7 @@ def test_a_pixel_that_is_no_number_may_be_masked(model: ForwardModel, theta: np.
 )
 def test_constants_of_another_kind_are_refused(data: object, model: ForwardModel) -> None:
     with pytest.raises(DataError, match="data"):
-        Likelihood(model, GRID, models.POISSON, data)  # type: ignore[arg-type]
+        Likelihood(model, GRID, POISSON, data)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -257,7 +258,7 @@ def test_residuals_judge_the_image_that_was_fitted(offset: float) -> None:
     theta = np.array([*CENTRE, 5.0, amplitude, 0.0])
     truth = bare.image(GRID, *theta[:4])
     assert 0 < np.abs(truth).max() < abs(offset)
-    which = models.poisson(calibrated, GRID, LIGHT * (1 + truth), LIGHT, LIGHT)
+    which = noise.poisson(calibrated, GRID, LIGHT * (1 + truth), LIGHT, LIGHT)
     np.testing.assert_allclose(which.signal(theta), truth, rtol=0, atol=1e-12)
     np.testing.assert_allclose(which.residuals(theta), 0, atol=1e-6)
     start = Candidate(CENTRE[0] / PIXEL_NM, CENTRE[1] / PIXEL_NM, 5.0, 1000.0, 5.0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import log_ndtr
 
 from iscat_analysis.calibration.camera.moments import Moments, robust_sigma
 from iscat_analysis.calibration.camera.result import Estimate
@@ -211,7 +211,7 @@ def _unselected(whole: _ReadVariance, half: Estimate, threshold: float) -> Estim
     mean, error = whole.adu2.value, whole.adu2.se
     delta = math.sqrt(max(half.se**2 - error**2, 0.01 * half.se**2))
     at = (threshold - mean) / delta
-    mills = math.exp(float(norm.logpdf(at) - norm.logsf(at)))
+    mills = math.exp(-(at**2) / 2 - float(log_ndtr(-at))) / math.sqrt(2 * math.pi)
     slope = whole.covariance / delta**2 * mills * (mills - at)
     se = math.sqrt(whole.e2.se**2 + 2 * slope * whole.covariance + (slope * error) ** 2)
     other = whole.e2.se * half.se / delta  # the error of the other half by itself

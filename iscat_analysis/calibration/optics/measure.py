@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import kstest
 
 from iscat_analysis.calibration.optics.estimate import (
     Build,
@@ -169,8 +168,10 @@ def judge(
     Returns
     -------
     Judgement
-        See there.
+        The p-value and χ² of each, and whether all p-values together are uniform.
     """
+    from scipy.stats import kstest  # a second to load, for those who learn optics
+
     found = np.array(list(mapper(lambda sight: judge_one(sight, settings), sights)))
     p_values = found[:, 1]
     return Judgement(p_values, found[:, 0], float(kstest(p_values, "uniform").pvalue))

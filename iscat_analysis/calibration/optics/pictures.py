@@ -70,7 +70,7 @@ def make_pictures(sights: Sequence[Sight], build: Build, settings: Settings) -> 
     Returns
     -------
     Pictures
-        See there.
+        Measured picture, model, residual, and the pupil.
     """
     shape, pixel = sights[0].grid.shape, sights[0].grid.pixel_nm
     sums, weight, noise = np.zeros((2, *shape)), 0.0, np.zeros(shape)

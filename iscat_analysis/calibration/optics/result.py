@@ -189,7 +189,7 @@ def make_result(
     Returns
     -------
     OpticsCalibration
-        See there.
+        The parameters, their errors, and what is to be told of them.
     """
     estimate = measured.estimate
     covariance, bound = estimate.covariance, estimate.bound

@@ -82,7 +82,7 @@ class Chunk:
         Returns
         -------
         Patch
-            See there.
+            Counts and light of these frames and pixels.
         """
         here, pixels = self.cut(start, stop), (slice(*rows), slice(*columns))
         camera = self.camera

@@ -75,7 +75,7 @@ def make_filter(chunk: Chunk, template: FloatArray, noise: NoiseSpectrum | None 
     Returns
     -------
     Filter
-        See there.
+        What every window of the chunk is filtered with.
     """
     rows, columns = chunk.shape
     half = template.shape[0] // 2

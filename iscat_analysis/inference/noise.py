@@ -1,0 +1,252 @@
+"""The noise models: from counts to the likelihood of one region.
+
+What to use when
+----------------
+`conditional`
+    Interferometric image after landing, with a background measured on frames before it.  The
+    unknown background of every pixel drops out exactly: given b + d counts, d is binomial.
+`poisson`
+    The background is known, or adds to the signal (dark field).  A measured background adds its own
+    variance, and read noise its own, through the shifted Poisson law of Huang et al. (2013).
+`asimov_conditional`, `asimov_poisson`
+    The same with expected instead of measured counts: the bounds of a planned experiment.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from iscat_analysis._kernels.scoring import CONDITIONAL, POISSON
+from iscat_analysis.errors import DataError
+from iscat_analysis.inference.checks import mask_of, pixels_of
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+
+FloatArray = NDArray[np.float64]
+
+
+def conditional(
+    model: ForwardModel,
+    grid: PixelGrid,
+    before_e: ArrayLike,
+    after_e: ArrayLike,
+    power_ratio: ArrayLike,
+    *,
+    read_variance_before_e2: ArrayLike = 0.0,
+    read_variance_after_e2: ArrayLike = 0.0,
+    masked: ArrayLike | None = None,
+) -> Likelihood:
+    """Binomial likelihood of counts before and after landing.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Gives the contrast.
+    grid : PixelGrid
+        The pixels.
+    before_e, after_e : ndarray, shape (ny, nx)
+        Photoelectrons summed before and after.
+    power_ratio : ndarray or float
+        ρ; as an array it may carry the contrast of neighbouring particles as a factor 1 + C.
+    read_variance_before_e2, read_variance_after_e2 : ndarray or float
+        Read-noise variance of the sums [e²]; it lowers each pixel's weight by the share it takes
+        of the variance of d − np.
+    masked : ndarray of bool, shape (ny, nx), optional
+        Pixels to leave out.
+
+    Returns
+    -------
+    Likelihood
+        Of kind CONDITIONAL.
+
+    Raises
+    ------
+    DataError
+        An array does not fit the grid, or an unmasked pixel holds no finite number.
+    """
+    masked = mask_of("masked", masked, grid.shape)
+    before = pixels_of("before_e", before_e, grid.shape, masked)
+    after = pixels_of("after_e", after_e, grid.shape, masked)
+    ratio = pixels_of("power_ratio", power_ratio, grid.shape, masked, scalar=True)
+    read_before, read_after = (
+        pixels_of(name, value, grid.shape, masked, scalar=True, least=0.0)
+        for name, value in (
+            ("read_variance_before_e2", read_variance_before_e2),
+            ("read_variance_after_e2", read_variance_after_e2),
+        )
+    )
+    if not np.any(ratio > 0):
+        raise DataError(
+            f"power_ratio = {float(ratio.flat[0]):g}: give the light after over that before, a "
+            "positive number"
+        )
+    usable = (before > 0) & (after > 0) & (ratio > 0) & ~masked
+    ratio = np.where(usable, ratio, 1.0)
+    data = np.zeros((4, *grid.shape))
+    total = before + after
+    p = ratio / (1 + ratio)
+    shot = total * p * (1 - p)
+    read = (1 - p) ** 2 * read_after + p**2 * read_before
+    data[0], data[1], data[2] = after, total, ratio
+    data[3] = shot / np.where(usable, shot + read, 1.0)
+    data[:, ~usable] = 0.0
+    return Likelihood(model, grid, CONDITIONAL, data)
+
+
+def poisson(
+    model: ForwardModel,
+    grid: PixelGrid,
+    counts_e: ArrayLike,
+    background_e: ArrayLike,
+    scale_e: ArrayLike,
+    *,
+    extra_variance_e2: ArrayLike = 0.0,
+    masked: ArrayLike | None = None,
+) -> Likelihood:
+    """Poisson likelihood with expectation background + scale·signal.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Gives the signal.
+    grid : PixelGrid
+        The pixels.
+    counts_e : ndarray, shape (ny, nx)
+        Photoelectrons.
+    background_e : ndarray or float
+        Expected without the particle [e].
+    scale_e : ndarray or float
+        Photoelectrons for unit signal: the background itself in the interferometric schemes, N·s
+        in dark field.
+    extra_variance_e2 : ndarray or float
+        Read noise and the variance of a measured background [e²].
+    masked : ndarray of bool, shape (ny, nx), optional
+        Pixels to leave out.
+
+    Returns
+    -------
+    Likelihood
+        Of kind POISSON.
+
+    Raises
+    ------
+    DataError
+        An array does not fit the grid, or an unmasked pixel holds no finite number.
+    """
+    masked = mask_of("masked", masked, grid.shape)
+    counts = pixels_of("counts_e", counts_e, grid.shape, masked)
+    background, scale, extra = (
+        pixels_of(name, value, grid.shape, masked, scalar=True)
+        for name, value in (
+            ("background_e", background_e),
+            ("scale_e", scale_e),
+            ("extra_variance_e2", extra_variance_e2),
+        )
+    )
+    if not np.any(scale > 0):
+        raise DataError(
+            f"scale_e = {float(scale.flat[0]):g}: give the photoelectrons for unit signal, a "
+            "positive number"
+        )
+    data = np.stack([counts + extra, background, scale, extra])
+    data[:, masked | (scale <= 0)] = 0.0
+    return Likelihood(model, grid, POISSON, data)
+
+
+def asimov_conditional(
+    model: ForwardModel,
+    grid: PixelGrid,
+    theta: FloatArray,
+    background_e: FloatArray | float,
+    n_before: int,
+    n_after: int,
+    *,
+    read_variance_e2: FloatArray | float = 0.0,
+) -> Likelihood:
+    """Conditional likelihood of the expected counts; its Fisher matrix is the bound's.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Gives the contrast.
+    grid : PixelGrid
+        The pixels.
+    theta : ndarray, shape (5,)
+        Truth.
+    background_e : ndarray or float
+        Expected background per frame [e].
+    n_before, n_after : int
+        Frames.
+    read_variance_e2 : ndarray or float
+        Read-noise variance per frame [e²].
+
+    Returns
+    -------
+    Likelihood
+        Of kind CONDITIONAL, with the read-noise weight taken at the truth.
+    """
+    signal = model.amplitude_image(grid, *(float(value) for value in theta[:4]))
+    before = np.broadcast_to(n_before * np.asarray(background_e, dtype=float), grid.shape)
+    after = n_after * np.asarray(background_e) * (1 + signal)
+    exact = conditional(model, grid, before, after, n_after / n_before)
+    p = after / (before + after)
+    shot = (before + after) * p * (1 - p)
+    read = ((1 - p) ** 2 * n_after + p**2 * n_before) * read_variance_e2
+    exact.data[3] *= shot / (shot + read)
+    return exact
+
+
+def asimov_poisson(
+    model: ForwardModel,
+    grid: PixelGrid,
+    theta: FloatArray,
+    background_e: FloatArray | float,
+    scale_e: FloatArray | float,
+    *,
+    extra_variance_e2: FloatArray | float = 0.0,
+) -> Likelihood:
+    """Poisson likelihood of the expected counts; its Fisher matrix is the bound's.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Gives the signal.
+    grid : PixelGrid
+        The pixels.
+    theta : ndarray, shape (5,)
+        Truth.
+    background_e, scale_e, extra_variance_e2 : ndarray or float
+        As in `poisson`, summed over the frames.
+
+    Returns
+    -------
+    Likelihood
+        Of kind POISSON.
+    """
+    signal = model.amplitude_image(grid, *(float(value) for value in theta[:4]))
+    counts = background_e + scale_e * signal
+    return poisson(model, grid, counts, background_e, scale_e, extra_variance_e2=extra_variance_e2)
+
+
+def compile_kernels(model: ForwardModel) -> None:
+    """Run every kernel once on a few pixels, so that later calls find them compiled.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Any.
+    """
+    grid = PixelGrid.region((0, 3), (0, 3), 10.0)
+    theta = np.array([10.0, 10.0, model.height_nm, 1.0, 0.0])
+    counts = np.full(grid.shape, 100.0)
+    likelihood = poisson(model, grid, counts, counts, counts)
+    free = np.array([True, True, True, True, False])
+    margin = np.array([1.0, 1.0, 0.0, 1.0, 0.0])
+    likelihood.maximize(theta, free, theta - margin, theta + margin, passes=2)
+    likelihood.values(theta[None])
+    likelihood.score_fisher(theta)
+    likelihood.observed_information(theta)
+    likelihood.signal(theta)
+    likelihood.scan_heights(theta[2:3], theta, None)
+    model.gradient(grid, *theta[:4])
