@@ -91,7 +91,7 @@ def test_simulate_fit_and_summary(mode: str, setup, capsys, tmp_path) -> None:
 
 
 def test_simulated_movers(setup, capsys, tmp_path) -> None:
-    options = ["--set=simulation.movers=[{count=2, d_um2_s=0.5}]", "--set=camera.frame_rate_hz=331"]
+    options = ["--set=simulation.movers=[{count=2, d_um2_s=0.5}]", "--set=camera.frame_rate_hz=150"]
     options += ["--set=simulation.frames=40", "--config", str(setup)]
     written = _printed(capsys, "simulate", "--out", str(tmp_path / "movie.tif"), *options)
     _check(written, "simulate")

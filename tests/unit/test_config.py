@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iscat_analysis.config import (
+    SIMULATED,
     Config,
     Mode,
     Section,
