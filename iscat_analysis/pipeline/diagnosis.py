@@ -81,7 +81,8 @@ def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
         The movie.
     config : Config
         Its background frames, or the first that are analysed, are looked at; nothing is where
-        ``background.power_normalization`` is false, or the background is dark or known.
+        ``background.power_normalization`` is false, the background is dark or known, or the fixed
+        pattern is followed as it moves: it changes the light of the lines far more than flicker.
     camera : Camera
         Counts → photoelectrons.
 
@@ -94,6 +95,7 @@ def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
     if (
         not background.power_normalization
         or background.method == "known"
+        or (background.method == "sliding" and background.drift_correction)
         or config.optics.scheme == "darkfield"
     ):
         return None

@@ -11,6 +11,11 @@ from scipy.stats import poisson
 
 import iscat_analysis as ia
 from iscat_analysis.config import Config, load_config
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie import Stack
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.lines import Lines
+from iscat_analysis.pipeline.diagnosis import judge_lines
 from iscat_analysis.study.simulate import Movie
 
 pytestmark = pytest.mark.large
@@ -18,6 +23,9 @@ pytestmark = pytest.mark.large
 PIXEL_NM, SIDE, LEVEL_E, GAIN = 84.0, 88, 1e5, 4.0
 FLICKER = 2e-3
 """Of each line of each frame: 0.4 of the variance of shot noise, and 1.1 of what a mass sees."""
+
+DRIFT_PX = (0.005, -0.002)
+"""Per frame: the noise of a window sixfold, where it is not followed."""
 
 MASSES, GRID = (300.0, 400.0, 480.0), (16, 43, 70)
 """None waits for another: two faint ones at one distance from a third are taken for its ring."""
@@ -27,8 +35,13 @@ UNBIASED = 0.01
 
 
 def _config(kind: str, *settings: str) -> Config:
+    landing = ["simulation.frames=140", "background.window_frames=40"]
     ranges = {
-        "landing": ["simulation.frames=140", "background.window_frames=40"],
+        "landing": landing,
+        "drifting": [
+            *landing, f"simulation.drift_px_per_frame={list(DRIFT_PX)}",
+            "background.drift_correction=true",
+        ],
         "fixed": [
             "simulation.frames=120", "background.method=fixed", "background.frames=[0, 60]",
             "fit.frames=[60, 120]",
@@ -59,14 +72,14 @@ def _recorded(config: Config, seed: int, lines: str, flicker: float) -> np.ndarr
     return np.round(rng.poisson(light) / GAIN).astype(np.uint16)
 
 
-def _fitted(kind: str, lines: str, movies: int) -> pd.DataFrame:
+def _fitted(kind: str, lines: str, movies: int, *settings: str) -> pd.DataFrame:
     """Errors over σ, and relative ones of the masses, of nine particles in each movie."""
     rows = []
     for seed in range(movies):
         rng = np.random.default_rng(seed)
         placed = [
             {
-                "frame": int(rng.integers(60, 80)) if kind == "landing" else 60,
+                "frame": int(rng.integers(60, 80)) if kind != "fixed" else 60,
                 "x_px": x + rng.uniform(-2, 2),
                 "y_px": y + rng.uniform(-2, 2),
                 "mass_kda": MASSES[(i + j) % 3],
@@ -74,7 +87,7 @@ def _fitted(kind: str, lines: str, movies: int) -> pd.DataFrame:
             for i, y in enumerate(GRID)
             for j, x in enumerate(GRID)
         ]
-        config = _config(kind, "detection.false_alarms_per_movie=1e-3")
+        config = _config(kind, "detection.false_alarms_per_movie=1e-3", *settings)
         simulation = type(config.simulation).model_validate(
             {**config.simulation.model_dump(), "events": placed}
         )
@@ -90,6 +103,7 @@ def _fitted(kind: str, lines: str, movies: int) -> pd.DataFrame:
                     "y": (found["y_px"] - truth["y_px"]) * PIXEL_NM / found["sigma_y_nm"],
                     "mass": (found["mass_kda"] - mass) / found["sigma_mass_kda"],
                     "relative": found["mass_kda"] / mass - 1,
+                    "false": len(table) - len(placed),
                     "weight": (mass / found["sigma_mass_kda"]) ** 2,
                 }
             )
@@ -136,6 +150,32 @@ def test_masses_are_too_low_where_what_is_left_is_not_foreseen(
     table = _fitted(kind, "both", 6)
     bias = float(np.average(table["relative"], weights=table["weight"]))
     assert -0.09 < bias < -0.03
+
+
+def test_lines_are_left_in_where_the_pattern_moves_and_the_spread_holds_them() -> None:
+    """A pattern that moves changes their light by more than they flicker."""
+    table = _fitted("drifting", "both", 12, 'fit.sigma="measured"')
+    assert not table["false"].any()
+    for name in ("x", "y", "mass"):
+        _assert_standard(table[name])
+    bias = float(np.average(table["relative"], weights=table["weight"]))
+    assert abs(bias) < SIGMAS / math.sqrt(table["weight"].sum())
+
+
+def test_lines_that_are_divided_out_of_a_moving_pattern_make_particles(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Control: of the test above, and of its own movie without flicker."""
+
+    def divided(movie: Stack, config: Config, camera: Camera) -> Lines | None:
+        background = config.background.model_copy(update={"drift_correction": False})
+        return judge_lines(movie, config.model_copy(update={"background": background}), camera)
+
+    monkeypatch.setattr("iscat_analysis.pipeline.judge_lines", divided)
+    config = _config("drifting", "simulation.count=0", "detection.false_alarms_per_movie=1e-3")
+    with pytest.raises(DataError, match="places in frames 0:140 pass the detection threshold"):
+        ia.fit_movie(_recorded(config, 0, "both", FLICKER), config=config)
+    assert not len(ia.fit_movie(_recorded(config, 0, "both", 0.0), config=config).table)
 
 
 @pytest.mark.parametrize("kind", ["landing", "fixed"])
