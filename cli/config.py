@@ -27,7 +27,7 @@ def config(context: typer.Context, *, mode: ModeOption = None, debug: DebugOptio
         from iscat_analysis.config import config_to_toml, load_config
 
         text = config_to_toml(load_config(None, [f"fit.mode={mode.value}"] if mode else ()))
-        text = _INTRODUCTION + text.replace("\n[bounds]", f"\n{_one_event()}\n[bounds]", 1)
+        text = _INTRODUCTION + text.replace("\n[bounds]", f"\n{_one_of_each()}\n[bounds]", 1)
         print_result("\n".join(_folded(line) for line in text.splitlines()))
 
 
@@ -48,11 +48,18 @@ def _folded(line: str) -> str:
     return "\n".join([line[:column] + first, *(f"{'# ':>{column}}{more}" for more in rest)])
 
 
-def _one_event() -> str:
-    """Write the keys of one simulated particle, which the defaults have none of."""
-    from iscat_analysis.config import SimulatedEvent
+def _one_of_each() -> str:
+    """Write the keys of simulated particles, which the defaults have none of."""
+    from iscat_analysis.config import SIMULATED
 
-    lines = ["# [[simulation.events]]  one such block for each particle, in place of count"]
-    for key, field in SimulatedEvent.model_fields.items():
-        lines.append(f"{f'# {key} =':<36} # {field.description}")
-    return "\n".join(lines) + "\n"
+    purposes = {
+        "events": "one such block for each particle, in place of count",
+        "movers": "one such block for each kind of particle that diffuses",
+    }
+    blocks = []
+    for name, model in SIMULATED.items():
+        lines = [f"# [[simulation.{name}]]  {purposes[name]}"]
+        for key, field in model.model_fields.items():
+            lines.append(f"{f'# {key} =':<36} # {field.description}")
+        blocks.append("\n".join(lines) + "\n")
+    return "\n".join(blocks)

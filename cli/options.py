@@ -32,14 +32,14 @@ def complete_setting(incomplete: str) -> list[str]:
     list of str
         ``"section.key="`` for every key that begins so.
     """
-    from iscat_analysis.config import Config
+    from iscat_analysis.config import SIMULATED, Config
 
     found = []
     for section, field in Config.model_fields.items():
         # [calibration] may be absent: its annotation is a union with None
         models = [part for part in (field.annotation, *get_args(field.annotation)) if part]
         keys = next(m.model_fields for m in models if hasattr(m, "model_fields"))
-        found += [f"{section}.{key}=" for key in keys if f"{section}.{key}" != "simulation.events"]
+        found += [f"{section}.{key}=" for key in keys if key not in SIMULATED]
     return [name for name in found if name.startswith(incomplete)]
 
 

@@ -44,7 +44,11 @@ def simulate(
     quiet: QuietOption = False,
     debug: DebugOption = False,
 ) -> None:
-    """Write a shot-noise movie of particles whose position and mass are known."""
+    """Write a shot-noise movie of particles whose position and mass are known.
+
+    They land and leave ([[simulation.events]], simulation.count) or diffuse
+    ([[simulation.movers]], blurred by the exposure, with the truth of every frame).
+    """
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
         from iscat_analysis.config import load_config
@@ -64,5 +68,8 @@ def simulate(
         else:
             from iscat_analysis.report.numbers import count
 
-            particles = count(len(truth), "particle")
+            number = len(truth)
+            if "track" in truth:  # rows are frames where particles move
+                number = int(truth["track"].isna().sum() + truth["track"].nunique())
+            particles = count(number, "particle")
             print_result(f"{particles} in {out}, truth in {table}")

@@ -198,6 +198,8 @@ def simulate_movie(
     -------
     pandas.DataFrame
         One row per particle: frames, position [px, nm], height [nm], mass [kDa], peak contrast.
+        Of particles that move, one row for each frame in which they are in the field, averaged over
+        its exposure, with `track`, `d_um2_s` [µm²/s] and the place in the middle of the exposure.
 
     Raises
     ------

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any, get_args
 
-from iscat_analysis.config.schema import Config, Section, SimulatedEvent
+from iscat_analysis.config.schema import SIMULATED, Config, Section
 
 _DECIMAL_COMMA = re.compile(r"\s*([-+]?\d+),(\d+)\s*")
 
@@ -67,8 +67,8 @@ def known_keys(location: list[str]) -> list[str]:
     for part in location:
         if part.isdigit():
             continue
-        if part == "events":
-            model = SimulatedEvent
+        if part in SIMULATED:
+            model = SIMULATED[part]
             continue
         annotation = model.model_fields[part].annotation
         model = annotation if isinstance(annotation, type) else model_of(annotation)

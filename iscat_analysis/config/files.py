@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from iscat_analysis.config.complaints import model_of
-from iscat_analysis.config.schema import Config, Section, SimulatedEvent
+from iscat_analysis.config.schema import SIMULATED, Config, Section
 from iscat_analysis.errors import ConfigError
 
 
@@ -167,8 +167,8 @@ def config_to_toml(
         fields = (model if isinstance(model, type) else type(model)).model_fields
         for key, info in fields.items():
             value = getattr(section, key) if section is not None else None
-            if key == "events":
-                tables = [_event_toml(event) for event in value or ()]
+            if key in SIMULATED:
+                tables += [_table_toml(key, each) for each in value or ()]
                 continue
             if value is None and not comments:
                 continue
@@ -178,9 +178,9 @@ def config_to_toml(
     return "\n\n".join(blocks) + "\n"
 
 
-def _event_toml(event: SimulatedEvent) -> str:
-    lines = [f"{k} = {_toml_value(v)}" for k, v in event.model_dump().items() if v is not None]
-    return "\n".join(["[[simulation.events]]", *lines])
+def _table_toml(key: str, table: Section) -> str:
+    lines = [f"{k} = {_toml_value(v)}" for k, v in table.model_dump().items() if v is not None]
+    return "\n".join([f"[[simulation.{key}]]", *lines])
 
 
 def _toml_value(value: Any) -> str:

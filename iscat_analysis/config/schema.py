@@ -542,6 +542,68 @@ class SimulatedEvent(Section):
         return self
 
 
+class SimulatedMover(Section):
+    """Particles of one kind that diffuse."""
+
+    count: Annotated[int, Field(ge=1, le=100_000)] = Field(
+        1, description="in the field in their first frame; as many enter as leave"
+    )
+    d_um2_s: NonNegative = Field(description="diffusion coefficient along each axis, µm²/s")
+    mass_kda: Positive | None = Field(None, description="default particle.mass_kda")
+    diameter_nm: Annotated[Positive, _length(0.1, 1e4)] | None = Field(
+        None, description="in place of mass_kda, of the material of [particle]"
+    )
+    space: Literal["membrane", "volume"] = Field(
+        "membrane", description='"membrane": z is fixed | "volume": above z = 0, which reflects'
+    )
+    z_nm: Annotated[NonNegative, _length(0.0, LARGEST_NM)] | None = Field(
+        None, description="at first; default particle.height_nm, below a ceiling anywhere"
+    )
+    ceiling_nm: Annotated[Positive, _length(0.0, LARGEST_NM)] | None = Field(
+        None, description="volume: a height that reflects too"
+    )
+    drift_um_s: tuple[Finite, Finite] = Field(
+        (0.0, 0.0), description="velocity along x and y, µm/s"
+    )
+    confinement_nm: Annotated[Positive, _length(1.0, LARGEST_NM)] | None = Field(
+        None, description="side of a square whose walls reflect, one for each particle"
+    )
+    frame: Annotated[int, Field(ge=0)] = Field(0, description="first frame with them")
+    leave: Annotated[int, Field(ge=1)] | None = Field(
+        None, description="first frame without them again"
+    )
+    x_px: Finite | None = Field(
+        None, description="column at first, of a single particle; absent: anywhere"
+    )
+    y_px: Finite | None = Field(None, description="row at first, downwards")
+
+    @model_validator(mode="after")
+    def _possible(self) -> SimulatedMover:
+        if self.mass_kda is not None and self.diameter_nm is not None:
+            raise ValueError("give mass_kda or diameter_nm, not both")
+        if self.leave is not None and self.leave <= self.frame:
+            raise ValueError(f"leave = {self.leave} must come after frame = {self.frame}")
+        if (self.x_px is None) != (self.y_px is None):
+            raise ValueError("give x_px and y_px, or neither")
+        if self.x_px is not None and self.count != 1:
+            raise ValueError(
+                f"count = {self.count} particles cannot all begin at x_px, y_px: leave the place "
+                "out, or give each a block of its own"
+            )
+        if self.ceiling_nm is not None:
+            if self.space == "membrane":
+                raise ValueError('ceiling_nm needs space = "volume"')
+            if self.z_nm is not None and self.z_nm > self.ceiling_nm:
+                raise ValueError(
+                    f"z_nm = {self.z_nm:g} lies above ceiling_nm = {self.ceiling_nm:g}"
+                )
+        return self
+
+
+SIMULATED: dict[str, type[Section]] = {"events": SimulatedEvent, "movers": SimulatedMover}
+"""Tables of [simulation] that may be there many times, each describing particles."""
+
+
 class Simulation(Section):
     """A synthetic movie with known truth."""
 
@@ -562,6 +624,7 @@ class Simulation(Section):
     )
     seed: Annotated[int, Field(ge=0)] = Field(1, description="same seed, same bytes")
     events: tuple[SimulatedEvent, ...] = Field((), description="each particle, placed by hand")
+    movers: tuple[SimulatedMover, ...] = Field((), description="particles that diffuse, by kind")
     count: Annotated[int, Field(ge=0, le=1_000_000)] | None = Field(
         None, description="landings at random places and times, in place of events; 0: a blank"
     )
@@ -592,6 +655,18 @@ class Simulation(Section):
                 raise ValueError(
                     f"events[{number}] appears at frame {event.frame}, after the "
                     f"{self.frames} frames of the movie"
+                )
+        for number, mover in enumerate(self.movers):
+            if mover.frame >= self.frames:
+                raise ValueError(
+                    f"movers[{number}] appear at frame {mover.frame}, after the {self.frames} "
+                    "frames of the movie"
+                )
+            x, y = mover.x_px or 0.0, mover.y_px or 0.0
+            if not (-0.5 <= y < self.shape[0] - 0.5 and -0.5 <= x < self.shape[1] - 0.5):
+                raise ValueError(
+                    f"movers[{number}] at x_px = {x}, y_px = {y} begins outside the field of "
+                    f"{self.shape[1]} x {self.shape[0]} pixels"
                 )
         return self
 

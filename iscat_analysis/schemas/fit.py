@@ -338,7 +338,7 @@ class Fit(Summary):
 
 
 class TrueEvent(Closed):
-    """One particle of a simulated movie."""
+    """One particle of a simulated movie, or one that moves in one frame."""
 
     event: Count = key("Number of the particle")
     frame: int = key("First frame with the particle")
@@ -349,7 +349,14 @@ class TrueEvent(Closed):
     y_nm: float = key("y_px times the pixel size [nm]")
     z_nm: float = key("Height above the coverslip [nm]")
     mass_kda: float = key("Mass [kDa]")
-    contrast: Number = key("Signed peak contrast; null in dark field")
+    contrast: Number = key(
+        "Signed peak contrast; null in dark field and for particles that move up and down"
+    )
+    track: int | None = maybe("Number of the track; null for particles that do not move")
+    d_um2_s: Number = maybe("Diffusion coefficient along each axis [µm²/s]")
+    x_middle_nm: Number = maybe("Column in the middle of the exposure; x_nm is its average [nm]")
+    y_middle_nm: Number = maybe("Row in the middle of the exposure [nm]")
+    z_middle_nm: Number = maybe("Height in the middle of the exposure [nm]")
 
 
 class Simulate(Document):

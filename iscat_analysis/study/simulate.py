@@ -7,6 +7,9 @@ made on a field larger by the way they go, and its expectation is shifted by the
 Fourier transform, exact for an image that the pixels resolve.  Every frame draws from a generator
 of its own, derived from the seed and the frame number, so the bytes do not depend on how the work
 is divided.
+
+Particles that move (`movers`) are averaged along their path: each alone, in places that stand for
+the exposure, and what two fields make of each other where they meet from their mean places.
 """
 
 from __future__ import annotations
@@ -31,6 +34,7 @@ from iscat_analysis.movie.camera import camera_from_config, read_map
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.materials import material
 from iscat_analysis.records import FloatArray, Progress, silent
+from iscat_analysis.study.movers import MovingParticle, place_movers, track_rows
 
 ComplexArray = NDArray[np.complex128]
 
@@ -39,10 +43,33 @@ TRUTH_COLUMNS = (
 )  # fmt: skip
 """The columns of ``STACK.truth.csv``."""
 
-_STREAMS = {"background": 0, "power": 1, "events": 2, "frames": 3}
+TRACK_COLUMNS = ("track", "d_um2_s", "x_middle_nm", "y_middle_nm", "z_middle_nm")
+"""Those added where particles move; a row then holds for one frame, with averaged places."""
+
+_STREAMS = {"background": 0, "power": 1, "events": 2, "frames": 3, "movers": 4}
+_HEIGHTS = 64  # of a particle that moves up and down, to find its highest contrast
 _BATCH = 32  # frames drawn at once
 _MARGIN_PX = 8  # around what is ever seen of a sample that drifts
 _NO_UUID = "urn:uuid:00000000-0000-0000-0000-000000000000"
+
+
+@dataclass(frozen=True, eq=False)
+class _Still:
+    """What does not change until a particle comes or leaves.
+
+    Attributes
+    ----------
+    field : ndarray of complex
+        Of the particles that stand still, on the samples inside each pixel.
+    expected : ndarray, shape (y, x)
+        Photoelectrons of the sample with them.
+    spectrum : ndarray or None
+        Its Fourier transform, where the sample drifts.
+    """
+
+    field: ComplexArray
+    expected: FloatArray
+    spectrum: ComplexArray | None
 
 
 @dataclass(frozen=True)
@@ -83,12 +110,14 @@ def write_stack(
     Returns
     -------
     pandas.DataFrame
-        One row per particle, columns `TRUTH_COLUMNS`.
+        One row per particle, columns `TRUTH_COLUMNS`; with particles that move, one row for each
+        and every frame in which it is in the field, and `TRACK_COLUMNS`.
 
     Raises
     ------
     ConfigError
-        The pixel size is missing, or the counts do not fit into 16 bits.
+        The pixel size is missing, the counts do not fit into 16 bits, or particles move and the
+        frame rate is missing or the exposure longer than the time between frames.
     DataError
         The file exists, or cannot be written.
     """
@@ -147,6 +176,8 @@ class Movie:
         Laser power of each frame, mean 1.
     particles : tuple of SimulatedParticle
         In order of landing.
+    movers : tuple of MovingParticle
+        Those that diffuse.
     """
 
     def __init__(self, config: Config, seed: int) -> None:
@@ -163,11 +194,15 @@ class Movie:
         )
         self._grid = PixelGrid.region(rows, columns, self._pixel_nm)
         self.particles = self._place()
+        self._near_px = config.fit.roi_nm / 2 / self._pixel_nm
+        self.movers = place_movers(config, self._near_px, lambda i: self._generator("movers", i))
         heights = [p.z_nm for p in self.particles]
+        heights += [float(p.points_nm[..., 2].max()) for p in self.movers]
+        reach = self._grid.diagonal_nm + self._pixel_nm
+        if not all(p.still for p in self.movers):
+            reach += (4 * self._near_px + 8) * self._pixel_nm  # also from beyond a corner
         self._model = forward_model(
-            config,
-            self._grid.diagonal_nm + self._pixel_nm,
-            z_max_nm=max([config.particle.height_nm, *heights]),
+            config, reach, z_max_nm=max([config.particle.height_nm, *heights])
         )
         self._camera = camera_from_config(config.camera, simulation.shape, np.uint16)
         self._sample_e = self._background()
@@ -181,7 +216,7 @@ class Movie:
     def truth(self) -> pd.DataFrame:
         """What was put into the movie."""
         peaks = self._peak_contrasts() if self._model.rho else {}
-        rows = [
+        rows: list[tuple[object, ...]] = [
             (
                 i, p.frame, p.leave, p.x_px, p.y_px, p.x_px * self._pixel_nm,
                 p.y_px * self._pixel_nm, p.z_nm, p.mass_kda,
@@ -189,50 +224,118 @@ class Movie:
             )
             for i, p in enumerate(self.particles)
         ]  # fmt: skip
-        table = pd.DataFrame(rows, columns=list(TRUTH_COLUMNS))
-        return table.astype({"leave": "Int64"})
+        if not self._config.simulation.movers:
+            table = pd.DataFrame(rows, columns=list(TRUTH_COLUMNS))
+            return table.astype({"leave": "Int64"})
+        rows = [(*row, *(None for _ in TRACK_COLUMNS)) for row in rows]
+        shape = self._config.simulation.shape
+        seen = track_rows(self.movers, shape, self._pixel_nm, self.drift_px, peaks)
+        rows += [(i, *row) for i, row in enumerate(seen, len(rows))]
+        table = pd.DataFrame(rows, columns=[*TRUTH_COLUMNS, *TRACK_COLUMNS])
+        return table.astype({"leave": "Int64", "track": "Int64"})
 
     def frames(self, workers: int = 1) -> Iterator[NDArray[np.uint16]]:
         """Draw the frames in order; the result does not depend on `workers`."""
-        expected = self.expected_frames()
+        still = self._without_movers()
         with ThreadPoolExecutor(workers) as pool:
             for start in range(0, self.power.size, _BATCH):
                 stop = min(start + _BATCH, self.power.size)
-                batch = [(t, next(expected)) for t in range(start, stop)]
+                batch = [(t, next(still)) for t in range(start, stop)]
                 yield from pool.map(self._draw, batch)
 
     def expected_frames(self) -> Iterator[FloatArray]:
         """Yield the expected photoelectrons of each frame in order, shape (y, x)."""
+        for t, still in enumerate(self._without_movers()):
+            yield self._light(t, still)
+
+    def _without_movers(self) -> Iterator[_Still]:
+        """Yield what every frame has in common with the one before, until that changes."""
         q = self._model.samples[1].size
         rows, columns = self._grid.shape
         field = np.zeros((2, rows * q, columns * q), dtype=complex)
         present: dict[int, ComplexArray] = {}
-        changed = True
+        particles = [*self.particles, *(self._standing(p) for p in self.movers if p.still)]
+        still = None
         for t in range(self.power.size):
-            for i, particle in enumerate(self.particles):
+            for i, particle in enumerate(particles):
                 if particle.frame == t:
                     present[i] = self._field_of(particle)
                     field = field + present[i]
-                    changed = True
+                    still = None
                 if particle.leave == t and i in present:
                     field = field - present.pop(i)
-                    changed = True
-            if changed:
-                current, changed = self._expected(field), False
+                    still = None
+            if still is None:
+                current = self._electrons(self._signal(field))
                 spectrum = fft.rfft2(current) if self.drift_px.any() else None
-            if spectrum is None:
-                yield self.power[t] * current
-            else:
-                yield self.power[t] * self._shifted(spectrum, t)
+                still = _Still(field, current, spectrum)
+            yield still
 
-    def _expected(self, field: ComplexArray) -> FloatArray:
-        """Average over the samples inside each pixel, on which `field` is given."""
-        weights = self._model.samples[1]
-        q = weights.size
+    def _light(self, frame: int, still: _Still) -> FloatArray:
+        """Give the photoelectrons expected in a frame, particles that move among them."""
+        current, spectrum = still.expected, still.spectrum
+        moving = [
+            (p, frame - p.first)
+            for p in self.movers
+            if not p.still and 0 <= frame - p.first < len(p.mean_nm)
+        ]
+        moving = [(p, i) for p, i in moving if self._near(p.mean_nm[i])]
+        if moving:
+            current = self._electrons(self._signal(still.field) + self._moving(moving, still.field))
+            current = np.maximum(current, 0.0)
+            spectrum = fft.rfft2(current) if spectrum is not None else None
+        if spectrum is None:
+            return np.asarray(self.power[frame] * current)
+        return np.asarray(self.power[frame] * self._shifted(spectrum, frame))
+
+    def _moving(self, moving: list[tuple[MovingParticle, int]], field: ComplexArray) -> FloatArray:
+        """Signal of particles that move, beside that of a field that stands still."""
         rows, columns = self._grid.shape
+        signal, meeting = np.zeros((rows, columns)), np.zeros(field.shape[1:])
+        together = field
+        for particle, i in moving:
+            points = particle.points_nm[i]
+            for x, y, z in points:
+                image = self._model.image(self._grid, x, y, z, particle.mass_kda)
+                signal += image / len(points)
+            if len(moving) > 1 or field.any():
+                x, y, z = particle.mean_nm[i]
+                alone = self._field_at(x, y, z, particle.mass_kda)
+                meeting += 2 * np.sum(together * alone.conj(), axis=0).real
+                together = together + alone
+        return signal + self._in_pixels(meeting)
+
+    def _near(self, place_nm: FloatArray) -> bool:
+        """Whether a particle is so near the sample's part that is drawn that its light matters."""
+        grid, margin = self._grid, (self._near_px + 1) * self._pixel_nm
+        x, y = place_nm[:2]
+        return bool(
+            grid.x_nm[0] - margin <= x <= grid.x_nm[-1] + margin
+            and grid.y_nm[0] - margin <= y <= grid.y_nm[-1] + margin
+        )
+
+    def _standing(self, particle: MovingParticle) -> SimulatedParticle:
+        """Take a particle that does not move for one that lands."""
+        x, y, z = particle.mean_nm[0]
+        dx, dy = self.drift_px[particle.first, ::-1]
+        return SimulatedParticle(
+            particle.first, particle.first + len(particle.mean_nm), x / self._pixel_nm + dx,
+            y / self._pixel_nm + dy, z, particle.mass_kda,
+        )  # fmt: skip
+
+    def _signal(self, field: ComplexArray) -> FloatArray:
+        """Intensity with the reference, of a field that is given on the samples inside pixels."""
         reference = np.array([self._model.rho, 0.0])[:, None, None]
-        intensity = np.sum(np.abs(reference + field) ** 2, axis=0).reshape(rows, q, columns, q)
-        signal = np.einsum("yixj,i,j->yx", intensity, weights, weights)
+        return self._in_pixels(np.sum(np.abs(reference + field) ** 2, axis=0))
+
+    def _in_pixels(self, intensity: FloatArray) -> FloatArray:
+        """Average over the samples inside each pixel."""
+        weights = self._model.samples[1]
+        rows, columns = self._grid.shape
+        inside = intensity.reshape(rows, weights.size, columns, weights.size)
+        return np.asarray(np.einsum("yixj,i,j->yx", inside, weights, weights))
+
+    def _electrons(self, signal: FloatArray) -> FloatArray:
         if self._model.rho:
             return np.asarray(self._sample_e * signal)
         return np.asarray(self._sample_e + self._signal_scale * signal)
@@ -274,15 +377,24 @@ class Movie:
         return np.asarray(np.maximum(moved[self._field], 0.0))
 
     def _field_of(self, particle: SimulatedParticle) -> ComplexArray:
-        offsets = self._model.samples[0] * self._pixel_nm
         dy, dx = self.drift_px[particle.frame]
-        x = (self._grid.x_nm[:, None] + offsets).ravel() - (particle.x_px - dx) * self._pixel_nm
-        y = (self._grid.y_nm[:, None] + offsets).ravel() - (particle.y_px - dy) * self._pixel_nm
-        dx, dy = np.meshgrid(x, y)
-        return self._model.field(dx, dy, particle.z_nm, particle.mass_kda)
+        x, y = (particle.x_px - dx) * self._pixel_nm, (particle.y_px - dy) * self._pixel_nm
+        return self._field_at(x, y, particle.z_nm, particle.mass_kda)
 
-    def _draw(self, job: tuple[int, FloatArray]) -> NDArray[np.uint16]:
-        frame, expected = job
+    def _field_at(self, x_nm: float, y_nm: float, z_nm: float, mass_kda: float) -> ComplexArray:
+        """Field of a particle in the sample, on the samples inside each pixel."""
+        offsets = self._model.samples[0] * self._pixel_nm
+        x = (self._grid.x_nm[:, None] + offsets).ravel() - x_nm
+        y = (self._grid.y_nm[:, None] + offsets).ravel() - y_nm
+        dx, dy = np.meshgrid(x, y)
+        field = np.zeros((2, *dx.shape), dtype=complex)  # an analyser leaves the first alone
+        given = self._model.field(dx, dy, z_nm, mass_kda)
+        field[: len(given)] = given
+        return field
+
+    def _draw(self, job: tuple[int, _Still]) -> NDArray[np.uint16]:
+        frame, still = job
+        expected = self._light(frame, still)
         rng = self._generator("frames", frame)
         camera = self._camera
         electrons = rng.poisson(expected).astype(float)
@@ -345,6 +457,11 @@ class Movie:
     def _peak_contrasts(self) -> dict[tuple[float, float], float]:
         """Peak contrast for every height and mass that occurs."""
         kinds = {(p.z_nm, p.mass_kda) for p in self.particles}
+        for p in self.movers:
+            heights = np.unique(p.mean_nm[:, 2])
+            if heights.size > _HEIGHTS:  # of these the table has no contrast
+                heights = np.linspace(heights[0], heights[-1], _HEIGHTS)
+            kinds |= {(float(z), p.mass_kda) for z in heights}
         return {kind: self._model.peak_contrast(*kind) for kind in kinds}
 
     def _check_range(self) -> None:

@@ -18,7 +18,7 @@ import tifffile
 from scenes import write_bright_landings
 from sketches import sketch_figures
 
-from iscat_analysis.config import Config, config_to_toml, load_config
+from iscat_analysis.config import SIMULATED, Config, config_to_toml, load_config
 from iscat_analysis.records import EVENT_COLUMNS
 from iscat_cli import console, main, main_fit
 from iscat_cli.app import COMMANDS, GROUPS
@@ -133,8 +133,10 @@ def test_the_configuration_is_complete_and_explained(capsys) -> None:
         assert keys
         block = out.split(f"[{section}]", 1)[1]
         for key, described in keys.items():
-            if key == "events":
-                assert "[[simulation.events]]" in out
+            if key in SIMULATED:
+                assert f"[[simulation.{key}]]" in out
+                for own in SIMULATED[key].model_fields:
+                    assert f"\n# {own} = " in out.split(f"[[simulation.{key}]]", 1)[1]
                 continue
             line = re.search(rf"^(?:# )?{key} = .*?# (.+)$|^# {key} = +# (.+)$", block, re.M)
             assert line is not None, f"{section}.{key}"
@@ -159,7 +161,8 @@ def test_every_line_of_the_configuration_can_be_used(capsys, tmp_path) -> None:
         text, count = re.subn(rf"^# {key} = ", f"{key} = {value} ", text, count=1, flags=re.M)
         assert count == 1
     text = text.replace("# [[simulation.events]]", "[[simulation.events]] #")
-    for key, value in {"frame": "3", "x_px": "20.0", "y_px": "20.0"}.items():
+    text = text.replace("# [[simulation.movers]]", "[[simulation.movers]] #")
+    for key, value in {"frame": "3", "x_px": "20.0", "y_px": "20.0", "d_um2_s": "0.5"}.items():
         text, count = re.subn(rf"^# {key} = ", f"{key} = {value} ", text, count=1, flags=re.M)
         assert count == 1
     path = tmp_path / "setup.toml"
@@ -167,6 +170,7 @@ def test_every_line_of_the_configuration_can_be_used(capsys, tmp_path) -> None:
     config = load_config(path)
     assert config.camera.pixel_size_nm == 84.4
     assert config.simulation.events[0].x_px == 20.0
+    assert config.simulation.movers[0].d_um2_s == 0.5
 
 
 # ---- completion ------------------------------------------------------------------------------

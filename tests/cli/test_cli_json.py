@@ -90,6 +90,18 @@ def test_simulate_fit_and_summary(mode: str, setup, capsys, tmp_path) -> None:
     _check(empty, "fit")
 
 
+def test_simulated_movers(setup, capsys, tmp_path) -> None:
+    options = ["--set=simulation.movers=[{count=2, d_um2_s=0.5}]", "--set=camera.frame_rate_hz=150"]
+    options += ["--set=simulation.frames=40", "--config", str(setup)]
+    written = _printed(capsys, "simulate", "--out", str(tmp_path / "movie.tif"), *options)
+    _check(written, "simulate")
+    tracks = {row["track"] for row in written["events"]}
+    assert None in tracks
+    assert len(tracks) >= 3
+    assert main(["simulate", "--out", str(tmp_path / "two.tif"), *options]) == 0
+    assert f"{len(tracks)} particles in" in capsys.readouterr().out
+
+
 def test_what_fit_prints_holds_the_summary() -> None:
     printed, summary = schema("fit")["properties"], schema("summary")["properties"]
     assert set(printed) - set(summary) == {"out"}

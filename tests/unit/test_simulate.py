@@ -146,6 +146,18 @@ def test_images_are_the_models(samples: int, psi: float) -> None:
     np.testing.assert_array_equal(frames[5], frames[11])
 
 
+def test_an_analyser_leaves_one_component() -> None:
+    """Of gold, whose square matters: the light across the reference is gone, not counted twice."""
+    options: dict[str, Any] = {
+        "calibrated": False, "optics": {"analyzer": True},
+        "particle": {"kind": "gold", "mass_kda": None, "diameter_nm": 60.0},
+    }  # fmt: skip
+    frame = list(Movie(_config(**options), 1).expected_frames())[5]
+    mass = forward_model(_config(**options), 6000.0).material.mass_kda
+    signal = _signal(_config(**options), 17.3, 21.8, 5.0, mass)
+    np.testing.assert_allclose(frame, 1e4 * (1 + signal), rtol=TABLE)
+
+
 def test_pixels_integrate() -> None:
     """Nine samples inside a pixel against the plain mean of a fine grid."""
     config = _config({"events": [EVENT]}, camera={"samples_per_pixel": 3})
