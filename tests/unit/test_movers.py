@@ -336,6 +336,22 @@ def test_a_moving_sample_takes_its_movers_along() -> None:
     assert abs(truth["x_px"][11] - 20 - 0.25 * 11) < 3
 
 
+def test_a_particle_above_the_surface_is_seen_at_its_heights() -> None:
+    """Without noise, and slow enough to be sharp, its picture is that of the truth's place."""
+    gold = {"kind": "gold", "mass_kda": None, "diameter_nm": 30.0}
+    kind = {"d_um2_s": 1e-3, "space": "volume", "z_nm": 700.0, "x_px": 21.0, "y_px": 20.0}
+    movie = Movie(_config({"movers": [kind]}, particle=gold, calibrated=False), 2)
+    truth = movie.truth
+    assert truth["contrast"].isna().all()
+    assert truth["z_nm"].nunique() == len(truth) == 12
+    grid, mass = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM), truth["mass_kda"][0]
+    for t, frame in enumerate(movie.expected_frames()):
+        signal = movie._model.image(
+            grid, *truth.loc[t, ["x_nm", "y_nm", "z_nm"]].astype(float), mass
+        )
+        assert np.abs(frame / 1e4 - 1 - signal).max() < 0.01 * np.abs(signal).max()
+
+
 # ---- files -----------------------------------------------------------------------------------
 
 
