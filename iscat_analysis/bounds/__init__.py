@@ -62,6 +62,7 @@ from iscat_analysis.bounds.shared import (
     imitation,
     joint_information,
     mass_drift,
+    peak_gradient,
     shared_sigma,
 )
 
@@ -103,6 +104,7 @@ __all__ = [
     "parse_names",
     "parse_scan",
     "parse_target",
+    "peak_gradient",
     "plan",
     "power_known",
     "power_searched",

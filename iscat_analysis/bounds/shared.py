@@ -160,23 +160,54 @@ def mass_drift(model: ForwardModel, amplitude: float, names: Sequence[str]) -> F
     ndarray, shape (len(names),)
         ∂(peak contrast)/∂p over the line's gradient [kDa per unit]; 0 without a calibration.
     """
-    line, height = model.scale.calibration, model.height_nm
+    line = model.scale.calibration
     if line is None or not names:
         return np.zeros(len(names))
+    *_, slopes = peak_gradient(model, model.height_nm, amplitude, names)
+    return np.asarray(slopes / line.gradient_per_kda)
+
+
+def peak_gradient(
+    model: ForwardModel, z_nm: float, amplitude: float, names: Sequence[str]
+) -> tuple[float, FloatArray, FloatArray]:
+    """Peak contrast, and how it changes with the particle and with the microscope.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        The microscope.
+    z_nm : float
+        Height of the particle [nm].
+    amplitude : float
+        Of the scattered field.
+    names : sequence of str
+        Parameters of the optics.
+
+    Returns
+    -------
+    contrast : float
+        Signed.
+    own : ndarray, shape (4,)
+        ∂/∂(x, y, z, amplitude); along x and y nothing, at a peak.
+    shared : ndarray, shape (len(names),)
+        Per unit of each parameter.
+    """
+    plain = model
+    if model.scale.calibration is not None:  # below an offset two amplitudes have one mass
+        plain = replace(model, scale=MassScale())
     spot = model.optics.wavelength_nm / model.optics.na
     x, y, half = 0.0, 0.0, min(PEAK_REACH * spot, model.reach_nm - spot) / math.sqrt(2)
     while half > _PEAK_NM:
         axis = np.linspace(-half, half, _PEAK_POINTS)
         grid = PixelGrid(x + axis, y + axis, _PEAK_NM)
-        signal = np.abs(model.amplitude_image(grid, 0.0, 0.0, height, amplitude))
+        signal = np.abs(plain.amplitude_image(grid, 0.0, 0.0, z_nm, amplitude))
         row, column = np.unravel_index(int(np.argmax(signal)), signal.shape)
         x, y = float(grid.x_nm[column]), float(grid.y_nm[row])
         half *= 3 / _PEAK_POINTS
     # where the signal is largest its place does not matter to first order
     there = PixelGrid(np.array([x]), np.array([y]), _PEAK_NM)
-    plain = replace(model, scale=MassScale())  # below an offset two amplitudes have one mass
-    *_, slopes = plain.joint_gradient(there, 0.0, 0.0, height, amplitude, names)
-    return np.asarray(slopes[:, 0, 0] / line.gradient_per_kda)
+    contrast, own, shared = plain.joint_gradient(there, 0.0, 0.0, z_nm, amplitude, names)
+    return float(contrast[0, 0]), own[:, 0, 0], shared[:, 0, 0]
 
 
 def shared_sigma(moves: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -127,8 +127,9 @@ def fit_field(
         windows = _refined(scene, windows, events)
     least = _AS_FOUND * scene.templates.threshold
     kept = [e for e in events if e.snr > least and _wanted(scene, e)]
-    if 0 < len(kept) < len(events):  # what is dropped must leave its neighbours' background too
-        kept = _fit_all(scene, windows, [e.candidate for e in kept], kept, pool)
+    while 0 < len(kept) < len(events):  # what is dropped must leave its neighbours' background too
+        events = _fit_all(scene, windows, [e.candidate for e in kept], kept, pool)
+        kept = [e for e in events if e.snr > least and _wanted(scene, e)]
     lobes: list[Event] = []
     if doubtful and not starts:
         lobes = _fit_all(scene, windows, doubtful, kept, pool, first=len(kept))

@@ -307,11 +307,17 @@ def _across(
 
 
 def _scale_error(good: pd.DataFrame) -> Callable[[FloatArray], FloatArray] | None:
-    """Read the error that all events share, as a function of mass, off the events themselves."""
+    """Read the error that all events share, as a function of mass, off the events themselves.
+
+    Without calibration the species are contrasts in units of the model, and share their error.
+    """
     if "systematic_mass_kda" not in good or good.empty:
         return None
     size = good["mass_kda"].abs().to_numpy(dtype=float)
     error = good["systematic_mass_kda"].to_numpy(dtype=float)
+    if "systematic_contrast" in good:
+        relative = good["systematic_contrast"] / good["contrast"].abs()
+        error = size * relative.to_numpy(dtype=float)
     order = np.argsort(size)
     return lambda masses: np.interp(masses, size[order], error[order])
 

@@ -16,10 +16,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.bounds import imitation, joint_information, mass_drift
+from iscat_analysis.bounds import imitation, joint_information, mass_drift, peak_gradient
 from iscat_analysis.calibration.mass import line_sigma_kda
 from iscat_analysis.config import Config
-from iscat_analysis.inference.likelihood import LEVEL
 from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.optics.measured import Template
@@ -29,7 +28,11 @@ _AMPLITUDES = 4  # at which the response to the optics is computed, for the span
 _HEIGHTS_PER_FRINGE = 10  # between them it is interpolated
 
 Source = Callable[[Config, pd.DataFrame], Mapping[str, FloatArray]]
-"""Gives, by parameter, the standard deviation for every event; none for what it does not move."""
+"""Gives, by name in `_COMMON`, the standard deviation for every event; none for what it does not
+move."""
+
+_COMMON = (*PARAMETERS, "contrast")
+"""What such errors are told of; of the contrast where it is the result, without a calibration."""
 
 
 def systematic(config: Config, table: pd.DataFrame) -> dict[str, FloatArray]:
@@ -45,14 +48,14 @@ def systematic(config: Config, table: pd.DataFrame) -> dict[str, FloatArray]:
     Returns
     -------
     dict of str to ndarray
-        Parameter (`PARAMETERS`) → standard deviation of every event [nm or kDa]; only of those
-        parameters for which an error is known.
+        Parameter (`PARAMETERS`), or ``"contrast"`` where no calibration makes masses of contrasts →
+        standard deviation of every event [nm or kDa]; only of those for which an error is known.
     """
     squares: dict[str, FloatArray] = {}
     for source in _SOURCES:
         for name, sigma in source(config, table).items():
             squares[name] = squares.get(name, np.zeros(len(table))) + np.square(sigma)
-    return {name: np.sqrt(squares[name]) for name in PARAMETERS if name in squares}
+    return {name: np.sqrt(squares[name]) for name in _COMMON if name in squares}
 
 
 def with_systematic(config: Config, table: pd.DataFrame) -> pd.DataFrame:
@@ -102,20 +105,22 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
     grid = PixelGrid.centred(side, pixel)
     known = table[["z_nm", "mass_kda"]].notna().all(axis=1).to_numpy()
     model = forward_model(config, 1.05 * grid.diagonal_nm / 2)
-    shifts = np.full((len(table), len(PARAMETERS), len(errors.names)), np.nan)
+    shifts = np.full((len(table), len(_COMMON), len(errors.names)), np.nan)
     if known.any():
         shifts[known] = _shifts(config, model, grid, table[known])
     covariance = np.array(errors.matrix)
     variance = np.einsum("eik,kl,eil->ei", shifts, covariance, shifts)
     sigma = np.sqrt(np.maximum(variance, 0.0))
-    free = FREE_PARAMETERS[config.fit.mode]
-    return {name: sigma[:, k] for k, name in enumerate(PARAMETERS) if name in free}
+    told = [*FREE_PARAMETERS[config.fit.mode]]
+    if "mass_kda" in told and config.calibration is None:
+        told.append("contrast")
+    return {name: sigma[:, k] for k, name in enumerate(_COMMON) if name in told}
 
 
 def _shifts(
     config: Config, model: ForwardModel, grid: PixelGrid, table: pd.DataFrame
 ) -> FloatArray:
-    """Shift of (x, y, z, mass) of every event per unit of each parameter of the optics, (n, 4, k).
+    """Shift of x, y, z, mass and contrast of every event per unit of the optics, (n, 5, k).
 
     D changes smoothly with the amplitude and along z with the fringes: a few amplitudes at each of
     some heights serve all events.
@@ -134,11 +139,12 @@ def _shifts(
     heights, by_height = _height_weights(
         table["z_nm"].to_numpy(dtype=float), model.z_range_nm, model.fringe_nm
     )
-    shifts = np.zeros((len(table), len(PARAMETERS), len(names)))
+    shifts = np.zeros((len(table), len(_COMMON), len(names)))
     for height, weight in zip(heights, by_height.T, strict=True):
         near = weight != 0
         found = np.einsum("en,nik->eik", by_amplitude[near], respond.at(float(height), nodes))
         shifts[near] += weight[near, None, None] * found
+    shifts[:, 4] *= table["contrast"].to_numpy(dtype=float)[:, None]
     if free[3]:
         shifts[:, 3] *= amplitude[:, None]
         if model.scale.calibration is not None:
@@ -160,11 +166,11 @@ class _Response:
     frames: tuple[int, int]
 
     def at(self, z_nm: float, amplitudes: FloatArray) -> FloatArray:
-        """D of (x, y, z [nm], ln a) per unit of each parameter, shape (amplitudes, 4, k)."""
+        """D of (x, y, z [nm], ln a, ln contrast) per unit of each parameter, (amplitudes, 5, k)."""
         count, (before, after) = len(self.names), self.frames
         kept = np.flatnonzero([*self.free, self.level])
         chosen = np.concatenate([np.arange(count), count + kept])
-        out = np.zeros((len(amplitudes), LEVEL + 1, count))
+        out = np.empty((len(amplitudes), len(_COMMON), count))
         for index, amplitude in enumerate(amplitudes):
             theta = np.array([*self._centre, z_nm, amplitude, 0.0])
             expected = (
@@ -173,9 +179,13 @@ class _Response:
                 else asimov_poisson(self.model, self.grid, theta, 1.0, 1.0)
             )
             whole = joint_information(expected, theta, self.names)
-            out[index, kept] = imitation(whole[np.ix_(chosen, chosen)], count)
-            out[index, 3] /= amplitude
-        return out[:, :4]
+            moved = np.zeros((theta.size, count))
+            moved[kept] = imitation(whole[np.ix_(chosen, chosen)], count)
+            contrast, own, shared = peak_gradient(self.model, z_nm, amplitude, self.names)
+            out[index, :3] = moved[:3]
+            out[index, 3] = moved[3] / amplitude
+            out[index, 4] = (own @ moved[:4] + shared) / contrast
+        return out
 
     @property
     def _centre(self) -> tuple[float, float]:
@@ -259,7 +269,9 @@ def _of_the_template(config: Config, table: pd.DataFrame) -> Mapping[str, FloatA
     if optics.psf != "measured" or optics.template is None or config.calibration is not None:
         return {}
     mass = table["mass_kda"].to_numpy(dtype=float)
-    return {"mass_kda": np.abs(mass) * Template.read(Path(optics.template)).peak_se}
+    contrast = table["contrast"].to_numpy(dtype=float)
+    relative = Template.read(Path(optics.template)).peak_se
+    return {"mass_kda": np.abs(mass) * relative, "contrast": np.abs(contrast) * relative}
 
 
 _SOURCES: tuple[Source, ...] = (_of_the_line, _of_the_optics, _of_the_template)

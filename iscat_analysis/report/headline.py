@@ -159,12 +159,13 @@ def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        A copy in which ``mass_kda`` and its σ and bounds are contrasts.
+        A copy in which ``mass_kda``, its σ, its bounds and its common error are contrasts.
     """
     per_kda = (table["contrast"] / table["mass_kda"]).abs()
-    kinds = ("sigma", "crb", "qcrb", "systematic")
-    columns = [name for kind in kinds if (name := f"{kind}_mass_kda") in table]
+    columns = [name for kind in ("sigma", "crb", "qcrb") if (name := f"{kind}_mass_kda") in table]
     scaled = {name: table[name] * per_kda for name in columns}
+    if "systematic_contrast" in table:
+        scaled["systematic_mass_kda"] = table["systematic_contrast"]
     return table.assign(**scaled, mass_kda=table["contrast"])
 
 
@@ -362,8 +363,8 @@ def _spread(analysis: Analysis, table: pd.DataFrame) -> list[str]:
         size = good["mass_kda"].abs()
         of_it = "contrast"
         sigma = f"{percent(quantiles((good['sigma_mass_kda'] / size).to_numpy(float))[1])} of it"
-        if shared:
-            relative = (good["systematic_mass_kda"] / size).to_numpy(float)
+        if "systematic_contrast" in good:
+            relative = (good["systematic_contrast"] / good["contrast"].abs()).to_numpy(float)
             shared = f"{percent(quantiles(relative)[1])} of it"
     text = f"σ of the {of_it}, from the curvature of the likelihood, is {sigma}"
     text += f", {number(p.over_crb)} times the Cramér–Rao bound"

@@ -78,6 +78,9 @@ class Event(Closed):
     systematic_y_nm: Number = maybe(_SYSTEMATIC.format("nm"))
     systematic_z_nm: Number = maybe(_SYSTEMATIC.format("nm"))
     systematic_mass_kda: Number = maybe(_SYSTEMATIC.format("kDa"))
+    systematic_contrast: Number = maybe(
+        "Error of the contrast that is common to the movie; where no calibration makes it a mass"
+    )
     repeat_x_nm: Number = maybe(_REPEAT.format("nm"))
     repeat_y_nm: Number = maybe(_REPEAT.format("nm"))
     repeat_z_nm: Number = maybe(_REPEAT.format("nm"))

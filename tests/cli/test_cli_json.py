@@ -69,7 +69,7 @@ def test_schemas_are_schemas() -> None:
 def test_the_schema_of_an_event_is_the_table() -> None:
     event = schema("fit")["$defs"]["Event"]
     assert event["required"] == list(EVENT_COLUMNS)
-    further = {"frame_ci95", "track"}
+    further = {"frame_ci95", "track", "systematic_contrast"}
     further |= {f"{kind}_{name}" for kind in ("systematic", "repeat") for name in PARAMETERS}
     assert set(event["properties"]) - set(EVENT_COLUMNS) == further
     assert schema("fit")["$defs"]["Status"]["enum"] == [str(status) for status in Status]

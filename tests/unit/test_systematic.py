@@ -55,13 +55,16 @@ def _fitted(
     width = np.where(free, width, 0.0)
     found = likelihood.maximize(start, free, start - width, start + width, tolerance=1e-9).theta
     mass = float(model.scale.mass(np.asarray(found[3])))
-    return dict(zip(PARAMETERS, (*map(float, found[:3]), mass), strict=True))
+    places = dict(zip(PARAMETERS, (*map(float, found[:3]), mass), strict=True))
+    return places | {"contrast": model.amplitude_contrast(float(found[2]), float(found[3]))}
 
 
 def _event(config: Config, z_nm: float, amplitude: float) -> pd.DataFrame:
-    mass = float(forward_model(config, 2000.0).scale.mass(np.asarray(amplitude)))
+    model = forward_model(config, 2000.0)
+    mass = float(model.scale.mass(np.asarray(amplitude)))
     row = dict.fromkeys(EVENT_COLUMNS, 0.0)
     values = {"z_nm": z_nm, "mass_kda": mass, "n_before": 200, "n_after": 200, "status": "ok"}
+    values["contrast"] = model.amplitude_contrast(z_nm, amplitude)
     return pd.DataFrame([row | values])
 
 
@@ -90,9 +93,10 @@ def test_a_small_error_of_one_parameter_moves_the_fit_as_predicted(
         up, down = (
             _fitted(_moved(plain, s * shift), plain, z_nm, amplitude, mode) for s in (1, -1)
         )
-        for parameter in FREE_PARAMETERS[mode]:
+        assert set(predicted) == {*FREE_PARAMETERS[mode], *(["contrast"] if line is None else [])}
+        for parameter in predicted:
             moved = abs(up[parameter] - down[parameter]) / 2
-            floor = 1e-6 * (1.0 if parameter != "mass_kda" else amplitude)
+            floor = 1e-6 * {"mass_kda": amplitude, "contrast": 1e-2}.get(parameter, 1.0)
             assert predicted[parameter][0] == pytest.approx(moved, rel=5e-3, abs=floor), (
                 name,
                 parameter,
@@ -173,7 +177,7 @@ def test_what_is_not_known_has_no_column() -> None:
     ):
         assert systematic(_config(**settings), table) == {}
     empty = systematic(_config(), table[:0])
-    assert set(empty) == {"x_nm", "y_nm", "mass_kda"}
+    assert set(empty) == {"x_nm", "y_nm", "mass_kda", "contrast"}
 
 
 def test_the_covariance_survives_the_way_through_a_file() -> None:
