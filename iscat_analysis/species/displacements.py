@@ -28,6 +28,7 @@ LEAST_POSITIONS = 4
 
 _RATES_HZ = (1e-6, 1e9)
 _LENGTHS_NM = (1e-6, 1e9)  # the smallest error and the largest place
+_MOST_RATIO = 1e5  # of the errors of a track; their squares must not drown in one another
 _MOST_FRAMES = 2**53  # beyond, not every frame has a number of its own
 _ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
 
@@ -204,6 +205,11 @@ def gather(
         raise DataError(
             f"sigma_nm = {columns[wrong].flat[0]:g}: give the standard error of each position in "
             f"nanometres, at least {least:g}"
+        )
+    if columns.max() > _MOST_RATIO * columns.min():
+        raise DataError(
+            f"sigma_nm: goes from {columns.min():g} to {columns.max():g} nm; leave out positions "
+            "that say nothing beside the others"
         )
     variance = np.broadcast_to(columns**2, places.shape).T
     return Displacements(

@@ -148,7 +148,7 @@ def track_rows(
     drift_px : ndarray, shape (frames, 2)
         How far the sample has moved, along y and x.
     contrasts : mapping of tuple to float
-        Peak contrasts by height and mass; others are left open.
+        Peak contrasts by height and mass; left open where a particle moves up and down.
 
     Yields
     ------
@@ -159,6 +159,7 @@ def track_rows(
     track = -1
     for p in movers:
         turn = None
+        level = bool(np.ptp(p.mean_nm[:, 2]) == 0)
         frames = p.first + np.arange(len(p.mean_nm))
         drift = drift_px[frames, ::-1]
         places = p.mean_nm[:, :2] / pixel_nm + drift
@@ -170,7 +171,8 @@ def track_rows(
             middle = p.middle_nm[i, :2] + drift[i] * pixel_nm
             yield (
                 int(frames[i]), int(frames[i]) + 1, x, y, x * pixel_nm, y * pixel_nm, z, p.mass_kda,
-                contrasts.get((z, p.mass_kda)), int(track), p.d_um2_s, *middle, p.middle_nm[i, 2],
+                contrasts.get((z, p.mass_kda)) if level else None, int(track), p.d_um2_s,
+                *middle, p.middle_nm[i, 2],
             )  # fmt: skip
 
 

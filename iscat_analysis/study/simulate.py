@@ -459,7 +459,7 @@ class Movie:
         kinds = {(p.z_nm, p.mass_kda) for p in self.particles}
         for p in self.movers:
             heights = np.unique(p.mean_nm[:, 2])
-            if heights.size > _HEIGHTS:  # of these the table has no contrast
+            if heights.size > 1:
                 heights = np.linspace(heights[0], heights[-1], _HEIGHTS)
             kinds |= {(float(z), p.mass_kda) for z in heights}
         return {kind: self._model.peak_contrast(*kind) for kind in kinds}

@@ -154,6 +154,25 @@ def test_what_does_not_matter() -> None:
     assert ia.fit_diffusion(**full) == found
 
 
+def test_any_track_gives_numbers() -> None:
+    """Lengths, errors, gaps and rates over many orders of magnitude."""
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        n, axes = rng.choice([4, 5, 8, 60]), rng.integers(1, 4)
+        rate = 10 ** rng.uniform(-5, 8)
+        places = rng.choice([0, 1, 1]) * 10 ** rng.uniform(-6, 8) * rng.standard_normal((n, axes))
+        found = ia.fit_diffusion(
+            np.cumsum(rng.integers(1, rng.choice([2, 4, 10**6]), n)),
+            places.cumsum(axis=0) if rng.random() < 0.5 else places,
+            10 ** (rng.uniform(-6, 4) + rng.uniform(0, 4.9, (n, axes))),
+            frame_rate_hz=rate, exposure_ms=rng.choice([0, 0.3, 1]) * 1e3 / rate,
+        )  # fmt: skip
+        low, high = found.interval_um2_s
+        assert 0 <= low <= found.d_um2_s <= high < math.inf
+        assert 0 < found.sigma_d_um2_s < math.inf
+        assert math.isfinite(found.covariance_d_um2_s + found.log_likelihood)
+
+
 # ---- the interval and the second opinion -----------------------------------------------------
 
 
@@ -363,6 +382,7 @@ GOOD: dict[str, Any] = {
         ({"sigma_nm": 0.0}, "sigma_nm = 0: give the standard error"),
         ({"sigma_nm": [1.0, 2.0, 3.0]}, "sigma_nm: has shape (3,)"),
         ({"sigma_nm": [1.0, 2.0, 3.0, math.inf, 2.0]}, "sigma_nm: is not finite"),
+        ({"sigma_nm": [1.0, 2.0, 3.0, 1e6, 2.0]}, "sigma_nm: goes from 1 to 1e+06 nm; leave out"),
     ],
 )
 def test_impossible_tracks(change: dict[str, Any], said: str) -> None:
