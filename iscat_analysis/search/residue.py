@@ -142,7 +142,8 @@ def size_on_ring(
 ) -> float:
     """Give how high the map rises at a candidate's distance from a particle, beside its own peak.
 
-    A fifth of the ring may be higher: so much is left for particles that are not known yet.
+    The highest peak there may be another particle that is not known yet, and a fifth of what is
+    then left of the ring may be higher, for more: a misfit rises all around.
 
     Parameters
     ----------
@@ -156,7 +157,7 @@ def size_on_ring(
     Returns
     -------
     float
-        The signal-to-noise ratio that four fifths of the ring do not exceed.
+        The signal-to-noise ratio that four fifths of what is left do not exceed.
     """
     (x0, y0), (xc, yc) = centre, place
     distance = max(math.hypot(xc - x0, yc - y0), _RING_PX)
@@ -174,6 +175,10 @@ def size_on_ring(
         if math.hypot(xo - x0, yo - y0) < 2 * far:  # a farther one is nearer to no pixel of it
             own &= (y - yo) ** 2 + (x - xo) ** 2 > away2
     y, x = y[own], x[own]
+    if y.size and distance > 2 * _PATCH_PX:  # nearer to it a patch hides a lobe of the misfit
+        k = np.argmax(np.abs(snr[y, x]))
+        own = (y - y[k]) ** 2 + (x - x[k]) ** 2 > _PATCH_PX**2
+        y, x = y[own], x[own]
     if not y.size:
         return 0.0
     sectors = max(8, round(2 * math.pi * distance / _SECTOR_PX))

@@ -28,7 +28,6 @@ DRIFT_PX = (0.005, -0.002)
 """Per frame: the noise of a window sixfold, where it is not followed."""
 
 MASSES, GRID = (300.0, 400.0, 480.0), (16, 43, 70)
-"""None waits for another: two faint ones at one distance from a third are taken for its ring."""
 
 SIGMAS, TAIL = 4.0, 1e-4
 UNBIASED = 0.01

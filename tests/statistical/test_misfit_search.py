@@ -16,7 +16,7 @@ from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.landing import LandingResult, analyse_landings
 from iscat_analysis.pipeline.scene import make_scene
-from iscat_analysis.search.residue import Described, chi2_excess, size_on_ring
+from iscat_analysis.search.residue import EXCEEDS, Described, chi2_excess, size_on_ring
 
 SHAPE = (500, 128, 128)
 COUNT = 12
@@ -140,6 +140,23 @@ def test_a_second_particle_is_higher_than_its_ring_and_a_misfit_is_not() -> None
     assert size_on_ring(blob, *place) < 0.1 * 20
     assert size_on_ring(lobes, *place, [(50.0 + 12 * np.cos(a), 50.0 + 12 * np.sin(a))
                                         for a in np.arange(1, 12) * np.pi / 6]) < 20  # fmt: skip
+
+
+@pytest.mark.parametrize(("known", "is_ring"), [((), False), ((-1.0, 2.6, 4.0), False),
+                                                ((-1.0, 2.6, 4.0), True)])  # fmt: skip
+def test_two_equal_particles_are_not_each_others_ring(known, is_ring) -> None:
+    """24 pixels from a third, whose ring known ones hide but for a quarter; the control is one."""
+    y, x = np.mgrid[:101, :101]
+
+    def at(angle: float) -> tuple[float, float]:
+        return 50 + 24 * np.cos(angle), 50 + 24 * np.sin(angle)
+
+    place, other = at(0.3), at(1.2)
+    snr = sum(20 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 12) for a, b in (place, other))
+    if is_ring:
+        snr = 20 * np.exp(-((np.hypot(x - 50, y - 50) - 24) ** 2) / 12)
+    size = size_on_ring(np.asarray(snr), (50.0, 50.0), place, [at(angle) for angle in known])
+    assert (EXCEEDS * size > 20) == is_ring
 
 
 def test_excess_is_none_in_noise() -> None:
