@@ -45,7 +45,9 @@ from iscat_analysis.search.templates import LARGEST_IMAGE, find_particles
 MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""
 
-_SWEEPS = 2  # fits of everything with everything else in place, after the last round
+_SWEEPS = 2  # fits of everything with everything else in place, after the last round; at least
+_MOST_SWEEPS = 16  # where two fits share one particle they part slowly
+_SETTLED = 0.1  # change of signal-to-noise ratios from one sweep to the next
 _AS_FOUND = 0.95  # of the threshold; what was found is dropped only where others explain it
 _DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
 
@@ -121,10 +123,12 @@ def fit_field(
             break
         events = _fit_all(scene, windows, [*(e.candidate for e in events), *fresh], events, pool)
         windows = _refined(scene, windows, events)
-    for _ in range(_SWEEPS if events else 0):
-        events = _without_doubles(events, scene)
-        events = _fit_all(scene, windows, [e.candidate for e in events], events, pool)
+    for sweep in range(_MOST_SWEEPS if events else 0):
+        last = _without_doubles(events, scene)
+        events = _fit_all(scene, windows, [e.candidate for e in last], last, pool)
         windows = _refined(scene, windows, events)
+        if sweep + 1 >= _SWEEPS and _is_settled(last, events, scene.roi_px / 2):
+            break
     least = _AS_FOUND * scene.templates.threshold
     kept = [e for e in events if e.snr > least and _wanted(scene, e)]
     while 0 < len(kept) < len(events):  # what is dropped must leave its neighbours' background too
@@ -292,6 +296,16 @@ def _wanted(scene: Scene, event: Event) -> bool:
     """Whether the fitted contrast has the polarity that is reported."""
     sign = {"both": 0, "bright": 1, "dark": -1}[scene.config.detection.polarity]
     return sign == 0 or scene.additive or sign * event.fit.contrast > 0
+
+
+def _is_settled(before: Sequence[Event], after: Sequence[Event], near_px: float) -> bool:
+    """Whether another sweep would change little of fits that are near each other."""
+    if len(before) != len(after) or not after:
+        return not after
+    places = np.array([(e.candidate.x_px, e.candidate.y_px) for e in after])
+    apart = np.hypot(*(places[:, None] - places).T) + 2 * near_px * np.eye(len(places))
+    moved = np.array([a.snr - b.snr for a, b in zip(before, after, strict=True)])
+    return bool(np.all((np.abs(moved) < _SETTLED) | (apart.min(axis=0) > near_px)))
 
 
 def _without_doubles(events: Sequence[Event], scene: Scene) -> list[Event]:
