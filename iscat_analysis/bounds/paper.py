@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -24,6 +23,7 @@ from iscat_analysis.bounds.quantum import Measure, quantum_bounds, quantum_infor
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.records import PARAMETERS, Progress, silent
+from iscat_analysis.threads import threads
 
 FloatArray = NDArray[np.float64]
 Convention = Literal["dong2021", "exact"]
@@ -252,7 +252,7 @@ def reproduce(*, workers: int = 2, progress: Progress = silent) -> Reproduction:
                 jobs.append((over_z, scheme, convention, attenuation))
                 jobs.append((over_focus, scheme, convention, attenuation))
     parts: list[pd.DataFrame] = []
-    with ThreadPoolExecutor(workers) as pool:
+    with threads(workers) as pool:
         for done, part in enumerate(pool.map(lambda job: _curves(*job), jobs), start=1):
             parts.append(part)
             progress("curves of Dong et al. (2021)", done, len(jobs))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,6 +24,7 @@ from iscat_analysis.config import Config, parse_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import MassScale, forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Progress, silent
+from iscat_analysis.threads import threads
 
 FloatArray = NDArray[np.float64]
 
@@ -294,7 +294,7 @@ def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress =
 
     rows: list[dict[str, Any]] = []
     parts = [plans[i : i + STRETCH] for i in range(0, len(plans), STRETCH)]
-    with ThreadPoolExecutor(min(config.compute.workers, get_num_threads())) as pool:
+    with threads(min(config.compute.workers, get_num_threads())) as pool:
         for found in pool.map(stretch, parts):
             rows += found
             progress(f"scan over {axis.name}", len(rows), len(plans))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -31,6 +30,7 @@ from iscat_analysis.records import (
     verdict,
 )
 from iscat_analysis.search.templates import Templates, make_templates, signal_to_noise
+from iscat_analysis.threads import threads
 
 FloatArray = NDArray[np.float64]
 
@@ -141,7 +141,7 @@ def fit_rois(
     corners = np.zeros((count, 2)) if corners_px is None else real_array("corners_px", corners_px)
     if corners.shape != (count, 2) or not np.all(np.isfinite(corners)):
         raise DataError(f"corners_px: has shape {corners.shape}; give {(count, 2)} finite numbers")
-    threads = int(number_in("workers", workers, least=1, whole=True))
+    n_threads = int(number_in("workers", workers, least=1, whole=True))
     templates = make_templates(
         counts.model, config.detection,
         pixel_nm=counts.grid.pixel_nm,
@@ -150,7 +150,7 @@ def fit_rois(
         field_px=counts.grid.shape,
     )  # fmt: skip
     compile_kernels(counts.model)
-    with ThreadPoolExecutor(threads) as pool:
+    with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
     return table_from(rows)
 

@@ -66,6 +66,7 @@ from iscat_analysis.records import (
 from iscat_analysis.report import EVENT_FIGURES, write_report
 from iscat_analysis.report.output import claim_output
 from iscat_analysis.report.spread import rejection
+from iscat_analysis.threads import threads
 
 DEPENDENCIES = (
     "numpy", "scipy", "numba", "tifffile", "emcee", "arviz-stats", "pandas", "pyarrow",
@@ -372,7 +373,7 @@ def _measured_background(
         if moved:
             tell(moved)
     clock.lap("background")
-    with ThreadPoolExecutor(config.compute.workers) as pool:
+    with threads(config.compute.workers) as pool:
         if scene.mode == "track":
             found = track_particles(
                 scene, movie, camera, windows, check=check, pool=pool, progress=progress

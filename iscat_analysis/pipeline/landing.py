@@ -65,6 +65,7 @@ from iscat_analysis.records import (
 from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.sliding import CORRELATION, STRIDES, Chunk
 from iscat_analysis.search.templates import LARGEST_IMAGE, make_templates
+from iscat_analysis.threads import threads
 
 POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""
@@ -194,7 +195,7 @@ def analyse_landings(
         )
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     reader = Reader(frames, camera, first, last, counts_budget(config))
-    with ThreadPoolExecutor(config.compute.workers) as pool:
+    with threads(config.compute.workers) as pool:
         noise = judge_noise(reader, config, pool.map)
     curve, window = noise.curve, noise.window
     if noise.spectrum is not None and noise.spectrum.message:
@@ -214,7 +215,7 @@ def analyse_landings(
     store = Store(partial, config, identity, reader.shape, (first, last), camera)
     merged = Merged(reader.shape)
     interrupted = False
-    with ThreadPoolExecutor(config.compute.workers) as pool:
+    with threads(config.compute.workers) as pool:
         try:
             for number, (core, span) in enumerate(plan):
                 done = None if posterior else store.load(number)

@@ -28,6 +28,7 @@ from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.pipeline.landing import has_landings
 from iscat_analysis.pipeline.microscope import calibrate_sights, goodness, microscopes
 from iscat_analysis.pipeline.sights import bound_sights, landing_sights, reach_nm
+from iscat_analysis.threads import threads
 
 REJECTED_P = 1e-3
 """Half of the brightest particles must fit worse than this before the optics are doubted: a few
@@ -77,7 +78,7 @@ def learn_optics(
         return config, {}
     tested: dict[str, Any] = {}
     try:
-        with ThreadPoolExecutor(config.compute.workers) as pool:
+        with threads(config.compute.workers) as pool:
             find = landing_sights if has_landings(config) else _bound
             sights, others = find(movie, config, camera, pool)
             if len(sights) < LEAST_TESTED:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from typing import Any
 
@@ -43,6 +42,7 @@ from iscat_analysis.pipeline.sights import (
     scan_sights,
 )
 from iscat_analysis.records import Mapper, Progress, silent
+from iscat_analysis.threads import threads
 
 STEP_FACTORS = (0.5, 2.0)
 """How much smaller or larger than said the steps of a scan may turn out."""
@@ -96,7 +96,7 @@ def calibrate_movie(
             notify(note)
     refuse_uncalibratable(config)
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
-    with ThreadPoolExecutor(config.compute.workers) as pool:
+    with threads(config.compute.workers) as pool:
         progress("particles", 0, 1)
         if focus_step_nm is not None:
             others: list[Sight] = []

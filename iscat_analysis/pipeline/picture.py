@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -28,6 +27,7 @@ from iscat_analysis.pipeline.landing import has_landings
 from iscat_analysis.pipeline.microscope import goodness, refuse_uncalibratable
 from iscat_analysis.pipeline.sights import bound_sights, landing_sights, reach_nm
 from iscat_analysis.records import Mapper, Progress, silent
+from iscat_analysis.threads import threads
 
 HELD_OUT_P = 1e-3
 """p-value of the held-out pictures' p-values, below which the template does not describe them."""
@@ -194,7 +194,7 @@ def measure_template(
     physics = config.optics.model_copy(update={"psf": "model", "template": None})
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     landing = has_landings(config)
-    with ThreadPoolExecutor(config.compute.workers) as pool:
+    with threads(config.compute.workers) as pool:
         for number, margin in enumerate(MARGINS_PX):
             progress("particles", number, len(MARGINS_PX))
             larger = config.fit.model_copy(update={"roi_nm": roi_nm + 2 * margin * pixel})

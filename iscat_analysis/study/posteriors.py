@@ -8,7 +8,6 @@ arXiv:1804.06788, 2018).
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +20,7 @@ from iscat_analysis.records import PARAMETERS, BoolArray, Box, FloatArray
 from iscat_analysis.study.scores import rank_test
 from iscat_analysis.study.setting import Setting
 from iscat_analysis.study.trials import trial_generator
+from iscat_analysis.threads import threads
 
 RANKS = 100
 """Possible ranks: each posterior is thinned to one draw less."""
@@ -147,6 +147,6 @@ def calibrate_posterior(
             inside[band, i] = (ends[0] <= truth[index]) & (truth[index] <= ends[1])
         return True
 
-    with ThreadPoolExecutor(workers) as pool:
+    with threads(workers) as pool:
         done = list(pool.map(one, range(draws)))
     return PosteriorRanks(setting.free, ranks, widths, inside[0], inside[1], draws - sum(done))

@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,6 +34,7 @@ from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.materials import material
 from iscat_analysis.records import FloatArray, Progress, silent
 from iscat_analysis.study.movers import MovingParticle, place_movers, track_rows
+from iscat_analysis.threads import threads
 
 ComplexArray = NDArray[np.complex128]
 
@@ -237,7 +237,7 @@ class Movie:
     def frames(self, workers: int = 1) -> Iterator[NDArray[np.uint16]]:
         """Draw the frames in order; the result does not depend on `workers`."""
         still = self._without_movers()
-        with ThreadPoolExecutor(workers) as pool:
+        with threads(workers) as pool:
             for start in range(0, self.power.size, _BATCH):
                 stop = min(start + _BATCH, self.power.size)
                 batch = [(t, next(still)) for t in range(start, stop)]

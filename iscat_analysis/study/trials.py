@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +20,7 @@ from iscat_analysis.inference.noise import compile_kernels
 from iscat_analysis.records import BoolArray, Candidate, FitResult, FloatArray, Status
 from iscat_analysis.study.baselines import Baselines
 from iscat_analysis.study.setting import Setting
+from iscat_analysis.threads import threads
 
 CHUNK = 16
 """Trials that a thread takes at a time."""
@@ -177,7 +177,7 @@ def run_trials(
             advance(last - first)
         return spent
 
-    with ThreadPoolExecutor(workers) as pool:
+    with threads(workers) as pool:
         seconds = sum(pool.map(work, range(0, count, chunk)))
     found = [fit for fit in fits if fit is not None]
     return Trials(
