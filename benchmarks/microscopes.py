@@ -162,15 +162,20 @@ def judge(name: str, seed: int) -> dict[str, Any]:
     start = time.process_time()
     result = analyse(movie, nominal(), said)
     seconds = time.process_time() - start
-    table = counted(result)
+    cause = next((text for text in said if "looks most like" in text), "")
+    return tally(landings, counted(result), seconds, cause)
+
+
+def tally(landings: Landings, table: pd.DataFrame, seconds: float, cause: str) -> dict[str, Any]:
+    """Count what was found of one movie, and what is not there."""
     matched = match(landings, table)
     return {
-        "particles": COUNT,
+        "particles": len(landings.frame),
         "found": int((matched.rows >= 0).sum()),
         "false": matched.false,
         "ok": int((table["status"] == "ok").sum()),
         "seconds": seconds,
-        "cause": next((text for text in said if "looks most like" in text), ""),
+        "cause": cause,
     }
 
 

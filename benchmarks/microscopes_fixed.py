@@ -16,7 +16,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from microscopes import MICROSCOPES, SEEDS, compare, match, nominal
+from microscopes import MICROSCOPES, SEEDS, compare, nominal, tally
 
 from instruments import Instrument, InstrumentMovie, draw_landings  # isort: skip
 
@@ -55,15 +55,8 @@ def judge(name: str, seed: int) -> dict[str, Any]:
     table = table_of(scene, [Row(k, event, windows) for k, event in enumerate(events)])
     seconds = time.process_time() - start
     table = table[table["status"] != "sidelobe"].reset_index(drop=True)
-    matched = match(landings, table.assign(frame=BOUND, **{FRAME_COLUMN: 0}))
-    return {
-        "particles": COUNT,
-        "found": int((matched.rows >= 0).sum()),
-        "false": matched.false,
-        "ok": int((table["status"] == "ok").sum()),
-        "seconds": seconds,
-        "cause": misfit_warning(config, events),
-    }
+    table = table.assign(frame=BOUND, **{FRAME_COLUMN: 0})
+    return tally(landings, table, seconds, misfit_warning(config, events))
 
 
 def main() -> int:

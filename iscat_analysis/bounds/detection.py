@@ -135,7 +135,7 @@ def detection_limit(experiment: Experiment) -> DetectionLimit | None:
     false, miss = at.false_alarm_probability, at.miss_probability
     known = -float(ndtri(false))
     searched = height_reached(-math.log1p(-false), area, lowest=known)
-    snr = known + -float(ndtri(miss))
+    snr = known - float(ndtri(miss))
     snr_searched = float(
         brentq(lambda s: power_searched(s, searched) - (1 - miss), 0.0, searched + 40.0)
     )

@@ -111,10 +111,16 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
     covariance = np.array(errors.matrix)
     variance = np.einsum("eik,kl,eil->ei", shifts, covariance, shifts)
     sigma = np.sqrt(np.maximum(variance, 0.0))
-    told = [*FREE_PARAMETERS[config.fit.mode]]
-    if "mass_kda" in told and config.calibration is None:
-        told.append("contrast")
+    told = [
+        *FREE_PARAMETERS[config.fit.mode],
+        *(["contrast"] if _is_about_contrast(config) else []),
+    ]
     return {name: sigma[:, k] for k, name in enumerate(_COMMON) if name in told}
+
+
+def _is_about_contrast(config: Config) -> bool:
+    """Whether contrasts are the result: masses are fitted, and no calibration makes them."""
+    return "mass_kda" in FREE_PARAMETERS[config.fit.mode] and config.calibration is None
 
 
 def _shifts(
@@ -134,6 +140,7 @@ def _shifts(
         replace(model, scale=MassScale()), grid, names, tuple(free),
         level=config.background.method == "sliding",
         frames=(int(table["n_before"].median()), int(table["n_after"].median())),
+        contrast=_is_about_contrast(config),
     )  # fmt: skip
     by_amplitude = _lagrange(nodes, np.clip(amplitude, nodes.min(), nodes.max()))
     heights, by_height = _height_weights(
@@ -164,13 +171,17 @@ class _Response:
     free: tuple[bool, ...]
     level: bool
     frames: tuple[int, int]
+    contrast: bool
 
     def at(self, z_nm: float, amplitudes: FloatArray) -> FloatArray:
-        """D of (x, y, z [nm], ln a, ln contrast) per unit of each parameter, (amplitudes, 5, k)."""
+        """D of (x, y, z [nm], ln a, ln contrast) per unit of each parameter, (amplitudes, 5, k).
+
+        The contrast is left at 0 where it is not the result.
+        """
         count, (before, after) = len(self.names), self.frames
         kept = np.flatnonzero([*self.free, self.level])
         chosen = np.concatenate([np.arange(count), count + kept])
-        out = np.empty((len(amplitudes), len(_COMMON), count))
+        out = np.zeros((len(amplitudes), len(_COMMON), count))
         for index, amplitude in enumerate(amplitudes):
             theta = np.array([*self._centre, z_nm, amplitude, 0.0])
             expected = (
@@ -181,10 +192,11 @@ class _Response:
             whole = joint_information(expected, theta, self.names)
             moved = np.zeros((theta.size, count))
             moved[kept] = imitation(whole[np.ix_(chosen, chosen)], count)
-            contrast, own, shared = peak_gradient(self.model, z_nm, amplitude, self.names)
             out[index, :3] = moved[:3]
             out[index, 3] = moved[3] / amplitude
-            out[index, 4] = (own @ moved[:4] + shared) / contrast
+            if self.contrast:
+                contrast, own, shared = peak_gradient(self.model, z_nm, amplitude, self.names)
+                out[index, 4] = (own @ moved[:4] + shared) / contrast
         return out
 
     @property
