@@ -30,6 +30,7 @@ from iscat_analysis.report.numbers import UNITS, count, number
 from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
 from iscat_analysis.report.posterior import posterior_groups
 from iscat_analysis.report.tables import event_table
+from iscat_analysis.report.tracks import tracks_of
 
 if TYPE_CHECKING:
     from arviz import InferenceData
@@ -56,6 +57,11 @@ class Result:
     def table(self) -> pd.DataFrame:
         """One row per event, the columns of ``fits.csv``, which carry their units."""
         return self.analysis.table
+
+    @property
+    def tracks(self) -> pd.DataFrame:
+        """Mode ``track``: one row per track, the columns of ``tracks.csv``; else empty."""
+        return tracks_of(self.analysis)
 
     @property
     def summary(self) -> Mapping[str, Any]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
-from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.errors import DataError
 from iscat_analysis.inference.moving import Ground, Judged, MovingField, Rows
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
@@ -78,7 +78,7 @@ class Moving:
 
 
 def exposure_of(config: Config) -> tuple[float, float]:
-    """Give the time from frame to frame and the exposure.
+    """Give the frame rate and the exposure.
 
     Parameters
     ----------
@@ -87,26 +87,14 @@ def exposure_of(config: Config) -> tuple[float, float]:
 
     Returns
     -------
-    interval_s, exposure_s : float
-        The whole interval where no exposure is given [s].
-
-    Raises
-    ------
-    ConfigError
-        There is no frame rate, or the exposure is longer than the interval.
+    rate_hz, exposure_s : float
+        Where the rate is not known one frame is the unit of time, which it lasts as a whole: how
+        far a particle goes in it, and so its blur, is seen all the same.
     """
     rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
     if rate is None:
-        raise ConfigError(
-            "camera.frame_rate_hz is needed to track particles, whose pictures are blurred by how "
-            "far they go: add it, as in camera.frame_rate_hz = 331.0"
-        )
-    if exposure is not None and exposure * rate > 1e3 * (1 + 1e-6):
-        raise ConfigError(
-            f"camera.exposure_ms = {exposure:g} is longer than the {1e3 / rate:g} ms from frame to "
-            f"frame at camera.frame_rate_hz = {rate:g}: correct one of them"
-        )
-    return 1 / rate, 1 / rate if exposure is None else exposure / 1e3
+        return 1.0, 1.0
+    return rate, 1 / rate if exposure is None else exposure / 1e3
 
 
 def track_scene(config: Config, field_px: tuple[int, int], frames: int) -> Scene:
@@ -168,8 +156,6 @@ def follow(
     ------
     DataError
         The movie is too short, or larger than `compute.memory_limit_mb`.
-    ConfigError
-        The timing is missing or impossible.
     """
     config = scene.config
     _, exposure = exposure_of(config)
@@ -351,6 +337,7 @@ def _diffusion(config: Config, field: MovingField, rows: Rows, judged: Judged) -
     index = np.flatnonzero(field.free[:4])
     sigma = np.sqrt(_inverse_diagonal(judged.fisher, index))
     axes = [0, 1]
+    rate, exposure = exposure_of(config)
     for k in range(tracks):
         mine = rows.track == k
         mine &= np.isfinite(sigma[:, axes]).all(axis=1)
@@ -358,8 +345,8 @@ def _diffusion(config: Config, field: MovingField, rows: Rows, judged: Judged) -
             continue
         found = fit_diffusion(
             rows.frame[mine], rows.theta[mine][:, axes], sigma[mine][:, axes],
-            frame_rate_hz=config.camera.frame_rate_hz or 0.0,
-            exposure_ms=config.camera.exposure_ms,
+            frame_rate_hz=rate,
+            exposure_ms=1e3 * exposure,
         )  # fmt: skip
         out[k] = found.d_um2_s, found.sigma_d_um2_s
     return out

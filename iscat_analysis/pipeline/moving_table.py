@@ -192,7 +192,7 @@ def _crowded(scene: Scene, moving: Moving) -> BoolArray:
 
 def _contrasts(model: ForwardModel, z_nm: FloatArray, amplitude: FloatArray) -> FloatArray:
     """Peak contrasts; at one height its two parts grow with the amplitude and its square."""
-    if np.ptp(z_nm) == 0 and len(z_nm):
+    if len(z_nm) and np.ptp(z_nm) == 0:
         middle = float(np.median(amplitude))
         linear, quadratic = model.wave.peak(float(z_nm[0]), middle, model.rho)
         share = amplitude / middle
