@@ -137,6 +137,22 @@ def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
     return (ordered[0] if ordered else Status.OK), ordered
 
 
+def track_numbers(fits: pd.DataFrame) -> pd.Series[int]:
+    """Give the track of every row.
+
+    Parameters
+    ----------
+    fits : pandas.DataFrame
+        With ``track``, or from mode ``track`` alone, where ``event`` is the number of the track.
+
+    Returns
+    -------
+    pandas.Series
+        Whole numbers, missing where a row belongs to no track.
+    """
+    return fits["track"] if "track" in fits else fits["event"]
+
+
 class TrackStatus(StrEnum):
     """The verdict on one track; worst first."""
 

@@ -24,13 +24,9 @@ from iscat_analysis.records import (
     Progress,
     TrackStatus,
     Windows,
-)
-from iscat_analysis.species.tracks import (
-    Correlation,
-    TrackSetup,
-    describe_tracks,
     track_numbers,
 )
+from iscat_analysis.species.tracks import Correlation, TrackSetup, describe_tracks
 
 SHORT_MOVIE = 20
 """Fewer frames than this hardly tell a diffusion coefficient."""

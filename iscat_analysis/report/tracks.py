@@ -9,10 +9,11 @@ from typing import Any
 
 import pandas as pd
 
-from iscat_analysis.records import TRACK_COLUMNS, Analysis, Status, TrackStatus
+from iscat_analysis.records import TRACK_COLUMNS, Analysis, TrackStatus
 from iscat_analysis.report.headline import (
     MOST_FLAGGED,
     NOT_A_MASS,
+    headline,
     is_uncalibrated,
     main_quantity,
     spread_lines,
@@ -55,11 +56,13 @@ def tracks_headline(analysis: Analysis, fits: pd.DataFrame) -> list[str]:
     """
     tracks = tracks_of(analysis)
     warned = [NOT_A_MASS] if is_uncalibrated(analysis) else []
+    if fits.empty:
+        return headline(analysis, fits)
     if tracks.empty:
         return [
-            f"No particle was followed for {_least(analysis)}: look at the field image, at "
-            "track.max_step_nm, which is the farthest a particle goes between frames, and at "
-            "detection.false_alarms_per_movie."
+            f"{count(len(fits), 'fitted position')}, and no particle was followed for "
+            "track.min_frames: look at the field image, at track.max_step_nm, which is the "
+            "farthest a particle goes between frames, and at detection.false_alarms_per_movie."
         ]
     good = tracks[tracks["status"] == TrackStatus.OK]
     text = (
@@ -183,8 +186,3 @@ def advice(tracks: pd.DataFrame) -> Iterator[str]:
     for status in TrackStatus:
         if remarks[status.value]:
             yield f"{count(remarks[status.value], 'track')} {status}: {status.advice}"
-
-
-def _least(analysis: Analysis) -> str:
-    statuses = analysis.table["status"]
-    return "a frame" if (statuses != Status.SIDELOBE).sum() == 0 else "track.min_frames"

@@ -47,7 +47,7 @@ from iscat_analysis.species.motion import (
     confinement_test,
 )
 from iscat_analysis.species.refraction import refractive_index
-from iscat_analysis.species.tracks import TrackSetup, describe_tracks, track_numbers
+from iscat_analysis.species.tracks import TrackSetup, describe_tracks
 
 __all__ = [
     "LEAST_EVENTS",
@@ -66,5 +66,4 @@ __all__ = [
     "fit_diffusion",
     "hydrodynamic_diameter",
     "refractive_index",
-    "track_numbers",
 ]

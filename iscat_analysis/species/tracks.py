@@ -26,6 +26,7 @@ from iscat_analysis.records import (
     Status,
     TrackStatus,
     silent,
+    track_numbers,
 )
 from iscat_analysis.species.common_mass import CommonMass, combine_masses, information_power
 from iscat_analysis.species.diffusion import Diffusion, fit_diffusion, hydrodynamic_diameter
@@ -99,22 +100,6 @@ class TrackSetup:
 
 Correlation = Callable[[FloatArray], FloatArray]
 """From places (n, 2) [nm] to the correlation (n, n) of the masses fitted there."""
-
-
-def track_numbers(fits: pd.DataFrame) -> pd.Series[int]:
-    """Give the track of every row.
-
-    Parameters
-    ----------
-    fits : pandas.DataFrame
-        With ``track``, or from mode ``track`` alone, where ``event`` is the number of the track.
-
-    Returns
-    -------
-    pandas.Series
-        Whole numbers, missing where a row belongs to no track.
-    """
-    return fits["track"] if "track" in fits else fits["event"]
 
 
 def describe_tracks(
