@@ -37,7 +37,7 @@ _LEAST_POSITIONS = 4  # of a track whose D is fitted
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
 _AS_FOUND = 0.9  # of the threshold, that a fit must keep to have found its particle
-_FEW = 1e-3  # of all rows: a search that finds no more is the last
+_FEW = 2e-3  # of all rows: a search that adds no more is the last
 _BYTES = 6  # of memory for each pixel and frame
 
 IntArray = NDArray[np.int64]
@@ -169,7 +169,8 @@ def follow(
     for number in range(ROUNDS):
         progress("track", number, total)
         found = _search(scene, field, ground, rows, pool)
-        if number and len(found.frame) <= _FEW * len(rows.frame):
+        before = len(rows.frame)
+        if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(scene, rows, found)
         rows, ground, done, _ = field.settle(
@@ -181,6 +182,8 @@ def follow(
             coarse=True,
         )
         rows = _credible(scene, field, ground, rows, done)
+        if number and len(rows.frame) <= (1 + _FEW) * before:
+            break
     progress("track", ROUNDS, total)
     rows = _linked(config, rows)
     for stage in range(2):
