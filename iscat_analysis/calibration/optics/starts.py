@@ -218,8 +218,10 @@ def _parts(model: Any, sight: Sight, place: tuple[float, float]) -> tuple[FloatA
 
 
 def _quadratures(model: Any, sight: Sight) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Contrast per mass at reference phases 0 and 90° of a particle in the centre, and the
-    scattered light per square of the mass."""
+    """Contrast per mass at reference phases 0 and 90°, and scattered light per squared mass.
+
+    The particle is in the centre.
+    """
     pixels = model.pixels(sight.grid)
     along, power = np.zeros(sight.grid.shape, complex), np.zeros(sight.grid.shape)
     for down, high in zip(pixels.offsets, pixels.weights, strict=True):
