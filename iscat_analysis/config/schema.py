@@ -731,7 +731,8 @@ class Config(Section):
     """A whole configuration; `iscat_analysis.config.configure` makes one.
 
     The method of the background is explicit in it: where `background.method` is not given, it is
-    ``"fixed"`` if background frames are given, in dark field and in mode track, else ``"sliding"``.
+    ``"fixed"`` if background frames are given and in dark field, else ``"tracks"`` in mode track
+    and ``"sliding"`` in the others.
     """
 
     optics: Optics = Field(default_factory=Optics)
@@ -751,7 +752,8 @@ class Config(Section):
     def _explicit_method(self) -> Config:
         known = self.background.frames is not None or self.optics.scheme == "darkfield"
         if self.background.method is None:
-            method = "fixed" if known or self.fit.mode == "track" else "sliding"
+            method = "tracks" if self.fit.mode == "track" else "sliding"
+            method = "fixed" if known else method
             # The model is frozen for its users; here it is still being made.
             self.__dict__["background"] = self.background.model_copy(update={"method": method})
         elif self.background.method == "sliding" and self.optics.scheme == "darkfield":
@@ -761,8 +763,8 @@ class Config(Section):
             )
         elif self.background.method == "sliding" and self.fit.mode == "track":
             raise ValueError(
-                'background.method = "sliding" has no tracks: give background.frames for '
-                'fit.mode = "track"'
+                'background.method = "sliding" has no tracks: leave it out for fit.mode = "track", '
+                "or give background.frames"
             )
         elif self.background.method == "tracks" and self.fit.mode != "track":
             raise ValueError(

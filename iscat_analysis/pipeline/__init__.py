@@ -48,13 +48,14 @@ from iscat_analysis.pipeline.diagnosis import (
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.landing import analyse_landings, has_landings, inject_and_recover
 from iscat_analysis.pipeline.learning import learn_optics
+from iscat_analysis.pipeline.moving import track_scene
 from iscat_analysis.pipeline.ranges import frame_ranges, tracked_frames
 from iscat_analysis.pipeline.repeats import field_repeats
 from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
 from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
 from iscat_analysis.pipeline.scene import Scene, field_likelihood, make_scene
 from iscat_analysis.pipeline.systematic import with_systematic
-from iscat_analysis.pipeline.tracking import track_particles
+from iscat_analysis.pipeline.tracking import learns_background, track_movie, track_particles
 from iscat_analysis.pipeline.tracks import judge_times, make_films, tracks_of
 from iscat_analysis.records import (
     Analysis,
@@ -352,6 +353,8 @@ def _measured_background(
     """Find particles against frames before they bound, or against a known background."""
     further: dict[str, Any] = {}
     shape = (movie.shape[1], movie.shape[2])
+    if learns_background(config):
+        return _moving_particles(movie, config, camera, clock, notify=notify, progress=progress)
     before, after = frame_ranges(movie, config)
     searches = after[1] - after[0] if config.fit.mode == "track" else 1
     scene = make_scene(config, shape, searches=searches, lines=lines)
@@ -406,6 +409,31 @@ def _measured_background(
         image = windows.after_e - windows.power_ratio * windows.before_e
     clock.lap("results")
     return scene, found, image, further
+
+
+def _moving_particles(
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    clock: _Clock,
+    *,
+    notify: Notify,
+    progress: Progress,
+) -> tuple[Scene, Found, FloatArray, dict[str, Any]]:
+    """Track particles over a background that is learnt with them."""
+    first, last = config.fit.frames or (0, movie.shape[0])
+    scene = track_scene(config, (movie.shape[1], movie.shape[2]), max(last - first, 1))
+    _warm_up(scene, notify)
+    clock.lap("model")
+
+    def check(counts: NDArray[Any], first: int) -> None:
+        check_counts(counts, first, movie.name, camera=camera)
+
+    with threads(config.compute.workers) as pool:
+        found = track_movie(scene, movie, camera, check=check, pool=pool, progress=progress)
+    clock.lap("track")
+    image = found.windows.after_e / found.windows.before_e - 1
+    return replace(scene, mode="track", config=config), found, image, {}
 
 
 def _bound_particles(

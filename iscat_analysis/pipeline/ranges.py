@@ -32,11 +32,6 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
         The background leaves no frame to fit.
     """
     before = config.background.frames
-    if config.background.method == "tracks":
-        raise ConfigError(
-            'background.method = "tracks", the background of moving particles, is not available '
-            'yet: use "fixed" with frames that hold no particles'
-        )
     if config.background.method == "known":
         before = None
     elif before is None:
