@@ -24,6 +24,7 @@ from iscat_cli.options import (
 )
 
 if TYPE_CHECKING:
+    import pandas as pd
     from rich.table import Table
 
     from iscat_analysis.records import Analysis
@@ -108,7 +109,8 @@ def fit(
     """Fit the particles of a movie and set each spread beside its Cramér–Rao bounds.
 
     Writes fits.csv, fits.parquet, summary.json, config.toml, report.html and figures to the
-    output folder.
+    output folder; in mode track also tracks.csv and tracks.parquet: mass and diffusion
+    coefficient of every particle.
     """
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
@@ -142,12 +144,21 @@ def fit(
             )
         rows: list[dict[str, Any]] = analysis.table.to_dict("records")
         if as_json:
-            print_json("fit", {**analysis.summary, "events": rows, "out": str(folder)})
+            found: dict[str, Any] = {**analysis.summary, "events": rows, "out": str(folder)}
+            if analysis.tracks is not None:
+                found["tracks"] = analysis.tracks.to_dict("records")
+            print_json("fit", found)
         else:
             _print_table(analysis, rows, folder)
         flagged = [row for row in rows if _is_flagged(row)]
         if flagged:
             _advise(messages, flagged)
+        if analysis.tracks is not None:
+            from iscat_analysis.report.tracks import advice
+
+            for line in advice(analysis.tracks):
+                messages.notify(line)
+            flagged += [row for row in analysis.tracks.to_dict("records") if _is_flagged(row)]
         understated = analysis.summary.get("repeats", {}).get("understated", False)
         if strict and (flagged or understated):
             raise typer.Exit(FLAGGED)
@@ -202,6 +213,9 @@ def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: 
     from iscat_analysis.report.headline import is_uncalibrated as uncalibrated
     from iscat_analysis.report.numbers import count
 
+    if analysis.tracks is not None:
+        _print_tracks(analysis, folder)
+        return
     if rows:
         console = Console()
         width = console.width if console.is_terminal else None
@@ -219,8 +233,67 @@ def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: 
         print_result(f"… and {len(rows) - ROWS_SHOWN} more in {folder / 'fits.csv'}")
     counts = Counter(str(row["status"]) for row in rows)
     verdict = ", ".join(f"{n} {status}" for status, n in counts.most_common())
-    found = count(len(rows) - counts["sidelobe"], "row" if analysis.mode == "track" else "event")
+    found = count(len(rows) - counts["sidelobe"], "event")
     print_result(f"{found}{': ' if verdict else ''}{verdict}; results in {folder}")
+
+
+def _print_tracks(analysis: Analysis, folder: Path) -> None:
+    from iscat_analysis.report.headline import main_quantity
+    from iscat_analysis.report.numbers import count
+    from iscat_analysis.report.tables import event_table
+    from iscat_analysis.report.tracks import track_lines, tracks_headline, tracks_of
+
+    tracks = tracks_of(analysis)
+    if len(tracks):
+        contrast = main_quantity(analysis).column == "contrast"
+        print_result(tracks_table(tracks.head(ROWS_SHOWN), contrast=contrast))
+    if len(tracks) > ROWS_SHOWN:
+        print_result(f"… and {len(tracks) - ROWS_SHOWN} more in {folder / 'tracks.csv'}")
+    for line in (*tracks_headline(analysis, event_table(analysis)), *track_lines(analysis.summary)):
+        print_result(line)
+    print_result(f"{count(len(tracks), 'track')}; results in {folder}")
+
+
+def tracks_table(tracks: pd.DataFrame, *, contrast: bool = False) -> Table:
+    """Tabulate tracks: mass and D ± σ, and where they are known diameter and index.
+
+    Parameters
+    ----------
+    tracks : pandas.DataFrame
+        Rows of ``tracks.csv``.
+    contrast : bool
+        Show contrasts in place of masses.
+
+    Returns
+    -------
+    rich.table.Table
+        One row per track.
+    """
+    from rich.table import Table
+
+    from iscat_analysis.report.tracks import TRACK_HEADINGS
+
+    table = Table(box=None, pad_edge=False)
+    rows = tracks.to_dict("records")
+    columns: dict[str, list[str]] = {
+        "track": [str(row["track"]) for row in rows],
+        "frames": [f"{row['first_frame']}–{row['last_frame']}" for row in rows],
+    }
+    for name, (column, error, unit) in TRACK_HEADINGS.items():
+        if name == "mass" and contrast:
+            columns["contrast ± σ"] = [
+                _with_spread(row["contrast"], abs(row[error] * row["contrast"] / row[column]))
+                for row in rows
+            ]
+        elif name in ("mass", "D") or tracks[column].notna().any():
+            heading = f"{name} ± σ{f' [{unit}]' if unit else ''}"
+            columns[heading] = [_with_spread(row[column], row[error]) for row in rows]
+    columns["status"] = [str(row["status"]) for row in rows]
+    for heading in columns:
+        table.add_column(heading, justify="left" if heading == "status" else "right", no_wrap=True)
+    for line in zip(*columns.values(), strict=True):
+        table.add_row(*line)
+    return table
 
 
 def events_table(

@@ -73,8 +73,12 @@ if TYPE_CHECKING:
     from iscat_analysis.pipeline import fit_stack as fit_stack
     from iscat_analysis.records import EVENT_COLUMNS as EVENT_COLUMNS
     from iscat_analysis.records import FREE_PARAMETERS as FREE_PARAMETERS
+    from iscat_analysis.records import TRACK_COLUMNS as TRACK_COLUMNS
     from iscat_analysis.records import Analysis as Analysis
     from iscat_analysis.records import Status as Status
+    from iscat_analysis.records import TrackStatus as TrackStatus
+    from iscat_analysis.report.exchange import to_napari as to_napari
+    from iscat_analysis.report.exchange import to_trackpy as to_trackpy
     from iscat_analysis.result import Bounds as Bounds
     from iscat_analysis.result import Result as Result
     from iscat_analysis.schemas import schema as schema
@@ -85,6 +89,7 @@ if TYPE_CHECKING:
     from iscat_analysis.species import confinement_test as confinement_test
     from iscat_analysis.species import fit_diffusion as fit_diffusion
     from iscat_analysis.species import hydrodynamic_diameter as hydrodynamic_diameter
+    from iscat_analysis.species import refractive_index as refractive_index
 
 _HOME = {
     "Optics": "config",
@@ -104,6 +109,9 @@ _HOME = {
     "confinement_test": "species",
     "ConfinementTest": "species",
     "hydrodynamic_diameter": "species",
+    "refractive_index": "species",
+    "to_trackpy": "report.exchange",
+    "to_napari": "report.exchange",
     "configure": "config",
     "fit_movie": "notebook",
     "Result": "notebook",
@@ -122,6 +130,8 @@ _HOME = {
     "Status": "records",
     "EVENT_COLUMNS": "records",
     "FREE_PARAMETERS": "records",
+    "TRACK_COLUMNS": "records",
+    "TrackStatus": "records",
     "IscatError": "errors",
     "ConfigError": "errors",
     "DataError": "errors",
@@ -131,6 +141,7 @@ _HOME = {
 __all__ = [
     "EVENT_COLUMNS",
     "FREE_PARAMETERS",
+    "TRACK_COLUMNS",
     "Analysis",
     "AnomalousTest",
     "Bounds",
@@ -148,6 +159,7 @@ __all__ = [
     "Result",
     "Stack",
     "Status",
+    "TrackStatus",
     "anomalous_test",
     "calibrate_optics",
     "compute_bounds",
@@ -166,8 +178,11 @@ __all__ = [
     "open_stack",
     "psf",
     "qcrb",
+    "refractive_index",
     "schema",
     "simulate_movie",
+    "to_napari",
+    "to_trackpy",
 ]
 
 

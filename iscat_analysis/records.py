@@ -40,6 +40,16 @@ REPEAT_COLUMNS = ("repeat_x_nm", "repeat_y_nm", "repeat_z_nm", "repeat_mass_kda"
 """Columns of ``fits.csv``: standard errors of an event as disjoint parts of its own frames show
 them; of a single frame, as the empty places of that frame do."""
 
+TRACK_COLUMNS = (
+    "track", "first_frame", "last_frame", "n_frames", "mass_kda", "sigma_mass_kda", "crb_mass_kda",
+    "d_um2_s", "sigma_d_um2_s", "crb_d_um2_s", "diameter_nm", "sigma_diameter_nm",
+    "refractive_index", "confinement_nm", "status", "flags",
+    "d_low_um2_s", "d_high_um2_s", "d_disagreement", "p_confinement", "exponent", "sigma_exponent",
+    "p_anomalous", "sigma_refractive_index", "contrast", "mass_scatter", "p_mass", "n_mass_frames",
+    "n_d_frames", "x_nm", "y_nm", "z_nm", "nearest_nm", "begins", "ends",
+)  # fmt: skip
+"""The columns of ``tracks.csv``, in order."""
+
 
 class Progress(Protocol):
     """Told how far a stage has come; the command line turns it into a bar on stderr."""
@@ -125,6 +135,55 @@ def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
     """
     ordered = tuple(sorted(set(flags) - {Status.OK}, key=SEVERITY.index))
     return (ordered[0] if ordered else Status.OK), ordered
+
+
+def track_numbers(fits: pd.DataFrame) -> pd.Series[int]:
+    """Give the track of every row.
+
+    Parameters
+    ----------
+    fits : pandas.DataFrame
+        With ``track``, or from mode ``track`` alone, where ``event`` is the number of the track.
+
+    Returns
+    -------
+    pandas.Series
+        Whole numbers, missing where a row belongs to no track.
+    """
+    return fits["track"] if "track" in fits else fits["event"]
+
+
+class TrackStatus(StrEnum):
+    """The verdict on one track; worst first."""
+
+    FEW_FRAMES = "few_frames"
+    POOR_FITS = "poor_fits"
+    MASS_VARIES = "mass_varies"
+    NOT_FREE = "not_free"
+    STANDS_STILL = "stands_still"
+    NEAR_WALL = "near_wall"
+    OK = "ok"
+
+    @property
+    def advice(self) -> str:
+        """What the status means and what to try."""
+        return _TRACK_ADVICE[self]
+
+
+_TRACK_ADVICE = {
+    TrackStatus.OK: "The frames agree on one mass, and the particle diffuses freely.",
+    TrackStatus.FEW_FRAMES: "Fewer positions than track.min_frames: no diffusion coefficient.",
+    TrackStatus.POOR_FITS: "Fewer than half of its frames are ok, so that its mass is that of a "
+    "selection: see the status of its rows in fits.csv.",
+    TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors: motion blurs "
+    "the picture, particles met, or the particle changed.",
+    TrackStatus.NOT_FREE: "It does not diffuse freely: p_confinement and p_anomalous say which "
+    "way, and D is that of free diffusion.",
+    TrackStatus.STANDS_STILL: "Its D is not above zero within its error: take d_high_um2_s as an "
+    "upper limit, or record for longer.",
+    TrackStatus.NEAR_WALL: "The coverslip, so near, slows it by more than 5 %: its diameter "
+    "is too large, its index too small.",
+}
 
 
 @dataclass(frozen=True)
@@ -405,6 +464,30 @@ class EventView:
 
 
 @dataclass(frozen=True)
+class Film:
+    """Some frames of one track, in a square that follows it.
+
+    Attributes
+    ----------
+    track : int
+        Its number.
+    frames : tuple of int
+        Which frames.
+    why : str
+        Why this track is shown.
+    contrast, model, residual : ndarray, shape (t, y, x)
+        As in `EventView`.
+    """
+
+    track: int
+    frames: tuple[int, ...]
+    why: str
+    contrast: FloatArray
+    model: FloatArray
+    residual: FloatArray
+
+
+@dataclass(frozen=True)
 class Provenance:
     """Where a result came from.
 
@@ -462,6 +545,10 @@ class Analysis:
         Versions, hash, command.
     warnings : tuple of str
         One line each.
+    tracks : pandas.DataFrame or None
+        Mode ``track``: one row per track, columns `TRACK_COLUMNS`.
+    films : tuple of Film
+        Tracks that are shown frame by frame.
     """
 
     config_toml: str
@@ -476,3 +563,5 @@ class Analysis:
     summary: Mapping[str, Any]
     provenance: Provenance
     warnings: tuple[str, ...] = field(default=())
+    tracks: pd.DataFrame | None = None
+    films: tuple[Film, ...] = ()

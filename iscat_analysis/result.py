@@ -16,8 +16,17 @@ from matplotlib.figure import Figure
 
 from iscat_analysis.bounds import parse_scan, scan
 from iscat_analysis.config import Config
-from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Progress, silent
+from iscat_analysis.records import (
+    FREE_PARAMETERS,
+    TRACK_COLUMNS,
+    Analysis,
+    EventView,
+    FloatArray,
+    Progress,
+    silent,
+)
 from iscat_analysis.report import write_report
+from iscat_analysis.report.exchange import to_napari, to_trackpy
 from iscat_analysis.report.headline import (
     as_contrasts,
     caution,
@@ -30,6 +39,7 @@ from iscat_analysis.report.numbers import UNITS, count, number
 from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
 from iscat_analysis.report.posterior import posterior_groups
 from iscat_analysis.report.tables import event_table
+from iscat_analysis.report.tracks import tracks_headline, tracks_of
 
 if TYPE_CHECKING:
     from arviz import InferenceData
@@ -38,6 +48,7 @@ ROWS_SHOWN = 20
 """Events that a `Result` shows of itself in a notebook."""
 
 _COLUMNS = ("event", "frame", "x_px", "y_px", "z_nm", "mass_kda")
+_TRACK_COLUMNS = TRACK_COLUMNS[: TRACK_COLUMNS.index("refractive_index")]
 
 
 @dataclass(frozen=True, repr=False)
@@ -56,6 +67,11 @@ class Result:
     def table(self) -> pd.DataFrame:
         """One row per event, the columns of ``fits.csv``, which carry their units."""
         return self.analysis.table
+
+    @property
+    def tracks(self) -> pd.DataFrame:
+        """Mode ``track``: one row per track, the columns of ``tracks.csv``; else empty."""
+        return tracks_of(self.analysis)
 
     @property
     def summary(self) -> Mapping[str, Any]:
@@ -179,6 +195,14 @@ class Result:
         groups = posterior_groups(self.analysis, [view_of(self.analysis, event)])
         return arviz.InferenceData(**{name: group.isel(event=0) for name, group in groups.items()})
 
+    def trackpy(self) -> pd.DataFrame:
+        """Mode ``track``: the tracks in trackpy's layout; see `to_trackpy`."""
+        return to_trackpy(self.table)
+
+    def napari(self) -> FloatArray:
+        """Mode ``track``: the tracks as an array (track, t, y, x); see `to_napari`."""
+        return to_napari(self.table)
+
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write the report, the tables and the figures into a folder.
 
@@ -204,12 +228,16 @@ class Result:
     def _heading(self) -> str:
         analysis = self.analysis
         name = Path(analysis.provenance.input_path).name or "movie"
-        return f"{count(len(self), 'event')} in {name}, mode {analysis.mode}"
+        found = count(len(self), "event")
+        if analysis.tracks is not None:
+            found = f"{count(len(self.tracks), 'track')} of {count(len(self), 'position')}"
+        return f"{found} in {name}, mode {analysis.mode}"
 
     def _facts(self) -> list[tuple[str, str]]:
-        table = event_table(self.analysis)
-        facts = [("", text) for text in headline(self.analysis, table)] if len(self) else []
-        counts = table["status"].value_counts()
+        table, tracked = event_table(self.analysis), self.analysis.tracks is not None
+        said = tracks_headline if tracked else headline
+        facts = [("", text) for text in said(self.analysis, table)] if len(self) else []
+        counts = (self.tracks if tracked else table)["status"].value_counts()
         facts.append(("status", ", ".join(f"{n} {s}" for s, n in counts.items()) or "no events"))
         for name in FREE_PARAMETERS[self.mode] if caution(table) is None else ():
             p = precision_of(self.analysis, table, name)
@@ -227,7 +255,10 @@ class Result:
             for line in textwrap.wrap(f"{name} {text}".strip(), 78, initial_indent="  ",
                                       subsequent_indent="    ")
         ]  # fmt: skip
-        hint = "  look at .table, .view(0), .histogram(), .posterior(0); keep with .save(folder)"
+        looks = ".view(0), .histogram(), .posterior(0)"
+        if self.analysis.tracks is not None:
+            looks = ".tracks, .overview(), .view(0), .histogram()"
+        hint = f"  look at .table, {looks}; keep with .save(folder)"
         return "\n".join([f"Result: {self._heading()}", *lines, hint])
 
     def _repr_html_(self) -> str:
@@ -237,19 +268,23 @@ class Result:
             for name, text in self._facts()
         )
         names = [*_COLUMNS, *(f"sigma_{name}" for name in FREE_PARAMETERS[self.mode]), "status"]
-        shown = self.table.head(ROWS_SHOWN)
+        listed = self.table
+        if self.analysis.tracks is not None:
+            names, listed = [*_TRACK_COLUMNS, "status"], self.tracks
+        shown = listed.head(ROWS_SHOWN)
         if main_quantity(self.analysis).column == "contrast":
             shown = as_contrasts(shown)
         shown = shown[names]
         if main_quantity(self.analysis).column == "contrast":
             new = {"mass_kda": "contrast", "sigma_mass_kda": "sigma_contrast"}
             shown = shown.rename(columns=new)
-        rest = len(self) - len(shown)
-        more = f"<p>… and {rest} more in <code>.table</code></p>" if rest else ""
+        rest = len(listed) - len(shown)
+        where = ".table" if listed is self.table else ".tracks"
+        more = f"<p>… and {rest} more in <code>{where}</code></p>" if rest else ""
         body = shown.to_html(index=False, float_format="{:.4g}".format, border=0, escape=True)
         return (
             f"<p><b>{html.escape(self._heading())}</b></p><table>{facts}</table>"
-            f"{body if len(self) else ''}{more}"
+            f"{body if len(listed) else ''}{more}"
         )
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+from walkers import SETUP
 
 from iscat_analysis.config import config_to_toml, parse_config
 from iscat_analysis.records import (
@@ -13,11 +14,14 @@ from iscat_analysis.records import (
     FREE_PARAMETERS,
     Analysis,
     EventView,
+    Film,
     PosteriorResult,
     Provenance,
     Status,
 )
+from iscat_analysis.species import describe_tracks
 
+FRAMES_OF_TRACK = 10
 HOSTILE = "/data/<script>alert(1)<img src=x onerror=alert(2)> & 'run' \"7\".tif"
 PIXEL_NM = 84.4
 
@@ -55,14 +59,16 @@ def make_analysis(
     n: int = 40, mode: str = "mass", *, scheme: str = "iscat", posteriors: int = 0,
     refused: int = 0, seed: int = 3, side: int = 32, field: int = 128,
 ) -> Analysis:  # fmt: skip
-    """Invent an analysis of `n` events (rows in track mode, ten to a track)."""
+    """Invent an analysis of `n` events (rows in track mode, `FRAMES_OF_TRACK` to a track)."""
     rng = np.random.default_rng(seed)
     free = FREE_PARAMETERS[mode]
     dark = scheme == "darkfield"
     mass = rng.choice([66.0, 146.0, 480.0], n) * rng.normal(1, 0.04, n)
     mass[::9] *= -1
     height = rng.gamma(4, 40, n) if "z_nm" in free else np.full(n, 5.0)
-    events = np.arange(n) // 10 if mode == "track" else np.arange(n)
+    events = np.arange(n) // FRAMES_OF_TRACK if mode == "track" else np.arange(n)
+    if mode == "track":
+        mass = rng.choice([66.0, 146.0, 480.0], n)[events] * rng.normal(1, 0.04, n)
     x = rng.uniform(8, field - 8, n)
     y = rng.uniform(8, field - 8, n)
     if mode == "track":
@@ -73,7 +79,9 @@ def make_analysis(
     base = {"x_nm": 2.1, "y_nm": 2.3, "z_nm": 9.0, "mass_kda": 4.2}
     table: dict[str, object] = {
         "event": events,
-        "frame": np.sort(rng.integers(20, 900, n)) if mode != "track" else 200 + np.arange(n) % 10,
+        "frame": np.sort(rng.integers(20, 900, n))
+        if mode != "track"
+        else 200 + np.arange(n) % FRAMES_OF_TRACK,
         "n_before": np.full(n, 200),
         "n_after": np.full(n, 200),
         "x_px": x,
@@ -129,6 +137,14 @@ def make_analysis(
         views.append(EventView(int(events[i]), row, column, data, model, (data - model) / noise,
                                sampled))  # fmt: skip
     values = {"fit": {"mode": mode}, "optics": {"scheme": scheme, "attenuation": 0.1}}
+    summary = summary_of(frame, mode, scheme)
+    tracks, films = None, ()
+    if mode == "track":
+        _, first = np.unique(events, return_index=True)
+        views = [views[k] for k in first]
+        tracks = describe_tracks(frame, replace(SETUP, field_nm=(field * PIXEL_NM,) * 2))
+        films = tuple(film_of(rng, track) for track in tracks["track"][:2])
+        summary |= {"tracks": len(tracks), "motion": motion_of(tracks)}
     return Analysis(
         config_toml=config_to_toml(parse_config(values)),
         mode=mode,
@@ -139,7 +155,9 @@ def make_analysis(
         ratio_image=image,
         power=1 + 0.004 * rng.standard_normal(400).cumsum() / 8,
         power_frames=np.arange(400),
-        summary=summary_of(frame, mode, scheme),
+        summary=summary,
+        tracks=tracks,
+        films=films,
         provenance=Provenance(
             command=f"iscat-fit {HOSTILE} --mode {mode} # </script><!--<script>",
             input_path=HOSTILE,
@@ -150,6 +168,24 @@ def make_analysis(
         ),
         warnings=("The TIFF says pixel_size_nm = 84.0, the configuration 84.4: using 84.4.",),
     )
+
+
+def film_of(rng: np.random.Generator, track: int) -> Film:
+    """Invent six frames of a track."""
+    model = np.array([spot(24, 11 + k / 2, 12.0, 2.4) for k in range(6)]) * -0.01
+    noise = rng.normal(0, 1, model.shape)
+    noise[0, 0, 0] = np.nan
+    return Film(track, tuple(range(6)), "because it is <b>long</b>", model + 0.001 * noise, model,
+                noise)  # fmt: skip
+
+
+def motion_of(tracks: pd.DataFrame) -> dict[str, object]:
+    """Say of invented tracks what a summary says."""
+    return {
+        "frame_rate_hz": 331.0, "exposure_ms": 2.5, "medians": {}, "flags": {},
+        "status": tracks["status"].value_counts().to_dict(), "sigma_d_over_d_median": None,
+        "begin_inside": 0, "end_inside": 0, "cross_border": len(tracks), "crossed": 0,
+    }  # fmt: skip
 
 
 def summary_of(table: pd.DataFrame, mode: str, scheme: str) -> dict[str, object]:
@@ -182,4 +218,7 @@ def summary_of(table: pd.DataFrame, mode: str, scheme: str) -> dict[str, object]
 
 def without_events(analysis: Analysis) -> Analysis:
     """Take every event out of an analysis."""
-    return replace(analysis, table=analysis.table.iloc[:0], views=(), warnings=())
+    tracks = None if analysis.tracks is None else analysis.tracks.iloc[:0]
+    return replace(
+        analysis, table=analysis.table.iloc[:0], views=(), warnings=(), tracks=tracks, films=()
+    )

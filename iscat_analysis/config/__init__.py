@@ -34,6 +34,7 @@ from iscat_analysis.config.schema import (
     SimulatedEvent,
     SimulatedMover,
     Simulation,
+    TrackConfig,
     plausible_pixel,
 )
 
@@ -62,6 +63,7 @@ __all__ = [
     "SimulatedEvent",
     "SimulatedMover",
     "Simulation",
+    "TrackConfig",
     "config_to_toml",
     "configure",
     "load_config",

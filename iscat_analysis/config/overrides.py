@@ -222,6 +222,7 @@ _METHOD_FOLLOWS = {
     ("optics", "scheme"),
     ("fit", "mode"),
 }
+_WITHOUT_FRAMES = ("sliding", "tracks")
 
 
 def _choose_method_again(values: dict[str, Any], changes: Iterable[Change]) -> None:
@@ -236,9 +237,9 @@ def _choose_method_again(values: dict[str, Any], changes: Iterable[Change]) -> N
         return
     named = {key: value for section, key, value in changes if section == "background"}
     if named.get("method") is not None:
-        if named["method"] == "sliding" and "frames" not in named:
+        if named["method"] in _WITHOUT_FRAMES and "frames" not in named:
             background.pop("frames", None)
-    elif background.get("method") == "sliding" or (
+    elif background.get("method") in _WITHOUT_FRAMES or (
         background.get("method") == "fixed" and background.get("frames") is None
     ):
         del background["method"]

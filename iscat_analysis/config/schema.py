@@ -388,8 +388,9 @@ class BackgroundConfig(Section):
 
     method: Method | None = Field(
         None,
-        description='"fixed": the mean of frames | "median": their median | "sliding": landing '
-        'movies | "tracks": moving particles | "known": level_e',
+        description='"fixed": the mean of frames | "median": their median, in mode track without '
+        'frames that of all | "sliding": landing movies | "tracks": moving particles, together '
+        'with their tracks | "known": level_e',
     )
     frames: FrameRange | None = Field(
         None, description="pre-binding frames [start, stop); absent in landing movies"
@@ -419,10 +420,10 @@ class BackgroundConfig(Section):
                 'method = "sliding" takes every frame against its neighbours: leave frames out, '
                 'or set method = "fixed"'
             )
-        if self.method == "tracks":
+        if self.method == "tracks" and self.frames is not None:
             raise ValueError(
-                'method = "tracks", the background of moving particles, is not available yet: use '
-                '"fixed" with frames that hold no particles'
+                'method = "tracks" learns the background from the frames in which the particles '
+                'are: leave frames out, or set method = "fixed"'
             )
         return self
 
@@ -470,6 +471,28 @@ class Fit(Section):
     def roi_px(self, pixel_nm: float) -> int:
         """Side of the square that is fitted, in pixels of a given side [nm]."""
         return max(5, round(self.roi_nm / pixel_nm))
+
+
+class TrackConfig(Section):
+    """Mode track: particles that move."""
+
+    free: Literal["mass", "joint"] = Field(
+        "joint",
+        description='fitted per frame: "mass" (x, y, mass: a membrane) | "joint" (x, y, z, mass)',
+    )
+    max_step_nm: Annotated[Positive, _length(1.0, LARGEST_NM)] = Field(
+        600.0, description="farthest that a particle goes from one frame to the next"
+    )
+    memory_frames: Annotated[int, Field(ge=0, le=1000)] = Field(
+        3, description="frames in which a particle may be missed without losing its track"
+    )
+    min_frames: Annotated[int, Field(ge=1)] = Field(10, description="shorter tracks are left out")
+    viscosity_mpa_s: Positive = Field(
+        0.89, description="of the medium, for hydrodynamic diameters; water at 25 °C: 0.89"
+    )
+    temperature_c: Annotated[float, Field(gt=-273.15, lt=1000.0)] = Field(
+        25.0, description="of the medium, for hydrodynamic diameters"
+    )
 
 
 class PosteriorConfig(Section):
@@ -708,7 +731,8 @@ class Config(Section):
     """A whole configuration; `iscat_analysis.config.configure` makes one.
 
     The method of the background is explicit in it: where `background.method` is not given, it is
-    ``"fixed"`` if background frames are given, in dark field and in mode track, else ``"sliding"``.
+    ``"fixed"`` if background frames are given and in dark field, else ``"tracks"`` in mode track
+    and ``"sliding"`` in the others.
     """
 
     optics: Optics = Field(default_factory=Optics)
@@ -717,6 +741,7 @@ class Config(Section):
     background: BackgroundConfig = Field(default_factory=BackgroundConfig)
     detection: Detection = Field(default_factory=Detection)
     fit: Fit = Field(default_factory=Fit)
+    track: TrackConfig = Field(default_factory=TrackConfig)
     posterior: PosteriorConfig = Field(default_factory=PosteriorConfig)
     calibration: Calibration | None = None
     simulation: Simulation = Field(default_factory=Simulation)
@@ -727,7 +752,8 @@ class Config(Section):
     def _explicit_method(self) -> Config:
         known = self.background.frames is not None or self.optics.scheme == "darkfield"
         if self.background.method is None:
-            method = "fixed" if known or self.fit.mode == "track" else "sliding"
+            method = "tracks" if self.fit.mode == "track" else "sliding"
+            method = "fixed" if known else method
             # The model is frozen for its users; here it is still being made.
             self.__dict__["background"] = self.background.model_copy(update={"method": method})
         elif self.background.method == "sliding" and self.optics.scheme == "darkfield":
@@ -737,8 +763,19 @@ class Config(Section):
             )
         elif self.background.method == "sliding" and self.fit.mode == "track":
             raise ValueError(
-                'background.method = "sliding" has no tracks: give background.frames for '
-                'fit.mode = "track"'
+                'background.method = "sliding" has no tracks: leave it out for fit.mode = "track", '
+                "or give background.frames"
+            )
+        elif self.background.method == "tracks" and self.fit.mode != "track":
+            raise ValueError(
+                'background.method = "tracks" is made of what fit.mode = "track" finds, and '
+                f'fit.mode is "{self.fit.mode}": use "sliding" for particles that land, or '
+                '"fixed" with background.frames'
+            )
+        elif self.background.method == "tracks" and self.optics.scheme == "darkfield":
+            raise ValueError(
+                'background.method = "tracks" needs an interferometric scheme: dark field needs '
+                "background.frames"
             )
         return self
 

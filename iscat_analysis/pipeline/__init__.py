@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config, config_to_toml
@@ -47,15 +48,18 @@ from iscat_analysis.pipeline.diagnosis import (
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.landing import analyse_landings, has_landings, inject_and_recover
 from iscat_analysis.pipeline.learning import learn_optics
-from iscat_analysis.pipeline.ranges import frame_ranges
+from iscat_analysis.pipeline.moving import track_scene
+from iscat_analysis.pipeline.ranges import frame_ranges, tracked_frames
 from iscat_analysis.pipeline.repeats import field_repeats
 from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
 from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
 from iscat_analysis.pipeline.scene import Scene, field_likelihood, make_scene
 from iscat_analysis.pipeline.systematic import with_systematic
-from iscat_analysis.pipeline.tracking import track_particles
+from iscat_analysis.pipeline.tracking import learns_background, track_movie, track_particles
+from iscat_analysis.pipeline.tracks import judge_times, make_films, tracks_of
 from iscat_analysis.records import (
     Analysis,
+    Film,
     FloatArray,
     PosteriorResult,
     Progress,
@@ -199,6 +203,9 @@ def analyse(
     config, notes = resolve_metadata(config, movie.metadata)
     for note in (*movie.notes, *notes):
         tell(note)
+    if config.fit.mode == "track":
+        for note in judge_times(config, tracked_frames(movie, config), movie.name):
+            tell(note)
     if config.optics.scheme == "darkfield" and config.particle.photons_per_frame is None:
         photons = config.simulation.photons_per_pixel
         tell(
@@ -287,6 +294,13 @@ def analyse(
         if further["repeats"]["message"]:
             tell(further["repeats"]["message"])
         found = replace(found, table=table)
+    tracks: pd.DataFrame | None = None
+    films: tuple[Film, ...] = ()
+    if scene.mode == "track":
+        tracks, said = tracks_of(scene, found.table, windows, tell=tell, progress=progress)
+        further |= said
+        films = make_films(scene, steady, camera, windows, found.table, tracks)
+        clock.lap("tracks")
     summary = summary_of(scene, found.table, windows, clock.seconds, achieved)
     sampled = config.samples_posterior
     provenance = Provenance(
@@ -320,6 +334,8 @@ def analyse(
         summary=summary,
         provenance=provenance,
         warnings=tuple(warnings),
+        tracks=tracks,
+        films=films,
     )
 
 
@@ -337,6 +353,8 @@ def _measured_background(
     """Find particles against frames before they bound, or against a known background."""
     further: dict[str, Any] = {}
     shape = (movie.shape[1], movie.shape[2])
+    if learns_background(config):
+        return _moving_particles(movie, config, camera, clock, notify=notify, progress=progress)
     before, after = frame_ranges(movie, config)
     searches = after[1] - after[0] if config.fit.mode == "track" else 1
     scene = make_scene(config, shape, searches=searches, lines=lines)
@@ -391,6 +409,31 @@ def _measured_background(
         image = windows.after_e - windows.power_ratio * windows.before_e
     clock.lap("results")
     return scene, found, image, further
+
+
+def _moving_particles(
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    clock: _Clock,
+    *,
+    notify: Notify,
+    progress: Progress,
+) -> tuple[Scene, Found, FloatArray, dict[str, Any]]:
+    """Track particles over a background that is learnt with them."""
+    first, last = config.fit.frames or (0, movie.shape[0])
+    scene = track_scene(config, (movie.shape[1], movie.shape[2]), max(last - first, 1))
+    _warm_up(scene, notify)
+    clock.lap("model")
+
+    def check(counts: NDArray[Any], first: int) -> None:
+        check_counts(counts, first, movie.name, camera=camera)
+
+    with threads(config.compute.workers) as pool:
+        found = track_movie(scene, movie, camera, check=check, pool=pool, progress=progress)
+    clock.lap("track")
+    image = found.windows.after_e / found.windows.before_e - 1
+    return replace(scene, mode="track", config=config), found, image, {}
 
 
 def _bound_particles(

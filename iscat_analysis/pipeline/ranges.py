@@ -47,3 +47,24 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
             f"{start} of them, so none is left to fit; change background.frames"
         )
     return before, after
+
+
+def tracked_frames(movie: Stack, config: Config) -> int:
+    """Count the frames in which mode ``track`` looks for particles.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        Its ranges may be left open.
+
+    Returns
+    -------
+    int
+        At least 0.
+    """
+    before = config.background.frames
+    first = before[1] if before else 0
+    first, last = config.fit.frames or (first, movie.shape[0])
+    return max(min(last, movie.shape[0]) - first, 0)

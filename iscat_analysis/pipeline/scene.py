@@ -34,7 +34,9 @@ SPREAD_NM = 10_000.0
 SATURATION_NM = 500.0
 """Saturated pixels nearer than this spoil a fit."""
 
-_VARIANCE_OF_BACKGROUND = {"fixed": MEAN, "sliding": MEAN, "median": MEDIAN, "known": KNOWN}
+_VARIANCE_OF_BACKGROUND = {
+    "fixed": MEAN, "sliding": MEAN, "tracks": MEAN, "median": MEDIAN, "known": KNOWN,
+}  # fmt: skip
 """Variance of a measured background over that of the mean of its frames."""
 
 

@@ -38,8 +38,9 @@ def write_report(
 ) -> Path:
     """Write everything one analysis found into a folder.
 
-    ``fits.csv``, ``fits.parquet``, ``summary.json``, ``config.toml``, ``posterior.nc`` (where a
-    posterior converged), ``report.html`` and ``figures/``.  The folder appears complete or not at
+    ``fits.csv``, ``fits.parquet``, in mode ``track`` ``tracks.csv`` and ``tracks.parquet``,
+    ``summary.json``, ``config.toml``, ``posterior.nc`` (where a posterior converged),
+    ``report.html`` and ``figures/``.  The folder appears complete or not at
     all; an earlier result is replaced only once the new one is complete.
 
     Parameters

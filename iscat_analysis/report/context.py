@@ -61,7 +61,8 @@ def report_context(
         The template's context.
     """
     source = analysis.provenance.input_path
-    images = event_images(analysis, table)
+    tracked = analysis.tracks is not None  # then `tracks_context` says what is said of events
+    images = {} if tracked else event_images(analysis, table)
     sampled = [view for view in analysis.views if view.posterior is not None]
     started = _when(analysis.provenance.started)
     said = headline(analysis, table)
@@ -88,7 +89,7 @@ def report_context(
         "histogram": next((name for name in figures if name.endswith("_histogram")), None),
         "main_label": main_quantity(analysis).label.capitalize(),
         "signs": _SIGNS.get(main_quantity(analysis).column),
-        "events": event_rows(analysis, table),
+        "events": {} if tracked else event_rows(analysis, table),
         "images": {str(row): list(packed) for row, packed in images.items()},
         "embedding_note": f"To keep this page small it holds the images of the first {len(images)} "
         f"of {len(table)} events."
@@ -121,13 +122,11 @@ def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
     flagged = int((table["status"] != Status.OK.value).sum())
     tiles = [
         {
-            "label": "Events" if analysis.mode != "track" else "Fitted positions",
+            "label": "Events",
             "value": str(len(table)),
             "note": f"{len(table) - flagged} ok, {flagged} flagged",
         }
     ]
-    if analysis.mode == "track":
-        tiles[0]["note"] = f"{count(table['event'].nunique(), 'track')}, " + tiles[0]["note"]
     values, main = sizes(analysis, table), main_quantity(analysis)
     if caution(table) is not None or not values.size:
         return tiles

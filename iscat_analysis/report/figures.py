@@ -23,6 +23,7 @@ from iscat_analysis.report.headline import as_contrasts, label_of, main_quantity
 from iscat_analysis.report.numbers import UNITS
 from iscat_analysis.report.spread import counted, spread_figure
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, VERMILLION, new_figure
+from iscat_analysis.report.track_figures import track_figures
 
 NUMBERED_EVENTS = 100
 """Events in the overview that may carry their number; the others are rings only."""
@@ -49,18 +50,23 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[tuple[str,
     Yields
     ------
     name : str
-        ``overview`` (the field with its events), a histogram, ``timeline``, ``precision`` (σ
+        Those of `track_figures` where there are tracks, else ``overview`` (the field with its
+        events), a histogram, ``timeline``, ``precision`` (σ
         against the bounds), ``spread`` (what was measured of it), ``diagnostics`` and ``power``;
         what has no data is left out.
     figure : Figure
         The figure.
     """
-    if np.asarray(analysis.ratio_image).size:
-        yield "overview", overview(analysis, table)
     main = main_quantity(analysis).column
-    if np.isfinite(counted(table)[main].to_numpy(float)).any():
+    fitted = np.isfinite(counted(table)[main].to_numpy(float)).any()
+    if analysis.tracks is not None:
+        yield from track_figures(analysis, table)
+    elif np.asarray(analysis.ratio_image).size:
+        yield "overview", overview(analysis, table)
+    if fitted and analysis.tracks is None:
         yield f"{_NAMES.get(main, main)}_histogram", histogram(analysis, table)
         yield "timeline", timeline(analysis, table)
+    if fitted:
         yield "precision", precision(analysis, table)
     if (measured := spread_figure(analysis, label_of)) is not None:
         yield "spread", measured
@@ -72,14 +78,21 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[tuple[str,
 
 
 def _points(
-    axes: Axes, x: FloatArray, y: FloatArray, rows: BoolArray, mark: str, **look: Any
+    axes: Axes,
+    x: FloatArray,
+    y: FloatArray,
+    rows: BoolArray,
+    mark: str,
+    *,
+    linked: bool = True,
+    **look: Any,
 ) -> None:
-    """Draw points that know the rows of the table they stand for."""
+    """Draw points that know the rows of the table they stand for, unless it is not on the page."""
     at = np.flatnonzero(rows & np.isfinite(x) & np.isfinite(y))
     (line,) = axes.plot(x[at], y[at], mark, ls="none", **look)
-    if at.size <= MOST_POINTS:
+    if linked and at.size <= MOST_POINTS:
         line.set_gid("rows-" + "_".join(map(str, at)))
-    else:
+    elif at.size > MOST_POINTS:
         line.set_rasterized(True)
 
 
@@ -110,12 +123,8 @@ def overview(analysis: Analysis, table: pd.DataFrame) -> Figure:
     scale_bar(axes, columns, rows, analysis.pixel_size_nm)
     unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
     figure.colorbar(shown, ax=axes, label=unit, fraction=0.05, pad=0.02)
-    if not table["event"].is_unique:
-        for _, track in table.groupby("event", sort=False):
-            axes.plot(track["x_px"], track["y_px"], color="#56B4E9", lw=1)
     x, y = table["x_px"].to_numpy(float), table["y_px"].to_numpy(float)
-    ring = 11 if table["event"].is_unique else 4
-    _points(axes, x, y, np.isfinite(x), "o", mfc="none", mec="#F0E442", ms=ring, mew=1)
+    _points(axes, x, y, np.isfinite(x), "o", mfc="none", mec="#F0E442", ms=11, mew=1)
     first = table.drop_duplicates("event")[["event", "x_px", "y_px"]].dropna()
     _number(axes, first.to_numpy(float), columns / 5.2, (rows, columns))
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
@@ -281,11 +290,14 @@ def precision(analysis: Analysis, table: pd.DataFrame) -> Figure:
             continue
         ends = np.array([crb[usable].min() / 1.15, crb[usable].max() * 1.15])
         axes.plot(ends, ends, color=INK, lw=1.2, label="CRB")
-        look: dict[str, Any] = {"ms": 3.5, "alpha": 0.7, "mew": 0}
+        look: dict[str, Any] = {
+            "ms": 3.5, "alpha": 0.7, "mew": 0, "linked": analysis.tracks is None
+        }  # fmt: skip
         _points(axes, crb, qcrb, usable, "s", color=BLUE, label="QCRB", **look)
         _points(axes, crb, sigma, usable & good, "o", color=VERMILLION, label="σ", **look)
         if (usable & ~good).any():
-            _points(axes, crb, sigma, usable & ~good, "x", color=PURPLE, ms=4, label="σ, flagged")
+            _points(axes, crb, sigma, usable & ~good, "x", color=PURPLE, label="σ, flagged",
+                    linked=analysis.tracks is None, ms=4)  # fmt: skip
         axes.set(xscale="log", yscale="log", xlim=tuple(ends))
         _plain_log_ticks(axes)
     named = {

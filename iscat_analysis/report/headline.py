@@ -330,10 +330,9 @@ def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
     if (flagged := caution(table)) is not None:
         return [flagged, *spread_lines(analysis, table), *warned]
     good = int((table["status"] == Status.OK.value).sum())
-    kind = "fitted position" if analysis.mode == "track" else "event"
-    text = f"{count(len(table), kind)}, {good if good < len(table) else 'all'} of them ok."
+    text = f"{count(len(table), 'event')}, {good if good < len(table) else 'all'} of them ok."
     if len(table) == 1:
-        text = f"One {kind}, and it is ok."
+        text = "One event, and it is ok."
     main, values = main_quantity(analysis), sizes(analysis, table)
     if values.size > 1:
         low, middle, high = quantiles(values)

@@ -24,6 +24,8 @@ OUTPUT_NAMES = frozenset(
     {
         "fits.csv",
         "fits.parquet",
+        "tracks.csv",
+        "tracks.parquet",
         "summary.json",
         "config.toml",
         "posterior.nc",

@@ -18,6 +18,7 @@ from iscat_analysis.report.figures import page_figures
 from iscat_analysis.report.headline import caution, is_uncalibrated
 from iscat_analysis.report.style import publish
 from iscat_analysis.report.tables import event_table
+from iscat_analysis.report.track_context import tracks_context
 from iscat_analysis.schemas import jsonable
 
 
@@ -88,11 +89,16 @@ def render_report(analysis: Analysis, *, folder: Path | None = None) -> str:
         corner_figures(analysis),
     )
     context = report_context(analysis, table, publish(drawn, folder))
+    tracked = analysis.tracks is not None
+    if tracked:
+        context |= tracks_context(analysis, table, folder)
     nav = [
         ("summary", "Summary"),
         ("distributions", "Distributions" if len(table) else "Field"),
+        *([("films", "Films")] if tracked and context["films"] else []),
         *([(species["id"], species["title"])] if species else []),
-        *([("precision", "Precision"), ("events", "Events")] if len(table) else []),
+        *([("precision", "Precision")] if len(table) else []),
+        *([("events", "Tracks" if tracked else "Events")] if context["n_events"] else []),
         *(
             [("posterior", "Posterior")]
             if context["posterior_rows"] or context["refused_rows"]
@@ -102,7 +108,9 @@ def render_report(analysis: Analysis, *, folder: Path | None = None) -> str:
         ("configuration", "Configuration"),
         ("provenance", "Provenance"),
     ]
-    return render_page("report.html", {**context, "species": species, "nav": nav})
+    return render_page(
+        "report.html", {"tracked": tracked, **context, "species": species, "nav": nav}
+    )
 
 
 class _AskableUndefined(jinja2.StrictUndefined):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import matplotlib as mpl
 import numpy as np
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import Analysis, EventView, PosteriorResult, Status
-from iscat_analysis.report import event_figures, figures
+from iscat_analysis.report import event_figures, figures, track_figures
 from iscat_analysis.report.headline import main_quantity
 from iscat_analysis.report.style import STYLE
 from iscat_analysis.report.tables import event_table
@@ -42,12 +42,15 @@ def draw(analysis: Analysis, kind: str) -> Figure:
     """
     table = event_table(analysis)
     main = main_quantity(analysis).column
-    kinds: Mapping[str, Callable[[], Figure]] = {
+    kinds: dict[str, Callable[[], Figure]] = {
         "overview": lambda: figures.overview(analysis, table),
         "histogram": lambda: figures.histogram(analysis, table),
         "precision": lambda: figures.precision(analysis, table),
         "power": lambda: figures.power(analysis),
     }
+    if analysis.tracks is not None:
+        kinds["overview"] = lambda: track_figures.trajectories(analysis, table)
+        kinds["histogram"] = lambda: track_figures.distributions(analysis)
     if kind not in kinds:
         raise ValueError(f"kind = {kind!r}: choose one of {', '.join(kinds)}")
     if kind in ("histogram", "precision") and not np.isfinite(table[main].to_numpy(float)).any():

@@ -59,7 +59,9 @@ def _text(value: Any) -> str:
 
 
 def write_tables(analysis: Analysis, folder: Path) -> None:
-    """Write ``fits.csv``, ``fits.parquet``, ``summary.json`` and ``config.toml``.
+    """Write ``fits.csv``, ``tracks.csv`` where there are tracks, both as Parquet, and the rest.
+
+    The rest is ``summary.json`` and ``config.toml``.
 
     Parameters
     ----------
@@ -68,12 +70,16 @@ def write_tables(analysis: Analysis, folder: Path) -> None:
     folder : Path
         An existing folder.
     """
-    table = event_table(analysis)
-    table.to_csv(
-        folder / "fits.csv", index=False, float_format=f"%.{CSV_DIGITS}g", lineterminator="\n"
-    )
-    with (folder / "fits.parquet").open("wb") as file:  # pyarrow opens no path that is not text
-        table.to_parquet(file, index=False)
+    tables = {"fits": event_table(analysis)}
+    if analysis.tracks is not None:
+        tables["tracks"] = analysis.tracks
+    for name, table in tables.items():
+        table.to_csv(
+            folder / f"{name}.csv", index=False, float_format=f"%.{CSV_DIGITS}g",
+            lineterminator="\n",
+        )  # fmt: skip
+        with (folder / f"{name}.parquet").open("wb") as file:  # pyarrow wants paths as text
+            table.to_parquet(file, index=False)
     summary = to_json("summary", analysis.summary)
     (folder / "summary.json").write_text(summary + "\n", encoding="utf-8")
     (folder / "config.toml").write_text(analysis.config_toml, encoding="utf-8")

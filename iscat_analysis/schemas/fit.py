@@ -25,6 +25,7 @@ from iscat_analysis.schemas.base import (
     maybe,
 )
 from iscat_analysis.schemas.calibration import OpticsParameter, Twin
+from iscat_analysis.schemas.tracks import Motion, Track
 
 _SIGMA = "Standard deviation from the observed information [{}]; null where it is not free"
 _CRB = "Joint Cramér–Rao bound at the estimate [{}]; null where the parameter is not free"
@@ -319,6 +320,8 @@ class Summary(Document):
     background: Background = maybe("Movies with background frames: noise and drift")
     landing: Landing = maybe("Landing movies: windows, search, noise and drift")
     injection: Injection = maybe("With --inject: known particles added to the movie")
+    tracks: Count = maybe("Mode track: tracks found")
+    motion: Motion = maybe("Mode track: what the tracks come to")
     across_particles: list[Across] = maybe(
         "Width of each species beyond σ; where the model is rejected, poor fits are counted too"
     )
@@ -331,9 +334,10 @@ class Summary(Document):
 
 
 class Fit(Summary):
-    """What iscat fit prints: the summary, with the events in place of their number."""
+    """What iscat fit prints: the summary, with events and tracks in place of their numbers."""
 
     events: list[Event] = key("The rows of fits.csv")  # type: ignore[assignment]
+    tracks: list[Track] = maybe("Mode track: the rows of tracks.csv")  # type: ignore[assignment]
     out: str = key("Output folder")
 
 

@@ -25,7 +25,8 @@ the likelihood above, `search` tries numbers of species, `bootstrap` repeats the
 
 A track tells a diffusion coefficient: `displacements` has the likelihood of its steps, with errors
 and motion blur, `diffusion` the estimate and the size that follows, and `motion` asks whether the
-particle diffuses freely.
+particle diffuses freely.  `tracks` puts all that and the mass (`common_mass`) into one row per
+track, with the refractive index (`refraction`) of particles in a volume.
 """
 
 from __future__ import annotations
@@ -45,6 +46,8 @@ from iscat_analysis.species.motion import (
     anomalous_test,
     confinement_test,
 )
+from iscat_analysis.species.refraction import refractive_index
+from iscat_analysis.species.tracks import TrackSetup, describe_tracks
 
 __all__ = [
     "LEAST_EVENTS",
@@ -55,9 +58,12 @@ __all__ = [
     "Diffusion",
     "Distribution",
     "Efficiency",
+    "TrackSetup",
     "anomalous_test",
     "confinement_test",
     "describe",
+    "describe_tracks",
     "fit_diffusion",
     "hydrodynamic_diameter",
+    "refractive_index",
 ]

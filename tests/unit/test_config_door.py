@@ -138,7 +138,7 @@ def test_nothing_asks_which_keys_were_given() -> None:
         (["background.frames=[0, 100]"], "fixed"),
         (["optics.scheme=cobri"], "sliding"),
         (["optics.scheme=darkfield"], "fixed"),
-        (["fit.mode=track"], "fixed"),
+        (["fit.mode=track"], "tracks"),
         (["background.method=median"], "median"),
         (["background.method=known", "background.level_e=2"], "known"),
     ],

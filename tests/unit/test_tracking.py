@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import tifffile
 from scenes import PIXEL_NM, make_config
@@ -15,18 +18,22 @@ from iscat_analysis.config import Config
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import analyse, fit_stack
-from iscat_analysis.records import Analysis
+from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.pipeline.tracks import mass_correlation
+from iscat_analysis.records import TRACK_COLUMNS, Analysis
 
 pytestmark = pytest.mark.usefixtures("sketched")
 
 BEFORE, FRAMES, LEVEL_E, SIGMAS = 60, 30, 1e5, 4.0
 SHAPE = (60, 76)
+RATE_HZ = 331.0
 STARTS = ((1800.0, 1900.0, 150.0), (4400.0, 3000.0, 150.0))  # x, y, z [nm]
 MASSES = (3000.0, 5000.0)
 
 
 def _config() -> Config:
     return make_config(
+        camera={"frame_rate_hz": RATE_HZ, "exposure_ms": 2.0},
         optics={"focus_nm": -500.0},
         particle={"height_nm": 150.0, "mass_kda": 4000.0},
         background={"frames": [0, BEFORE]},
@@ -77,6 +84,50 @@ def test_each_particle_is_one_track_with_standard_pulls(tmp_path: Path) -> None:
         assert abs(pulls.mean()) < SIGMAS / math.sqrt(pulls.size)
         assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * pulls.size)
     assert len(found.views) == len(STARTS)
+    assert found.tracks is not None
+    for row in found.tracks.itertuples():
+        mass = MASSES[int(np.argmin(np.abs(np.array(MASSES) - row.mass_kda)))]
+        assert abs(row.mass_kda - mass) < SIGMAS * row.sigma_mass_kda
+        assert (row.first_frame, row.last_frame) == (BEFORE, BEFORE + FRAMES - 1)
+    written = pd.read_csv(tmp_path / "movie.iscat" / "tracks.csv")
+    kept = pd.read_parquet(tmp_path / "movie.iscat" / "tracks.parquet")
+    assert tuple(written.columns[: len(TRACK_COLUMNS)]) == TRACK_COLUMNS
+    pd.testing.assert_frame_equal(kept, found.tracks, check_dtype=False)
+    assert np.allclose(written["mass_kda"], kept["mass_kda"], rtol=1e-8)
+    summary = json.loads((tmp_path / "movie.iscat" / "summary.json").read_text())
+    assert summary["tracks"] == len(STARTS)
+    assert summary["motion"]["frame_rate_hz"] == RATE_HZ
+
+
+def test_frames_share_the_noise_of_their_background(tmp_path: Path) -> None:
+    """At one place the masses of two frames have 1/(n + 1) of their variance in common."""
+    _movie(tmp_path / "movie.tif")
+    with open_stack(tmp_path / "movie.tif") as movie:
+        table = analyse(movie, _config()).table
+    scene = make_scene(_config(), SHAPE)
+    correlation = mass_correlation(scene, table)
+    assert correlation is not None
+    reach = np.array([0.0, 1.0, 150.0, 900.0])
+    found = correlation(np.stack([reach, np.zeros(4)], axis=1))
+    assert np.allclose(np.diag(found), 1)
+    assert np.all(np.linalg.eigvalsh(found) > 0)
+    share = 1 / (BEFORE + 1)
+    assert abs(found[0, 1] / share - 1) < 0.05
+    assert abs(found[0, 2]) < share
+    assert abs(found[0, 3]) < 0.2 * share
+    known = make_config(background={"method": "known", "frames": None, "level_e": 1e5})
+    assert mass_correlation(replace(scene, config=known), table) is None
+
+
+def test_films_show_what_the_fits_explain(tmp_path: Path) -> None:
+    _movie(tmp_path / "movie.tif")
+    with open_stack(tmp_path / "movie.tif") as movie:
+        found = analyse(movie, _config())
+    assert {film.track for film in found.films} == {0, 1}
+    for film in found.films:
+        assert len(film.frames) == len(film.contrast) == FRAMES
+        assert abs(np.nanstd(film.residual) - 1) < 0.05
+        assert np.abs(film.model).max() > 5 * np.nanstd(film.contrast - film.model)
 
 
 def test_a_track_outlives_frames_in_which_the_particle_is_not_seen(tmp_path: Path) -> None:

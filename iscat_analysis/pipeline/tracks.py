@@ -1,0 +1,367 @@
+"""From the fits of mode ``track`` to its tracks: their table, what is said of them, their films."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.ndimage import map_coordinates
+
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.movie.background import add_frames, start_power
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.optics.materials import material
+from iscat_analysis.pipeline.scene import Region, Scene, region_likelihood
+from iscat_analysis.records import (
+    Film,
+    FloatArray,
+    FrameSource,
+    Progress,
+    TrackStatus,
+    Windows,
+    track_numbers,
+)
+from iscat_analysis.species.tracks import Correlation, TrackSetup, describe_tracks
+
+SHORT_MOVIE = 20
+"""Fewer frames than this hardly tell a diffusion coefficient."""
+
+FILMS = 3
+"""Tracks of each kind, the best and the worst, that are shown frame by frame."""
+
+FILM_FRAMES = 40
+"""Frames of such a film, at most."""
+
+_ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
+_NAMED = 3  # of pairs of tracks that met, in a message
+_ABSORBS = 1e-6  # of a permittivity, where a refractive index says it all no more
+
+
+def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
+    """Say what frame rate, exposure and length of a movie leave unknown of its tracks.
+
+    Parameters
+    ----------
+    config : Config
+        In mode ``track``, metadata filled in.
+    frames : int
+        Frames to be tracked.
+    name : str
+        What messages call the movie.
+
+    Yields
+    ------
+    str
+        One line each.
+
+    Raises
+    ------
+    ConfigError
+        The exposure is longer than the time from frame to frame.
+    """
+    rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
+    if rate is None:
+        yield (
+            "camera.frame_rate_hz is not known, so that there is no diffusion coefficient: add it, "
+            "as in camera.frame_rate_hz = 331.0; positions and masses do not need it"
+        )
+    elif exposure is None:
+        yield (
+            f"camera.exposure_ms is not known and taken as the {1e3 / rate:.3g} ms from frame to "
+            "frame, over which motion is averaged: add it if it is shorter"
+        )
+    elif exposure > 1e3 / rate * (1 + _ROUNDING):
+        raise ConfigError(
+            f"camera.exposure_ms = {exposure:g} is longer than the {1e3 / rate:.4g} ms from frame "
+            f"to frame at camera.frame_rate_hz = {rate:g}: correct one of them"
+        )
+    if frames < SHORT_MOVIE:
+        best = 100 / np.sqrt(max(frames - 1, 1))
+        text = f"{name}: {frames} frames tell no diffusion coefficient better than to {best:.0f} %"
+        if frames < config.track.min_frames:
+            text += f", and none at all below track.min_frames = {config.track.min_frames}"
+        yield f"{text}; record more, at least {SHORT_MOVIE}"
+
+
+def tracks_of(
+    scene: Scene,
+    fits: pd.DataFrame,
+    windows: Windows,
+    *,
+    tell: Callable[[str], None],
+    progress: Progress,
+) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Describe the tracks of a movie.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models and configuration.
+    fits : pandas.DataFrame
+        One row per particle and frame, with its track.
+    windows : Windows
+        Frame ranges.
+    tell : callable
+        Told what the user should know.
+    progress : Progress
+        Told the tracks.
+
+    Returns
+    -------
+    tracks : pandas.DataFrame
+        Columns `TRACK_COLUMNS`.
+    summary : dict
+        ``tracks`` and ``motion`` of ``summary.json``.
+    """
+    setup = track_setup(scene, windows)
+    tracks = describe_tracks(
+        fits,
+        setup,
+        correlation=mass_correlation(scene, fits),
+        seed=scene.config.compute.seed,
+        progress=progress,
+    )
+    met = tracks[tracks["nearest_nm"] < setup.near_nm]
+    if len(met):
+        tell(_crossings(met, setup))
+    return tracks, {"tracks": len(tracks), "motion": _summary(tracks, setup)}
+
+
+def track_setup(scene: Scene, windows: Windows) -> TrackSetup:
+    """Gather what all tracks of a movie have in common.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models and configuration.
+    windows : Windows
+        Frame ranges and the shape of the field.
+
+    Returns
+    -------
+    TrackSetup
+        For `describe_tracks`.
+    """
+    config = scene.config
+    rows, columns = windows.after_e.shape
+    matter = material(config.particle, config.optics.wavelength_nm)
+    absorbs = abs(matter.permittivity.imag) > _ABSORBS or matter.permittivity.real <= 0
+    return TrackSetup(
+        frame_rate_hz=config.camera.frame_rate_hz,
+        exposure_ms=config.camera.exposure_ms,
+        frames=windows.frames_after,
+        field_nm=((rows - 1) * scene.pixel_nm, (columns - 1) * scene.pixel_nm),
+        near_nm=config.detection.min_separation_nm,
+        min_frames=config.track.min_frames,
+        volume=config.track.free == "joint",
+        viscosity_mpa_s=config.track.viscosity_mpa_s,
+        temperature_c=config.track.temperature_c,
+        index=None if absorbs else float(np.sqrt(matter.permittivity.real)),
+        density_kg_m3=matter.density_kg_m3,
+        n_medium=config.optics.n_sample,
+    )
+
+
+def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
+    """Give the correlation of the masses of frames that share a measured background.
+
+    A mass is the picture h times the pixels, over Σ h²; of the noise of the background, which is
+    s = f/(f + n) of a frame's variance with n frames before, two frames share what their pictures
+    have in common: Σ h(u) h(u − r)/Σ h².  Where the height is fitted as well, h is what of the
+    picture its derivative along z does not explain.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models and configuration.
+    fits : pandas.DataFrame
+        One row per particle and frame.
+
+    Returns
+    -------
+    callable or None
+        None where each frame has a background of its own, or none that is measured.
+    """
+    method = scene.config.background.method
+    before = fits["n_before"].median() if len(fits) else 0
+    if method not in ("fixed", "median") or not before > 0:
+        return None
+    share = scene.background_variance / (scene.background_variance + before)
+    side = scene.roi_px
+    middle = (side - 1) / 2 * scene.pixel_nm
+    grid = PixelGrid.region((0, side), (0, side), scene.pixel_nm)
+    height, mass = (float(fits[name].median()) for name in ("z_nm", "mass_kda"))
+    slopes = scene.model.gradient(grid, middle, middle, height, mass)[1]
+    picture = slopes[3]
+    if fits["sigma_z_nm"].notna().any():
+        along = slopes[2]
+        picture = picture - along * np.sum(along * picture) / np.sum(along**2)
+    light = np.abs(np.fft.rfft2(picture, (2 * side - 1, 2 * side - 1))) ** 2
+    common = np.fft.fftshift(np.fft.irfft2(light, (2 * side - 1, 2 * side - 1)))
+    common /= common[side - 1, side - 1]
+
+    def correlation(places_nm: FloatArray) -> FloatArray:
+        apart = (places_nm[:, None] - places_nm) / scene.pixel_nm + (side - 1)
+        shared = map_coordinates(common, [apart[..., 1], apart[..., 0]], order=1)
+        among = share * (shared + shared.T) / 2
+        np.fill_diagonal(among, 1.0)
+        return np.asarray(among)
+
+    return correlation
+
+
+def _crossings(met: pd.DataFrame, setup: TrackSetup) -> str:
+    """Say which tracks came near each other."""
+    named = ", ".join(str(track) for track in met["track"].head(_NAMED))
+    more = f" and {len(met) - _NAMED} more" if len(met) > _NAMED else ""
+    return (
+        f"tracks {named}{more} come nearer than {setup.near_nm:g} nm to another (to "
+        f"{met['nearest_nm'].min():.0f} nm), where masses are shared and numbers may be exchanged: "
+        "they are flagged crosses; record fewer particles to avoid it"
+    )
+
+
+def _summary(tracks: pd.DataFrame, setup: TrackSetup) -> dict[str, Any]:
+    """Count and take medians over the tracks that are ok."""
+    good = tracks[tracks["status"] == TrackStatus.OK]
+    names = ("n_frames", "mass_kda", "d_um2_s", "diameter_nm", "refractive_index")
+    medians = {}
+    for name in names:
+        values = good[name].dropna().to_numpy(float)
+        medians[name] = float(np.median(values)) if values.size else None
+    ratios = good["sigma_d_um2_s"] / good["d_um2_s"]
+    flags = Counter(flag for flags in tracks["flags"] for flag in flags.split(";") if flag)
+    return {
+        "frame_rate_hz": setup.frame_rate_hz,
+        "exposure_ms": setup.exposure_ms,
+        "status": dict(sorted(Counter(tracks["status"]).items())),
+        "flags": dict(sorted(flags.items())),
+        "medians": medians,
+        "sigma_d_over_d_median": float(ratios.median()) if ratios.notna().any() else None,
+        "begin_inside": int((tracks["begins"] == "inside").sum()),
+        "end_inside": int((tracks["ends"] == "inside").sum()),
+        "cross_border": int(((tracks["begins"] == "border") | (tracks["ends"] == "border")).sum()),
+        "crossed": int((tracks["nearest_nm"] < setup.near_nm).sum()),
+    }
+
+
+def make_films(
+    scene: Scene,
+    movie: FrameSource,
+    camera: Camera,
+    windows: Windows,
+    fits: pd.DataFrame,
+    tracks: pd.DataFrame,
+) -> tuple[Film, ...]:
+    """Draw the best and the worst tracks frame by frame.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    movie : FrameSource
+        The movie.
+    camera : Camera
+        Counts → photoelectrons.
+    windows : Windows
+        The background.
+    fits : pandas.DataFrame
+        One row per particle and frame, with its track.
+    tracks : pandas.DataFrame
+        From `tracks_of`.
+
+    Returns
+    -------
+    tuple of Film
+        The best first.
+    """
+    numbers = track_numbers(fits)
+    films = []
+    for track, why, worst in _chosen(tracks):
+        rows = fits[numbers == track].sort_values("frame")
+        films.append(_film(scene, movie, camera, windows, fits, rows, track, why, worst))
+    return tuple(film for film in films if film is not None)
+
+
+def _chosen(tracks: pd.DataFrame) -> Iterator[tuple[int, str, bool]]:
+    """Choose tracks: the longest that are ok, and those with the worst remarks."""
+    good = tracks[tracks["status"] == TrackStatus.OK].sort_values(
+        ["n_frames", "mass_scatter"], ascending=[False, True]
+    )
+    for row in good.head(FILMS).itertuples():
+        yield int(row.track), f"one of the longest that are ok: {row.n_frames} frames", False
+    rank = tracks["status"].map([str(status) for status in TrackStatus].index)
+    bad = tracks.assign(rank=rank)[tracks["status"] != TrackStatus.OK]
+    shown = bad[bad["status"] != TrackStatus.FEW_FRAMES].sort_values(
+        ["rank", "n_frames"], ascending=[True, False]
+    )
+    for row in shown.head(FILMS).itertuples():
+        yield int(row.track), TrackStatus(row.status).advice, True
+    rest = good.iloc[FILMS:].sort_values("mass_scatter", ascending=False)
+    for row in rest.head(max(0, FILMS - len(shown))).itertuples():
+        text = f"ok; its frames scatter most, {row.mass_scatter:.2f} times their errors"
+        yield int(row.track), text, True
+
+
+def _film(
+    scene: Scene,
+    movie: FrameSource,
+    camera: Camera,
+    windows: Windows,
+    fits: pd.DataFrame,
+    rows: pd.DataFrame,
+    track: int,
+    why: str,
+    worst: bool,
+) -> Film | None:
+    """Draw the first frames of a track, or of a bad one those around its worst fit."""
+    frames = rows["frame"].to_numpy(int)
+    if frames.size < 2:
+        return None
+    start = 0
+    if worst and rows["chi2_reduced"].notna().any():
+        start = int(np.nanargmax(rows["chi2_reduced"].to_numpy(float))) - FILM_FRAMES // 2
+    start = max(0, min(start, frames.size - FILM_FRAMES))
+    shown = rows.iloc[start : start + FILM_FRAMES]
+    region = _square(scene, windows, shown)
+    pictures = []
+    for frame in shown["frame"].to_numpy(int):
+        single = add_frames(windows, camera, movie.read(frame, frame + 1), frame)
+        if scene.config.background.power_normalization:
+            single = start_power(single)
+        here = fits[(fits["frame"] == frame) & fits["mass_kda"].notna()]
+        pictures.append(_picture(scene, single, region, here))
+    contrast, model, residual = (np.array(part) for part in zip(*pictures, strict=True))
+    return Film(track, tuple(shown["frame"].astype(int)), why, contrast, model, residual)
+
+
+def _square(scene: Scene, windows: Windows, rows: pd.DataFrame) -> Region:
+    """Place a square in the field around the middle of the places."""
+    spans = []
+    for name, size in zip(("y_px", "x_px"), windows.after_e.shape, strict=True):
+        side = min(scene.roi_px, size)
+        middle = (rows[name].min() + rows[name].max()) / 2
+        low = int(np.clip(round(middle - side / 2), 0, size - side))
+        spans.append((low, low + side))
+    return Region(*spans)
+
+
+def _picture(
+    scene: Scene, single: Windows, region: Region, here: pd.DataFrame
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Draw data, model and residual of one frame, with all particles in it."""
+    likelihood = region_likelihood(scene, single, region, None)
+    model = np.zeros(region.shape)
+    low, high = scene.wide.z_range_nm
+    for row in here.itertuples():
+        height = float(np.clip(row.z_nm, low, high))
+        model += scene.wide.image(likelihood.grid, row.x_nm, row.y_nm, height, row.mass_kda)
+    data = likelihood.measured_signal()
+    residual = (data - model) * np.sqrt(likelihood.signal_information(model))
+    unit = likelihood.data[2] if scene.additive else 1.0
+    return data * unit, model * unit, residual

@@ -1,0 +1,121 @@
+"""Tracks as small films: data, model and residual, frame by frame, looped."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from iscat_analysis.records import Analysis, Film, FloatArray
+from iscat_analysis.report.event_figures import DIVERGING, display_range, residual_limit
+from iscat_analysis.report.numbers import number
+
+FILM_BYTES = 3_000_000
+"""Films inside the page, at most; those after that are left out."""
+
+FRAME_MS = 120
+"""Time for which a frame is shown."""
+
+_GAP = 2  # pixels between the three pictures
+_SHADES = 48  # of each scale: fewer make smaller films, and noise hides the steps
+
+
+@dataclass(frozen=True)
+class FilmShown:
+    """One film as the page shows it.
+
+    Attributes
+    ----------
+    track : int
+        Its number.
+    why : str
+        Why it is shown.
+    scales : str
+        Ranges of the scales, in words.
+    film, still : str
+        Animated WebP, and its first picture as PNG, in base64.
+    width, height : int
+        Size of a frame [px].
+    """
+
+    track: int
+    why: str
+    scales: str
+    film: str
+    still: str
+    width: int
+    height: int
+
+
+def films_shown(analysis: Analysis, folder: Path | None = None) -> Iterator[FilmShown]:
+    """Make the films of the page, as many as `FILM_BYTES` hold.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        With films.
+    folder : Path, optional
+        Where each goes as a file, ``track_NNNN.webp``; nothing is written without it.
+
+    Yields
+    ------
+    FilmShown
+        The best first.
+    """
+    spent = 0
+    unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
+    for film in analysis.films:
+        low, high = display_range([film.contrast, film.model], analysis.scheme)
+        limit = residual_limit(film.residual)
+        pictures = [Image.fromarray(frame) for frame in _frames(film, low, high, limit)]
+        moving = _animated(pictures)
+        spent += len(moving)
+        if spent > FILM_BYTES:
+            break
+        if folder is not None:
+            (folder / f"track_{film.track:04d}.webp").write_bytes(moving)
+        still = io.BytesIO()
+        pictures[0].save(still, "PNG")
+        yield FilmShown(
+            film.track,
+            film.why,
+            f"frames {film.frames[0]} to {film.frames[-1]}; {unit} {number(low)} to "
+            f"{number(high)}; residual ±{limit:g} σ",
+            base64.b64encode(moving).decode("ascii"),
+            base64.b64encode(still.getvalue()).decode("ascii"),
+            *pictures[0].size,
+        )
+
+
+def _frames(film: Film, low: float, high: float, limit: float) -> NDArray[np.uint8]:
+    """Colour data, model and residual side by side, shape (t, y, 3 x + gaps, 3)."""
+    gray = mpl.colormaps["gray"]
+    gap = np.zeros((*film.contrast.shape[:2], _GAP, 4))
+    strip = [
+        gray(_stepped((film.contrast - low) / (high - low))), gap,
+        gray(_stepped((film.model - low) / (high - low))), gap,
+        DIVERGING(_stepped((film.residual / limit + 1) / 2)),
+    ]  # fmt: skip
+    return np.asarray(255 * np.concatenate(strip, axis=2)[..., :3], dtype=np.uint8)
+
+
+def _stepped(values: FloatArray) -> FloatArray:
+    """Round to a few shades; what is masked has the middle one."""
+    inside = np.clip(np.nan_to_num(values, nan=0.5), 0.0, 1.0)
+    return np.asarray(np.round(inside * (_SHADES - 1)) / (_SHADES - 1))
+
+
+def _animated(pictures: list[Image.Image]) -> bytes:
+    buffer = io.BytesIO()
+    pictures[0].save(
+        buffer, "WEBP", save_all=True, append_images=pictures[1:], duration=FRAME_MS, loop=0,
+        lossless=True, quality=60, method=4, minimize_size=False,
+    )  # fmt: skip
+    return buffer.getvalue()

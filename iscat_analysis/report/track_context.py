@@ -1,0 +1,168 @@
+"""What the report page of a movie of moving particles is made of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from markupsafe import Markup, escape
+
+from iscat_analysis.records import Analysis, TrackStatus
+from iscat_analysis.report.event_figures import event_images
+from iscat_analysis.report.films import films_shown
+from iscat_analysis.report.headline import (
+    NOT_A_MASS,
+    as_contrasts,
+    is_uncalibrated,
+    main_quantity,
+)
+from iscat_analysis.report.numbers import decimals_for, fixed
+from iscat_analysis.report.tracks import (
+    medians,
+    track_lines,
+    tracks_caution,
+    tracks_headline,
+    tracks_of,
+)
+
+_COLUMNS = (
+    ("n_frames", "frames"), ("x_nm", "x [nm]"), ("y_nm", "y [nm]"), ("z_nm", "z [nm]"),
+    ("mass_kda", "mass [kDa]"), ("sigma_mass_kda", "σ [kDa]"), ("crb_mass_kda", "CRB [kDa]"),
+    ("systematic_mass_kda", "systematic [kDa]"),
+    ("d_um2_s", "D [µm²/s]"), ("sigma_d_um2_s", "σ [µm²/s]"), ("crb_d_um2_s", "CRB [µm²/s]"),
+    ("diameter_nm", "diameter [nm]"), ("sigma_diameter_nm", "σ [nm]"),
+    ("refractive_index", "index"), ("sigma_refractive_index", "σ of index"),
+    ("exponent", "exponent"), ("p_confinement", "p, confined"), ("p_anomalous", "p, anomalous"),
+    ("confinement_nm", "well [nm]"), ("mass_scatter", "scatter / σ"),
+)  # fmt: skip
+_ERROR_OF = {
+    "mass_kda": "sigma_mass_kda",
+    "d_um2_s": "sigma_d_um2_s",
+    "diameter_nm": "sigma_diameter_nm",
+    "refractive_index": "sigma_refractive_index",
+}
+_TWO = ("exponent", "p_confinement", "p_anomalous", "mass_scatter")
+
+
+def tracks_context(
+    analysis: Analysis, fits: pd.DataFrame, folder: Path | None = None
+) -> dict[str, Any]:
+    """Gather what the page says of tracks, in place of what it says of events.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        With tracks.
+    fits : pandas.DataFrame
+        From `event_table`.
+    folder : Path, optional
+        Where films go as files.
+
+    Returns
+    -------
+    dict
+        Further keys of the template's context.
+    """
+    tracks = tracks_of(analysis)
+    numbered = tracks.rename(columns={"track": "event"})
+    images = event_images(analysis, numbered)
+    said = tracks_headline(analysis, fits)
+    return {
+        "n_events": len(tracks),
+        "headline": [text for text in said if text != NOT_A_MASS],
+        "flagged": bool(len(tracks)) and tracks_caution(tracks) is not None,
+        "cautions": [text for text in said if text == NOT_A_MASS],
+        "tiles": _tiles(analysis, fits),
+        "events": track_rows(analysis),
+        "images": {str(row): list(packed) for row, packed in images.items()},
+        "embedding_note": None,
+        "films": list(films_shown(analysis, folder)),
+        "track_lines": list(track_lines(analysis.summary)),
+        "track_statuses": _statuses(tracks),
+    }
+
+
+def _tiles(analysis: Analysis, fits: pd.DataFrame) -> list[dict[str, str]]:
+    """Give the large numbers at the top."""
+    tracks = tracks_of(analysis)
+    good = int((tracks["status"] == TrackStatus.OK).sum())
+    tiles = [
+        {"label": "Tracks", "value": str(len(tracks)), "note": f"{good} ok, {len(tracks) - good} "
+         f"flagged; {len(fits)} fitted positions"}
+    ]  # fmt: skip
+    if tracks_caution(tracks) is None:
+        for label, text in medians(analysis):
+            value, _, unit = text.partition(" ")
+            tiles.append({"label": f"Median {label}", "value": value, "unit": unit,
+                          "note": "over tracks that are ok"})  # fmt: skip
+    return tiles
+
+
+def track_rows(analysis: Analysis) -> dict[str, Any]:
+    """Write the table of tracks.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        With tracks.
+
+    Returns
+    -------
+    dict
+        ``columns``: the headings; ``body``: the rows as HTML.
+    """
+    tracks = tracks_of(analysis)
+    names = dict(_COLUMNS)
+    if main_quantity(analysis).column == "contrast":
+        tracks = as_contrasts(tracks) if len(tracks) else tracks
+        for name in ("mass_kda", "sigma_mass_kda", "crb_mass_kda", "systematic_mass_kda"):
+            tracks = tracks.assign(**{name: 1e3 * tracks[name]}) if name in tracks else tracks
+            names[name] = names[name].replace("mass", "contrast").replace("kDa", "10⁻³")
+    elif is_uncalibrated(analysis):
+        names["mass_kda"] = "mass, model scale [kDa]"
+    shown: list[tuple[str, list[str]]] = []
+    for name, heading in names.items():
+        if name not in tracks or not np.isfinite(values := tracks[name].to_numpy(float)).any():
+            continue
+        spread = tracks[_ERROR_OF[name]].to_numpy(float) if name in _ERROR_OF else values
+        decimals = _decimals(spread, 2 if name in _ERROR_OF or name.startswith("sigma") else 3)
+        if name in _TWO:
+            decimals = 2
+        if name in ("n_frames", "x_nm", "y_nm"):
+            decimals = 0
+        shown.append((heading, [fixed(value, decimals) for value in values]))
+    lines = []
+    for row in range(len(tracks)):
+        status = TrackStatus(tracks["status"].iloc[row])
+        flags = [f for f in str(tracks["flags"].iloc[row]).split(";") if f and f != status]
+        kind = "status" if status is TrackStatus.OK else "status flagged"
+        cells = "".join(f'<td class="num">{column[row]}' for _, column in shown)
+        lines.append(
+            f'<tr id="row-{row}"><td><button type="button" class="toggle" aria-expanded="false">'
+            f'{tracks["track"].iloc[row]}</button><td class="num">'
+            f"{tracks['first_frame'].iloc[row]}{cells}"
+            f'<td class="{kind}" title="{escape(status.advice)}">'
+            f"{escape('; '.join([status.value, *flags]))}"
+        )
+    return {
+        "columns": ["track", "from frame", *(heading for heading, _ in shown), "status"],
+        "body": Markup("\n".join(lines)),  # the only text, the flags, is escaped
+    }
+
+
+def _decimals(values: Any, digits: int) -> int:
+    """Give the decimals that show so many digits of the median."""
+    return decimals_for([float(np.nanmedian(np.abs(values)))], digits=digits)
+
+
+def _statuses(tracks: pd.DataFrame) -> list[list[str]]:
+    """Count the verdicts on tracks and other remarks, with what each means."""
+    counts = tracks["status"].value_counts()
+    rows = [[s.value, str(counts[s.value]), s.advice] for s in TrackStatus if s.value in counts]
+    crossed = sum("crosses" in flags.split(";") for flags in tracks["flags"])
+    if crossed:
+        rows.append(["crosses", str(crossed), "A remark that makes no verdict: it came near "
+                     "another track, where numbers may be exchanged."])  # fmt: skip
+    return rows

@@ -1,0 +1,188 @@
+"""What the tracks of a movie say in a few words: on the page, on stdout, in a notebook."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pandas as pd
+
+from iscat_analysis.records import TRACK_COLUMNS, Analysis, TrackStatus
+from iscat_analysis.report.headline import (
+    MOST_FLAGGED,
+    NOT_A_MASS,
+    headline,
+    is_uncalibrated,
+    main_quantity,
+    spread_lines,
+)
+from iscat_analysis.report.numbers import count, number
+
+
+def tracks_of(analysis: Analysis) -> pd.DataFrame:
+    """Give the tracks of an analysis.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns `TRACK_COLUMNS`; empty but in mode ``track``.
+    """
+    found = analysis.tracks
+    return pd.DataFrame(columns=list(TRACK_COLUMNS)) if found is None else found
+
+
+def tracks_headline(analysis: Analysis, fits: pd.DataFrame) -> list[str]:
+    """Say in two or three sentences what the tracks come to.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        With tracks.
+    fits : pandas.DataFrame
+        One row per particle and frame.
+
+    Returns
+    -------
+    list of str
+        The first sentence counts; medians are over the tracks that are ok, and there are none
+        where more than a fifth of the tracks is flagged.
+    """
+    tracks = tracks_of(analysis)
+    warned = [NOT_A_MASS] if is_uncalibrated(analysis) else []
+    if fits.empty:
+        return headline(analysis, fits)
+    if tracks.empty:
+        return [
+            f"{count(len(fits), 'fitted position')}, and no particle was followed for "
+            "track.min_frames: look at the field image, at track.max_step_nm, which is the "
+            "farthest a particle goes between frames, and at detection.false_alarms_per_movie."
+        ]
+    good = tracks[tracks["status"] == TrackStatus.OK]
+    text = (
+        f"{count(len(tracks), 'track')} of {count(len(fits), 'fitted position')}, "
+        f"{len(good) if len(good) < len(tracks) else 'all'} of them ok."
+    )
+    if (flagged := tracks_caution(tracks)) is not None:
+        return [f"{text} {flagged}", *spread_lines(analysis, fits), *warned]
+    said = [f"{label} {value}" for label, value in medians(analysis)]
+    if said:
+        text += f" Medians over tracks: {', '.join(said)}."
+    return [text, *spread_lines(analysis, fits), *warned]
+
+
+def tracks_caution(tracks: pd.DataFrame) -> str | None:
+    """Say that too many tracks are flagged for a median.
+
+    Parameters
+    ----------
+    tracks : pandas.DataFrame
+        Columns `TRACK_COLUMNS`.
+
+    Returns
+    -------
+    str or None
+        One or two sentences with the commonest reason; None where few are flagged.
+    """
+    judged = tracks["status"][tracks["status"] != TrackStatus.FEW_FRAMES]  # these have no D
+    flagged = judged[judged != TrackStatus.OK]
+    if len(flagged) <= MOST_FLAGGED * len(judged):
+        return None
+    commonest = TrackStatus(Counter(flagged).most_common(1)[0][0])
+    return (
+        f"{len(flagged)} of {len(judged)} that are long enough are flagged, so no median is given: "
+        f"the rest is no fair sample. The commonest reason is {commonest}. {commonest.advice}"
+    )
+
+
+def medians(analysis: Analysis) -> list[tuple[str, str]]:
+    """Give the medians over the tracks that are ok, as text with units.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        With tracks.
+
+    Returns
+    -------
+    list of (str, str)
+        What it is, and how much; what is not known is left out.
+    """
+    tracks = tracks_of(analysis)
+    good = tracks[tracks["status"] == TrackStatus.OK]
+    main = main_quantity(analysis)
+    size = "contrast" if main.column == "contrast" else "mass_kda"
+    named = (
+        (size, "contrast" if size == "contrast" else "mass", "" if size == "contrast" else "kDa"),
+        ("d_um2_s", "D", "µm²/s"),
+        ("diameter_nm", "hydrodynamic diameter", "nm"),
+        ("refractive_index", "refractive index", ""),
+    )
+    found = [(label, good[name].median(), unit) for name, label, unit in named]
+    return [
+        (label, f"{number(value)} {unit}".rstrip()) for label, value, unit in found
+        if math.isfinite(value)
+    ]  # fmt: skip
+
+
+def track_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    """Say where tracks begin, end and meet.
+
+    Parameters
+    ----------
+    summary : mapping
+        What ``summary.json`` holds.
+
+    Yields
+    ------
+    str
+        One sentence each.
+    """
+    motion = summary.get("motion")
+    if not motion or not summary.get("tracks"):
+        return
+    if motion["cross_border"]:
+        yield (
+            f"{motion['cross_border']} of {count(summary['tracks'], 'track')} begin or end at the "
+            "border of the field; a particle that leaves and comes back is another track."
+        )
+    lost = motion["end_inside"] + motion["begin_inside"]
+    if lost:
+        yield (
+            f"{motion['begin_inside']} begin and {motion['end_inside']} end inside the field: "
+            "particles come from the liquid and go there, meet others, or are lost from sight."
+        )
+
+
+TRACK_HEADINGS: Mapping[str, tuple[str, str, str]] = {
+    "mass": ("mass_kda", "sigma_mass_kda", "kDa"),
+    "D": ("d_um2_s", "sigma_d_um2_s", "µm²/s"),
+    "diameter": ("diameter_nm", "sigma_diameter_nm", "nm"),
+    "index": ("refractive_index", "sigma_refractive_index", ""),
+}
+"""Columns of the short table, with their errors and units."""
+
+
+def advice(tracks: pd.DataFrame) -> Iterator[str]:
+    """Explain the remarks on tracks.
+
+    Parameters
+    ----------
+    tracks : pandas.DataFrame
+        Columns `TRACK_COLUMNS`.
+
+    Yields
+    ------
+    str
+        One line for each status that was given.
+    """
+    remarks = Counter(flag for flags in tracks["flags"] for flag in str(flags).split(";"))
+    for status in TrackStatus:
+        if remarks[status.value]:
+            yield f"{count(remarks[status.value], 'track')} {status}: {status.advice}"

@@ -1,0 +1,148 @@
+"""One mass from many frames: a particle keeps its mass while it moves.
+
+Each frame k gives an estimate m_k with the information J_k = 1/σ_k².  Its σ_k is that of its own
+estimate, and follows it: J ∝ m^p makes w_k ∝ 1 + p (m_k − m)/m, and the weighted mean is too large
+by the share
+
+    E[m̂]/m − 1 = p (σ/m)² (1 − 1/n),
+
+which does not become less with more frames.  With shot noise alone C = m h gives
+J = B Σ h²/(1 + m h), so that p = −m Σ h³/Σ h² is some hundredths for a protein and the error below
+10⁻⁴; where the scattered light outshines its noise p is 2, and 10 % errors of single frames make
+2 %.  So information is taken at the common mass, J_k (m̂/m_k)^p: that is independent of what noise
+did to frame k.
+
+Frames that share a measured background share its noise where the particle is at the same place;
+then their errors are correlated, and the mean is that of generalised least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import chdtrc
+
+from iscat_analysis.records import FloatArray
+
+_ROUNDS = 8  # of mass and weights in turn; each has an error (p σ/m)²/n of the one before
+_SETTLED = 1e-9  # of the mass
+
+
+@dataclass(frozen=True)
+class CommonMass:
+    """The mass of a track.
+
+    Attributes
+    ----------
+    mass_kda : float
+        Best linear combination of the frames [kDa].
+    sigma_mass_kda : float
+        Its standard error, from those of the frames [kDa].
+    crb_mass_kda : float
+        The same from the frames' Cramér–Rao bounds [kDa].
+    scatter : float
+        Standard deviation of the frames about it over their σ; 1 where σ is right and the mass is
+        common.
+    p_value : float
+        Chance of at least as much scatter.
+    frames : int
+        How many were combined.
+    """
+
+    mass_kda: float
+    sigma_mass_kda: float
+    crb_mass_kda: float
+    scatter: float
+    p_value: float
+    frames: int
+
+
+def combine_masses(
+    mass_kda: FloatArray,
+    sigma_kda: FloatArray,
+    crb_kda: FloatArray,
+    *,
+    power: float = 0.0,
+    correlation: FloatArray | None = None,
+) -> CommonMass:
+    """Combine the frames of one track.
+
+    Parameters
+    ----------
+    mass_kda : ndarray, shape (n,)
+        Estimates of the frames, without bias of their own [kDa].
+    sigma_kda, crb_kda : ndarray, shape (n,)
+        Their standard errors and Cramér–Rao bounds, at their own estimates [kDa].
+    power : float
+        p of J ∝ m^p, from `information_power`.
+    correlation : ndarray, shape (n, n), optional
+        Of the errors; absent, they are independent.
+
+    Returns
+    -------
+    CommonMass
+        Mass, error, bound, and whether the frames agree.
+    """
+    own = np.eye(mass_kda.size) if correlation is None else correlation
+    mass = float(np.median(mass_kda))
+    for _ in range(_ROUNDS):
+        before, there = mass, _at(mass, mass_kda, power)
+        mass, variance = _least_squares(mass_kda, sigma_kda * there, own)
+        if abs(mass - before) <= _SETTLED * abs(mass):
+            break
+    there = _at(mass, mass_kda, power)
+    _, bound = _least_squares(mass_kda, crb_kda * there, own)
+    off = (mass_kda - mass) / (sigma_kda * there)
+    inside = float(off @ cho_solve(cho_factor(own), off))
+    free = mass_kda.size - 1
+    return CommonMass(
+        mass_kda=mass,
+        sigma_mass_kda=float(np.sqrt(variance)),
+        crb_mass_kda=float(np.sqrt(bound)),
+        scatter=float(np.sqrt(inside / free)) if free else float("nan"),
+        p_value=float(chdtrc(free, inside)) if free else float("nan"),
+        frames=mass_kda.size,
+    )
+
+
+def information_power(tracks: Sequence[tuple[FloatArray, FloatArray]]) -> float:
+    """Learn how a frame's information on the mass follows its estimate: p of J ∝ m^p.
+
+    A line through ln J against ln m inside the tracks, with one slope for all, so that what differs
+    between particles takes no part.
+
+    Parameters
+    ----------
+    tracks : sequence of (ndarray, ndarray)
+        Estimates and standard errors of each track's frames [kDa].
+
+    Returns
+    -------
+    float
+        p; 0 where there is nothing to learn from.
+    """
+    product = square = 0.0
+    for mass, sigma in tracks:
+        size, information = np.log(np.abs(mass)), -2 * np.log(sigma)
+        size = size - size.mean()
+        product += float(size @ (information - information.mean()))
+        square += float(size @ size)
+    return product / square if square > 0 else 0.0
+
+
+def _at(common: float, own: FloatArray, power: float) -> FloatArray:
+    """Give what takes each frame's σ from its own estimate to the common mass."""
+    return np.asarray(np.abs(own / common) ** (power / 2) if power else np.ones_like(own))
+
+
+def _least_squares(
+    values: FloatArray, sigma: FloatArray, correlation: FloatArray
+) -> tuple[float, float]:
+    """Mean of correlated values, and its variance."""
+    factor = cho_factor(correlation)
+    weights = cho_solve(factor, 1 / sigma) / sigma
+    total = float(weights.sum())
+    return float(weights @ values) / total, 1 / total

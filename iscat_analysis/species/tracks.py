@@ -1,0 +1,361 @@
+"""Tracks: what the frames of one particle say together.
+
+`describe_tracks` takes the fits, one row per particle and frame, and gives one row per track: the
+mass that its frames have in common (`common_mass`), D from its positions with their own errors and
+blur (`diffusion`), tests of whether it diffuses freely (`motion`), and of particles in a volume the
+size and the refractive index that follow (`refraction`).
+
+D is that along x and y.  Height is left out: the coverslip reflects there, and a fit that takes a
+neighbouring fringe makes a step that no particle made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.spatial.distance import cdist
+
+from iscat_analysis.records import (
+    TRACK_COLUMNS,
+    FloatArray,
+    Progress,
+    Status,
+    TrackStatus,
+    silent,
+    track_numbers,
+)
+from iscat_analysis.species.common_mass import CommonMass, combine_masses, information_power
+from iscat_analysis.species.diffusion import Diffusion, fit_diffusion, hydrodynamic_diameter
+from iscat_analysis.species.displacements import LEAST_POSITIONS
+from iscat_analysis.species.motion import anomalous_test, confinement_test
+from iscat_analysis.species.refraction import refractive_index
+
+TESTED_POSITIONS = 300
+"""Positions of a track whose motion is tested, from its first: the time of a test grows fast."""
+
+SURPRISING = 0.005
+"""A p-value this small is remarked on: of free tracks one in a hundred, with two tests."""
+
+COVERAGE = 0.95
+"""Of the interval of D."""
+
+SLOWED = 0.05
+"""Share by which a wall slows a particle before its size is remarked on."""
+
+_FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
+_DOUBT = 0.1
+_NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE)
+_USELESS = 300.0  # times the median error: such a place says nothing
+_UM2 = 1e6  # nm²
+
+
+@dataclass(frozen=True)
+class TrackSetup:
+    """What a movie and its configuration say of all tracks.
+
+    Attributes
+    ----------
+    frame_rate_hz : float or None
+        Without it there is no D [Hz].
+    exposure_ms : float or None
+        Absent, all of the time from frame to frame [ms].
+    frames : (int, int)
+        Half-open range that was analysed.
+    field_nm : (float, float)
+        Height and width of the field [nm].
+    near_nm : float
+        Tracks that come nearer than this to each other have crossed, and those that end nearer
+        than a step to the border of the field have left it [nm].
+    min_frames : int
+        Fewer positions make no D.
+    volume : bool
+        Whether particles move freely in the liquid, so that D tells their size.
+    viscosity_mpa_s, temperature_c : float
+        Of the liquid.
+    index : float or None
+        Refractive index of the material of the mass scale; None where it absorbs.
+    density_kg_m3 : float
+        Its density [kg/m³].
+    n_medium : float
+        Refractive index of the liquid.
+    """
+
+    frame_rate_hz: float | None
+    exposure_ms: float | None
+    frames: tuple[int, int]
+    field_nm: tuple[float, float]
+    near_nm: float
+    min_frames: int = 10
+    volume: bool = False
+    viscosity_mpa_s: float = 0.89
+    temperature_c: float = 25.0
+    index: float | None = 1.46
+    density_kg_m3: float = 1350.0
+    n_medium: float = 1.33
+
+
+Correlation = Callable[[FloatArray], FloatArray]
+"""From places (n, 2) [nm] to the correlation (n, n) of the masses fitted there."""
+
+
+def describe_tracks(
+    fits: pd.DataFrame,
+    setup: TrackSetup,
+    *,
+    correlation: Correlation | None = None,
+    seed: int = 1,
+    progress: Progress = silent,
+) -> pd.DataFrame:
+    """Make the table of tracks.
+
+    Parameters
+    ----------
+    fits : pandas.DataFrame
+        One row per particle and frame, with its track; columns as in ``fits.csv``.
+    setup : TrackSetup
+        Frame rate, field, liquid.
+    correlation : callable, optional
+        Correlation of the masses that frames give, by place; absent, they are independent.
+    seed : int
+        Of the free tracks that the test of confinement draws.
+    progress : Progress
+        Told the tracks; an interrupt leaves out the tests of those that remain.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns `TRACK_COLUMNS`, one row per track in the order of their numbers, and
+        ``systematic_mass_kda`` where `fits` has it.
+    """
+    numbers = track_numbers(fits)
+    groups = {
+        int(track): rows.sort_values("frame")
+        for track, rows in fits[numbers.notna()].groupby(numbers[numbers.notna()])
+    }
+    power = information_power(
+        [
+            (good["mass_kda"].to_numpy(float), good["sigma_mass_kda"].to_numpy(float))
+            for rows in groups.values()
+            if len(good := _massive(rows)) > 1
+        ]
+    )
+    nearest = _nearest(fits[numbers.notna()], numbers.dropna())
+    rng, tested = np.random.default_rng(seed), True
+    records = []
+    for done, (track, rows) in enumerate(groups.items()):
+        record = _record(track, rows, setup, power, correlation, nearest.get(track, np.inf))
+        try:
+            if tested:
+                record |= _tests(rows, setup, rng) if np.isfinite(record["d_um2_s"]) else {}
+                progress("tracks", done + 1, len(groups))
+        except KeyboardInterrupt:
+            tested = False
+        status = _remarks(record, setup)
+        record["status"] = str(status[0]) if status else str(TrackStatus.OK)
+        crossed = ["crosses"] if record["nearest_nm"] < setup.near_nm else []
+        record["flags"] = ";".join([*map(str, status), *crossed])
+        records.append(record)
+    return _table(records, fits)
+
+
+def _massive(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows whose mass counts."""
+    known = rows["sigma_mass_kda"].notna() & rows["crb_mass_kda"].notna() & (rows["mass_kda"] != 0)
+    return rows[known & (rows["status"] == Status.OK)]
+
+
+def _placed(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows whose place counts.
+
+    A status that motion itself makes more likely must not choose, or fast steps would be missing.
+    """
+    errors = rows[["sigma_x_nm", "sigma_y_nm"]].max(axis=1)
+    useful = errors <= _USELESS * errors.median()
+    return rows[useful & ~rows["status"].isin(_NO_PLACE) & ~rows["frame"].duplicated()]
+
+
+def _record(
+    track: int,
+    rows: pd.DataFrame,
+    setup: TrackSetup,
+    power: float,
+    correlation: Correlation | None,
+    nearest_nm: float,
+) -> dict[str, Any]:
+    """Describe one track, but for the tests of its motion."""
+    good, placed = _massive(rows), _placed(rows)
+    record: dict[str, Any] = dict.fromkeys(TRACK_COLUMNS, np.nan)
+    record |= {
+        "track": track,
+        "first_frame": int(rows["frame"].iloc[0]),
+        "last_frame": int(rows["frame"].iloc[-1]),
+        "n_frames": len(rows),
+        "n_mass_frames": len(good),
+        "n_d_frames": len(placed),
+        "x_nm": rows["x_nm"].mean(),
+        "y_nm": rows["y_nm"].mean(),
+        "z_nm": rows["z_nm"].mean(),
+        "nearest_nm": nearest_nm,
+    }
+    if len(good):
+        mass = _mass(good, power, correlation)
+        record |= {
+            "mass_kda": mass.mass_kda,
+            "sigma_mass_kda": mass.sigma_mass_kda,
+            "crb_mass_kda": mass.crb_mass_kda,
+            "mass_scatter": mass.scatter,
+            "p_mass": mass.p_value,
+            "contrast": mass.mass_kda * float((good["contrast"] / good["mass_kda"]).median()),
+        }
+    found = _diffusion(placed, setup)
+    if found is not None:
+        record |= {
+            "d_um2_s": found.d_um2_s,
+            "sigma_d_um2_s": found.sigma_d_um2_s,
+            "crb_d_um2_s": found.crb_d_um2_s,
+            "d_low_um2_s": found.interval_um2_s[0],
+            "d_high_um2_s": found.interval_um2_s[1],
+            "d_disagreement": found.disagreement,
+        }
+        if setup.volume and found.interval_um2_s[0] > 0:
+            record |= _size(record, setup)
+    return record | _ends(rows, setup, record["d_um2_s"])
+
+
+def _mass(good: pd.DataFrame, power: float, correlation: Correlation | None) -> CommonMass:
+    columns = (good[f"{kind}mass_kda"].to_numpy(float) for kind in ("", "sigma_", "crb_"))
+    among = None
+    if correlation is not None:
+        among = correlation(good[["x_nm", "y_nm"]].to_numpy(float))
+    return combine_masses(*columns, power=power, correlation=among)
+
+
+def _diffusion(placed: pd.DataFrame, setup: TrackSetup) -> Diffusion | None:
+    if setup.frame_rate_hz is None or len(placed) < max(LEAST_POSITIONS, setup.min_frames):
+        return None
+    return fit_diffusion(
+        *_positions(placed),
+        frame_rate_hz=setup.frame_rate_hz,
+        exposure_ms=setup.exposure_ms,
+        level=COVERAGE,
+    )
+
+
+def _positions(placed: pd.DataFrame) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return (
+        placed["frame"].to_numpy(float),
+        placed[["x_nm", "y_nm"]].to_numpy(float),
+        placed[["sigma_x_nm", "sigma_y_nm"]].to_numpy(float),
+    )
+
+
+def _size(record: Mapping[str, Any], setup: TrackSetup) -> dict[str, float]:
+    """Diameter and refractive index of a particle that moves freely in the liquid.
+
+    A sphere whose middle is nearer to the coverslip than its radius does not float: what moves so
+    slowly there is bound to a membrane, or to the glass.
+    """
+    diameter, sigma = hydrodynamic_diameter(
+        record["d_um2_s"],
+        record["sigma_d_um2_s"],
+        viscosity_mpa_s=setup.viscosity_mpa_s,
+        temperature_c=setup.temperature_c,
+    )
+    if diameter / 2 > record["z_nm"]:
+        return {}
+    size = {"diameter_nm": float(diameter), "sigma_diameter_nm": float(sigma)}
+    if setup.index is not None and np.isfinite(record["mass_kda"]):
+        index, error = refractive_index(
+            abs(record["mass_kda"]),
+            diameter,
+            sigma_mass_kda=record["sigma_mass_kda"],
+            sigma_diameter_nm=sigma,
+            index=setup.index,
+            density_kg_m3=setup.density_kg_m3,
+            n_medium=setup.n_medium,
+        )
+        size |= {"refractive_index": float(index), "sigma_refractive_index": float(error)}
+    return size
+
+
+def _tests(rows: pd.DataFrame, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:
+    """Ask whether the motion is free, of the first positions of a long track."""
+    track = _positions(_placed(rows).iloc[:TESTED_POSITIONS])
+    times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
+    walls = confinement_test(*track, **times, resamples=_FIRST_LOOK, rng=rng)
+    if walls.p_value <= _DOUBT:
+        walls = confinement_test(*track, **times, resamples=_FULL_LOOK, rng=rng)
+    power = anomalous_test(*track, **times)
+    return {
+        "p_confinement": walls.p_value,
+        "confinement_nm": walls.confinement_nm if walls.p_value <= SURPRISING else np.nan,
+        "exponent": power.exponent,
+        "sigma_exponent": power.sigma_exponent,
+        "p_anomalous": power.p_value,
+    }
+
+
+def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
+    """Everything that makes a number of the track less than it seems, worst first."""
+    seen = {
+        TrackStatus.FEW_FRAMES: record["n_d_frames"] < max(LEAST_POSITIONS, setup.min_frames),
+        TrackStatus.POOR_FITS: record["n_mass_frames"] < record["n_frames"] / 2,
+        TrackStatus.MASS_VARIES: record["p_mass"] < SURPRISING / 10,
+        TrackStatus.NOT_FREE: min(record["p_confinement"], record["p_anomalous"]) <= SURPRISING,
+        TrackStatus.STANDS_STILL: record["d_low_um2_s"] == 0,
+        TrackStatus.NEAR_WALL: 9 / 32 * record["diameter_nm"] > SLOWED * record["z_nm"],
+    }
+    return [status for status in TrackStatus if seen.get(status, False)]
+
+
+def _ends(rows: pd.DataFrame, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:
+    """Say whether the track begins and ends with the movie, at the border, or inside the field."""
+    step_nm = 0.0
+    if setup.frame_rate_hz is not None and np.isfinite(d_um2_s):
+        step_nm = 3 * float(np.sqrt(2 * d_um2_s * _UM2 / setup.frame_rate_hz))
+    border = setup.near_nm + step_nm
+    said = {}
+    for which, at, frame in (("begins", 0, setup.frames[0]), ("ends", -1, setup.frames[1] - 1)):
+        row = rows.iloc[at]
+        room = min(
+            row["x_nm"], row["y_nm"], setup.field_nm[1] - row["x_nm"],
+            setup.field_nm[0] - row["y_nm"],
+        )  # fmt: skip
+        where = "border" if room < border else "inside"
+        said[which] = "movie" if row["frame"] == frame else where
+    return said
+
+
+def _nearest(fits: pd.DataFrame, numbers: pd.Series[int]) -> dict[int, float]:
+    """Smallest distance of each track from any other in the same frame [nm]."""
+    closest: dict[int, float] = {}
+    places, tracks = fits[["x_nm", "y_nm"]].to_numpy(float), numbers.to_numpy(int)
+    for rows in fits.reset_index(drop=True).groupby("frame").indices.values():
+        if len(rows) < 2:
+            continue
+        apart = cdist(places[rows], places[rows])
+        apart[tracks[rows][:, None] == tracks[rows]] = np.inf
+        for track, distance in zip(tracks[rows], apart.min(axis=1), strict=True):
+            closest[int(track)] = min(closest.get(int(track), np.inf), float(distance))
+    return closest
+
+
+def _table(records: Iterable[Mapping[str, Any]], fits: pd.DataFrame) -> pd.DataFrame:
+    """Put records into columns with the right types."""
+    table = pd.DataFrame(list(records), columns=list(TRACK_COLUMNS))
+    whole = ("track", "first_frame", "last_frame", "n_frames", "n_mass_frames", "n_d_frames")
+    text = ("status", "flags", "begins", "ends")
+    kinds = {
+        name: "int64" if name in whole else "object" if name in text else "float64"
+        for name in TRACK_COLUMNS
+    }
+    table = table.astype(kinds)
+    table["nearest_nm"] = table["nearest_nm"].where(np.isfinite(table["nearest_nm"]))
+    if "systematic_mass_kda" in fits:
+        shared = fits.groupby(track_numbers(fits))["systematic_mass_kda"].median()
+        table["systematic_mass_kda"] = table["track"].map(shared).astype("float64")
+    return table

@@ -1,0 +1,293 @@
+"""Particles that move over an unknown background: the likelihood, its maximum, what it knows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from scenes import PIXEL_NM, make_config
+
+from iscat_analysis.config import Config
+from iscat_analysis.errors import DataError
+from iscat_analysis.inference.bias import first_order_bias
+from iscat_analysis.inference.moving import Ground, MovingField, Rows
+from iscat_analysis.inference.noise import poisson
+from iscat_analysis.optics.blur import blurred, path_variance_nm2
+from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.pipeline import fit_stack
+from iscat_analysis.search.moving import gaps, link
+
+SHAPE, FRAMES, LEVEL_E, ROI = (40, 44), 60, 4e5, 24
+MASSES = (200.0, 400.0)
+READ_E2 = 900.0
+SIGMAS = 4.0
+SAME = 1e-6
+FITTED = 0.05  # standard deviations: where a fit ends, and the differences of its likelihood
+
+
+def _config(camera: dict[str, object] | None = None) -> Config:
+    return make_config(
+        background={"frames": None},
+        camera={"frame_rate_hz": 331.0} if camera is None else camera,
+        fit={"mode": "track", "frames": None, "roi_nm": ROI * PIXEL_NM},
+        track={"free": "mass"},
+        simulation={"shape": list(SHAPE)},
+    )
+
+
+@pytest.fixture(scope="module")
+def pool() -> Iterator[ThreadPoolExecutor]:
+    with ThreadPoolExecutor(2) as threads:
+        yield threads
+
+
+def _paths(step_nm: float) -> np.ndarray:
+    """Two paths that do not meet, shape (2, frames, 2)."""
+    rng = np.random.default_rng(3)
+    walk = np.cumsum(rng.normal(0, step_nm, (2, FRAMES, 2)), axis=1)
+    walk -= walk.mean(axis=1, keepdims=True)
+    return walk + np.array([[1200.0, 1500.0], [2500.0, 1900.0]])[:, None]
+
+
+def _movie(paths: np.ndarray, *, noise: bool) -> tuple[np.ndarray, Ground, Rows]:
+    """Make counts (t, y, x), the light that made them, and the truth."""
+    rng = np.random.default_rng(5)
+    model = forward_model(_config(), 1e4)
+    grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
+    level = LEVEL_E * (1 + 0.15 * rng.standard_normal(SHAPE))
+    power = 1 + 0.02 * rng.standard_normal(FRAMES)
+    power /= power.mean()
+    theta = np.zeros((2 * FRAMES, 5))
+    expected = np.empty((FRAMES, *SHAPE))
+    for t in range(FRAMES):
+        signal = np.zeros(SHAPE)
+        for k, mass in enumerate(MASSES):
+            signal += model.image(grid, *paths[k, t], model.height_nm, mass)
+            amplitude = model.scale.amplitude(mass)
+            theta[2 * t + k] = *paths[k, t], model.height_nm, amplitude, 0.0
+        expected[t] = power[t] * level * (1 + signal)
+    counts = rng.poisson(expected) + rng.normal(0, math.sqrt(READ_E2), expected.shape)
+    frame, track = np.divmod(np.arange(2 * FRAMES), 2)
+    return counts if noise else expected, Ground(level, power), Rows.of(frame, track, theta)
+
+
+def _field(counts: np.ndarray, pool: ThreadPoolExecutor, read_e2: float = 0.0) -> MovingField:
+    config = _config()
+    near = forward_model(config, math.sqrt(2) * (ROI / 2 + 6) * PIXEL_NM)
+    return MovingField(
+        counts.astype(np.float32), np.full(SHAPE, read_e2), np.ones(SHAPE, dtype=bool),
+        near, forward_model(config, 1e4), pixel_nm=PIXEL_NM, roi_px=ROI, z_range_nm=None,
+        largest=1e6, pool=pool,
+    )  # fmt: skip
+
+
+def _square(theta: np.ndarray) -> tuple[slice, slice]:
+    """Where a row is fitted."""
+    spans = []
+    for centre, size in zip((theta[1], theta[0]), SHAPE, strict=True):
+        first = round(centre / PIXEL_NM - (ROI - 1) / 2)
+        spans.append(slice(max(first, 0), min(first + ROI, size)))
+    return spans[0], spans[1]
+
+
+@pytest.mark.parametrize(
+    ("step_nm", "taken_least", "left_most"), [(20.0, 0.2, 0.02), (60.0, 0.05, 3e-4)]
+)
+def test_background_takes_nothing_of_particles(
+    pool: ThreadPoolExecutor, step_nm: float, taken_least: float, left_most: float
+) -> None:
+    """Without noise the truth is the fixed point.
+
+    A median of the frames takes off the particles what they left there: 8 % at 60 nm a frame, 58 %
+    and 23 % of these two at 20 nm, where they stay within 100 nm.
+    """
+    counts, ground, truth = _movie(_paths(step_nm), noise=False)
+    field = _field(counts, pool)
+    start = field.first_ground(follow_power=True)
+    over_median, _, _ = field.fit(start, truth)
+    rows, found, done, _ = field.settle(start, truth, follow_power=True)
+    taken = 1 - over_median.theta[:, 3] / truth.theta[:, 3]
+    left = rows.theta[:, 3] / truth.theta[:, 3] - 1
+    assert done.all()
+    assert taken.reshape(-1, 2).mean(axis=0).min() > taken_least
+    assert np.abs(left).max() < left_most
+    assert np.abs(found.power / ground.power - 1).max() < 1e-6
+
+
+def test_fixed_point_is_the_maximum_of_the_multinomial(pool: ThreadPoolExecutor) -> None:
+    """Its gradient on a row's square, by differences, vanishes within the tolerance of a fit."""
+    counts, _, truth = _movie(_paths(40.0), noise=True)
+    field = _field(counts, pool)
+    start = field.first_ground(follow_power=True)
+    rows, ground, _, _ = field.settle(start, truth, follow_power=True)
+    for _ in range(3):  # beyond what is asked of it
+        rows, found, _ = field.fit(ground, rows)
+        ground = Ground(found.level, ground.power)
+    model = forward_model(_config(), 1e4)
+    grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
+    kept = counts.astype(np.float32).astype(float)
+    images = np.array([model.amplitude_image(grid, *theta[:4]) for theta in rows.theta])
+
+    def value(row: int, theta: np.ndarray) -> float:
+        changed = images.copy()
+        changed[row] = model.amplitude_image(grid, *theta[:4])
+        share = ground.power[:, None, None] * (1 + changed.reshape(FRAMES, 2, *SHAPE).sum(axis=1))
+        of_pixel = np.sum(kept * np.log(share / share.sum(axis=0)), axis=0)
+        return float(of_pixel[_square(rows.theta[row])].sum())
+
+    judged = field.judge(ground, rows)
+    for row in (0, 37, 98):
+        for parameter in (0, 1, 3):
+            sigma = 1 / math.sqrt(judged.fisher[row, parameter, parameter])
+            step = np.zeros(5)
+            step[parameter] = 0.3 * sigma
+            here = rows.theta[row]
+            slope = (value(row, here + step) - value(row, here - step)) / 0.6
+            assert abs(slope) < FITTED, (row, parameter)
+
+
+def test_rows_are_fitted_by_the_one_likelihood(pool: ThreadPoolExecutor) -> None:
+    """Estimate, informations, bias and fit of a row are those of `Likelihood` on its square."""
+    counts, ground, truth = _movie(_paths(40.0), noise=True)
+    field = _field(counts, pool, READ_E2)
+    rows, _, done = field.fit(ground, truth, sweeps=3)
+    judged = field.judge(ground, rows)
+    assert done.all()
+    model = forward_model(_config(), math.sqrt(2) * (ROI / 2 + 6) * PIXEL_NM)
+    wide = forward_model(_config(), 1e4)
+    for row in (4, 51):
+        t, theta = rows.frame[row], rows.theta[row]
+        other = rows.theta[row ^ 1]
+        cut = _square(theta)
+        grid = PixelGrid.region(*((side.start, side.stop) for side in cut), PIXEL_NM)
+        light = ground.power[t] * ground.level[cut]
+        base = light * (1 + wide.amplitude_image(grid, *other[:4]))
+        likelihood = poisson(
+            model, grid, counts.astype(np.float32)[t][cut], base, light, extra_variance_e2=READ_E2
+        )
+        free = np.array([True, True, False, True, False])
+        margin = np.array([300.0, 300.0, 0.0, 1e5, 0.0])
+        best = likelihood.maximize(truth.theta[row], free, theta - margin, theta + margin)
+        index = np.array([0, 1, 3])
+        fisher = likelihood.score_fisher(theta)[2][:4, :4]
+        sigma = 1 / np.sqrt(np.diag(fisher))
+        assert np.all(np.abs(best.theta - theta)[index] < FITTED * sigma[index])
+        scale = np.outer(sigma, sigma)
+        assert np.allclose(judged.fisher[row] * scale, fisher * scale, atol=SAME)
+        observed = likelihood.observed_information(theta)
+        square = np.ix_(index, index)
+        assert np.allclose((judged.observed[row] * scale)[square],
+                           (observed[:4, :4] * scale)[square], atol=2e-3)  # fmt: skip
+        bias = first_order_bias(likelihood, theta, free, likelihood.derivatives(theta))
+        assert np.allclose(judged.bias[row] / sigma, bias[:4] / sigma, atol=2e-3)
+        residuals = likelihood.residuals(theta)
+        assert judged.chi2[row] == pytest.approx(np.nansum(residuals**2), rel=1e-5)
+        assert judged.worst[row] == pytest.approx(np.nanmax(np.abs(residuals)), rel=1e-4)
+        gain = likelihood.values(theta[None])[0]
+        assert judged.gain[row] == pytest.approx(gain, rel=1e-4)
+
+
+def test_threads_do_not_change_the_result() -> None:
+    counts, ground, truth = _movie(_paths(40.0), noise=True)
+    found = []
+    for workers in (1, 3):
+        with ThreadPoolExecutor(workers) as threads:
+            rows, light, _ = _field(counts, threads).fit(ground, truth)
+        found.append((rows.theta, light.level))
+    assert np.array_equal(found[0][0], found[1][0])
+    assert np.array_equal(found[0][1], found[1][1])
+
+
+@pytest.mark.parametrize("optics", [{}, {"aberrations_nm": {"z7": 10.0}}])
+def test_blurred_model_is_the_average(optics: dict[str, object]) -> None:
+    """Gauss–Hermite points along both axes, of a particle so faint that |e|² is nothing."""
+    model = forward_model(make_config(optics=optics), 3000.0)
+    grid, variance = PixelGrid.centred(25, PIXEL_NM), 800.0
+    points, weights = np.polynomial.hermite_e.hermegauss(9)
+    weights = weights / weights.sum()
+    average = sum(
+        wx * wy * model.image(grid, *(math.sqrt(variance) * np.array([x, y])), 5.0, 0.1)
+        for x, wx in zip(points, weights, strict=True)
+        for y, wy in zip(points, weights, strict=True)
+    )
+    picture = blurred(model, variance, upwards=False).image(grid, 0.0, 0.0, 5.0, 0.1)
+    sharp = model.image(grid, 0.0, 0.0, 5.0, 0.1)
+    assert np.abs(picture - average).max() < 1e-4 * np.abs(sharp).max()
+    assert np.abs(sharp - average).max() > 0.05 * np.abs(sharp).max()
+
+
+def test_blur_is_that_of_a_brownian_path() -> None:
+    rng = np.random.default_rng(1)
+    d, exposure, steps = 0.8, 3e-3, 400
+    walk = np.cumsum(rng.normal(0, math.sqrt(2 * d * 1e6 * exposure / steps), (4000, steps)), 1)
+    spread = walk.var(axis=1)
+    expected = path_variance_nm2(d, exposure)
+    assert spread.mean() == pytest.approx(expected, rel=SIGMAS * math.sqrt(0.8 / 4000))
+    assert spread.var() / expected**2 == pytest.approx(0.8, rel=0.15)
+
+
+def test_links_survive_gaps() -> None:
+    frame = np.array([0, 0, 1, 1, 2, 4, 4, 5])
+    places = np.array([[0.0, 0], [900, 0], [50, 0], [950, 0], [940, 0], [60, 0], [930, 0], [0, 0]])
+    track = link(frame, places, reach_nm=200.0, memory=3)
+    assert track[0] == track[2] == track[5] == track[7]
+    assert track[1] == track[3] == track[4] == track[6]
+    missed, before, after, share = gaps(frame, track)
+    assert sorted(zip(missed.tolist(), track[before].tolist(), strict=True)) == sorted(
+        [(2, track[0]), (3, track[0]), (3, track[1])]
+    )
+    assert np.all(track[before] == track[after])
+    between = (1 - share) * places[before, 0] + share * places[after, 0]
+    assert np.all((between >= 50) & (between <= 60) | (between >= 930) & (between <= 940))
+
+
+# ---- the whole job ---------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("sketched")
+def test_raw_movie_becomes_tracks(tmp_path: Path) -> None:
+    paths = _paths(40.0)
+    counts, _, _ = _movie(paths, noise=True)
+    movie = tmp_path / "movie.tif"
+    tifffile.imwrite(movie, np.round(counts).astype(np.uint32), photometric="minisblack")
+    config = _config(camera={"frame_rate_hz": 331.0, "exposure_ms": 0.01, "read_noise_e": 30.0})
+    assert config.background.method == "tracks"
+    found = fit_stack(movie, config)
+    table = found.table
+    assert len(table) == 2 * FRAMES
+    assert table.groupby("track")["frame"].nunique().tolist() == [FRAMES, FRAMES]
+    assert len(found.views) == 2
+    assert table["sigma_z_nm"].isna().all()
+    assert (table["status"] == "ok").mean() > 0.9
+    for _, rows in table.groupby("track"):
+        k = int(np.argmin([abs(rows["mass_kda"].median() - mass) for mass in MASSES]))
+        pulls = ((rows["mass_kda"] - MASSES[k]) / rows["sigma_mass_kda"]).to_numpy()
+        assert abs(pulls.mean()) < SIGMAS / math.sqrt(FRAMES)
+        assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * FRAMES)
+        for axis, name in enumerate(("x_nm", "y_nm")):
+            pulls = ((rows[name] - paths[k, :, axis]) / rows[f"sigma_{name}"]).to_numpy()
+            assert abs(pulls.mean()) < SIGMAS / math.sqrt(FRAMES)
+            assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * FRAMES)
+
+
+def test_too_few_frames_are_refused(tmp_path: Path) -> None:
+    movie = tmp_path / "movie.tif"
+    counts = np.random.default_rng(1).poisson(1e4, (12, *SHAPE)).astype(np.uint16)
+    tifffile.imwrite(movie, counts, photometric="minisblack")
+    with pytest.raises(DataError, match="12 frames are too few"):
+        fit_stack(movie, _config())
+
+
+@pytest.mark.usefixtures("sketched")
+def test_an_empty_movie_has_no_tracks(tmp_path: Path) -> None:
+    """The frame rate is not needed for that, nor for the blur of a whole frame."""
+    movie = tmp_path / "movie.tif"
+    counts = np.random.default_rng(1).poisson(1e4, (25, *SHAPE)).astype(np.uint16)
+    tifffile.imwrite(movie, counts, photometric="minisblack")
+    found = fit_stack(movie, _config(camera={"frame_rate_hz": None}))
+    assert len(found.table) == 0

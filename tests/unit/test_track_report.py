@@ -1,0 +1,91 @@
+"""The report of a tracking job: paths, masses, speeds, films."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+from report_factory import make_analysis
+from walkers import EXPOSURE_MS, RATE_HZ, fits_of, walk
+
+from iscat_analysis.records import TRACK_COLUMNS
+from iscat_analysis.report import films, track_figures, write_report
+from iscat_analysis.report.headline import NOT_A_MASS
+from iscat_analysis.report.tracks import tracks_headline
+from iscat_analysis.result import Result
+
+
+def test_a_page_of_tracks_shows_paths_masses_speeds_and_films(tmp_path: Path) -> None:
+    analysis = make_analysis(200, "track")
+    assert analysis.tracks is not None
+    out = write_report(analysis, tmp_path / "out")
+    page = (out / "report.html").read_text(encoding="utf-8")
+    drawn = {path.stem for path in (out / "figures").iterdir()}
+    assert {"overview", "mass_d", "distributions", "msd", "track_0000"} <= drawn
+    assert page.count('<tr id="row-') == len(analysis.tracks) == 20
+    assert page.count("data:image/webp;base64,") == len(analysis.films) == 2
+    assert "because it is &lt;b&gt;long" in page
+    with Image.open(out / "figures" / "track_0000.webp") as film:
+        assert film.n_frames == 6
+        assert film.info["loop"] == 0
+        assert film.size == (3 * 24 + 2 * 2, 24)
+    for gid in re.findall(r'id="\w+-rows-([\d_]+)"', page):
+        assert all(int(row) < 20 for row in gid.split("_"))
+    assert f"{len(analysis.tracks)} tracks of 200 fitted positions" in page
+    written = pd.read_csv(out / "tracks.csv")
+    assert list(written.columns) == list(TRACK_COLUMNS)
+
+
+def test_films_that_would_fill_the_page_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    analysis = make_analysis(40, "track")
+    assert len(list(films.films_shown(analysis))) == 2
+    monkeypatch.setattr(films, "FILM_BYTES", 9000)
+    assert len(list(films.films_shown(analysis))) == 1
+
+
+def test_the_line_through_a_mean_squared_displacement_is_the_one_expected() -> None:
+    """Over many tracks the points of the figure are what D, errors and blur make of them."""
+    rng, lags_of = np.random.default_rng(3), []
+    for _ in range(200):
+        path = fits_of([walk(rng, 80, 0.3)], rng, sigma_nm=20.0)
+        lags, measured, error = track_figures._msd(path)
+        predicted = 4 * 0.3e6 * (lags / RATE_HZ - EXPOSURE_MS / 3e3) + error
+        lags_of.append(measured / predicted)
+    ratios = np.array(lags_of)
+    error = ratios.std(axis=0) / np.sqrt(len(ratios))
+    assert np.all(np.abs(ratios.mean(axis=0) - 1) < 4 * error)
+
+
+def test_a_headline_of_tracks_that_are_flagged_has_no_median() -> None:
+    analysis = make_analysis(200, "track")
+    assert analysis.tracks is not None
+    tracks = analysis.tracks.assign(status="ok", flags="")
+    said = tracks_headline(replace(analysis, tracks=tracks), analysis.table)
+    assert "Medians over tracks: mass" in said[0]
+    tracks.loc[:4, ["status", "flags"]] = "not_free"
+    said = tracks_headline(replace(analysis, tracks=tracks), analysis.table)
+    assert "5 of 20 that are long enough are flagged" in said[0]
+    assert "Medians" not in said[0]
+    tracks.loc[:4, ["status", "flags"]] = "few_frames"
+    assert "Medians" in tracks_headline(replace(analysis, tracks=tracks), analysis.table)[0]
+    bare = replace(analysis, tracks=tracks, summary={**analysis.summary, "mass_scale": "absolute"})
+    said = tracks_headline(bare, analysis.table)
+    assert NOT_A_MASS in said
+    assert "contrast" in said[0]
+    assert "kDa" not in said[0]
+
+
+def test_a_result_shows_its_tracks() -> None:
+    result = Result(make_analysis(40, "track"))
+    assert "4 tracks of 40 positions" in repr(result)
+    assert ".tracks" in repr(result)
+    assert "d_um2_s" in result._repr_html_()
+    assert len(result.tracks) == 4
+    assert list(Result(make_analysis(3)).tracks.columns) == list(TRACK_COLUMNS)
+    assert result.overview() is not None
+    assert result.histogram() is not None

@@ -1,0 +1,278 @@
+"""What the frames of a track say together: mass, D, size, and what is remarked on it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from walkers import PIXEL_NM, SETUP, fits_of, setup, walk
+
+from iscat_analysis import refractive_index
+from iscat_analysis.config import parse_config
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.pipeline.tracks import SHORT_MOVIE, judge_times
+from iscat_analysis.records import TRACK_COLUMNS, TrackStatus
+from iscat_analysis.species.common_mass import combine_masses, information_power
+from iscat_analysis.species.tracks import describe_tracks
+from iscat_analysis.units import sphere_mass_kda
+
+SIGMAS = 4.0
+
+
+def _frames(
+    rng: np.random.Generator, n: int, relative: float, power: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Estimates of a mass of 400 kDa, and the σ that each frame believes."""
+    mass = 400 * (1 + relative * rng.standard_normal(n))
+    return mass, 400 * relative * (mass / 400) ** (-power / 2)
+
+
+@pytest.mark.parametrize("power", [0.01, 2.0])
+def test_weights_that_follow_the_estimate_bias_the_mass_as_predicted(power: float) -> None:
+    rng, n, relative, tracks = np.random.default_rng(1), 200, 0.1, 400
+    drawn = [_frames(rng, n, relative, power) for _ in range(tracks)]
+    learned = information_power(drawn)
+    assert abs(learned - power) < 1e-6 * max(power, 1)
+    naive = [combine_masses(m, s, s).mass_kda / 400 - 1 for m, s in drawn]
+    right = [combine_masses(m, s, s, power=learned).mass_kda / 400 - 1 for m, s in drawn]
+    error = relative / math.sqrt(n * tracks)
+    assert abs(np.mean(right)) < SIGMAS * error
+    predicted = power * relative**2 * (1 - 1 / n)
+    next_order = 3 * power * relative**4
+    assert abs(np.mean(naive) - predicted) < SIGMAS * error + next_order
+    pulls = [
+        (combine_masses(m, s, s, power=learned).mass_kda - 400)
+        / combine_masses(m, s, s, power=learned).sigma_mass_kda
+        for m, s in drawn
+    ]
+    assert abs(np.std(pulls) - 1) < SIGMAS / math.sqrt(2 * tracks)
+
+
+def test_frames_of_different_precision_are_weighted() -> None:
+    sigma = np.array([10.0, 10.0, 1000.0])
+    found = combine_masses(np.array([400.0, 402.0, 900.0]), sigma, sigma)
+    assert abs(found.mass_kda - 401) < 0.1
+    assert abs(found.sigma_mass_kda - 10 / math.sqrt(2)) < 0.01
+
+
+def test_errors_that_frames_share_do_not_average_out() -> None:
+    rng, n, share, tracks = np.random.default_rng(2), 100, 0.02, 500
+    among = share * np.ones((n, n)) + (1 - share) * np.eye(n)
+    factor = np.linalg.cholesky(among)
+    pulls, naive = [], []
+    sigma = np.full(n, 20.0)
+    for _ in range(tracks):
+        mass = 400 + 20 * factor @ rng.standard_normal(n)
+        found = combine_masses(mass, sigma, sigma, correlation=among)
+        pulls.append((found.mass_kda - 400) / found.sigma_mass_kda)
+        naive.append((mass.mean() - 400) / combine_masses(mass, sigma, sigma).sigma_mass_kda)
+    doubt = SIGMAS / math.sqrt(2 * tracks)
+    assert abs(np.std(pulls) - 1) < doubt
+    assert abs(np.std(naive) / math.sqrt(1 + share * (n - 1)) - 1) < doubt
+
+
+def test_the_scatter_of_one_mass_is_not_remarked_on_and_that_of_two_is() -> None:
+    rng = np.random.default_rng(3)
+    sigma = np.full(100, 20.0)
+    p_values = [
+        combine_masses(400 + 20 * rng.standard_normal(100), sigma, sigma).p_value
+        for _ in range(200)
+    ]
+    assert abs(np.mean(p_values) - 0.5) < SIGMAS / math.sqrt(12 * 200)
+    two = np.where(np.arange(100) < 50, 380.0, 420.0) + 20 * rng.standard_normal(100)
+    assert combine_masses(two, sigma, sigma).p_value < 1e-6
+
+
+def test_a_sphere_of_its_own_material_has_its_own_index() -> None:
+    diameter = np.array([5.0, 30.0, 100.0])
+    for own, density in ((1.46, 1350.0), (1.59, 1050.0), (1.20, 800.0)):
+        mass = np.array([sphere_mass_kda(float(d), density) for d in diameter])
+        found, _ = refractive_index(mass, diameter, index=own, density_kg_m3=density, n_medium=1.33)
+        assert np.allclose(found, own, rtol=1e-12)
+    empty, _ = refractive_index(0.0, 30.0)
+    assert abs(float(empty) - 1.33) < 1e-12
+
+
+def test_the_error_of_an_index_is_that_of_drawn_masses_and_diameters() -> None:
+    rng = np.random.default_rng(4)
+    n, draws = 1.46, 20_000
+    mass = sphere_mass_kda(30.0, 1350.0)
+    drawn, _ = refractive_index(
+        mass * (1 + 0.01 * rng.standard_normal(draws)), 30 * (1 + 0.01 * rng.standard_normal(draws))
+    )
+    found, sigma = refractive_index(mass, 30.0, sigma_mass_kda=0.01 * mass, sigma_diameter_nm=0.3)
+    assert abs(float(found) - n) < 1e-9
+    assert abs(np.std(drawn) / float(sigma) - 1) < 0.02 + SIGMAS / math.sqrt(2 * draws)
+
+
+def test_no_sphere_scatters_more_than_a_perfect_conductor() -> None:
+    found, sigma = refractive_index(1e6, 10.0)
+    assert np.isnan(found)
+    assert np.isnan(sigma)
+    assert np.isnan(refractive_index(150.0, np.inf)[0])
+    with pytest.raises(ConfigError, match="is that of the medium"):
+        refractive_index(150.0, 7.0, index=1.33)
+    with pytest.raises(DataError, match="shapes that do not go together"):
+        refractive_index([1.0, 2.0], [1.0, 2.0, 3.0])
+
+
+def test_tracks_have_the_mass_and_d_of_their_particles() -> None:
+    rng, many, n = np.random.default_rng(5), 60, 150
+    truth = [0.15, 0.8]
+    paths = [walk(rng, n, truth[k % 2], start_nm=(4e4 * k, 5e3)) for k in range(many)]
+    tracks = describe_tracks(
+        fits_of(paths, rng, mass_kda=(400.0, 200.0)), setup(field_nm=(1e4, 1e7))
+    )
+    assert tuple(tracks.columns) == TRACK_COLUMNS
+    assert (tracks["n_frames"] == n).all()
+    for kind, (mass, d) in enumerate(((400.0, 0.15), (200.0, 0.8))):
+        rows = tracks.iloc[kind::2]
+        for name, true in (("mass_kda", mass), ("d_um2_s", d)):
+            off = (rows[name] - true).to_numpy()
+            pulls = off / rows[f"sigma_{name}"]
+            assert abs(off.mean()) < SIGMAS * off.std() / math.sqrt(len(rows))
+            assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * len(rows))
+            assert (rows[f"sigma_{name}"] / rows[f"crb_{name}"]).between(0.9, 1.1).all()
+    flagged = (tracks["status"] != TrackStatus.OK).sum()
+    assert flagged <= 4  # of 60 free tracks with two tests at 0.5 %: 0.6 on average
+    assert tracks[["diameter_nm", "refractive_index", "confinement_nm"]].notna().sum().sum() <= 1
+    assert (tracks["begins"] == "movie").all()
+    assert (tracks["ends"] != "movie").all()
+
+
+def test_only_particles_in_a_volume_have_a_size() -> None:
+    rng = np.random.default_rng(6)
+    diameter, density, n_frames = 30.0, 1350.0, 180
+    d = 1.380649e-23 * 298.15 / (3 * math.pi * 0.89e-3 * diameter * 1e-9) * 1e12
+    mass = sphere_mass_kda(diameter, density)
+    table = fits_of(
+        [walk(rng, n_frames, d, start_nm=(5e5, 5e5))], rng, mass_kda=(mass,), sigma_kda=0.02 * mass,
+        z_nm=800.0,
+    )  # fmt: skip
+    row = describe_tracks(table, setup(volume=True)).iloc[0]
+    assert abs(row["diameter_nm"] - diameter) < SIGMAS * row["sigma_diameter_nm"]
+    assert row["sigma_diameter_nm"] < 0.15 * diameter
+    assert abs(row["refractive_index"] - 1.46) < SIGMAS * row["sigma_refractive_index"]
+    metal = describe_tracks(table, setup(volume=True, index=None)).iloc[0]
+    assert np.isnan(metal["refractive_index"])
+    near = describe_tracks(table.assign(z_nm=40.0), setup(volume=True)).iloc[0]
+    assert near["status"] == TrackStatus.NEAR_WALL
+    bound = describe_tracks(table.assign(z_nm=5.0), setup(volume=True)).iloc[0]
+    assert np.isnan(bound["diameter_nm"])  # its middle cannot be nearer to the wall than its radius
+    assert np.isnan(describe_tracks(table, setup()).iloc[0]["diameter_nm"])
+
+
+def test_what_does_not_move_is_flagged_and_has_no_size() -> None:
+    rng = np.random.default_rng(7)
+    still = np.tile([5000.0, 5000.0], (80, 1))
+    found = describe_tracks(fits_of([still] * 1, rng), setup(volume=True)).iloc[0]
+    assert found["status"] == TrackStatus.STANDS_STILL
+    assert found["d_low_um2_s"] == 0
+    assert found["d_high_um2_s"] > found["d_um2_s"]
+    assert np.isnan(found["diameter_nm"])
+
+
+def test_a_track_of_few_frames_has_a_mass_and_no_d() -> None:
+    rng = np.random.default_rng(8)
+    found = describe_tracks(fits_of([walk(rng, 6, 0.3)], rng), SETUP).iloc[0]
+    assert found["status"] == TrackStatus.FEW_FRAMES
+    assert np.isnan(found["d_um2_s"])
+    assert abs(found["mass_kda"] - 400) < SIGMAS * found["sigma_mass_kda"]
+
+
+def test_confined_motion_is_remarked_on_with_the_size_of_the_well() -> None:
+    rng = np.random.default_rng(9)
+    found = describe_tracks(fits_of([walk(rng, 200, 0.8, side_nm=500.0)], rng), SETUP).iloc[0]
+    assert found["status"] == TrackStatus.NOT_FREE
+    assert found["p_confinement"] == 1 / 200
+    assert abs(found["confinement_nm"] / (500 / math.sqrt(12)) - 1) < 0.35
+
+
+def test_tracks_that_meet_are_marked_and_keep_their_verdict() -> None:
+    rng, n = np.random.default_rng(10), 100
+    apart = np.linspace(-2000, 2000, n)[:, None] * [1.0, 0.0]
+    paths = [walk(rng, n, 0.1), walk(rng, n, 0.1) + apart]
+    found = describe_tracks(fits_of([*paths, walk(rng, n, 0.1, start_nm=(9000, 9000))], rng), SETUP)
+    assert ["crosses" in flags for flags in found["flags"]] == [True, True, False]
+    assert found["nearest_nm"].iloc[:2].lt(500).all()
+    assert found["status"].iloc[0] == TrackStatus.OK
+
+
+def test_ends_tell_the_border_from_the_inside() -> None:
+    rng, n = np.random.default_rng(11), 60
+    leaving = np.linspace(3000, 10_600, n)[:, None] * [1.0, 0.0] + [0.0, 5000.0]
+    fits = fits_of([leaving, walk(rng, n, 0.05)], rng, first=(140, 20))
+    found = describe_tracks(fits, SETUP)
+    assert found[["begins", "ends"]].to_numpy().tolist() == [["inside", "movie"], ["inside"] * 2]
+    early = fits_of([leaving], rng, first=(0,))
+    assert describe_tracks(early, SETUP)[["begins", "ends"]].to_numpy().tolist() == [
+        ["movie", "border"]
+    ]
+
+
+def test_without_a_frame_rate_there_are_masses_and_places_and_no_d() -> None:
+    rng = np.random.default_rng(12)
+    found = describe_tracks(fits_of([walk(rng, 50, 0.3)], rng), setup(frame_rate_hz=None)).iloc[0]
+    assert found["status"] == TrackStatus.OK
+    assert np.isnan(found["d_um2_s"])
+    assert np.isfinite(found["mass_kda"])
+
+
+def test_frames_that_are_flagged_do_not_make_the_mass_but_the_path() -> None:
+    rng = np.random.default_rng(13)
+    fits = fits_of([walk(rng, 100, 0.3)], rng)
+    fits.loc[fits.index[::3], ["status", "mass_kda"]] = ["poor_fit", 1000.0]
+    found = describe_tracks(fits, SETUP).iloc[0]
+    assert abs(found["mass_kda"] - 400) < SIGMAS * found["sigma_mass_kda"]
+    assert (found["n_mass_frames"], found["n_d_frames"]) == (66, 100)
+    fits.loc[fits.index[:60], "status"] = "poor_fit"
+    assert describe_tracks(fits, SETUP).iloc[0]["status"] == TrackStatus.POOR_FITS
+
+
+def test_no_rows_make_an_empty_table_with_its_columns() -> None:
+    fits = fits_of([np.zeros((1, 2))], np.random.default_rng(1)).iloc[:0]
+    found = describe_tracks(fits, SETUP)
+    assert found.empty
+    assert tuple(found.columns) == TRACK_COLUMNS
+
+
+def test_rows_without_a_track_belong_to_none() -> None:
+    rng = np.random.default_rng(14)
+    fits = fits_of([walk(rng, 30, 0.3), walk(rng, 30, 0.3, start_nm=(9e3, 9e3))], rng)
+    fits["track"] = fits["event"].astype("Int64")
+    fits.loc[fits["event"] == 0, "track"] = pd.NA
+    assert describe_tracks(fits, SETUP)["track"].tolist() == [1]
+
+
+def _timed(**camera: float) -> list[str]:
+    config = parse_config(
+        {"camera": {"pixel_size_nm": PIXEL_NM, **camera}, "fit": {"mode": "track"},
+         "background": {"frames": [0, 10]}}
+    )  # fmt: skip
+    return list(judge_times(config, 100, "movie.tif"))
+
+
+def test_an_exposure_longer_than_the_interval_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"exposure_ms = 4 is longer than the 3\.021 ms"):
+        _timed(frame_rate_hz=331.0, exposure_ms=4.0)
+
+
+def test_a_missing_frame_rate_and_exposure_are_said_with_their_keys() -> None:
+    assert _timed(frame_rate_hz=331.0, exposure_ms=2.5) == []
+    (line,) = _timed(exposure_ms=2.5)
+    assert "camera.frame_rate_hz = 331.0" in line
+    (line,) = _timed(frame_rate_hz=331.0)
+    assert "camera.exposure_ms" in line
+
+
+def test_a_short_movie_is_said_with_what_it_can_tell() -> None:
+    config = parse_config({"camera": {"pixel_size_nm": 84.0, "frame_rate_hz": 331.0,
+                                      "exposure_ms": 2.0}, "fit": {"mode": "track"},
+                           "background": {"frames": [0, 10]}})  # fmt: skip
+    assert not list(judge_times(config, SHORT_MOVIE, "movie.tif"))
+    (line,) = judge_times(config, 10, "movie.tif")
+    assert line.startswith("movie.tif: 10 frames tell no diffusion coefficient better than to 33 %")
+    (line,) = judge_times(config, 5, "movie.tif")
+    assert "track.min_frames = 10" in line
