@@ -30,6 +30,8 @@ from iscat_cli.calibrate import SUMMARY as CALIBRATE_SUMMARY
 from iscat_cli.config import EXAMPLE as CONFIG_EXAMPLE
 from iscat_cli.config import config
 from iscat_cli.console import UNEXPECTED, Messages, silence
+from iscat_cli.export import EXAMPLE as EXPORT_EXAMPLE
+from iscat_cli.export import export
 from iscat_cli.fit import EXAMPLE as FIT_EXAMPLE
 from iscat_cli.fit import fit
 from iscat_cli.simulate import EXAMPLE as SIMULATE_EXAMPLE
@@ -41,6 +43,7 @@ COMMANDS = (
     (simulate, SIMULATE_EXAMPLE),
     (bounds, BOUNDS_EXAMPLE),
     (benchmark, BENCHMARK_EXAMPLE),
+    (export, EXPORT_EXAMPLE),
     (config, CONFIG_EXAMPLE),
 )
 

@@ -77,6 +77,8 @@ if TYPE_CHECKING:
     from iscat_analysis.records import Analysis as Analysis
     from iscat_analysis.records import Status as Status
     from iscat_analysis.records import TrackStatus as TrackStatus
+    from iscat_analysis.report.exchange import to_napari as to_napari
+    from iscat_analysis.report.exchange import to_trackpy as to_trackpy
     from iscat_analysis.result import Bounds as Bounds
     from iscat_analysis.result import Result as Result
     from iscat_analysis.schemas import schema as schema
@@ -108,6 +110,8 @@ _HOME = {
     "ConfinementTest": "species",
     "hydrodynamic_diameter": "species",
     "refractive_index": "species",
+    "to_trackpy": "report.exchange",
+    "to_napari": "report.exchange",
     "configure": "config",
     "fit_movie": "notebook",
     "Result": "notebook",
@@ -177,6 +181,8 @@ __all__ = [
     "refractive_index",
     "schema",
     "simulate_movie",
+    "to_napari",
+    "to_trackpy",
 ]
 
 

@@ -21,10 +21,12 @@ from iscat_analysis.records import (
     TRACK_COLUMNS,
     Analysis,
     EventView,
+    FloatArray,
     Progress,
     silent,
 )
 from iscat_analysis.report import write_report
+from iscat_analysis.report.exchange import to_napari, to_trackpy
 from iscat_analysis.report.headline import (
     as_contrasts,
     caution,
@@ -192,6 +194,14 @@ class Result:
             import arviz
         groups = posterior_groups(self.analysis, [view_of(self.analysis, event)])
         return arviz.InferenceData(**{name: group.isel(event=0) for name, group in groups.items()})
+
+    def trackpy(self) -> pd.DataFrame:
+        """Mode ``track``: the tracks in trackpy's layout; see `to_trackpy`."""
+        return to_trackpy(self.table)
+
+    def napari(self) -> FloatArray:
+        """Mode ``track``: the tracks as an array (track, t, y, x); see `to_napari`."""
+        return to_napari(self.table)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write the report, the tables and the figures into a folder.

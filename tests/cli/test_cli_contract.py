@@ -48,9 +48,7 @@ def _analysis(
     table = pd.DataFrame(list(rows), columns=list(EVENT_COLUMNS))
     summary = summary_of(table, mode, "iscat") | {"count": np.int64(len(rows))}
     summary["mass_scale"] = mass_scale
-    return SimpleNamespace(
-        table=table, mode=mode, scheme="iscat", summary=summary, tracks=None, films=()
-    )
+    return SimpleNamespace(table=table, mode=mode, scheme="iscat", summary=summary, tracks=None)
 
 
 @pytest.fixture
@@ -474,7 +472,7 @@ def fit_stack(stack, config, *, progress, notify, **_):
         progress("fitting", done, 3)
     notify("half way")
     table = pd.DataFrame([], columns=list(EVENT_COLUMNS))
-    return SimpleNamespace(table=table, mode="mass", summary={}, tracks=None, films=())
+    return SimpleNamespace(table=table, mode="mass", summary={}, tracks=None)
 sys.modules["iscat_analysis.pipeline"] = SimpleNamespace(fit_stack=fit_stack)
 sys.exit(main_fit(sys.argv[1:]))
 """

@@ -17,9 +17,11 @@ import pytest
 import tifffile
 from scenes import write_bright_landings
 from sketches import sketch_figures
+from walkers import SETUP, fits_of, walk
 
 from iscat_analysis.config import SIMULATED, Config, config_to_toml, load_config
 from iscat_analysis.records import EVENT_COLUMNS
+from iscat_analysis.species import describe_tracks
 from iscat_cli import console, main, main_fit
 from iscat_cli.app import COMMANDS, GROUPS
 from iscat_cli.console import Messages, duration
@@ -73,6 +75,10 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory, sample_configs) -> Path
     table = table.assign(mass_kda=mass, sigma_mass_kda=8.0, contrast=-3.1e-5 * mass)
     (folder / "standards.iscat").mkdir()
     table.assign(status="ok", flags="").to_csv(folder / "standards.iscat/fits.csv", index=False)
+    (folder / "moving.iscat").mkdir()
+    fits = fits_of([walk(random, 30, 0.3)], random)
+    fits.to_csv(folder / "moving.iscat/fits.csv", index=False)
+    describe_tracks(fits, SETUP).to_csv(folder / "moving.iscat/tracks.csv", index=False)
     return folder
 
 
