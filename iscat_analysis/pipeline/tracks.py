@@ -354,13 +354,18 @@ def _square(scene: Scene, windows: Windows, rows: pd.DataFrame) -> Region:
 def _picture(
     scene: Scene, single: Windows, region: Region, here: pd.DataFrame
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Draw data, model and residual of one frame, with all particles in it."""
+    """Draw data, model and residual of one frame, with all particles whose light is known there."""
     likelihood = region_likelihood(scene, single, region, None)
-    model = np.zeros(region.shape)
+    model, grid = np.zeros(region.shape), likelihood.grid
+    far = [
+        np.maximum(np.abs(here[name] - axis[0]), np.abs(here[name] - axis[-1])) + grid.pixel_nm
+        for name, axis in (("x_nm", grid.x_nm), ("y_nm", grid.y_nm))
+    ]
+    here = here[np.hypot(*far) < scene.wide.reach_nm]
     low, high = scene.wide.z_range_nm
     for row in here.itertuples():
         height = float(np.clip(row.z_nm, low, high))
-        model += scene.wide.image(likelihood.grid, row.x_nm, row.y_nm, height, row.mass_kda)
+        model += scene.wide.image(grid, row.x_nm, row.y_nm, height, row.mass_kda)
     data = likelihood.measured_signal()
     residual = (data - model) * np.sqrt(likelihood.signal_information(model))
     unit = likelihood.data[2] if scene.additive else 1.0
