@@ -46,7 +46,7 @@ DEGREE = 10
 _SHARPNESS = 20.0  # of the window, best for TAPS and LATTICE_STEP
 FILTER = 10
 """Half length of the filter that undoes the window."""
-_BLOCK = 48  # radial nodes whose Bessel functions are held at once
+_BLOCK = 128  # radial nodes whose Bessel functions are held at once
 
 RADIAL_STEP = 0.3
 """Radial step times bandwidth: the quintic errs by 1.6e-8 of the peak."""
@@ -118,29 +118,26 @@ def radial_waves(
     """
     fields, count, _ = harmonics.shape
     largest = count // 2
-    nodes = np.empty((3, intervals + 1, largest + 1, 4, fields))
-    pairs = np.empty((largest + 1, transverse.size, 4, fields))
-    for m in range(largest + 1):
-        plus, minus = harmonics[:, largest + m].T, harmonics[:, largest - m].T
-        even = 1j**m * (plus + minus) if m else plus
-        odd = 1j ** (m + 1) * (plus - minus)
-        pairs[m] = np.stack([even.real, even.imag, odd.real, odd.imag], axis=1)
-    columns = pairs.reshape(largest + 1, transverse.size, -1)
-    turn = transverse * step_nm
+    series = np.ascontiguousarray(np.moveaxis(harmonics, 0, 2))
+    plus, minus = series[largest:], series[largest::-1]
+    turn = (1j ** np.arange(largest + 1))[:, None, None]
+    even, odd = turn * (plus + minus), 1j * turn * (plus - minus)
+    even[0] = plus[0]
+    columns = np.concatenate([even.real, even.imag, odd.real, odd.imag], axis=2)
+    nodes = np.empty((3, intervals + 1, largest + 1, 4 * fields))
+    once = transverse * step_nm
     for start in range(0, intervals + 1, _BLOCK):
         r = step_nm * np.arange(start, min(start + _BLOCK, intervals + 1))
-        x = np.multiply.outer(transverse, r)
-        bessel = np.empty((largest + 3, *x.shape))
-        bessel_ladder(x.ravel(), bessel.reshape(largest + 3, -1))
-        for m in range(largest + 1):
-            below = bessel[m - 1] if m else -bessel[1]
-            two_below = bessel[abs(m - 2)] * (-1.0 if m == 1 else 1.0)
-            slope = (below - bessel[m + 1]) / 2
-            bend = (two_below - 2 * bessel[m] + bessel[m + 2]) / 4
-            for order, value in enumerate((bessel[m], slope, bend)):
-                scaled = value * (turn**order)[:, None]
-                found = scaled.T @ columns[m]
-                nodes[order, start : start + r.size, m] = found.reshape(-1, 4, fields)
+        bessel = np.empty((largest + 5, r.size, transverse.size))  # from order −2 on
+        x = np.multiply.outer(r, transverse)
+        bessel_ladder(x.ravel(), bessel[2:].reshape(largest + 3, -1))
+        bessel[1], bessel[0] = -bessel[3], bessel[4]
+        value = bessel[2:-2]
+        slope = (bessel[1:-3] - bessel[3:-1]) * (once / 2)
+        bend = (bessel[:-4] - 2 * value + bessel[4:]) * (once**2 / 4)
+        for order, part in enumerate((value, slope, bend)):
+            found = nodes[order, start : start + r.size].transpose(1, 0, 2)
+            np.matmul(part, columns, out=found)
     powers = np.empty((intervals, 6, largest + 1, 4, fields))
     _fill_quintics(nodes.reshape(3, intervals + 1, -1), powers.reshape(intervals, 6, -1))
     return powers
@@ -260,7 +257,7 @@ def sum_waves(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sample(waves: FloatArray, inv_step: float, step: float, out: FloatArray) -> None:
-    """Fill `out` (k, 2, side, side) with the fields at the nodes, four mirror images at a time."""
+    """Fill `out` (k, 2, side, side) with the fields at the nodes, eight mirror images at a time."""
     intervals, _, count, _, fields = waves.shape
     flat = waves.reshape(intervals, 6, -1)
     value = np.empty((count, 4, fields))
@@ -268,24 +265,25 @@ def _sample(waves: FloatArray, inv_step: float, step: float, out: FloatArray) ->
     sums = np.empty((2, 2, 2, fields))
     half = out.shape[2] // 2
     out[:] = 0.0
-    for ix in range(half + 1):
-        for iy in range(half + 1):
-            r = step * np.sqrt(float(ix * ix + iy * iy))
+    for far in range(half + 1):
+        for near in range(far + 1):
+            r = step * np.sqrt(float(far * far + near * near))
             i = int(r * inv_step)
             if i >= intervals:
                 continue
-            cos, sin = (ix * step / r, iy * step / r) if r > 0 else (1.0, 0.0)
             _quintic(flat[i], r * inv_step - i, line)
-            _sum_azimuths(value, cos, sin, sums)
-            right, left, low, high = half + ix, half - ix, half - iy, half + iy
-            for k in range(fields):
-                for part in range(2):
-                    ce, co = sums[0, 0, part, k], sums[0, 1, part, k]
-                    se, so = sums[1, 0, part, k], sums[1, 1, part, k]
-                    out[k, part, right, high] = ce + co + se + so
-                    out[k, part, left, high] = ce - co - se + so
-                    out[k, part, right, low] = ce + co - se - so
-                    out[k, part, left, low] = ce - co + se - so
+            for ix, iy in ((far, near), (near, far)):
+                cos, sin = (ix * step / r, iy * step / r) if r > 0 else (1.0, 0.0)
+                _sum_azimuths(value, cos, sin, sums)
+                right, left, low, high = half + ix, half - ix, half - iy, half + iy
+                for k in range(fields):
+                    for part in range(2):
+                        ce, co = sums[0, 0, part, k], sums[0, 1, part, k]
+                        se, so = sums[1, 0, part, k], sums[1, 1, part, k]
+                        out[k, part, right, high] = ce + co + se + so
+                        out[k, part, left, high] = ce - co - se + so
+                        out[k, part, right, low] = ce + co - se - so
+                        out[k, part, left, low] = ce - co + se - so
 
 
 def spread(waves: FloatArray, radial_step_nm: float, step_nm: float, half: int) -> FloatArray:

@@ -20,6 +20,7 @@ from iscat_analysis.search.templates import FAR_LOBE, LARGEST_IMAGE, NEAR, SIDEL
 
 _RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
 _RINGS = 0.04  # the same for the rest of its region
+_TOGETHER = 64  # peaks that are compared at once with all higher ones
 
 
 @dataclass(frozen=True)
@@ -84,21 +85,22 @@ class Sieve:
 
         One that waits casts its shadow too, or its rings would be taken for particles.
         """
-        if not peaks:
-            return []
         table = np.array([(p.frame, p.x_px, p.y_px, abs(p.snr)) for p in peaks])
-        return [bool(np.any(self._shadow(table[:k], table[k]))) for k in range(len(table))]
+        blocks = (slice(k, k + _TOGETHER) for k in range(0, len(table), _TOGETHER))
+        return [waits for rows in blocks for waits in self._in_shadow(table, rows).tolist()]
 
-    def _shadow(self, higher: FloatArray, peak: FloatArray) -> BoolArray:
-        """Tell which of the higher ones hide a peak; columns are frame, x, y and height."""
+    def _in_shadow(self, table: FloatArray, rows: slice) -> BoolArray:
+        """Tell which rows an earlier one, that is higher, hides; columns: frame, x, y, height."""
         reach = STRIDES * self.stride
-        frames, dx, dy = np.abs(higher[:, :3] - peak[:3]).T
+        own, higher = table[rows, None], table[None, : rows.stop]
+        frames, dx, dy = (np.abs(higher[..., k] - own[..., k]) for k in range(3))
         away = np.maximum(dx, dy)
         share = np.where(away < self.roi_px, SIDELOBE, FAR_LOBE)
-        lobe = (away < LARGEST_IMAGE * self.roi_px) & (peak[3] < share * higher[:, 3])
+        lobe = (away < LARGEST_IMAGE * self.roi_px) & (own[..., 3] < share * higher[..., 3])
         same = (frames < reach) & (np.hypot(dx, dy) < NEAR * self.roi_px)
-        hidden: BoolArray = (frames <= reach + self.stride) & (lobe | same)
-        return hidden
+        hidden = (frames <= reach + self.stride) & (lobe | same)
+        waits: BoolArray = np.any(np.tril(hidden, rows.start - 1), axis=1)
+        return waits
 
     def _is_residue(self, step: Step, peak: Peak) -> bool:
         """Whether a peak may be what a fitted step left over: the model is never quite right."""

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
 from iscat_analysis.records import BoolArray, FloatArray
-from iscat_analysis.search.peaks import SAMPLED, summit
+from iscat_analysis.search.peaks import SAMPLED, summits
 from iscat_analysis.search.templates import FAR_LOBE, NEAR, SIDELOBE, Templates
 
 IntArray = NDArray[np.int64]
@@ -128,19 +129,15 @@ class FrameFilter:
             overlap = self._filtered_by(spectrum)
             snr = overlap / np.sqrt(power[i] * self._norm[self._layers])
             best = snr.max(axis=0) if len(snr) > 1 else snr[0]
-            peaks = []
-            for row, column in np.argwhere(best > SAMPLED * threshold).tolist():
-                around = best[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-                if best[row, column] < around.max():
-                    continue
-                k = int(snr[:, row, column].argmax())
-                dy, dx, above = summit(snr[k], row, column)
-                height = float(best[row, column]) + above
-                if height > threshold:
-                    peaks.append((height, k, row, column, row + dy, column + dx))
-            peaks.sort(reverse=True)
+            at = _maxima(best, SAMPLED * threshold)
+            layers = snr[:, *at].argmax(axis=0)
+            dy, dx, above = summits(snr, np.stack([layers, *at], axis=1))
+            tops = [best[*at] + above, layers, *at, at[0] + dy, at[1] + dx]
+            peaks = sorted(zip(*(t.tolist() for t in tops), strict=True), reverse=True)
             kept: list[tuple[float, float, float]] = []
             for height, k, row, column, y, x in peaks:
+                if height <= threshold:
+                    break
                 if self._is_lobe(height, x, y, kept) or self._is_left_over(height, x, y, known[i]):
                     continue
                 kept.append((height, x, y))
@@ -180,6 +177,15 @@ class FrameFilter:
         half, (_, rows, columns) = self._half, self._norm.shape
         full = irfft2(spectrum * self._duals[self._layers], self._padded)
         return np.asarray(full[:, half : half + rows, half : half + columns])
+
+
+def _maxima(field: FloatArray, level: float) -> tuple[IntArray, IntArray]:
+    """Rows and columns of the pixels above a level that none of their neighbours exceeds."""
+    row, column = np.nonzero(field > level)
+    padded = np.pad(field, 1, constant_values=-np.inf)
+    around = sliding_window_view(padded, (3, 3))[row, column].max(axis=(1, 2))
+    highest = field[row, column] == around
+    return row[highest], column[highest]
 
 
 def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int) -> IntArray:

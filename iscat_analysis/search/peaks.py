@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
+
+FloatArray = NDArray[np.float64]
 
 SAMPLED = 0.85
 """Of a peak's height that the pixel next to it has at least."""
@@ -18,43 +19,44 @@ _REACH_PX = 6  # of the pixels that the spline goes through
 _FINE = np.linspace(-0.625, 0.625, 11)
 
 
-def summit(field: NDArray[Any], row: int, column: int) -> tuple[float, float, float]:
-    """Find the top of a smooth field, or its bottom, between its pixels.
+def summits(
+    fields: NDArray[Any], at: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Find the tops of smooth fields, or their bottoms, between the pixels.
 
     Parameters
     ----------
-    field : ndarray, shape (y, x)
-        The field.
-    row, column : int
-        A pixel that no neighbour of its sign exceeds in magnitude.
+    fields : ndarray, shape (k, y, x)
+        The fields.
+    at : ndarray of int, shape (n, 3)
+        Field, row and column of pixels that no neighbour of their sign exceeds in magnitude.
 
     Returns
     -------
-    dy, dx : float
-        From the pixel to there; never out of the field.
-    above : float
+    dy, dx : ndarray, shape (n,)
+        From each pixel to there; never out of the field.
+    above : ndarray, shape (n,)
         Magnitude there above that at the pixel, ≥ 0.
     """
-    value = float(field[row, column])
+    layer, *place = at.T
+    value = fields[layer, place[0], place[1]].astype(np.float64)
     around = np.arange(-_REACH_PX, _REACH_PX + 1)
-    patch = field[
-        np.ix_(*(_mirrored(c + around, n) for c, n in zip((row, column), field.shape, strict=True)))
-    ]
+    y, x = (_mirrored(c[:, None] + around, n) for c, n in zip(place, fields.shape[1:], strict=True))
+    patches = fields[layer[:, None, None], y[:, :, None], x[:, None, :]]
     spline = _spline()
-    fine = math.copysign(1.0, value) * (spline @ patch @ spline.T)
-    y, x = (
-        np.flatnonzero((c + _FINE >= 0) & (c + _FINE <= n - 1))
-        for c, n in zip((row, column), field.shape, strict=True)
-    )
-    fine = fine[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
-    i, j = (int(k) for k in np.unravel_index(int(fine.argmax()), fine.shape))
-    (dy, above), (dx, beside) = vertex(fine[:, j], i), vertex(fine[i], j)
+    fine = np.where(value < 0, -1.0, 1.0)[:, None, None] * (spline @ patches @ spline.T)
+    there = [c[:, None] + _FINE for c in place]
+    inside = [(t >= 0) & (t <= n - 1) for t, n in zip(there, fields.shape[1:], strict=True)]
+    fine[~(inside[0][:, :, None] & inside[1][:, None, :])] = -np.inf
+    i, j = np.divmod(fine.reshape(-1, _FINE.size**2).argmax(axis=1), _FINE.size)
+    each = np.arange(len(at))
+    (dy, higher), (dx, beside) = vertices(fine[each, :, j], i), vertices(fine[each, i], j)
+    height = fine[each, i, j] + higher + beside
     spacing = float(_FINE[1] - _FINE[0])
-    height = float(fine[i, j]) + above + beside
     return (
-        float(_FINE[y[i]]) + spacing * dy,
-        float(_FINE[x[j]]) + spacing * dx,
-        max(height - abs(value), 0.0),
+        _FINE[i] + spacing * dy,
+        _FINE[j] + spacing * dx,
+        np.maximum(height - np.abs(value), 0.0),
     )
 
 
@@ -66,7 +68,7 @@ def _mirrored(places: NDArray[np.int64], size: int) -> NDArray[np.int64]:
 
 
 @cache
-def _spline() -> NDArray[np.float64]:
+def _spline() -> FloatArray:
     """Weights of the pixels at the places of `_FINE`, shape (len(_FINE), 2·_REACH_PX + 1)."""
     pixels = np.eye(2 * _REACH_PX + 1)
     places = [_REACH_PX + _FINE]
@@ -75,28 +77,28 @@ def _spline() -> NDArray[np.float64]:
     )
 
 
-def vertex(line: NDArray[Any], index: int) -> tuple[float, float]:
-    """Vertex of the parabola through a maximum and its two neighbours.
+def vertices(lines: NDArray[Any], index: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    """Vertices of the parabolas through maxima and their two neighbours.
 
     Parameters
     ----------
-    line : ndarray, shape (n,)
-        The field along one axis.
-    index : int
-        Where it has a maximum.
+    lines : ndarray, shape (n, m)
+        Fields along one axis; −inf where there is none.
+    index : ndarray of int, shape (n,)
+        Where each has a maximum.
 
     Returns
     -------
-    shift : float
+    shift : ndarray, shape (n,)
         From the maximum to the vertex, at most half a step; 0 at an end of the line.
-    above : float
+    above : ndarray, shape (n,)
         Height of the vertex above the maximum.
     """
-    if not 0 < index < line.size - 1:
-        return 0.0, 0.0
-    low, mid, high = (float(v) for v in line[index - 1 : index + 2])
+    each, last = np.arange(len(lines)), lines.shape[1] - 1
+    low, mid, high = (lines[each, np.clip(index + k, 0, last)] for k in (-1, 0, 1))
+    inner = (index > 0) & (index < last) & np.isfinite(low) & np.isfinite(high)
+    low, high = np.where(inner, low, mid), np.where(inner, high, mid)
     bend = low - 2 * mid + high
-    if bend >= 0:
-        return 0.0, 0.0
-    shift = max(-0.5, min(0.5 * (low - high) / bend, 0.5))
+    bent = bend < 0
+    shift = np.where(bent, 0.5 * (low - high) / np.where(bent, bend, 1.0), 0.0).clip(-0.5, 0.5)
     return shift, 0.25 * (high - low) * shift

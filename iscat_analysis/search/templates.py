@@ -25,7 +25,7 @@ from iscat_analysis.inference.random_field import extent, height_reached
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
-from iscat_analysis.search.peaks import SAMPLED, summit, vertex
+from iscat_analysis.search.peaks import SAMPLED, summits, vertices
 from iscat_analysis.search.residue import EXCEEDS, is_hidden, size_on_ring
 
 HEIGHTS_PER_FRINGE = 8
@@ -314,15 +314,13 @@ def _peaks(
     The field that is smooth is the one with its sign.
     """
     sampled = (best == maximum_filter(best, size=3)) & (best > SAMPLED * threshold)
-    found = []
-    for row, column in np.argwhere(sampled).tolist():
-        layer = int(ranked[:, row, column].argmax())
-        dy, dx, above = summit(signed[layer], row, column)
-        height = float(best[row, column]) + above
-        height += vertex(ranked[:, row, column], layer)[1]
-        if height > threshold:
-            found.append(_Peak(layer, row, column, row + dy, column + dx, height))
-    return found
+    row, column = np.nonzero(sampled)
+    heights = ranked[:, row, column].T
+    layer = heights.argmax(axis=1)
+    dy, dx, above = summits(signed, np.stack([layer, row, column], axis=1))
+    height = best[row, column] + above + vertices(heights, layer)[1]
+    columns = [part.tolist() for part in (layer, row, column, row + dy, column + dx, height)]
+    return [_Peak(*each) for each in zip(*columns, strict=True) if each[-1] > threshold]
 
 
 def _beside(

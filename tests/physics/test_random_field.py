@@ -11,7 +11,7 @@ from scipy import fft
 from scipy.ndimage import gaussian_filter, label, maximum_filter
 
 from iscat_analysis.inference.random_field import expected_maxima, extent, height_reached
-from iscat_analysis.search.peaks import summit
+from iscat_analysis.search.peaks import summits
 
 SIDE, FINE, LEVEL = 256, 4, 3.3
 SIGMAS = 4.0
@@ -72,7 +72,9 @@ def test_a_peak_is_known_between_its_pixels() -> None:
     for _ in range(200):
         dy, dx = rng.uniform(-0.5, 0.5, 2)
         peak = np.exp(-((y - 10 - dy) ** 2 + (x - 10 - dx) ** 2) / (4 * WIDTH_PX**2))
-        found_dy, found_dx, above = summit(peak, 10, 10)
+        found_dy, found_dx, above = (
+            float(v[0]) for v in summits(peak[None], np.array([[0, 10, 10]]))
+        )
         errors.append(peak[10, 10] + above - 1)
         assert math.hypot(found_dy - dy, found_dx - dx) < 0.02
         rise = 0.0
@@ -81,7 +83,7 @@ def test_a_peak_is_known_between_its_pixels() -> None:
         parabolas.append(peak[10, 10] + rise - 1)
     assert np.abs(errors).max() < 3e-3
     assert np.abs(parabolas).max() > 1e-2
-    assert summit(field, 0, 0)[2] >= 0
+    assert summits(field[None], np.array([[0, 0, 0]]))[2][0] >= 0
 
 
 @pytest.mark.parametrize("alarms", [1e-3, 0.1, 10.0])

@@ -32,7 +32,6 @@ FOCUS_STEP_NM = 80.0
 
 _FOCI = 7  # of a scan, whose averages are searched
 _ROUNDS = 3  # of registration
-_CENTRE = (0.0, 0.0)
 _UNIT_KDA = 1e3  # at which interference and scattered light are told apart, by their powers
 _TURNS = 24  # of half a circle of phases, for strong particles
 _FAINT = 1e-3  # share of what is explained below which the scattered light alone is left out
@@ -218,6 +217,22 @@ def _parts(model: Any, sight: Sight, place: tuple[float, float]) -> tuple[FloatA
     return (2 * signal - _UNIT_KDA * slope) / _UNIT_KDA, (_UNIT_KDA * slope - signal) / _UNIT_KDA**2
 
 
+def _quadratures(model: Any, sight: Sight) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Contrast per mass at reference phases 0 and 90°, and scattered light per squared mass.
+
+    The particle is in the centre.
+    """
+    pixels = model.pixels(sight.grid)
+    along, power = np.zeros(sight.grid.shape, complex), np.zeros(sight.grid.shape)
+    for down, high in zip(pixels.offsets, pixels.weights, strict=True):
+        for right, wide in zip(pixels.offsets, pixels.weights, strict=True):
+            dx, dy = np.meshgrid(pixels.x + right, pixels.y + down)
+            field = model.field(dx, dy, sight.z_nm, _UNIT_KDA) / _UNIT_KDA
+            along += wide * high * field[0]
+            power += wide * high * np.sum(np.abs(field) ** 2, axis=0)
+    return 2 * along.real, 2 * along.imag, power
+
+
 def _strengths(
     linear: FloatArray, square: FloatArray, ll: FloatArray, ls: FloatArray, ss: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -283,10 +298,8 @@ def search_starts(
     for values in candidates:
         gram, overlaps = np.zeros((3, 3)), np.zeros((3, here.size, here.size))
         for average, (spectrum, noise) in zip(averages, spectra, strict=True):
-            now = average.seen_with(values)
-            cosine, square = _parts(build({**now, "reference_phase_deg": 0.0}), average, _CENTRE)
-            sine, _ = _parts(build({**now, "reference_phase_deg": 90.0}), average, _CENTRE)
-            pictures = [picture - picture.mean() for picture in (cosine, sine, square)]
+            model = build({**average.seen_with(values), "reference_phase_deg": 0.0})
+            pictures = [picture - picture.mean() for picture in _quadratures(model, average)]
             gram += np.einsum("iyx,jyx->ij", pictures, pictures) / noise
             for k, picture in enumerate(pictures):
                 match = fft.irfft2(spectrum * np.conj(fft.rfft2(picture)), s=shape)

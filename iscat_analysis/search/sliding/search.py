@@ -20,7 +20,7 @@ from scipy import fft
 from iscat_analysis._kernels.sliding import contrast_map, step_peaks
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.records import FloatArray, Mapper
-from iscat_analysis.search.peaks import SAMPLED, summit
+from iscat_analysis.search.peaks import SAMPLED, summits
 from iscat_analysis.search.sliding.frames import Chunk
 
 MapArray = NDArray[np.float32]
@@ -235,14 +235,13 @@ def find_steps(
     list of Peak
         With sub-pixel positions.
     """
-    peaks = []
-    for k, i, j in step_peaks(snr, SAMPLED * threshold).tolist():
-        value = float(snr[k, i, j])
-        dy, dx, above = summit(snr[k], i, j)
-        height = math.copysign(abs(value) + above, value)
-        if abs(height) <= threshold:
-            continue
-        amplitude = height / math.sqrt(float(effective[k]) * float(matched.norm[i, j]))
-        boundary = chunk.first + int(chunk.edges[k + 1])
-        peaks.append(Peak(boundary, float(j + dx), float(i + dy), height, amplitude))
+    at = step_peaks(snr, SAMPLED * threshold)
+    k, i, j = at.T
+    dy, dx, above = summits(snr, at)
+    value = snr[k, i, j].astype(np.float64)
+    height = value + np.copysign(above, value)
+    amplitude = height / np.sqrt(effective[k] * matched.norm[i, j])
+    boundary = chunk.first + chunk.edges[k + 1]
+    columns = [part.tolist() for part in (boundary, j + dx, i + dy, height, amplitude)]
+    peaks = [Peak(*row) for row in zip(*columns, strict=True) if abs(row[3]) > threshold]
     return sorted(peaks, key=lambda p: -abs(p.snr))
