@@ -18,7 +18,7 @@ MOST_FRAMES = 2000
 BLOCK = 20
 """Frames that are averaged: particles on a membrane, 0.15 µm²/s at 331 Hz, go 190 nm in them."""
 
-MOST_STAYING, MOST_UNDONE = 0.5, 0.1
+MOST_STAYING, MOST_UNDONE = 0.5, 0.05
 """Shares of changes that may stay where particles move (some do stay for 40 frames), and that may
 be undone where they land (one lands where another just left)."""
 
