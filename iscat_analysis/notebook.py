@@ -95,7 +95,7 @@ def fit_movie(
         "posterior": posterior,
         "workers": workers,
     }
-    resolved = _with_arguments(configure(config, settings=settings), given)
+    resolved = _resolved(config, settings, given)
     folder = _path(out)
     if folder is not None:
         check_output(folder, overwrite)
@@ -239,7 +239,7 @@ def compute_bounds(
     ConfigError
         A setting is unknown or impossible, or the pixel size is missing.
     """
-    resolved = _with_arguments(configure(config, settings=settings), {"mode": mode})
+    resolved = _resolved(config, settings, {"mode": mode})
     return Bounds(resolved, bounds_report(resolved))
 
 
@@ -299,11 +299,15 @@ _KEYS = {
 """Argument → key of the configuration."""
 
 
-def _with_arguments(config: Config, given: Mapping[str, Any]) -> Config:
-    """Change the keys that arguments stand for; messages name the arguments."""
-    changes = {_KEYS[name]: value for name, value in given.items() if value is not None}
-    called = {key: name for name, key in _KEYS.items()}
-    return configure(config, settings=changes, called=called)
+def _resolved(
+    config: str | Path | Mapping[str, Any] | Config | None,
+    settings: Mapping[str, Any] | Iterable[str] | None,
+    given: Mapping[str, Any],
+) -> Config:
+    """Make a configuration with the keys that arguments stand for; messages name the arguments."""
+    arguments = {_KEYS[name]: value for name, value in given.items() if value is not None}
+    called = {_KEYS[name]: name for name in given if given[name] is not None}
+    return configure(config, settings=settings, arguments=arguments, called=called)
 
 
 def _path(source: str | Path | None) -> Path | None:

@@ -36,6 +36,7 @@ def configure(
     source: str | Path | Mapping[str, Any] | Config | None = None,
     *,
     settings: Mapping[str, Any] | Iterable[str] | None = None,
+    arguments: Mapping[str, Any] | None = None,
     called: Mapping[str, str] | None = None,
 ) -> Config:
     """Make a configuration from a file, a mapping, another configuration, or the defaults.
@@ -50,6 +51,8 @@ def configure(
         (200, 400)}``, or text as in ``["optics.na=1.3"]``.  None as a value unsets a key.  Where
         two keys exclude each other, as ``particle.mass_kda`` and ``particle.diameter_nm`` do, the
         later one replaces the earlier.
+    arguments : mapping of str to Any, optional
+        Further changes, which win over `settings`.
     called : mapping of str to str, optional
         What messages call a key that reached this function under another name, as in
         ``{"fit.mode": "mode"}``.
@@ -66,7 +69,7 @@ def configure(
         impossible.
     """
     if isinstance(source, Config):
-        if not settings:
+        if not settings and not arguments:
             return source
         values = source.model_dump(exclude_none=True)
         where = "arguments" if called else "settings"
@@ -82,7 +85,7 @@ def configure(
             f"{type(source).__name__}: give the path of a TOML file, or sections of keys as in "
             '{"optics": {"na": 1.42}}'
         )
-    changes = _changes(settings)
+    changes = _changes(settings) + _changes(arguments)
     for section, key, value in changes:
         _change(values, section, key, value)
     if any(change[:2] in _METHOD_FOLLOWS for change in changes):

@@ -61,7 +61,11 @@ from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, vi
 from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
 from iscat_analysis.pipeline.scene import Scene, field_likelihood, make_scene
 from iscat_analysis.pipeline.systematic import with_systematic
-from iscat_analysis.pipeline.tracking import learns_background, track_movie, track_particles
+from iscat_analysis.pipeline.tracking import (
+    learns_background,
+    track_movie,
+    track_particles,
+)
 from iscat_analysis.pipeline.tracks import judge_times, make_films, tracks_of
 from iscat_analysis.records import (
     Analysis,
@@ -316,7 +320,9 @@ def analyse(
     tracks: pd.DataFrame | None = None
     films: tuple[Film, ...] = ()
     if scene.mode == "track":
-        tracks, said = tracks_of(scene, found.table, windows, tell=tell, progress=progress)
+        tracks, said = tracks_of(
+            scene, found.table, windows, masses=found.masses, tell=tell, progress=progress
+        )
         further |= said
         films = make_films(scene, steady, camera, windows, found.table, tracks)
         clock.lap("tracks")

@@ -41,7 +41,6 @@ FILM_FRAMES = 40
 """Frames of such a film, at most."""
 
 _ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
-_LEAST_LEFT = 1e-6  # of the information that a background leaves
 _NAMED = 3  # of pairs of tracks that met, in a message
 _ABSORBS = 1e-6  # of a permittivity, where a refractive index says it all no more
 
@@ -97,6 +96,7 @@ def tracks_of(
     fits: pd.DataFrame,
     windows: Windows,
     *,
+    masses: pd.DataFrame | None,
     tell: Callable[[str], None],
     progress: Progress,
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
@@ -110,6 +110,8 @@ def tracks_of(
         One row per particle and frame, with its track.
     windows : Windows
         Frame ranges.
+    masses : pandas.DataFrame or None
+        Masses of the exact likelihood, as in `Found`.
     tell : callable
         Told what the user should know.
     progress : Progress
@@ -127,6 +129,7 @@ def tracks_of(
         fits,
         setup,
         correlation=mass_correlation(scene, fits),
+        masses=masses,
         seed=scene.config.compute.seed,
         progress=progress,
     )
@@ -172,14 +175,12 @@ def track_setup(scene: Scene, windows: Windows) -> TrackSetup:
 
 
 def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
-    """Give the covariance of the masses of frames that share a background, in units of their σ.
+    """Give the correlation of the masses of frames that share a background recorded before.
 
     A mass is the picture h times the pixels, over Σ h², and of their pictures two frames have
     K = Σ h(u) h(u − r)/Σ h² in common.  With n frames before, the noise of their mean (f = 1) or
-    median is s = f/(f + n) of a frame's variance: (1 − s) I + s K.  A background learnt from the N
-    frames themselves gives way to what stays at its place: of the information I it leaves I − K/N,
-    whose inverse is the covariance, and of a particle that never moves nothing.  Where the height
-    is fitted as well, h is what of the picture its derivative along z does not explain.
+    median is s = f/(f + n) of a frame's variance: (1 − s) I + s K.  Where the height is fitted as
+    well, h is what of the picture its derivative along z does not explain.
 
     Parameters
     ----------
@@ -191,13 +192,13 @@ def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
     Returns
     -------
     callable or None
-        None where each frame has a background of its own, or none that is measured.
+        None where the background is known, or learnt with the tracks, whose masses are exact then.
     """
     config = scene.config
     before = fits["n_before"].median() if len(fits) else 0
-    if config.background.method == "known" or scene.additive or not before > 0:
+    known = config.background.method == "known" or scene.additive or learns_background(config)
+    if known or not before > 0:
         return None
-    learnt = learns_background(config)
     share = scene.background_variance / (scene.background_variance + before)
     side = scene.roi_px
     middle = (side - 1) / 2 * scene.pixel_nm
@@ -216,10 +217,7 @@ def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
         apart = (places_nm[:, None] - places_nm) / scene.pixel_nm + (side - 1)
         shared = map_coordinates(common, [apart[..., 1], apart[..., 0]], order=1)
         both = (shared + shared.T) / 2
-        if not learnt:
-            return np.asarray((1 - share) * np.eye(len(both)) + share * both)
-        left, ways = np.linalg.eigh(np.eye(len(both)) - both / before)
-        return np.asarray(ways / np.maximum(left, _LEAST_LEFT) @ ways.T)
+        return np.asarray((1 - share) * np.eye(len(both)) + share * both)
 
     return correlation
 
@@ -377,13 +375,18 @@ def _square(scene: Scene, windows: Windows, rows: pd.DataFrame) -> Region:
 def _picture(
     scene: Scene, single: Windows, region: Region, here: pd.DataFrame
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Draw data, model and residual of one frame, with all particles in it."""
+    """Draw data, model and residual of one frame, with all particles whose light is known there."""
     likelihood = region_likelihood(scene, single, region, None)
-    model = np.zeros(region.shape)
+    model, grid = np.zeros(region.shape), likelihood.grid
+    far = [
+        np.maximum(np.abs(here[name] - axis[0]), np.abs(here[name] - axis[-1])) + grid.pixel_nm
+        for name, axis in (("x_nm", grid.x_nm), ("y_nm", grid.y_nm))
+    ]
+    here = here[np.hypot(*far) < scene.wide.reach_nm]
     low, high = scene.wide.z_range_nm
     for row in here.itertuples():
         height = float(np.clip(row.z_nm, low, high))
-        model += row.model.image(likelihood.grid, row.x_nm, row.y_nm, height, row.mass_kda)
+        model += row.model.image(grid, row.x_nm, row.y_nm, height, row.mass_kda)
     data = likelihood.measured_signal()
     residual = (data - model) * np.sqrt(likelihood.signal_information(model))
     unit = likelihood.data[2] if scene.additive else 1.0

@@ -119,28 +119,6 @@ def test_frames_share_the_noise_of_their_background(tmp_path: Path) -> None:
     assert mass_correlation(replace(scene, config=known), table) is None
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 1.0])
-def test_a_background_learnt_with_the_tracks_takes_what_stays_at_its_place(share: float) -> None:
-    """Of n frames at one place among N it leaves n (1 − n/N); of n that are far apart 1 − 1/N."""
-    config = make_config(
-        background={"frames": None},
-        fit={"mode": "track", "frames": None},
-        optics={"focus_nm": -500},
-    )
-    scene, frames = make_scene(config, SHAPE), 80
-    n = round(share * frames)
-    table = pd.DataFrame({"n_before": [frames], "z_nm": [5.0], "mass_kda": [1000.0],
-                          "sigma_z_nm": [np.nan]})  # fmt: skip
-    correlation = mass_correlation(scene, table)
-    assert correlation is not None
-    ones = np.ones(n)
-    left = ones @ np.linalg.solve(correlation(np.full((n, 2), 900.0)), ones)
-    assert abs(left - n * (1 - share)) < 1e-3 * n
-    apart = np.stack([2e4 * np.arange(n), np.zeros(n)], axis=1)
-    left = ones @ np.linalg.solve(correlation(apart), ones)
-    assert abs(left / n - (1 - 1 / frames)) < 1e-6
-
-
 def test_films_show_what_the_fits_explain(tmp_path: Path) -> None:
     _movie(tmp_path / "movie.tif")
     with open_stack(tmp_path / "movie.tif") as movie:

@@ -1,0 +1,132 @@
+"""Movies of particles that move on a membrane, through microscopes of `instruments`.
+
+A frame is the average of the particle's pictures along its path.  In the space of wave vectors that
+is the picture's spectrum times the mean of exp(−i q r) over the places of the path, whatever they
+are: nothing is expanded, and nothing is taken from the package.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from instruments import Instrument, Pictures
+from numpy.typing import NDArray
+from scipy.fft import fft2, irfft2, next_fast_len
+from scipy.ndimage import gaussian_filter
+
+FloatArray = NDArray[np.float64]
+
+PARTS = 16
+"""Places in one exposure."""
+
+MARGIN_PX = 8.0
+"""How far out of the field particles go before they turn back."""
+
+SPECIES = ((200.0, 0.15, 4), (200.0, 0.8, 3), (400.0, 0.15, 4), (400.0, 0.8, 3))
+"""Mass [kDa], diffusion coefficient [µm²/s] and number."""
+
+
+@dataclass(frozen=True)
+class Wanderers:
+    """A movie and its truth.
+
+    Attributes
+    ----------
+    counts : ndarray of uint16, shape (frames, y, x)
+        What the camera gives.
+    truth : DataFrame
+        track, frame, x_nm, y_nm (averages over the exposure), mass_kda, d_um2_s; one row for each
+        particle and frame in which it is in the field.
+    """
+
+    counts: NDArray[np.uint16]
+    truth: pd.DataFrame
+
+
+def wander(
+    shape: tuple[int, int, int],
+    *,
+    seed: int,
+    instrument: Instrument | None = None,
+    species: tuple[tuple[float, float, int], ...] = SPECIES,
+    level_e: float = 4e5,
+    speckle: float = 0.15,
+    power_noise: float = 0.01,
+    frame_rate_hz: float = 331.0,
+    pixel_nm: float = 84.0,
+    gain_e_per_adu: float = 20.0,
+) -> Wanderers:
+    """Record particles that diffuse during the whole of every frame.
+
+    Parameters
+    ----------
+    shape : (int, int, int)
+        Frames, rows, columns.
+    seed : int
+        Of everything.
+    instrument : Instrument, optional
+        Through which they are seen; the default conserves energy.
+    species : tuple of (float, float, int)
+        As in `SPECIES`.
+    level_e, speckle, power_noise : float
+        Photoelectrons per pixel and frame, their relative spread from pixel to pixel, and from
+        frame to frame.
+    frame_rate_hz, pixel_nm, gain_e_per_adu : float
+        Of the camera.
+
+    Returns
+    -------
+    Wanderers
+        The movie.
+    """
+    rng = np.random.default_rng(seed)
+    frames, rows, columns = shape
+    mass, diffusion = (np.array([row[k] for row in species for _ in range(row[2])]) for k in (0, 1))
+    low = -MARGIN_PX * pixel_nm
+    size = np.array([columns - 1, rows - 1]) * pixel_nm - 2 * low
+    step = np.sqrt(2e6 * diffusion / (frame_rate_hz * PARTS))[:, None, None]
+    walk = np.cumsum(step * rng.standard_normal((mass.size, frames * PARTS, 2)), axis=1)
+    walk += rng.uniform(0, size, (mass.size, 1, 2))
+    walk = low + size - np.abs(walk % (2 * size) - size)  # between walls that reflect
+    walk = walk.reshape(mass.size, frames, PARTS, 2)
+
+    reach = max(rows, columns) + math.ceil(MARGIN_PX) + 1
+    side = next_fast_len(2 * reach)
+    offset = (np.arange(side) - side // 2) * pixel_nm
+    farthest = 1.02 * math.sqrt(2) * side / 2 * pixel_nm
+    pictures = Pictures(instrument or Instrument(emission="reciprocal"), farthest)
+    above = pictures.contrast(offset[None, :], offset[:, None], 1e3)
+    below = pictures.contrast(offset[None, :], offset[:, None], -1e3)
+    linear, square = (above - below) / 2e3, (above + below) / 2e6
+    spectra = [fft2(np.fft.ifftshift(part))[:, : side // 2 + 1] for part in (linear, square)]
+    ky = 2 * np.pi * np.fft.fftfreq(side)
+    kx = 2 * np.pi * np.fft.rfftfreq(side)
+
+    rough = gaussian_filter(rng.standard_normal((rows, columns)), 3.0, mode="wrap")
+    light = level_e * (1 + speckle * rough / rough.std())
+    weights = np.repeat(mass, PARTS) / PARTS
+    squares = np.repeat(mass**2, PARTS) / PARTS
+    counts = np.empty(shape, dtype=np.uint16)
+    for t in range(frames):
+        places = walk[:, t].reshape(-1, 2) / pixel_nm
+        along = np.exp(-1j * np.outer(places[:, 0], kx))
+        across = np.exp(-1j * np.outer(ky, places[:, 1]))
+        spectrum = spectra[0] * ((across * weights) @ along)
+        spectrum += spectra[1] * ((across * squares) @ along)
+        contrast = irfft2(spectrum, s=(side, side))[:rows, :columns]
+        expected = (1 + power_noise * rng.standard_normal()) * light * (1 + contrast)
+        noisy = expected + np.sqrt(expected) * rng.standard_normal((rows, columns))
+        counts[t] = np.floor(noisy / gain_e_per_adu + rng.random((rows, columns)))
+
+    mean = walk.mean(axis=2)
+    inside = (mean >= 0) & (mean <= size + 2 * low)
+    track, frame = np.nonzero(inside.all(axis=2))
+    truth = pd.DataFrame({
+        "track": track, "frame": frame,
+        "x_nm": mean[track, frame, 0], "y_nm": mean[track, frame, 1],
+        "mass_kda": mass[track], "d_um2_s": diffusion[track],
+    })  # fmt: skip
+    return Wanderers(counts, truth)
