@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from iscat_analysis.inference.moving import Ground, Judged, MovingField, Rows
 from iscat_analysis.records import BoolArray, FloatArray
@@ -38,6 +38,8 @@ MOST_PIXELS = 1800
 """Pixels of a track whose information is taken as a whole."""
 
 _SINGULAR = 1e-9
+_POLISH = 3  # steps
+_FARTHEST = 0.02  # step of the logarithm of the background
 _STEPS = 4  # of Newton's method; each leaves the square of the error before
 _SETTLED = 0.01  # standard deviations
 
@@ -114,7 +116,8 @@ def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged
         mine = mine[good]
         if not mine.size:
             continue
-        of_track, fisher = rows.only(mine), judged.fisher[mine]
+        fisher = judged.fisher[mine]
+        of_track = rows.only(np.isin(np.arange(len(rows.frame)), mine))
         square = np.ix_(mine, index, index)
         if field.pixels_of(of_track) <= MOST_PIXELS:
             extra, amplitudes = _all_pixels(field, ground, of_track, fisher, index)
@@ -124,6 +127,65 @@ def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged
             extra, taken[k] = _common_modes(fisher, lost, index)
         covariance[square] = extra
     return Shared(covariance, taken, together)
+
+
+def polish(
+    field: MovingField, ground: Ground, rows: Rows, *, follow_power: bool
+) -> tuple[Rows, Ground, BoolArray]:
+    """Take the last steps to the maximum by Newton's method where turns are too slow.
+
+    A turn moves the background by δ = (n − Σ_t λ_t)/N, as if the rows stayed.  As they follow, the
+    whole way is M⁻¹ N δ: where particles hardly move it is many times as far.
+
+    Parameters
+    ----------
+    field : MovingField
+        The movie.
+    ground : Ground
+        Where turns ended.
+    rows : Rows
+        Particles.
+    follow_power : bool
+        Whether the power is fitted too.
+
+    Returns
+    -------
+    rows : Rows
+        Estimates.
+    ground : Ground
+        Over which they are.
+    converged : ndarray of bool, shape (n,)
+        Which fits did.
+    """
+    judged = field.judge(ground, rows, brief=True)
+    index = np.flatnonzero(field.free[:4])
+    good = np.linalg.det(_scaled(judged.fisher, index)[0]) > _SINGULAR
+    factors = []
+    for k in np.unique(rows.track):
+        mine = np.flatnonzero((rows.track == k) & good)
+        of_track = rows.only((rows.track == k) & good)
+        if not mine.size or field.pixels_of(of_track) > MOST_PIXELS:
+            continue
+        patterns, weight = field.patterns(ground, of_track)
+        pixels = weight > 0
+        slopes = patterns[:, index][:, :, pixels]
+        flat = slopes.reshape(-1, slopes.shape[2])
+        follows = (_inverse(judged.fisher[mine], index) @ slopes).reshape(flat.shape)
+        left = _factor(np.diag(1 / weight[pixels]) - flat.T @ follows)
+        if left is not None:
+            factors.append((field.box(of_track), pixels, weight[pixels], left))
+    for _ in range(_POLISH if factors else 0):
+        rows, found, _ = field.fit(ground, rows)
+        move = np.log(found.level / ground.level)
+        for cut, pixels, weight, left in factors:
+            here = move[cut]
+            here[pixels] = np.clip(
+                cho_solve((left, True), here[pixels] / weight), -_FARTHEST, _FARTHEST
+            )
+        power = found.power if follow_power else ground.power
+        ground = Ground(ground.level * np.exp(move), power)
+    rows, _, done = field.fit(ground, rows)
+    return rows, ground, done
 
 
 def _all_pixels(

@@ -204,7 +204,7 @@ class MovingField:
         self.pixel_nm, self.roi_px = pixel_nm, roi_px
         pixels = near.pixels(grid)
         self._whole = Field(pixels, pixel_nm, roi_px, DRAWN * roi_px)
-        self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, 2 * roi_px)
+        self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, roi_px)
         self.free = np.array([True, True, z_range_nm is not None, True, False])
         reach = window_nm(pixel_nm)
         half = pixel_nm / 2 + _BEYOND * near.optics.wavelength_nm / near.optics.na
@@ -408,7 +408,9 @@ class MovingField:
         )  # fmt: skip
         return out
 
-    def judge(self, ground: Ground, rows: Rows, *, brief: bool = False) -> Judged:
+    def judge(
+        self, ground: Ground, rows: Rows, *, brief: bool = False, coarse: bool = False
+    ) -> Judged:
         """Say what the likelihood knows of every row.
 
         Parameters
@@ -419,6 +421,8 @@ class MovingField:
             Particles, at their estimates.
         brief : bool
             Leave out observed information and bias, which take most of the time.
+        coarse : bool
+            As in `fit`.
 
         Returns
         -------
@@ -430,12 +434,13 @@ class MovingField:
         near, far = self._pictures
         starts = rows.starts(self.frames)
         fisher, turned, ways = np.empty((3, n, 4, 4))
+        field = self._coarse if coarse else self._whole
         bias, score = np.empty((2, n, 4))
         numbers = np.empty((n, 5))
 
         def block(first: int) -> FloatArray:
             judge_frames(
-                light, self._whole, near, far, self.free, starts, first,
+                light, field, near, far, self.free, starts, first,
                 min(first + _BLOCK, self.frames), rows.theta, rows.group, fisher, turned, ways,
                 bias, score, numbers, brief,
             )  # fmt: skip
@@ -535,14 +540,14 @@ class MovingField:
         ndarray, shape (4, 4)
             Σ over pixels of (Σ_t w B ∂C)(Σ_t w B ∂C)ᵀ / Σ_t w B (1 + C), in (x, y, z, a).
         """
-        cut = self._box(rows)
+        cut = self.box(rows)
         modes = np.empty((4, *ground.level[cut].shape))
         self._modes(ground, rows, cut, modes)
         return np.asarray(np.einsum("ayx,byx,yx->ab", modes, modes, self._weight(ground, cut)))
 
     def pixels_of(self, rows: Rows) -> int:
         """Count the pixels of the box in which all rows are fitted."""
-        rows_, columns = self._box(rows)
+        rows_, columns = self.box(rows)
         return int((rows_.stop - rows_.start) * (columns.stop - columns.start))
 
     def patterns(self, ground: Ground, rows: Rows) -> tuple[FloatArray, FloatArray]:
@@ -562,13 +567,13 @@ class MovingField:
         weight : ndarray, shape (y, x)
             One over the counts of all frames; less where there is read noise, 0 where not used.
         """
-        cut = self._box(rows)
+        cut = self.box(rows)
         out = np.empty((len(rows.frame), 4, *ground.level[cut].shape))
         for i in range(len(out)):
             self._modes(ground, rows.only(np.arange(len(out)) == i), cut, out[i])
         return out, self._weight(ground, cut)
 
-    def _box(self, rows: Rows) -> tuple[slice, slice]:
+    def box(self, rows: Rows) -> tuple[slice, slice]:
         """Give the pixels that the squares of rows cover."""
         spans = []
         for axis, size in ((1, self.used.shape[0]), (0, self.used.shape[1])):
@@ -623,7 +628,9 @@ class MovingField:
         ndarray, shape (n,)
             At least 0.
         """
-        return np.asarray(np.sqrt(2 * np.maximum(self.judge(ground, rows, brief=True).gain, 0.0)))
+        return np.asarray(
+            np.sqrt(2 * np.maximum(self.judge(ground, rows, brief=True, coarse=True).gain, 0.0))
+        )
 
     @cached_property
     def _frame_totals(self) -> FloatArray:

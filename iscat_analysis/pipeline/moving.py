@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.inference.common import CommonAmplitudes, common_amplitudes, shared_errors
+from iscat_analysis.inference.common import (
+    CommonAmplitudes,
+    common_amplitudes,
+    polish,
+    shared_errors,
+)
 from iscat_analysis.inference.moving import Ground, Judged, MovingField, Rows
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
@@ -31,10 +36,14 @@ from iscat_analysis.species import fit_diffusion
 LEAST_FRAMES = 20
 """Frames in a movie at least: fewer leave the background to the particles."""
 
+OUTLYING = 5.0
+"""Standard deviations from its track's mass beyond which a row is not of that particle alone."""
+
 ROUNDS = 8
 """Searches of the whole movie; each sees what the fits so far leave over."""
 
 _FIRST_TURNS = 3  # of background and particles between two searches
+_NEXT_TURNS = 8  # between two extensions of the tracks
 _BLOCK = 64  # frames that are searched at a time
 _LEAST_POSITIONS = 4  # of a track whose D is fitted
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
@@ -202,14 +211,15 @@ def follow(
     resolution = config.optics.wavelength_nm / config.optics.na
     for number in range(ROUNDS):
         rows, ground, done, _ = field.settle(
-            ground, rows, follow_power=follow_power, follow_level=follow_level, coarse=True
-        )
+            ground, rows, follow_power=follow_power, follow_level=follow_level,
+            turns=_NEXT_TURNS, coarse=True,
+        )  # fmt: skip
         rows = _trimmed(rows)
         rows, added = extended(
             field, ground, rows, resolution_nm=resolution, reach_nm=config.track.max_step_nm
         )
         rows = _linked(config, rows, _places(config, field, ground, rows), bridged=True)
-        rows = _alone(config, field, rows)
+        rows = _alone(scene, field, ground, rows)
         if number < _HELD_ROUNDS and follow_level:
             rows, held = _held(config, field, rows)
             added += held
@@ -230,15 +240,47 @@ def follow(
             diffusion = _diffusion(config, field, rows, judged)
             rows, variances = _blurred(rows, diffusion, exposure)
             field.set_blurs(variances)
+    if follow_level:
+        rows, ground, done = polish(field, ground, rows, follow_power=follow_power)
     judged = field.judge(ground, rows)
     shared = shared_errors(field, ground, rows, judged)
     inside = np.array([field.holds(theta) for theta in rows.theta], dtype=bool)
-    alone = done & inside & ~crowded(rows, field, config.detection.min_separation_nm)
+    alone = (
+        done
+        & inside
+        & ~shares_mass(rows, judged)
+        & ~crowded(rows, field, config.detection.min_separation_nm)
+    )
     common = common_amplitudes(field, ground, rows, judged, alone, shared)
     progress("track", total, total)
     return Moving(
         rows, ground, judged, done, variances, diffusion, change, field, shared.covariance, common
     )
+
+
+def shares_mass(rows: Rows, judged: Judged) -> BoolArray:
+    """Tell which rows differ so much from their track's mass that they hold part of another's.
+
+    Parameters
+    ----------
+    rows : Rows
+        Particles, at their estimates.
+    judged : Judged
+        Of these rows.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        Where the mass is `OUTLYING` standard deviations, as its track scatters, from the median.
+    """
+    out = np.zeros(len(rows.frame), dtype=bool)
+    error = 1 / np.sqrt(np.maximum(judged.fisher[:, 3, 3], 1e-300))
+    for k in np.unique(rows.track):
+        mine = rows.track == k
+        off = (rows.theta[mine, 3] - np.median(rows.theta[mine, 3])) / error[mine]
+        scale = max(1.0, float(np.median(np.abs(off))) / 0.6745)
+        out[mine] = np.abs(off) > OUTLYING * scale
+    return out
 
 
 def crowded(rows: Rows, field: MovingField, limit_nm: float) -> BoolArray:
@@ -384,7 +426,7 @@ def _places(config: Config, field: MovingField, ground: Ground, rows: Rows) -> F
     """
     if not len(rows.frame):
         return rows.theta[:, :2]
-    fisher = field.judge(ground, rows, brief=True).fisher
+    fisher = field.judge(ground, rows, brief=True, coarse=True).fisher
     error = 1 / np.sqrt(max(float(np.median(fisher[:, 3, 3])), 1e-300))
     return np.column_stack(
         [rows.theta[:, :2], rows.theta[:, 3] * (_STEP * config.track.max_step_nm / error)]
@@ -400,15 +442,17 @@ def _typical(rows: Rows) -> Rows:
     return replace(rows, theta=theta)
 
 
-def _alone(config: Config, field: MovingField, rows: Rows) -> Rows:
-    """Leave out tracks that are hardly ever alone: they may be parts of their neighbours."""
+def _alone(scene: Scene, field: MovingField, ground: Ground, rows: Rows) -> Rows:
+    """Leave out tracks that are hardly ever alone, or seen: they may be parts of neighbours."""
+    config = scene.config
     if not len(rows.frame):
         return rows
     near = crowded(rows, field, _BESIDE * config.optics.wavelength_nm / config.optics.na)
     tracks = int(rows.track.max(initial=0)) + 1
     free = np.bincount(rows.track[~near], minlength=tracks)
-    light = np.array([np.median(rows.theta[rows.track == k, 3]) for k in range(tracks)]) <= 0
-    kept = (free >= config.track.min_frames) & ~light
+    snr = np.where(rows.theta[:, 3] > 0, field.snr_of(ground, rows), 0.0)
+    median = np.array([np.median(snr[rows.track == k]) for k in range(tracks)])
+    kept = (free >= config.track.min_frames) & (median > _AS_FOUND * scene.templates.threshold)
     return _numbered(rows.only(kept[rows.track]))
 
 

@@ -10,7 +10,7 @@ from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.inference.fit import POOR_FIT_P
 from iscat_analysis.optics.blur import PATH_SPREAD, blurred
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
-from iscat_analysis.pipeline.moving import Moving, crowded
+from iscat_analysis.pipeline.moving import Moving, crowded, shares_mass
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import EVENT_COLUMNS, PARAMETERS, BoolArray, FloatArray, Status, verdict
 
@@ -202,6 +202,7 @@ def _flags(
     lost = ~moving.converged | ~np.isfinite(sigma[:, free]).all(axis=1)
     poor = (p_value < POOR_FIT_P) | (losses > LARGEST_LOSS)
     close = crowded(rows, moving.field, scene.config.detection.min_separation_nm)
+    close |= shares_mass(rows, moving.judged)
     bound = moving.field.on_wall(rows)
     marks = (
         (lost, Status.NOT_CONVERGED), (bound, Status.AT_BOUND), (poor, Status.POOR_FIT),
