@@ -101,31 +101,6 @@ def track_movie(
     return Found(table=table, views=tuple(views), windows=windows, masses=masses)
 
 
-def with_common_masses(tracks: pd.DataFrame, masses: pd.DataFrame | None) -> pd.DataFrame:
-    """Put the masses of the exact likelihood into the table of tracks.
-
-    Parameters
-    ----------
-    tracks : pandas.DataFrame
-        One row per track, with means of its frames.
-    masses : pandas.DataFrame or None
-        As in `Found`.
-
-    Returns
-    -------
-    pandas.DataFrame
-        A copy; a track that has no such mass keeps its mean.
-    """
-    if masses is None or tracks.empty:
-        return tracks
-    found = masses.reindex(tracks["track"]).set_index(tracks.index)
-    known = np.isfinite(found.to_numpy(float)).all(axis=1)
-    out = tracks.copy()
-    for name in found.columns:
-        out[name] = np.where(known, found[name], tracks[name])
-    return out
-
-
 def _windows(moving: Moving, camera: Camera, span: tuple[int, int]) -> Windows:
     """Put the background and the sum of all frames side by side."""
     field, ground = moving.field, moving.ground
