@@ -513,3 +513,54 @@ def judge_frames(
                 for a in range(4):
                     turned[r, a, k] = -(ahead[a] - behind[a]) / (2 * PART)
                     ways[r, a, k] = ways_here[a, k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def common_modes(
+    light: Light,
+    field: Field,
+    near: Pictures,
+    frame: IntArray,
+    theta: FloatArray,
+    group: IntArray,
+    top: int,
+    left: int,
+    out: FloatArray,
+) -> None:
+    """Add up what the frames of one track change of each pixel's light, per parameter in common.
+
+    Parameters
+    ----------
+    light, field, near
+        As in `fit_frames`.
+    frame, group : ndarray of int, shape (n,)
+        Frames and pictures of the track's rows.
+    theta : ndarray, shape (n, 5)
+        Their estimates.
+    top, left : int
+        First row and column of `out` in the field.
+    out : ndarray, shape (4, y, x)
+        Filled with Σ w B ∂C over the frames, for (x, y, z, a) [e per unit].
+    """
+    rows, columns = light.background.shape
+    work, profile = scratch(_table(near, 0), near.lens, 2)
+    g = np.empty(5 * field.side**2)
+    out[:] = 0.0
+    for k in range(frame.size):
+        p, w = theta[k], light.power[frame[k]]
+        r0, r1 = box_of(p[1], field.pixel_nm, field.side, rows)
+        c0, c1 = box_of(p[0], field.pixel_nm, field.side, columns)
+        if r1 <= r0 or c1 <= c0:
+            continue
+        ny, nx = r1 - r0, c1 - c0
+        table = _table(near, group[k])
+        profile_at(table, p[2], 0, table.heights.shape[3], work, profile)
+        here = g[: 5 * ny * nx].reshape(ny, 5, nx)
+        pixels = _cut(field.pixels, r0, r1, c0, c1)
+        signal_gradient(profile, near.lens, pixels, p[0], p[1], p[3], here)
+        for i in range(ny):
+            for j in range(nx):
+                if light.used[r0 + i, c0 + j]:
+                    level = w * light.background[r0 + i, c0 + j]
+                    for a in range(4):
+                        out[a, r0 - top + i, c0 - left + j] += level * here[i, 1 + a, j]

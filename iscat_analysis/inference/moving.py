@@ -28,6 +28,7 @@ from iscat_analysis._kernels.moving import (
     Light,
     Pictures,
     Search,
+    common_modes,
     fit_frames,
     judge_frames,
     residual_frames,
@@ -203,7 +204,7 @@ class MovingField:
         self.pixel_nm, self.roi_px = pixel_nm, roi_px
         pixels = near.pixels(grid)
         self._whole = Field(pixels, pixel_nm, roi_px, DRAWN * roi_px)
-        self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, 2 * roi_px)
+        self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, roi_px)
         self.free = np.array([True, True, z_range_nm is not None, True, False])
         reach = window_nm(pixel_nm)
         half = pixel_nm / 2 + _BEYOND * near.optics.wavelength_nm / near.optics.na
@@ -214,7 +215,9 @@ class MovingField:
             self.free,
             np.array([reach, reach, _ANY, _ANY, 0.0]),
             np.array([-half, -half, low, 0.0 if sign_kept else -largest, 0.0]),
-            np.array([columns * pixel_nm - half, rows * pixel_nm - half, high, largest, 0.0]),
+            np.array(
+                [(columns - 1) * pixel_nm + half, (rows - 1) * pixel_nm + half, high, largest, 0.0]
+            ),
             np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, _ANY, 1.0]),
             _TOLERANCE,
             _PASSES,
@@ -405,7 +408,9 @@ class MovingField:
         )  # fmt: skip
         return out
 
-    def judge(self, ground: Ground, rows: Rows, *, brief: bool = False) -> Judged:
+    def judge(
+        self, ground: Ground, rows: Rows, *, brief: bool = False, coarse: bool = False
+    ) -> Judged:
         """Say what the likelihood knows of every row.
 
         Parameters
@@ -416,6 +421,8 @@ class MovingField:
             Particles, at their estimates.
         brief : bool
             Leave out observed information and bias, which take most of the time.
+        coarse : bool
+            As in `fit`.
 
         Returns
         -------
@@ -427,12 +434,13 @@ class MovingField:
         near, far = self._pictures
         starts = rows.starts(self.frames)
         fisher, turned, ways = np.empty((3, n, 4, 4))
+        field = self._coarse if coarse else self._whole
         bias, score = np.empty((2, n, 4))
         numbers = np.empty((n, 5))
 
         def block(first: int) -> FloatArray:
             judge_frames(
-                light, self._whole, near, far, self.free, starts, first,
+                light, field, near, far, self.free, starts, first,
                 min(first + _BLOCK, self.frames), rows.theta, rows.group, fisher, turned, ways,
                 bias, score, numbers, brief,
             )  # fmt: skip
@@ -456,6 +464,136 @@ class MovingField:
         return Judged(
             fisher, observed, np.nan_to_num(shift), score, gain, chi2, pixels, worst, level
         )
+
+    def holds(self, theta: FloatArray) -> bool:
+        """Tell whether a particle is in the field.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (5,)
+            Of a row.
+
+        Returns
+        -------
+        bool
+            Whether its centre lies on a pixel.
+        """
+        rows, columns = self.used.shape
+        x, y = theta[:2] / self.pixel_nm
+        return bool(-0.5 <= x < columns - 0.5 and -0.5 <= y < rows - 0.5)
+
+    def refit(
+        self, ground: Ground, rows: Rows, *, sweeps: int
+    ) -> tuple[Rows, BoolArray, FloatArray]:
+        """Fit all particles of a few frames, the smaller square of each.
+
+        Parameters
+        ----------
+        ground : Ground
+            Background.
+        rows : Rows
+            All particles of these frames.
+        sweeps : int
+            How often each, with the others in place.
+
+        Returns
+        -------
+        rows : Rows
+            Estimates.
+        converged : ndarray of bool, shape (n,)
+            Which fits did.
+        snr : ndarray, shape (n,)
+            √(2 Δℓ) of each, the others in place.
+        """
+        light = self._light(ground)
+        near, far = self._pictures
+        theta, starts, n = rows.theta.copy(), rows.starts(self.frames), len(rows.frame)
+        outcome, passes = np.zeros((2, n), dtype=np.int64)
+        expected, stretch = np.zeros(self.frames), np.zeros(self.used.shape)
+        fisher, turned, ways = np.zeros((3, n, 4, 4))
+        bias, score = np.zeros((2, n, 4))
+        numbers = np.zeros((n, 5))
+        for t in np.unique(rows.frame).tolist():
+            fit_frames(
+                light, self._coarse, near, far, self._search, starts, t, t + 1, sweeps, theta,
+                rows.group, outcome, passes, expected, stretch,
+            )  # fmt: skip
+            judge_frames(
+                light, self._coarse, near, far, self.free, starts, t, t + 1, theta, rows.group,
+                fisher, turned, ways, bias, score, numbers, True,
+            )  # fmt: skip
+        snr = np.sqrt(2 * np.maximum(numbers[:, 0], 0.0))
+        return replace(rows, theta=theta), outcome == CONVERGED, snr
+
+    def lost(self, ground: Ground, rows: Rows) -> FloatArray:
+        """Information on what the rows of one track have in common that their background takes.
+
+        Parameters
+        ----------
+        ground : Ground
+            Background.
+        rows : Rows
+            All of one track.
+
+        Returns
+        -------
+        ndarray, shape (4, 4)
+            Σ over pixels of (Σ_t w B ∂C)(Σ_t w B ∂C)ᵀ / Σ_t w B (1 + C), in (x, y, z, a).
+        """
+        cut = self.box(rows)
+        modes = np.empty((4, *ground.level[cut].shape))
+        self._modes(ground, rows, cut, modes)
+        return np.asarray(np.einsum("ayx,byx,yx->ab", modes, modes, self._weight(ground, cut)))
+
+    def pixels_of(self, rows: Rows) -> int:
+        """Count the pixels of the box in which all rows are fitted."""
+        rows_, columns = self.box(rows)
+        return int((rows_.stop - rows_.start) * (columns.stop - columns.start))
+
+    def patterns(self, ground: Ground, rows: Rows) -> tuple[FloatArray, FloatArray]:
+        """Give what each row changes of the light of every pixel of its track.
+
+        Parameters
+        ----------
+        ground : Ground
+            Background.
+        rows : Rows
+            All of one track.
+
+        Returns
+        -------
+        patterns : ndarray, shape (n, 4, y, x)
+            w B ∂C of each row, in (x, y, z, a) [e per unit].
+        weight : ndarray, shape (y, x)
+            One over the counts of all frames; less where there is read noise, 0 where not used.
+        """
+        cut = self.box(rows)
+        out = np.empty((len(rows.frame), 4, *ground.level[cut].shape))
+        for i in range(len(out)):
+            self._modes(ground, rows.only(np.arange(len(out)) == i), cut, out[i])
+        return out, self._weight(ground, cut)
+
+    def box(self, rows: Rows) -> tuple[slice, slice]:
+        """Give the pixels that the squares of rows cover."""
+        spans = []
+        for axis, size in ((1, self.used.shape[0]), (0, self.used.shape[1])):
+            first = np.rint(rows.theta[:, axis] / self.pixel_nm - (self.roi_px - 1) / 2)
+            low = int(np.clip(first.min(), 0, size - 1))
+            spans.append(slice(low, int(np.clip(first.max() + self.roi_px, low + 1, size))))
+        return spans[0], spans[1]
+
+    def _modes(self, ground: Ground, rows: Rows, cut: tuple[slice, slice], out: FloatArray) -> None:
+        """Fill `out` with the sum over rows of what they change of the light."""
+        common_modes(
+            self._light(ground), self._whole, self._pictures[0], rows.frame, rows.theta, rows.group,
+            cut[0].start, cut[1].start, out,
+        )  # fmt: skip
+
+    def _weight(self, ground: Ground, cut: tuple[slice, slice]) -> FloatArray:
+        """One over the information of the pixels on the logarithm of their light."""
+        level = ground.level[cut]
+        share = np.where(self.used[cut], level / (level + self.read_e2[cut]), 0.0)
+        return np.asarray(share / np.maximum(self._total[cut], 1.0))
 
     def on_wall(self, rows: Rows) -> BoolArray:
         """Tell which rows ended on a wall of the search.
@@ -490,7 +628,9 @@ class MovingField:
         ndarray, shape (n,)
             At least 0.
         """
-        return np.asarray(np.sqrt(2 * np.maximum(self.judge(ground, rows, brief=True).gain, 0.0)))
+        return np.asarray(
+            np.sqrt(2 * np.maximum(self.judge(ground, rows, brief=True, coarse=True).gain, 0.0))
+        )
 
     @cached_property
     def _frame_totals(self) -> FloatArray:

@@ -19,7 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config, config_to_toml
-from iscat_analysis.errors import ConfigError
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.achieved import Achieved
 from iscat_analysis.inference.noise import compile_kernels
 from iscat_analysis.inference.posterior import sample_posterior
@@ -50,12 +50,22 @@ from iscat_analysis.pipeline.landing import analyse_landings, has_landings, inje
 from iscat_analysis.pipeline.learning import learn_optics
 from iscat_analysis.pipeline.moving import track_scene
 from iscat_analysis.pipeline.ranges import frame_ranges, tracked_frames
+from iscat_analysis.pipeline.recognise import (
+    as_landing,
+    as_moving,
+    changes_summary,
+    look_at_changes,
+)
 from iscat_analysis.pipeline.repeats import field_repeats
 from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
 from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
 from iscat_analysis.pipeline.scene import Scene, field_likelihood, make_scene
 from iscat_analysis.pipeline.systematic import with_systematic
-from iscat_analysis.pipeline.tracking import learns_background, track_movie, track_particles
+from iscat_analysis.pipeline.tracking import (
+    learns_background,
+    track_movie,
+    track_particles,
+)
 from iscat_analysis.pipeline.tracks import judge_times, make_films, tracks_of
 from iscat_analysis.records import (
     Analysis,
@@ -238,18 +248,31 @@ def analyse(
     if learned:
         further["optics"] = learned
     clock.lap("optics")
-    if has_landings(config):
-        result = analyse_landings(
-            movie,
-            config,
-            camera,
-            tell=tell,
-            progress=progress,
-            prepare=lambda scene: _warm_up(scene, notify),
-            partial=partial,
-            identity=fingerprint(movie.path) if partial else "",
-            lines=lines,
-        )
+    landing, tracked = has_landings(config), config.fit.mode == "track"
+    other = ""
+    if landing or tracked:
+        background = config.background.frames
+        span = config.fit.frames or (background[1] if background else 0, movie.shape[0])
+        changes = look_at_changes(steady, config, camera, span)
+        further["changes"] = changes_summary(changes)
+        other = (as_landing if tracked else as_moving)(changes, movie.name)
+        if other:
+            tell(other)
+    if landing:
+        try:
+            result = analyse_landings(
+                movie,
+                config,
+                camera,
+                tell=tell,
+                progress=progress,
+                prepare=lambda scene: _warm_up(scene, notify),
+                partial=partial,
+                identity=fingerprint(movie.path) if partial else "",
+                lines=lines,
+            )
+        except DataError as error:  # what seems to be noise is then particles
+            raise DataError(other) if other else error from None
         scene, image = result.scene, result.image
         further["landing"] = result.summary
         found = Found(
@@ -297,7 +320,9 @@ def analyse(
     tracks: pd.DataFrame | None = None
     films: tuple[Film, ...] = ()
     if scene.mode == "track":
-        tracks, said = tracks_of(scene, found.table, windows, tell=tell, progress=progress)
+        tracks, said = tracks_of(
+            scene, found.table, windows, masses=found.masses, tell=tell, progress=progress
+        )
         further |= said
         films = make_films(scene, steady, camera, windows, found.table, tracks)
         clock.lap("tracks")

@@ -16,13 +16,31 @@ from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.inference.common import (
+    CommonAmplitudes,
+    common_amplitudes,
+    polish,
+    shared_errors,
+)
 from iscat_analysis.inference.moving import Ground, Judged, MovingField, Rows
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.blur import path_variance_nm2
+from iscat_analysis.pipeline.extension import extended
+from iscat_analysis.pipeline.linking import (
+    AS_FOUND,
+    alone,
+    crowded,
+    held,
+    linked,
+    mass_places,
+    shares_mass,
+    trimmed,
+    typical,
+)
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress
-from iscat_analysis.search.moving import FrameFilter, Sightings, gaps, link
+from iscat_analysis.search.moving import FrameFilter, Sightings
 from iscat_analysis.species import fit_diffusion
 
 LEAST_FRAMES = 20
@@ -32,12 +50,13 @@ ROUNDS = 8
 """Searches of the whole movie; each sees what the fits so far leave over."""
 
 _FIRST_TURNS = 3  # of background and particles between two searches
+_NEXT_TURNS = 8  # between two extensions of the tracks
 _BLOCK = 64  # frames that are searched at a time
 _LEAST_POSITIONS = 4  # of a track whose D is fitted
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
-_AS_FOUND = 0.9  # of the threshold, that a fit must keep to have found its particle
-_FEW = 1e-3  # of all rows: a search that finds no more is the last
+_FEW = 2e-3  # of all rows: a search that adds no more is the last
+_HELD_ROUNDS = 2  # in which slow particles are tried where they were not seen
 _BYTES = 6  # of memory for each pixel and frame
 
 IntArray = NDArray[np.int64]
@@ -65,6 +84,10 @@ class Moving:
         What the last turn changed of the background [its standard deviations].
     field : MovingField
         The movie.
+    shared : ndarray, shape (n, 4, 4)
+        Covariance of (x, y, z, a) of each row that its background adds.
+    common : CommonAmplitudes
+        One amplitude for each track.
     """
 
     rows: Rows
@@ -75,6 +98,8 @@ class Moving:
     diffusion: FloatArray
     change: float
     field: MovingField
+    shared: FloatArray
+    common: CommonAmplitudes
 
 
 def exposure_of(config: Config) -> tuple[float, float]:
@@ -169,7 +194,8 @@ def follow(
     for number in range(ROUNDS):
         progress("track", number, total)
         found = _search(scene, field, ground, rows, pool)
-        if number and len(found.frame) <= _FEW * len(rows.frame):
+        before = len(rows.frame)
+        if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(scene, rows, found)
         rows, ground, done, _ = field.settle(
@@ -181,8 +207,31 @@ def follow(
             coarse=True,
         )
         rows = _credible(scene, field, ground, rows, done)
+        if number and len(rows.frame) <= (1 + _FEW) * before:
+            break
     progress("track", ROUNDS, total)
-    rows = _linked(config, rows)
+    rows = linked(config, rows, mass_places(config, field, ground, rows))
+    resolution = config.optics.wavelength_nm / config.optics.na
+    for number in range(ROUNDS):
+        rows, ground, done, _ = field.settle(
+            ground, rows, follow_power=follow_power, follow_level=follow_level,
+            turns=_NEXT_TURNS, coarse=True,
+        )  # fmt: skip
+        rows = trimmed(rows)
+        rows, added = extended(
+            field, ground, rows, resolution_nm=resolution, reach_nm=config.track.max_step_nm
+        )
+        rows = linked(config, rows, mass_places(config, field, ground, rows), bridged=True)
+        rows = alone(scene, field, ground, rows)
+        if number < _HELD_ROUNDS and follow_level:
+            rows, tried = held(config, field, rows)
+            added += tried
+        # the background that is told of all frames, before these are fitted over it
+        _, found_ground, _ = field.fit(ground, typical(rows), sweeps=0)
+        ground = replace(ground, level=found_ground.level) if follow_level else ground
+        if added <= _FEW * len(rows.frame):
+            break
+    rows = trimmed(rows)
     for stage in range(2):
         rows, ground, done, change = field.settle(
             ground, rows, follow_power=follow_power, follow_level=follow_level,
@@ -194,9 +243,22 @@ def follow(
             diffusion = _diffusion(config, field, rows, judged)
             rows, variances = _blurred(rows, diffusion, exposure)
             field.set_blurs(variances)
+    if follow_level:
+        rows, ground, done = polish(field, ground, rows, follow_power=follow_power)
     judged = field.judge(ground, rows)
+    shared = shared_errors(field, ground, rows, judged)
+    inside = np.array([field.holds(theta) for theta in rows.theta], dtype=bool)
+    counted = (
+        done
+        & inside
+        & ~shares_mass(rows, judged)
+        & ~crowded(rows, field, config.detection.min_separation_nm)
+    )
+    common = common_amplitudes(field, ground, rows, judged, counted, shared)
     progress("track", total, total)
-    return Moving(rows, ground, judged, done, variances, diffusion, change, field)
+    return Moving(
+        rows, ground, judged, done, variances, diffusion, change, field, shared.covariance, common
+    )
 
 
 def _load(
@@ -293,7 +355,7 @@ def _credible(
     if not len(rows.frame):
         return rows
     snr = field.snr_of(ground, rows)
-    kept = done & (rows.theta[:, 3] > 0) & (snr > _AS_FOUND * scene.templates.threshold)
+    kept = done & (rows.theta[:, 3] > 0) & (snr > AS_FOUND * scene.templates.threshold)
     near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na)
     starts = rows.starts(field.frames)
     for t in np.flatnonzero(np.diff(starts) > 1):
@@ -304,30 +366,6 @@ def _credible(
                 if kept[a] and kept[b] and apart < near:
                     kept[a] = False
     return rows.only(kept)
-
-
-def _linked(config: Config, rows: Rows) -> Rows:
-    """Link, drop what is too short, and fill gaps; tracks are numbered by first frame and place."""
-    track = link(
-        rows.frame, rows.theta[:, :2],
-        reach_nm=config.track.max_step_nm, memory=config.track.memory_frames,
-    )  # fmt: skip
-    counts = np.bincount(track, minlength=1)
-    rows = replace(rows, track=track).only(counts[track] >= config.track.min_frames)
-    missed, before, after, share = gaps(rows.frame, rows.track)
-    between = (1 - share)[:, None] * rows.theta[before] + share[:, None] * rows.theta[after]
-    rows = Rows.of(
-        np.concatenate([rows.frame, missed]),
-        np.concatenate([rows.track, rows.track[before]]),
-        np.concatenate([rows.theta, between]),
-        np.concatenate([rows.group, rows.group[before]]),
-    )
-    _, first = np.unique(rows.track, return_index=True)
-    numbers = np.full(int(rows.track.max(initial=0)) + 1, -1)
-    order = np.lexsort((rows.theta[first, 0], rows.theta[first, 1], rows.frame[first]))
-    numbers[rows.track[first[order]]] = np.arange(first.size)
-    track = numbers[rows.track] if len(rows.track) else rows.track
-    return Rows.of(rows.frame, track, rows.theta, rows.group)
 
 
 def _diffusion(config: Config, field: MovingField, rows: Rows, judged: Judged) -> FloatArray:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pandas as pd
 from scipy.special import gammainc, gammaincc, ndtr
@@ -12,6 +10,7 @@ from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.inference.fit import POOR_FIT_P
 from iscat_analysis.optics.blur import PATH_SPREAD, blurred
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+from iscat_analysis.pipeline.linking import crowded, shares_mass
 from iscat_analysis.pipeline.moving import Moving
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import EVENT_COLUMNS, PARAMETERS, BoolArray, FloatArray, Status, verdict
@@ -46,7 +45,8 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
 
     Notes
     -----
-    Errors of the mass hold what is not known of the path in a single frame, `PATH_SPREAD`.
+    Errors of the mass hold what is not known of the path in a single frame, `PATH_SPREAD`; all
+    errors hold what the background takes.
     """
     rows, judged, field = moving.rows, moving.judged, moving.field
     model, pixel, free = scene.model, scene.pixel_nm, moving.field.free[:4]
@@ -63,6 +63,8 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     losses = losses_to_blur(scene, moving)[rows.group]
     path = PATH_SPREAD * losses * np.abs(mass)
     sigma[:, 3], crb[:, 3] = np.hypot(sigma[:, 3], path), np.hypot(crb[:, 3], path)
+    own = np.sqrt(np.einsum("nii->ni", moving.shared)) * units
+    sigma, crb = np.hypot(sigma, own), np.hypot(crb, own)
     freedom = np.maximum(judged.pixels - index.size, 1)
     p_value = _p_values(judged.chi2, freedom, judged.worst, judged.pixels)
     collected = judged.level / pixel**2 * _areas(model, estimate[:, 2], mass)
@@ -87,6 +89,39 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     places = rows.theta[:, :2] / pixel
     inside = np.all((places >= -0.5) & (places < size - 0.5), axis=1)
     return table[inside].sort_values(["track", "frame"], kind="stable").reset_index(drop=True)
+
+
+def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
+    """Give the mass of each track that the exact likelihood of all its frames has.
+
+    Parameters
+    ----------
+    scene : Scene
+        From `iscat_analysis.pipeline.moving.track_scene`.
+    moving : Moving
+        From `iscat_analysis.pipeline.moving.follow`.
+
+    Returns
+    -------
+    pandas.DataFrame
+        By track: ``mass_kda``, ``sigma_mass_kda`` and ``crb_mass_kda``.  The errors hold what the
+        background takes, the paths of single frames and the error of D, which sets the blur.
+    """
+    common, scale = moving.common, scene.model.scale
+    known = np.isfinite(common.amplitude)
+    amplitude = np.where(known, common.amplitude, 1.0)
+    mass = np.where(known, scale.mass(amplitude), np.nan)
+    slope = np.array([abs(scale.slope(float(a))) for a in amplitude])
+    tracks = np.arange(len(mass))
+    group = np.zeros(len(mass), dtype=np.int64)
+    group[moving.rows.track] = moving.rows.group
+    loss = losses_to_blur(scene, moving)[group] if len(mass) else np.zeros(0)
+    d, sigma_d = np.nan_to_num(moving.diffusion).T if len(mass) else np.zeros((2, 0))
+    path = (PATH_SPREAD * loss) ** 2 / np.maximum(common.frames, 1.0)
+    blur = (loss * np.where(d > 0, sigma_d / np.where(d > 0, d, 1.0), 0.0)) ** 2
+    sigma = np.sqrt(common.variance * slope**2 + mass**2 * (path + blur))
+    table = pd.DataFrame({"mass_kda": mass, "sigma_mass_kda": sigma, "crb_mass_kda": sigma})
+    return table.set_index(pd.Index(tracks, name="track"))
 
 
 def losses_to_blur(scene: Scene, moving: Moving) -> FloatArray:
@@ -167,27 +202,14 @@ def _flags(
     rows, free = moving.rows, np.flatnonzero(moving.field.free[:4])
     lost = ~moving.converged | ~np.isfinite(sigma[:, free]).all(axis=1)
     poor = (p_value < POOR_FIT_P) | (losses > LARGEST_LOSS)
-    close = _crowded(scene, moving)
+    close = crowded(rows, moving.field, scene.config.detection.min_separation_nm)
+    close |= shares_mass(rows, moving.judged)
     bound = moving.field.on_wall(rows)
     marks = (
         (lost, Status.NOT_CONVERGED), (bound, Status.AT_BOUND), (poor, Status.POOR_FIT),
         (close, Status.TOO_CLOSE),
     )  # fmt: skip
     return [[mark for told, mark in marks if told[i]] for i in range(len(rows.frame))]
-
-
-def _crowded(scene: Scene, moving: Moving) -> BoolArray:
-    """Which rows have another particle of their frame nearer than is resolved."""
-    rows, limit = moving.rows, scene.config.detection.min_separation_nm
-    out = np.zeros(len(rows.frame), dtype=bool)
-    starts = rows.starts(moving.field.frames)
-    for t in np.flatnonzero(np.diff(starts) > 1):
-        span = slice(starts[t], starts[t + 1])
-        places = rows.theta[span, :2]
-        apart = np.hypot(*(places[:, None] - places).T)
-        np.fill_diagonal(apart, math.inf)
-        out[span] = apart.min(axis=0) < limit
-    return out
 
 
 def _contrasts(model: ForwardModel, z_nm: FloatArray, amplitude: FloatArray) -> FloatArray:

@@ -61,6 +61,9 @@ class Found:
         single frames, what they say where there is no particle.
     empty : EmptySpread or None
         The noise of whole windows, or of single frames, where there is no particle.
+    masses : pandas.DataFrame or None
+        Of tracks over a background that was learnt with them: ``mass_kda``, ``sigma_mass_kda`` and
+        ``crb_mass_kda`` by the exact likelihood of all frames, indexed by track.
     """
 
     table: pd.DataFrame
@@ -69,6 +72,7 @@ class Found:
     interrupted: bool = False
     repeats: tuple[FloatArray, ...] = ()
     empty: EmptySpread | None = None
+    masses: pd.DataFrame | None = None
 
 
 def collected_photons(scene: Scene, windows: Windows, event: Event) -> float:

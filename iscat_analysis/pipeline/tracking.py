@@ -22,7 +22,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.blank import FrameNoise
 from iscat_analysis.pipeline.field import Event, fit_field
 from iscat_analysis.pipeline.moving import Moving, follow
-from iscat_analysis.pipeline.moving_table import moving_table
+from iscat_analysis.pipeline.moving_table import common_masses, moving_table
 from iscat_analysis.pipeline.results import Found, Row, table_of, view_of
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import EventView, FloatArray, FrameSource, Progress, Windows
@@ -97,7 +97,8 @@ def track_movie(
     if len(table):
         best = table.loc[table.groupby("track")["snr"].idxmax()]
         views = [_view(moving, row, span[0]) for row in best.itertuples()]
-    return Found(table=table, views=tuple(views), windows=windows)
+    masses = common_masses(scene, moving)
+    return Found(table=table, views=tuple(views), windows=windows, masses=masses)
 
 
 def _windows(moving: Moving, camera: Camera, span: tuple[int, int]) -> Windows:

@@ -14,9 +14,12 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.movie.background import add_frames, start_power
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.optics.blur import blurred, path_variance_nm2
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.materials import material
+from iscat_analysis.pipeline.moving import exposure_of
 from iscat_analysis.pipeline.scene import Region, Scene, region_likelihood
+from iscat_analysis.pipeline.tracking import learns_background
 from iscat_analysis.records import (
     Film,
     FloatArray,
@@ -80,7 +83,7 @@ def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
             f"camera.exposure_ms = {exposure:g} is longer than the {1e3 / rate:.4g} ms from frame "
             f"to frame at camera.frame_rate_hz = {rate:g}: correct one of them"
         )
-    if frames < SHORT_MOVIE:
+    if frames < SHORT_MOVIE and not learns_background(config):  # which refuses it altogether
         best = 100 / np.sqrt(max(frames - 1, 1))
         text = f"{name}: {frames} frames tell no diffusion coefficient better than to {best:.0f} %"
         if frames < config.track.min_frames:
@@ -93,6 +96,7 @@ def tracks_of(
     fits: pd.DataFrame,
     windows: Windows,
     *,
+    masses: pd.DataFrame | None,
     tell: Callable[[str], None],
     progress: Progress,
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
@@ -106,6 +110,8 @@ def tracks_of(
         One row per particle and frame, with its track.
     windows : Windows
         Frame ranges.
+    masses : pandas.DataFrame or None
+        Masses of the exact likelihood, as in `Found`.
     tell : callable
         Told what the user should know.
     progress : Progress
@@ -123,6 +129,7 @@ def tracks_of(
         fits,
         setup,
         correlation=mass_correlation(scene, fits),
+        masses=masses,
         seed=scene.config.compute.seed,
         progress=progress,
     )
@@ -168,12 +175,12 @@ def track_setup(scene: Scene, windows: Windows) -> TrackSetup:
 
 
 def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
-    """Give the correlation of the masses of frames that share a measured background.
+    """Give the correlation of the masses of frames that share a background recorded before.
 
-    A mass is the picture h times the pixels, over Σ h²; of the noise of the background, which is
-    s = f/(f + n) of a frame's variance with n frames before, two frames share what their pictures
-    have in common: Σ h(u) h(u − r)/Σ h².  Where the height is fitted as well, h is what of the
-    picture its derivative along z does not explain.
+    A mass is the picture h times the pixels, over Σ h², and of their pictures two frames have
+    K = Σ h(u) h(u − r)/Σ h² in common.  With n frames before, the noise of their mean (f = 1) or
+    median is s = f/(f + n) of a frame's variance: (1 − s) I + s K.  Where the height is fitted as
+    well, h is what of the picture its derivative along z does not explain.
 
     Parameters
     ----------
@@ -185,11 +192,12 @@ def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
     Returns
     -------
     callable or None
-        None where each frame has a background of its own, or none that is measured.
+        None where the background is known, or learnt with the tracks, whose masses are exact then.
     """
-    method = scene.config.background.method
+    config = scene.config
     before = fits["n_before"].median() if len(fits) else 0
-    if method not in ("fixed", "median") or not before > 0:
+    known = config.background.method == "known" or scene.additive or learns_background(config)
+    if known or not before > 0:
         return None
     share = scene.background_variance / (scene.background_variance + before)
     side = scene.roi_px
@@ -208,9 +216,8 @@ def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
     def correlation(places_nm: FloatArray) -> FloatArray:
         apart = (places_nm[:, None] - places_nm) / scene.pixel_nm + (side - 1)
         shared = map_coordinates(common, [apart[..., 1], apart[..., 0]], order=1)
-        among = share * (shared + shared.T) / 2
-        np.fill_diagonal(among, 1.0)
-        return np.asarray(among)
+        both = (shared + shared.T) / 2
+        return np.asarray((1 - share) * np.eye(len(both)) + share * both)
 
     return correlation
 
@@ -281,11 +288,25 @@ def make_films(
         The best first.
     """
     numbers = track_numbers(fits)
+    fits = fits.assign(model=numbers.map(_models(scene, tracks)))
     films = []
     for track, why, worst in _chosen(tracks):
         rows = fits[numbers == track].sort_values("frame")
         films.append(_film(scene, movie, camera, windows, fits, rows, track, why, worst))
     return tuple(film for film in films if film is not None)
+
+
+def _models(scene: Scene, tracks: pd.DataFrame) -> dict[int, ForwardModel]:
+    """Give each track the model that it was fitted with: blurred by its own motion, or sharp."""
+    known = np.nan_to_num(tracks["d_um2_s"].to_numpy(float))
+    if not learns_background(scene.config):
+        known[:] = 0.0
+    _, exposure_s = exposure_of(scene.config)
+    upwards = scene.config.track.free == "joint"
+    return {
+        int(track): blurred(scene.wide, path_variance_nm2(d, exposure_s), upwards=upwards)
+        for track, d in zip(tracks["track"], known, strict=True)
+    }
 
 
 def _chosen(tracks: pd.DataFrame) -> Iterator[tuple[int, str, bool]]:
@@ -334,7 +355,7 @@ def _film(
         single = add_frames(windows, camera, movie.read(frame, frame + 1), frame)
         if scene.config.background.power_normalization:
             single = start_power(single)
-        here = fits[(fits["frame"] == frame) & fits["mass_kda"].notna()]
+        here = fits[(fits["frame"] == frame) & fits["mass_kda"].notna() & fits["model"].notna()]
         pictures.append(_picture(scene, single, region, here))
     contrast, model, residual = (np.array(part) for part in zip(*pictures, strict=True))
     return Film(track, tuple(shown["frame"].astype(int)), why, contrast, model, residual)
@@ -365,7 +386,7 @@ def _picture(
     low, high = scene.wide.z_range_nm
     for row in here.itertuples():
         height = float(np.clip(row.z_nm, low, high))
-        model += scene.wide.image(grid, row.x_nm, row.y_nm, height, row.mass_kda)
+        model += row.model.image(grid, row.x_nm, row.y_nm, height, row.mass_kda)
     data = likelihood.measured_signal()
     residual = (data - model) * np.sqrt(likelihood.signal_information(model))
     unit = likelihood.data[2] if scene.additive else 1.0

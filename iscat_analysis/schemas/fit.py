@@ -249,6 +249,14 @@ class Repeats(Closed):
     cause: str = key("What kind of noise it looks like")
 
 
+class Changes(Closed):
+    """What becomes of clear changes between averages of 20 frames, in the first 2000 at most."""
+
+    number: Count = key("Changes above 12 standard deviations")
+    staying: Share = key("Share that stay: particles that land or leave")
+    undone: Share = key("Share that are undone at once: particles that move")
+
+
 class Learned(Closed):
     """What ``optics.calibrate`` did: the test of the optics, and what was learned of them."""
 
@@ -320,6 +328,7 @@ class Summary(Document):
     background: Background = maybe("Movies with background frames: noise and drift")
     landing: Landing = maybe("Landing movies: windows, search, noise and drift")
     injection: Injection = maybe("With --inject: known particles added to the movie")
+    changes: Changes = maybe("Landing movies and mode track: whether particles land or move")
     tracks: Count = maybe("Mode track: tracks found")
     motion: Motion = maybe("Mode track: what the tracks come to")
     across_particles: list[Across] = maybe(

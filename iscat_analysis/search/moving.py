@@ -195,8 +195,9 @@ def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int
     ----------
     frame : ndarray of int, shape (n,)
         Not decreasing.
-    places_nm : ndarray, shape (n, 2)
-        x and y [nm].
+    places_nm : ndarray, shape (n, axes)
+        x and y [nm], and whatever else is its own, as a length: a particle keeps its mass where it
+        crosses another.
     reach_nm : float
         Farthest that a particle goes from one frame to the next [nm].
     memory : int

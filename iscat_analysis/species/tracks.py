@@ -107,6 +107,7 @@ def describe_tracks(
     setup: TrackSetup,
     *,
     correlation: Correlation | None = None,
+    masses: pd.DataFrame | None = None,
     seed: int = 1,
     progress: Progress = silent,
 ) -> pd.DataFrame:
@@ -120,6 +121,9 @@ def describe_tracks(
         Frame rate, field, liquid.
     correlation : callable, optional
         Correlation of the masses that frames give, by place; absent, they are independent.
+    masses : pandas.DataFrame, optional
+        Masses that the likelihood of all frames together gave: ``mass_kda``, ``sigma_mass_kda`` and
+        ``crb_mass_kda``, indexed by track.  They take the place of combinations of the frames.
     seed : int
         Of the free tracks that the test of confinement draws.
     progress : Progress
@@ -147,7 +151,9 @@ def describe_tracks(
     rng, tested = np.random.default_rng(seed), True
     records = []
     for done, (track, rows) in enumerate(groups.items()):
-        record = _record(track, rows, setup, power, correlation, nearest.get(track, np.inf))
+        exact = masses.loc[track].to_dict() if masses is not None and track in masses.index else {}
+        record = _record(track, rows, setup, power, correlation, exact)
+        record["nearest_nm"] = nearest.get(track, np.inf)
         try:
             if tested:
                 record |= _tests(rows, setup, rng) if np.isfinite(record["d_um2_s"]) else {}
@@ -184,7 +190,7 @@ def _record(
     setup: TrackSetup,
     power: float,
     correlation: Correlation | None,
-    nearest_nm: float,
+    exact: Mapping[str, float],
 ) -> dict[str, Any]:
     """Describe one track, but for the tests of its motion."""
     good, placed = _massive(rows), _placed(rows)
@@ -199,7 +205,6 @@ def _record(
         "x_nm": rows["x_nm"].mean(),
         "y_nm": rows["y_nm"].mean(),
         "z_nm": rows["z_nm"].mean(),
-        "nearest_nm": nearest_nm,
     }
     if len(good):
         mass = _mass(good, power, correlation)
@@ -209,8 +214,10 @@ def _record(
             "crb_mass_kda": mass.crb_mass_kda,
             "mass_scatter": mass.scatter,
             "p_mass": mass.p_value,
-            "contrast": mass.mass_kda * float((good["contrast"] / good["mass_kda"]).median()),
         }
+    if all(np.isfinite(value) for value in exact.values()):
+        record |= exact
+    record["contrast"] = record["mass_kda"] * float((rows["contrast"] / rows["mass_kda"]).median())
     found = _diffusion(placed, setup)
     if found is not None:
         record |= {

@@ -231,6 +231,19 @@ def test_frames_that_are_flagged_do_not_make_the_mass_but_the_path() -> None:
     assert describe_tracks(fits, SETUP).iloc[0]["status"] == TrackStatus.POOR_FITS
 
 
+def test_masses_of_the_exact_likelihood_take_the_place_of_means() -> None:
+    rng = np.random.default_rng(15)
+    fits = fits_of([walk(rng, 30, 0.3), walk(rng, 30, 0.3, start_nm=(9e3, 9e3))], rng)
+    exact = pd.DataFrame(
+        {"mass_kda": [390.0, np.nan], "sigma_mass_kda": [2.0, 2.0], "crb_mass_kda": [1.9, 1.9]},
+        index=[0, 1],
+    )
+    found, mean = describe_tracks(fits, SETUP, masses=exact), describe_tracks(fits, SETUP)
+    assert found[list(exact)].iloc[0].tolist() == [390.0, 2.0, 1.9]
+    assert abs(found["contrast"].iloc[0] + 3.1e-5 * 390) < 1e-12
+    assert found["mass_kda"].iloc[1] == mean["mass_kda"].iloc[1]
+
+
 def test_no_rows_make_an_empty_table_with_its_columns() -> None:
     fits = fits_of([np.zeros((1, 2))], np.random.default_rng(1)).iloc[:0]
     found = describe_tracks(fits, SETUP)

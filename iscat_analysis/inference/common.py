@@ -1,0 +1,333 @@
+"""What the frames of one track have in common: one mass, and the errors of its background.
+
+The information on all parameters of a track over an unknown background is, per pixel,
+
+    J = Σ_t w_t B ∂C_t ∂C_tᵀ/(1 + C_t) − (Σ_t w_t B ∂C_t)(Σ_t w_t B ∂C_t)ᵀ / Σ_t w_t B (1 + C_t).
+
+The second part, of rank one in each pixel, is what the background takes.  Shared among the frames
+it takes 1/T from each, but adds up for what they have in common: a particle that hardly moves is
+told from its background by its motion alone, and how it moved must be told as well.
+
+With F_t the information of frame t on its own (x, y, z, a), G_t = w_t B ∂C_t and N the counts of
+each pixel, the background that is left undetermined when every frame follows its own noise has the
+information M = N − Σ_t G_tᵀ F_t⁻¹ G_t, and a row the covariance
+
+    F_t⁻¹ + F_t⁻¹ G_t M⁻¹ G_tᵀ F_t⁻¹.
+
+A mass that is common to the frames keeps Σ_t J_t − cᵀ M⁻¹ c, with M, c and J_t those that are left
+when the places alone follow.  M couples all pixels of a track.  Where it covers so many that it
+moved far (`MOST_PIXELS`), only the errors common to all frames are kept: with F = Σ_t F_t and
+L = (Σ_t G_t)(Σ_t G_t)ᵀ/N their covariance is (F − L)⁻¹ − F⁻¹.  Tracks are taken one by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+
+from iscat_analysis.inference.moving import Ground, Judged, MovingField, Rows
+from iscat_analysis.records import BoolArray, FloatArray
+
+IntArray = NDArray[np.int64]
+
+MOST_PIXELS = 1800
+"""Pixels of a track whose information is taken as a whole."""
+
+_SINGULAR = 1e-9
+_POLISH = 3  # steps
+_FARTHEST = 0.02  # step of the logarithm of the background
+_STEPS = 4  # of Newton's method; each leaves the square of the error before
+_SETTLED = 0.01  # standard deviations
+
+
+@dataclass(frozen=True)
+class CommonAmplitudes:
+    """Amplitudes that are common to the frames of each track, by the exact likelihood.
+
+    Attributes
+    ----------
+    amplitude : ndarray, shape (tracks,)
+        Where the likelihood has its maximum, its bias of order 1/N taken off; NaN where no frame
+        counts.
+    variance : ndarray, shape (tracks,)
+        Its variance, with what the background takes.
+    known : ndarray, shape (tracks,)
+        The same over a background that is known.
+    frames : ndarray, shape (tracks,)
+        How many frames would weigh as much, were they alike: (Σ J_t)²/Σ J_t².
+    """
+
+    amplitude: FloatArray
+    variance: FloatArray
+    known: FloatArray
+    frames: FloatArray
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What the background takes from tracks.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (n, 4, 4)
+        Covariance of (x, y, z, a) of each row besides that over a known background; infinite on the
+        diagonal where nothing is known, 0 where not free.
+    taken : ndarray, shape (tracks,)
+        Share of the information on a common amplitude that is lost, of tracks that moved far.
+    together : mapping of int to (ndarray of int, ndarray)
+        Of the other tracks: their rows and the covariance of the amplitudes of these.
+    """
+
+    covariance: FloatArray
+    taken: FloatArray
+    together: Mapping[int, tuple[IntArray, FloatArray]]
+
+
+def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged) -> Shared:
+    """Say what the background takes from the rows and from the tracks.
+
+    Parameters
+    ----------
+    field : MovingField
+        The movie.
+    ground : Ground
+        The background.
+    rows : Rows
+        Particles, at their estimates.
+    judged : Judged
+        Of these rows.
+
+    Returns
+    -------
+    Shared
+        By row and by track.
+    """
+    tracks = int(rows.track.max(initial=-1)) + 1
+    index = np.flatnonzero(field.free[:4])
+    covariance, taken = np.zeros((len(rows.frame), 4, 4)), np.zeros(tracks)
+    together: dict[int, tuple[IntArray, FloatArray]] = {}
+    for k in range(tracks):
+        mine = np.flatnonzero(rows.track == k)
+        good = np.linalg.det(_scaled(judged.fisher[mine], index)[0]) > _SINGULAR
+        mine = mine[good]
+        if not mine.size:
+            continue
+        fisher = judged.fisher[mine]
+        of_track = rows.only(np.isin(np.arange(len(rows.frame)), mine))
+        square = np.ix_(mine, index, index)
+        if field.pixels_of(of_track) <= MOST_PIXELS:
+            extra, amplitudes = _all_pixels(field, ground, of_track, fisher, index)
+            together[k] = mine, amplitudes
+        else:
+            lost = field.lost(ground, of_track)
+            extra, taken[k] = _common_modes(fisher, lost, index)
+        covariance[square] = extra
+    return Shared(covariance, taken, together)
+
+
+def polish(
+    field: MovingField, ground: Ground, rows: Rows, *, follow_power: bool
+) -> tuple[Rows, Ground, BoolArray]:
+    """Take the last steps to the maximum by Newton's method where turns are too slow.
+
+    A turn moves the background by δ = (n − Σ_t λ_t)/N, as if the rows stayed.  As they follow, the
+    whole way is M⁻¹ N δ: where particles hardly move it is many times as far.
+
+    Parameters
+    ----------
+    field : MovingField
+        The movie.
+    ground : Ground
+        Where turns ended.
+    rows : Rows
+        Particles.
+    follow_power : bool
+        Whether the power is fitted too.
+
+    Returns
+    -------
+    rows : Rows
+        Estimates.
+    ground : Ground
+        Over which they are.
+    converged : ndarray of bool, shape (n,)
+        Which fits did.
+    """
+    judged = field.judge(ground, rows, brief=True)
+    index = np.flatnonzero(field.free[:4])
+    good = np.linalg.det(_scaled(judged.fisher, index)[0]) > _SINGULAR
+    factors = []
+    for k in np.unique(rows.track):
+        mine = np.flatnonzero((rows.track == k) & good)
+        of_track = rows.only((rows.track == k) & good)
+        if not mine.size or field.pixels_of(of_track) > MOST_PIXELS:
+            continue
+        patterns, weight = field.patterns(ground, of_track)
+        pixels = weight > 0
+        slopes = patterns[:, index][:, :, pixels]
+        flat = slopes.reshape(-1, slopes.shape[2])
+        follows = (_inverse(judged.fisher[mine], index) @ slopes).reshape(flat.shape)
+        left = _factor(np.diag(1 / weight[pixels]) - flat.T @ follows)
+        if left is not None:
+            factors.append((field.box(of_track), pixels, weight[pixels], left))
+    for _ in range(_POLISH if factors else 0):
+        rows, found, _ = field.fit(ground, rows)
+        move = np.log(found.level / ground.level)
+        for cut, pixels, weight, left in factors:
+            here = move[cut]
+            here[pixels] = np.clip(
+                cho_solve((left, True), here[pixels] / weight), -_FARTHEST, _FARTHEST
+            )
+        power = found.power if follow_power else ground.power
+        ground = Ground(ground.level * np.exp(move), power)
+    rows, _, done = field.fit(ground, rows)
+    return rows, ground, done
+
+
+def _all_pixels(
+    field: MovingField, ground: Ground, rows: Rows, fisher: FloatArray, index: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Covariance of every row besides its own, and that of the amplitudes of all rows."""
+    patterns, weight = field.patterns(ground, rows)
+    pixels = weight > 0
+    slopes = patterns[:, index][:, :, pixels]  # (n, free, pixels)
+    inverse = _inverse(fisher, index)
+    follows = inverse @ slopes  # F⁻¹ G
+    flat = slopes.reshape(-1, slopes.shape[2])
+    left = _factor(np.diag(1 / weight[pixels]) - flat.T @ follows.reshape(flat.shape))
+    own = np.diag(inverse[:, -1, -1])
+    if left is None:
+        unknown = np.broadcast_to(np.diag(np.full(index.size, np.inf)), inverse.shape)
+        return unknown, np.full_like(own, np.inf)
+    root = solve_triangular(left, follows.reshape(flat.shape).T, lower=True)
+    root = root.T.reshape(follows.shape)
+    extra = np.einsum("nip,njp->nij", root, root)
+    return extra, own + root[:, -1] @ root[:, -1].T
+
+
+def _factor(matrix: FloatArray) -> FloatArray | None:
+    """Lower Cholesky factor, None where the matrix is not positive."""
+    scale = np.diag(matrix).max()
+    try:
+        return np.asarray(cholesky(matrix + _SINGULAR * scale * np.eye(len(matrix)), lower=True))
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _common_modes(
+    fisher: FloatArray, lost: FloatArray, index: IntArray
+) -> tuple[FloatArray, float]:
+    """Covariance that all rows share, and the share of a common amplitude that is lost."""
+    square = np.ix_(index, index)
+    whole = fisher.sum(axis=0)[square]
+    scale = 1 / np.sqrt(np.diag(whole))
+    whole, part = (m * np.outer(scale, scale) for m in (whole, lost[square]))
+    taken = float(np.clip(part[-1, -1], 0.0, 1.0 - _SINGULAR))
+    if np.linalg.eigvalsh(whole - part)[0] < _SINGULAR:
+        return np.diag(np.full(index.size, np.inf)), taken
+    return (np.linalg.inv(whole - part) - np.linalg.inv(whole)) * np.outer(scale, scale), taken
+
+
+def _scaled(fisher: FloatArray, index: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Informations of some parameters with ones on the diagonal, and what made them so."""
+    part = fisher[:, index][:, :, index]
+    scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", part), 1e-300))
+    return part * scale[:, :, None] * scale[:, None, :], scale
+
+
+def _inverse(fisher: FloatArray, index: IntArray) -> FloatArray:
+    """Invert informations on some parameters, shape (n, len(index), len(index))."""
+    scaled, scale = _scaled(fisher, index)
+    return np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :]
+
+
+def common_amplitudes(
+    field: MovingField,
+    ground: Ground,
+    rows: Rows,
+    judged: Judged,
+    counted: BoolArray,
+    shared: Shared,
+) -> CommonAmplitudes:
+    """Fit one amplitude to all frames of each track, with the background that is most likely then.
+
+    Parameters
+    ----------
+    field : MovingField
+        The movie.
+    ground : Ground
+        Under the rows.
+    rows : Rows
+        Particles, at their estimates.
+    judged : Judged
+        Of these rows.
+    counted : ndarray of bool, shape (n,)
+        Rows that count; the others stay as they are.
+    shared : Shared
+        From `shared_errors`.
+
+    Returns
+    -------
+    CommonAmplitudes
+        By Newton's method on the likelihood with the background put in, the places following the
+        amplitude to first order.  Of tracks whose pixels are taken as a whole it is the mean of
+        generalised least squares over their rows, whose maximum is that of the same likelihood.
+    """
+    tracks, taken = int(rows.track.max(initial=-1)) + 1, shared.taken
+    where = np.flatnonzero(counted)
+    owner = rows.track[where]
+    theta = rows.theta.copy()
+
+    def summed(values: FloatArray) -> FloatArray:
+        return np.bincount(owner, weights=values, minlength=tracks).astype(np.float64)
+
+    others = np.flatnonzero(field.free[:3])
+    _, information = _marginal(judged, where, others)
+    total = summed(information)
+    safe = np.maximum(total, 1e-300)
+    amplitude = summed(information * theta[where, 3]) / safe
+    bias = summed(information * judged.bias[where, 3]) / safe
+    for _ in range(_STEPS):
+        theta[where, 3] = amplitude[owner]
+        same = replace(rows, theta=theta)
+        _, found, _ = field.fit(ground, same, sweeps=0)
+        ground = Ground(found.level, ground.power)
+        at = field.judge(ground, same, brief=True)
+        score, information = _marginal(at, where, others)
+        total = summed(information)
+        safe = np.maximum(total, 1e-300)
+        step = summed(score) / (safe * (1 - taken))
+        amplitude = amplitude + step
+        if np.all(np.abs(step) * np.sqrt(safe) < _SETTLED):
+            break
+    known = np.where(total > 0, 1 / safe, np.nan)
+    frames = total**2 / np.maximum(summed(information**2), 1e-300)
+    amplitude = np.where(total > 0, amplitude - bias, np.nan)
+    variance = known / (1 - taken)
+    for k, (mine, covariance) in shared.together.items():
+        used = counted[mine] & np.isfinite(np.diag(covariance))
+        if not used.any():
+            amplitude[k] = variance[k] = np.nan
+            continue
+        weights = np.linalg.solve(covariance[np.ix_(used, used)], np.ones(int(used.sum())))
+        variance[k] = 1 / weights.sum()
+        each = (rows.theta[:, 3] - judged.bias[:, 3])[mine][used]
+        amplitude[k] = variance[k] * weights @ each
+    return CommonAmplitudes(amplitude, variance, known, frames)
+
+
+def _marginal(judged: Judged, where: IntArray, others: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Score and information on the amplitude of rows, their places following it."""
+    fisher, score = judged.fisher[where], judged.score[where]
+    cross = fisher[:, others, 3]
+    scaled, scale = _scaled(fisher, others)
+    scaled = scaled + 1e-12 * np.eye(others.size)
+    along = np.linalg.solve(scaled, (cross * scale)[..., None])[..., 0] * scale
+    return (
+        score[:, 3] - np.einsum("ni,ni->n", along, score[:, others]),
+        np.maximum(fisher[:, 3, 3] - np.einsum("ni,ni->n", along, cross), 0.0),
+    )

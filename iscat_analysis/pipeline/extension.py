@@ -1,0 +1,147 @@
+"""Tracks go on where the matched filter lost them.
+
+A particle is lost where another comes so near that both make one peak, and where it was so slow
+that the first background took most of it.  The place where it was last seen predicts the next one:
+it is fitted there together with its neighbours, which start from their own last places with the
+masses that their tracks have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from iscat_analysis.inference.moving import Ground, MovingField, Rows
+from iscat_analysis.records import FloatArray
+
+LEAST_SNR = 4.0
+"""Signal-to-noise ratio, with its neighbours in place, that a predicted particle needs."""
+
+LEAST_SHARE = 0.5
+"""Of its track's mass that it needs beside another: one particle is not two of half the mass."""
+
+_SWEEPS = 6  # fits in turn of particles that overlap
+_MEETING = 1.5  # resolutions λ/NA within which particles are fitted from their predictions
+_SAME = 0.25  # resolutions within which two rows are one particle
+
+
+@dataclass(frozen=True)
+class _End:
+    """An open end of a track: the frame of its last row there, and the direction."""
+
+    track: int
+    frame: int
+    way: int
+
+
+def extended(
+    field: MovingField, ground: Ground, rows: Rows, *, resolution_nm: float, reach_nm: float
+) -> tuple[Rows, int]:
+    """Let tracks go on from their ends as far as the movie shows them.
+
+    Parameters
+    ----------
+    field : MovingField
+        The movie.
+    ground : Ground
+        The background.
+    rows : Rows
+        Particles with their tracks.
+    resolution_nm : float
+        λ/NA [nm].
+    reach_nm : float
+        Farthest that a particle goes from one frame to the next [nm].
+
+    Returns
+    -------
+    rows : Rows
+        With the new ones.
+    added : int
+        How many.
+    """
+    tracks = int(rows.track.max(initial=-1)) + 1
+    if not tracks:
+        return rows, 0
+    typical = np.array([np.median(rows.theta[rows.track == k, 3]) for k in range(tracks)])
+    blur = np.zeros(tracks, dtype=np.int64)
+    blur[rows.track] = rows.group
+    frames: list[dict[int, FloatArray]] = [{} for _ in range(field.frames)]
+    for t, k, theta in zip(rows.frame, rows.track, rows.theta, strict=True):
+        frames[t][int(k)] = theta
+    ends = []
+    for k in range(tracks):
+        mine = rows.frame[rows.track == k]
+        ends += [_End(k, int(mine.max()), 1), _End(k, int(mine.min()), -1)]
+    added = 0
+    meeting, same = _MEETING * resolution_nm, _SAME * resolution_nm
+    while ends:
+        proposed: dict[int, dict[int, _End]] = {}
+        for end in ends:
+            t = end.frame + end.way
+            if not 0 <= t < field.frames or end.track in frames[t]:
+                continue
+            here = frames[end.frame][end.track]
+            newborn = any(
+                k not in frames[end.frame] and np.hypot(*(theta - here)[:2]) < same
+                for k, theta in frames[t].items()
+            )
+            if field.holds(here) and not newborn:
+                proposed.setdefault(t, {})[end.track] = end
+        if not proposed:
+            break
+        trial = _starts(frames, proposed, typical, blur, meeting)
+        fitted, done, snr = field.refit(ground, trial, sweeps=_SWEEPS)
+        ends = []
+        for t, new in proposed.items():
+            of_frame = np.flatnonzero(fitted.frame == t)
+            found = {int(fitted.track[i]): fitted.theta[i] for i in of_frame}
+            sure = {int(fitted.track[i]): bool(done[i]) and snr[i] > LEAST_SNR for i in of_frame}
+            kept = []
+            for k, end in new.items():
+                theta, last = found[k], frames[end.frame][k]
+                beside = [np.hypot(*(theta - o)[:2]) for j, o in found.items() if j != k]
+                alone = min(beside, default=np.inf) > meeting
+                heavy = theta[3] > LEAST_SHARE * typical[k]
+                step = np.hypot(*(theta - last)[:2])
+                apart = min(beside, default=np.inf) > same
+                if sure[k] and (alone or heavy) and apart and step < reach_nm:
+                    kept.append(end)
+            if not kept:
+                continue
+            for k, theta in found.items():
+                if k in frames[t] or k in {end.track for end in kept}:
+                    frames[t][k] = theta
+            added += len(kept)
+            ends += [_End(end.track, t, end.way) for end in kept]
+    frame = np.array([t for t, found in enumerate(frames) for _ in found], dtype=np.int64)
+    track = np.array([k for found in frames for k in found], dtype=np.int64)
+    theta = np.array([theta for found in frames for theta in found.values()])
+    return Rows.of(frame, track, theta, blur[track]), added
+
+
+def _starts(
+    frames: list[dict[int, FloatArray]],
+    proposed: dict[int, dict[int, _End]],
+    typical: FloatArray,
+    blur: np.ndarray,
+    meeting_nm: float,
+) -> Rows:
+    """Give the rows of the frames in question, those that meet at their predictions."""
+    frame, track, theta = [], [], []
+    for t, new in proposed.items():
+        rows = {k: value.copy() for k, value in frames[t].items()}
+        for k, end in new.items():
+            start = frames[end.frame][k].copy()
+            start[3] = typical[k]
+            for j, other in frames[t].items():
+                if np.hypot(*(other - start)[:2]) < meeting_nm:
+                    rows[j] = frames[end.frame].get(j, other).copy()
+                    rows[j][3] = typical[j]
+            rows[k] = start
+        for k, value in rows.items():
+            frame.append(t)
+            track.append(k)
+            theta.append(value)
+    tracks = np.array(track, dtype=np.int64)
+    return Rows.of(np.array(frame, dtype=np.int64), tracks, np.array(theta), blur[tracks])

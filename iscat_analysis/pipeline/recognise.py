@@ -1,0 +1,132 @@
+"""A movie that was given to the wrong mode is recognised, and said."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.special import bdtrc
+
+from iscat_analysis.config import Config
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.records import FloatArray, FrameSource
+from iscat_analysis.search.changes import Changes, find_changes, spot_of
+
+MOST_FRAMES = 2000
+"""Of a movie that are looked at, from its first."""
+
+BLOCK = 20
+"""Frames that are averaged: particles on a membrane, 0.15 µm²/s at 331 Hz, go 190 nm in them."""
+
+MOST_STAYING, MOST_UNDONE = 0.5, 0.05
+"""Shares of changes that may stay where particles move (some do stay for 40 frames), and that may
+be undone where they land (one lands where another just left)."""
+
+DOUBT = 0.03
+"""A movie is said to be of the other kind where so many changes have a smaller chance than this."""
+
+
+def look_at_changes(
+    movie: FrameSource, config: Config, camera: Camera, span: tuple[int, int]
+) -> Changes:
+    """Find what changes in the first frames of a movie.
+
+    Parameters
+    ----------
+    movie : FrameSource
+        The movie.
+    config : Config
+        Its optics and pixel size.
+    camera : Camera
+        Counts → photoelectrons.
+    span : (int, int)
+        Half-open range of frames.
+
+    Returns
+    -------
+    Changes
+        Of blocks of `BLOCK` frames, whatever light each had.
+    """
+    last = min(span[1], span[0] + MOST_FRAMES, movie.shape[0])
+    images: list[FloatArray] = []
+    for first in range(span[0], last - BLOCK + 1, BLOCK):
+        light = camera.to_electrons(movie.read(first, first + BLOCK)).mean(axis=0)
+        if light.mean() > 0:
+            images.append(light / light.mean())
+    if not images:
+        return Changes(0, float("nan"), float("nan"))
+    blocks = np.stack(images)
+    level = blocks.mean(axis=0)
+    usable = level > 0.1 * np.median(level)
+    blocks = np.where(usable, blocks / np.where(usable, level, 1.0), 1.0)
+    pixel = config.camera.pixel_size_nm or config.optics.wavelength_nm / config.optics.na
+    return find_changes(blocks, spot_of(config.optics.wavelength_nm, config.optics.na, pixel))
+
+
+def as_landing(changes: Changes, name: str) -> str:
+    """Say that a movie in mode ``track`` shows landings.
+
+    Parameters
+    ----------
+    changes : Changes
+        From `look_at_changes`.
+    name : str
+        What messages call the movie.
+
+    Returns
+    -------
+    str
+        One line; empty where it does not.
+    """
+    if _chance(changes.number, changes.staying, MOST_STAYING) > DOUBT:
+        return ""
+    return (
+        f"{name}: its particles land or leave rather than move: of {changes.number} clear changes "
+        f"{100 * changes.staying:.0f} % stay as they are; use "
+        'fit.mode = "mass" without background.frames, whose windows follow landings'
+    )
+
+
+def as_moving(changes: Changes, name: str) -> str:
+    """Say that a movie with sliding windows shows particles that move.
+
+    Parameters
+    ----------
+    changes : Changes
+        From `look_at_changes`.
+    name : str
+        What messages call the movie.
+
+    Returns
+    -------
+    str
+        One line; empty where it does not.
+    """
+    if _chance(changes.number, changes.undone, MOST_UNDONE) > DOUBT:
+        return ""
+    return (
+        f"{name}: its particles move rather than land: of {changes.number} clear changes from "
+        f"{BLOCK} frames to the next {100 * changes.undone:.0f} % are undone at once, as by one "
+        'that comes and goes on; use fit.mode = "track", which follows them'
+    )
+
+
+def _chance(number: int, share: float, most: float) -> float:
+    """Chance that at least this share of the changes are such, if each is with chance `most`."""
+    return float(bdtrc(round(number * share) - 1, number, most)) if number and share > 0 else 1.0
+
+
+def changes_summary(changes: Changes) -> dict[str, Any]:
+    """Give what ``summary.json`` says of changes.
+
+    Parameters
+    ----------
+    changes : Changes
+        From `look_at_changes`.
+
+    Returns
+    -------
+    dict
+        Plain values.
+    """
+    return {"number": changes.number, "staying": changes.staying, "undone": changes.undone}

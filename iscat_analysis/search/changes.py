@@ -1,0 +1,106 @@
+"""What becomes of changes in a movie: whether particles land and stay, or move.
+
+Averages A_j of successive blocks of frames change where something happens.  A change is seen as
+S_j = A_{j+1} − A_{j−1}, with the block in which it happens between.  Where a particle lands or
+leaves, the blocks before agree with each other, and so do those after: A_{j+2} − A_{j+1} and
+A_{j−1} − A_{j−2} are noise.  Where one came that moves, it is gone again after, or came just
+before, and one of these differences undoes the change: it is near −S_j.  A pattern that drifts
+steadily changes by S_j/2 each time, which is neither.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, maximum_filter
+
+from iscat_analysis.records import FloatArray
+
+CLEAR = 12.0
+"""Standard deviations of noise that a change must exceed: the ratios below then have errors of a
+tenth."""
+
+STAYS, UNDONE = 0.15, -0.5
+"""Bounds of what the neighbouring differences come to, as parts of a change: beyond the first, and
+beyond noise, it does not stay, for rings of others make less; below the second it is undone."""
+
+_QUIET = 4.0  # standard deviations of noise
+_SPOT = 0.21  # standard deviation of a spot, in wavelengths over NA
+_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
+_BESIDE = 5  # changes are the largest within so many pixels
+_LEAST_BLOCKS = 5
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Clear changes in a movie.
+
+    Attributes
+    ----------
+    number : int
+        How many there are.
+    staying : float
+        Share after which everything stays as it is, as before; NaN where there is none.
+    undone : float
+        Share that is undone at once, or undoes another.
+    """
+
+    number: int
+    staying: float
+    undone: float
+
+
+def find_changes(blocks: FloatArray, spot_px: float) -> Changes:
+    """Look for changes from block to block, and at what becomes of them.
+
+    Parameters
+    ----------
+    blocks : ndarray, shape (n, y, x)
+        Mean images of successive blocks of frames, over that of all: 1 where nothing changes.
+    spot_px : float
+        Standard deviation of a particle's picture [px], from `spot_of`.
+
+    Returns
+    -------
+    Changes
+        None in fewer than 5 blocks.
+    """
+    if len(blocks) < _LEAST_BLOCKS:
+        return Changes(0, float("nan"), float("nan"))
+    smooth = np.stack([
+        gaussian_filter(image, spot_px) - gaussian_filter(image, 4 * spot_px) for image in blocks
+    ])  # fmt: skip
+    lag = np.diff(smooth, axis=0)
+    noise = _NORMAL * float(np.median(np.abs(lag - np.median(lag))))
+    change = smooth[3:-1] - smooth[1:-3]
+    size = np.abs(change)
+    largest = maximum_filter(size, (3, _BESIDE, _BESIDE))
+    found = np.nonzero((size == largest) & (size > CLEAR * noise) & (size > 0))
+    if not found[0].size:
+        return Changes(0, float("nan"), float("nan"))
+    before, after = (part[found] / change[found] for part in (lag[: len(change)], lag[3:]))
+    quiet = np.maximum(_QUIET * noise / size[found], STAYS)
+    staying = np.maximum(np.abs(before), np.abs(after)) < quiet
+    undone = np.minimum(before, after) < UNDONE
+    return Changes(found[0].size, float(staying.mean()), float(undone.mean()))
+
+
+def spot_of(wavelength_nm: float, na: float, pixel_nm: float) -> float:
+    """Give the standard deviation of a particle's picture.
+
+    Parameters
+    ----------
+    wavelength_nm : float
+        Of the light [nm].
+    na : float
+        Numerical aperture.
+    pixel_nm : float
+        Side of a pixel [nm].
+
+    Returns
+    -------
+    float
+        In pixels, at least half a one.
+    """
+    return max(_SPOT * wavelength_nm / na / pixel_nm, 0.5)

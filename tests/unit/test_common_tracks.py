@@ -1,0 +1,151 @@
+"""What the frames of a track have in common: one mass, and the errors of its background."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from scenes import PIXEL_NM, make_config
+
+from iscat_analysis.inference.common import common_amplitudes, shared_errors
+from iscat_analysis.inference.moving import Ground, MovingField, Rows
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.pipeline.extension import extended
+
+SHAPE, FRAMES, LEVEL_E, ROI, MASS = (30, 30), 40, 4e5, 20, 400.0
+TRIALS, SIGMAS = 40, 4.0
+
+
+@pytest.fixture(scope="module")
+def pool() -> Iterator[ThreadPoolExecutor]:
+    with ThreadPoolExecutor(2) as threads:
+        yield threads
+
+
+@pytest.fixture(scope="module")
+def model() -> ForwardModel:
+    return forward_model(make_config(), 1e4)
+
+
+def _expected(model: ForwardModel, paths: np.ndarray) -> tuple[np.ndarray, Rows]:
+    """Mean counts of particles on paths (tracks, frames, 2), NaN where they are not, and rows."""
+    grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
+    level = LEVEL_E * (1 + 0.1 * np.random.default_rng(2).standard_normal(SHAPE))
+    signal = np.zeros((FRAMES, *SHAPE))
+    amplitude = model.scale.amplitude(MASS)
+    frame, track, theta = [], [], []
+    for k, path in enumerate(paths):
+        for t, place in enumerate(path):
+            if np.isfinite(place).all():
+                signal[t] += model.image(grid, *place, model.height_nm, MASS)
+                frame.append(t)
+                track.append(k)
+                theta.append([*place, model.height_nm, amplitude, 0.0])
+    rows = Rows.of(np.array(frame), np.array(track), np.array(theta))
+    return level * (1 + signal), rows
+
+
+def _field(model: ForwardModel, counts: np.ndarray, pool: ThreadPoolExecutor) -> MovingField:
+    near = forward_model(make_config(), math.sqrt(2) * (ROI / 2 + 6) * PIXEL_NM)
+    return MovingField(
+        counts.astype(np.float32), np.zeros(SHAPE), np.ones(SHAPE, dtype=bool), near, model,
+        pixel_nm=PIXEL_NM, roi_px=ROI, z_range_nm=None, largest=1e6, pool=pool,
+    )  # fmt: skip
+
+
+def test_information_lost_is_that_of_all_parameters(
+    model: ForwardModel, pool: ThreadPoolExecutor
+) -> None:
+    """One mass and the light of every pixel: the Schur complement of their Fisher matrix."""
+    path = np.random.default_rng(4).normal(1250.0, 40.0, (1, FRAMES, 2))
+    counts, rows = _expected(model, path)
+    field = _field(model, counts, pool)
+    ground = Ground(counts.mean(axis=0), np.ones(FRAMES))
+    _, ground, _ = field.fit(ground, rows, sweeps=0)
+    ground = Ground(ground.level, np.ones(FRAMES))
+    lost = field.lost(ground, rows)[3, 3]
+    grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
+    own = across = within = 0.0
+    for theta in rows.theta:
+        first = [round(c / PIXEL_NM - (ROI - 1) / 2) for c in theta[1::-1]]
+        seen = np.zeros(SHAPE)
+        seen[first[0] : first[0] + ROI, first[1] : first[1] + ROI] = 1.0
+        signal, slopes = model.amplitude_gradient(grid, *theta[:4])
+        change = slopes[3] * seen
+        own = own + np.sum(ground.level * change**2 / (1 + signal))
+        across = across + ground.level * change / ground.level  # ∂λ/∂a ∂λ/∂B / λ
+        within = within + (1 + signal) / ground.level
+    assert lost == pytest.approx(np.sum(across**2 / within), rel=1e-3)
+    assert 0.5 < lost / own < 1.0  # it hardly moves: most of what it says is lost
+
+
+def test_common_mass_and_shared_errors_are_right(
+    model: ForwardModel, pool: ThreadPoolExecutor
+) -> None:
+    """Over many movies: the mean of the masses, and their scatter, of a particle that is slow."""
+    path = np.cumsum(np.random.default_rng(4).normal(0.0, 25.0, (1, FRAMES, 2)), axis=1) + 1250.0
+    mean, truth = _expected(model, path)
+    rng = np.random.default_rng(6)
+    amplitude, variance, errors = [], [], []
+    for _ in range(TRIALS):
+        field = _field(model, rng.poisson(mean), pool)
+        start = Ground(mean.mean(axis=0), np.ones(FRAMES))
+        rows, ground, done, _ = field.settle(start, truth, follow_power=False)
+        judged = field.judge(ground, rows)
+        shared = shared_errors(field, ground, rows, judged)
+        found = common_amplitudes(field, ground, rows, judged, done, shared)
+        amplitude.append(found.amplitude[0])
+        variance.append(found.variance[0])
+        index = np.array([0, 1, 3])
+        own = np.linalg.inv(judged.fisher[:, index][:, :, index])
+        spread = own + shared.covariance[:, index][:, :, index]
+        off = (rows.theta[:, :4] - judged.bias - truth.theta[:, :4])[:, index]
+        errors.append(off / np.sqrt(np.einsum("nii->ni", spread)))
+        assert found.variance[0] > 2 * found.known[0]
+    sigma = math.sqrt(np.mean(variance))
+    true = model.scale.amplitude(MASS)
+    assert abs(np.mean(amplitude) - true) < SIGMAS * sigma / math.sqrt(TRIALS)
+    assert abs(np.std(amplitude) / sigma - 1) < SIGMAS / math.sqrt(2 * TRIALS)
+    for pulls in np.moveaxis(np.array(errors), 2, 0):  # of x, y, a: (trials, frames)
+        assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * TRIALS)
+
+
+def test_tracks_go_on_through_a_meeting(model: ForwardModel, pool: ThreadPoolExecutor) -> None:
+    """Two particles pass each other at 230 nm; one was lost while they were close."""
+    way = np.linspace(-900.0, 900.0, FRAMES)
+    paths = np.array([
+        np.column_stack([1250 + way, np.full(FRAMES, 1150.0)]),
+        np.column_stack([1250 - way, np.full(FRAMES, 1380.0)]),
+    ])  # fmt: skip
+    mean, truth = _expected(model, paths)
+    counts = np.random.default_rng(8).poisson(mean)
+    field = _field(model, counts, pool)
+    near = np.hypot(*(paths[0] - paths[1]).T) < 400.0
+    seen = ~((truth.track == 1) & near[truth.frame] & (truth.frame >= 5))
+    seen &= ~((truth.track == 1) & (truth.frame > 20))
+    start = Ground(mean.mean(axis=0), np.ones(FRAMES))
+    _, ground, _ = field.fit(start, truth, sweeps=0)
+    merged = truth.only(seen)
+    rows, added = extended(field, ground, merged, resolution_nm=370.0, reach_nm=600.0)
+    assert added == FRAMES - int(np.sum(merged.track == 1))
+    for k in range(2):
+        mine = rows.track == k
+        assert np.array_equal(rows.frame[mine], np.arange(FRAMES))
+        assert np.abs(rows.theta[mine, :2] - paths[k]).max() < 100.0
+    rows, again = extended(field, ground, rows, resolution_nm=370.0, reach_nm=600.0)
+    assert again == 0
+
+
+def test_a_track_that_ends_is_not_made_longer(
+    model: ForwardModel, pool: ThreadPoolExecutor
+) -> None:
+    path = np.full((1, FRAMES, 2), 1250.0)
+    path[0, 25:] = np.nan
+    mean, truth = _expected(model, path)
+    field = _field(model, np.random.default_rng(8).poisson(mean), pool)
+    ground = Ground(mean[-1], np.ones(FRAMES))
+    _, added = extended(field, ground, truth, resolution_nm=370.0, reach_nm=600.0)
+    assert added == 0
