@@ -10,7 +10,8 @@ from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.inference.fit import POOR_FIT_P
 from iscat_analysis.optics.blur import PATH_SPREAD, blurred
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
-from iscat_analysis.pipeline.moving import Moving, crowded, shares_mass
+from iscat_analysis.pipeline.linking import crowded, shares_mass
+from iscat_analysis.pipeline.moving import Moving
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import EVENT_COLUMNS, PARAMETERS, BoolArray, FloatArray, Status, verdict
 
