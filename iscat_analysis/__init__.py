@@ -23,6 +23,7 @@ Whole jobs, from a movie to a report::
     result.table                # pandas.DataFrame, one row per event
     result.view(0)              # matplotlib Figure: data, model, residual
     result.posterior(0)         # arviz.InferenceData
+    result.tracks               # of particles that move: mass, D, one row per track
     result.save("movie.iscat")  # report.html, fits.csv, fits.parquet, …
     ia.calibrate_optics("movie.tif", config=setup)  # focus, aberrations… from the movie itself
     ia.compute_bounds(setup)    # what no estimate from such frames can beat

@@ -57,7 +57,7 @@ def fit_movie(
         As for `configure`; they win over `config`, and the arguments below win over both.
     mode : str, optional
         ``"mass"`` (x, y, mass), ``"localize"`` (x, y, z), ``"joint"`` (x, y, z, mass) or
-        ``"track"`` (joint in every frame, linked).
+        ``"track"`` (particles that move: every frame, linked; `Result.tracks`).
     background : (int, int), optional
         Frames before the particles bound, ``[start, stop)``.
     frames : (int, int), optional
