@@ -41,7 +41,8 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     -------
     pandas.DataFrame
         Columns `EVENT_COLUMNS`, and ``track``; ``event`` is the track too.  Rows whose particle is
-        outside the field are left out: they were fitted for the sake of the others.
+        outside the field are left out: they were fitted for the sake of the others.  So are tracks
+        with fewer than `track.min_frames` in the field.
 
     Notes
     -----
@@ -88,7 +89,10 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     size = np.array([field.used.shape[1], field.used.shape[0]])
     places = rows.theta[:, :2] / pixel
     inside = np.all((places >= -0.5) & (places < size - 0.5), axis=1)
-    return table[inside].sort_values(["track", "frame"], kind="stable").reset_index(drop=True)
+    table = table[inside]
+    seen = table.groupby("track")["frame"].transform("size")
+    table = table[seen >= scene.config.track.min_frames]
+    return table.sort_values(["track", "frame"], kind="stable").reset_index(drop=True)
 
 
 def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
