@@ -27,6 +27,7 @@ from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.blur import path_variance_nm2
 from iscat_analysis.pipeline.extension import extended
+from iscat_analysis.pipeline.heights import decide_heights
 from iscat_analysis.pipeline.linking import (
     AS_FOUND,
     alone,
@@ -232,6 +233,11 @@ def follow(
         if added <= _FEW * len(rows.frame):
             break
     rows = trimmed(rows)
+    if scene.mode == "joint":
+        rows = decide_heights(
+            field, ground, rows,
+            fringe_nm=scene.model.fringe_nm, z_range_nm=config.fit.z_range_nm,
+        )  # fmt: skip
     for stage in range(2):
         rows, ground, done, change = field.settle(
             ground, rows, follow_power=follow_power, follow_level=follow_level,
