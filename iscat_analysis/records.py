@@ -27,6 +27,27 @@ FREE_PARAMETERS: Mapping[str, tuple[str, ...]] = {
 }
 """What each mode fits."""
 
+
+def free_parameters(mode: str, fits: pd.DataFrame) -> tuple[str, ...]:
+    """Tell what was fitted: in mode ``track`` the height only where ``track.free`` asks for it.
+
+    Parameters
+    ----------
+    mode : str
+        Key of `FREE_PARAMETERS`.
+    fits : pandas.DataFrame
+        With a column ``sigma_…`` of each, empty where it was held fixed.
+
+    Returns
+    -------
+    tuple of str
+        A subset of `PARAMETERS`, in that order.
+    """
+    names = FREE_PARAMETERS[mode]
+    fitted = tuple(name for name in names if fits[f"sigma_{name}"].notna().any())
+    return fitted if mode == "track" and fitted else names
+
+
 EVENT_COLUMNS = (
     "event", "frame", "n_before", "n_after", "x_px", "y_px", "x_nm", "y_nm", "z_nm", "mass_kda",
     "contrast", "sigma_x_nm", "sigma_y_nm", "sigma_z_nm", "sigma_mass_kda",

@@ -23,6 +23,7 @@ from iscat_analysis.records import (
     PosteriorResult,
     Status,
     Windows,
+    free_parameters,
 )
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.search.empty import EmptySpread
@@ -186,7 +187,7 @@ def summary_of(
         Nested plain values.
     """
     good = table[table["status"] == Status.OK]
-    free = FREE_PARAMETERS[scene.mode]
+    free = free_parameters(scene.mode, table)
     conflict = {"z_nm", "mass_kda"} <= set(free) and len(good) > 0
     cost = _holevo_over_quantum(scene, good["z_nm"].to_numpy(float)) if conflict else {}
     distribution = _distribution(scene, good)

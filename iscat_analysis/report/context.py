@@ -12,7 +12,13 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup, escape
 
-from iscat_analysis.records import FREE_PARAMETERS, Analysis, EventView, Status
+from iscat_analysis.records import (
+    FREE_PARAMETERS,
+    Analysis,
+    EventView,
+    Status,
+    free_parameters,
+)
 from iscat_analysis.report.event_figures import event_images
 from iscat_analysis.report.headline import (
     caution,
@@ -66,7 +72,9 @@ def report_context(
     sampled = [view for view in analysis.views if view.posterior is not None]
     started = _when(analysis.provenance.started)
     said = headline(analysis, table)
-    precision = [precision_of(analysis, table, name) for name in FREE_PARAMETERS[analysis.mode]]
+    precision = [
+        precision_of(analysis, table, name) for name in free_parameters(analysis.mode, table)
+    ]
     return {
         "title": PurePath(source.replace("\\", "/")).name or "Analysis",
         "subtitle": f"{_SCHEMES[analysis.scheme]}, mode {analysis.mode}: {_MODES[analysis.mode]}. "

@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from iscat_analysis.records import (
-    FREE_PARAMETERS,
     Analysis,
     BoolArray,
     FloatArray,
     Status,
+    free_parameters,
 )
 from iscat_analysis.report.event_figures import HALO, display_range, scale_bar
 from iscat_analysis.report.headline import as_contrasts, label_of, main_quantity
@@ -273,7 +273,7 @@ def precision(analysis: Analysis, table: pd.DataFrame) -> Figure:
     Figure
         One panel for each free parameter.
     """
-    free = FREE_PARAMETERS[analysis.mode]
+    free = free_parameters(analysis.mode, table)
     figure = new_figure(3.0 * len(free), 3.4)
     good = _is_ok(table)
     for place, name in enumerate(free):

@@ -13,8 +13,8 @@ from PIL import Image
 from report_factory import make_analysis
 from walkers import EXPOSURE_MS, RATE_HZ, fits_of, walk
 
-from iscat_analysis.records import TRACK_COLUMNS
-from iscat_analysis.report import films, track_figures, write_report
+from iscat_analysis.records import FREE_PARAMETERS, TRACK_COLUMNS, free_parameters
+from iscat_analysis.report import films, render_report, track_figures, write_report
 from iscat_analysis.report.headline import NOT_A_MASS
 from iscat_analysis.report.tracks import tracks_headline
 from iscat_analysis.result import Result
@@ -78,6 +78,17 @@ def test_a_headline_of_tracks_that_are_flagged_has_no_median() -> None:
     assert NOT_A_MASS in said
     assert "contrast" in said[0]
     assert "kDa" not in said[0]
+
+
+def test_a_height_that_was_held_fixed_is_in_no_table_of_precision() -> None:
+    analysis = make_analysis(40, "track")
+    assert free_parameters("track", analysis.table) == FREE_PARAMETERS["joint"]
+    flat = analysis.table.assign(sigma_z_nm=np.nan, crb_z_nm=np.nan)
+    assert free_parameters("track", flat) == FREE_PARAMETERS["mass"]
+    assert free_parameters("joint", flat) == FREE_PARAMETERS["joint"]
+    page = render_report(replace(analysis, table=flat))
+    assert "<td>z [nm]</td>" not in page
+    assert "<td>z [nm]</td>" in render_report(analysis)
 
 
 def test_a_result_shows_its_tracks() -> None:
