@@ -89,8 +89,8 @@ def judge(movie: Wanderers, result: ia.Result) -> tuple[dict[str, Any], pd.DataF
         for k in ("x_nm", "y_nm", "mass_kda")
     }
     counted = {
-        "positions": len(movie.truth),
-        "found": int(true.sum()),
+        "positions": int(movie.truth["inside"].sum()),
+        "found": int(fitted["inside"].sum()),
         "not there": int((~true).sum()),
         "false tracks": len(false),
         "tracks": len(tracks),

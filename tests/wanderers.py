@@ -38,8 +38,8 @@ class Wanderers:
     counts : ndarray of uint16, shape (frames, y, x)
         What the camera gives.
     truth : DataFrame
-        track, frame, x_nm, y_nm (averages over the exposure), mass_kda, d_um2_s; one row for each
-        particle and frame in which it is in the field.
+        track, frame, x_nm, y_nm (averages over the exposure), inside (whether that is in the
+        field), mass_kda, d_um2_s; one row for each particle and frame.
     """
 
     counts: NDArray[np.uint16]
@@ -84,14 +84,8 @@ def wander(
     """
     rng = np.random.default_rng(seed)
     frames, rows, columns = shape
-    mass, diffusion = (np.array([row[k] for row in species for _ in range(row[2])]) for k in (0, 1))
-    low = -MARGIN_PX * pixel_nm
-    size = np.array([columns - 1, rows - 1]) * pixel_nm - 2 * low
-    step = np.sqrt(2e6 * diffusion / (frame_rate_hz * PARTS))[:, None, None]
-    walk = np.cumsum(step * rng.standard_normal((mass.size, frames * PARTS, 2)), axis=1)
-    walk += rng.uniform(0, size, (mass.size, 1, 2))
-    walk = low + size - np.abs(walk % (2 * size) - size)  # between walls that reflect
-    walk = walk.reshape(mass.size, frames, PARTS, 2)
+    walk, truth = _paths(rng, shape, species, frame_rate_hz, pixel_nm)
+    mass = np.array([row[0] for row in species for _ in range(row[2])])
 
     reach = max(rows, columns) + math.ceil(MARGIN_PX) + 1
     side = next_fast_len(2 * reach)
@@ -121,12 +115,33 @@ def wander(
         noisy = expected + np.sqrt(expected) * rng.standard_normal((rows, columns))
         counts[t] = np.floor(noisy / gain_e_per_adu + rng.random((rows, columns)))
 
+    return Wanderers(counts, truth)
+
+
+def _paths(
+    rng: np.random.Generator,
+    shape: tuple[int, int, int],
+    species: tuple[tuple[float, float, int], ...],
+    frame_rate_hz: float,
+    pixel_nm: float,
+) -> tuple[FloatArray, pd.DataFrame]:
+    """Places x, y of every particle in every part of a frame [nm], and the truth."""
+    frames, rows, columns = shape
+    mass, diffusion = (np.array([row[k] for row in species for _ in range(row[2])]) for k in (0, 1))
+    low = -MARGIN_PX * pixel_nm
+    field = np.array([columns - 1, rows - 1]) * pixel_nm
+    size = field - 2 * low
+    step = np.sqrt(2e6 * diffusion / (frame_rate_hz * PARTS))[:, None, None]
+    walk = np.cumsum(step * rng.standard_normal((mass.size, frames * PARTS, 2)), axis=1)
+    walk += rng.uniform(0, size, (mass.size, 1, 2))
+    walk = low + size - np.abs(walk % (2 * size) - size)  # between walls that reflect
+    walk = walk.reshape(mass.size, frames, PARTS, 2)
     mean = walk.mean(axis=2)
-    inside = (mean >= 0) & (mean <= size + 2 * low)
-    track, frame = np.nonzero(inside.all(axis=2))
+    inside = ((mean >= 0) & (mean <= field)).all(axis=2)
+    track, frame = (k.ravel() for k in np.indices(inside.shape))
     truth = pd.DataFrame({
         "track": track, "frame": frame,
-        "x_nm": mean[track, frame, 0], "y_nm": mean[track, frame, 1],
+        "x_nm": mean[..., 0].ravel(), "y_nm": mean[..., 1].ravel(), "inside": inside.ravel(),
         "mass_kda": mass[track], "d_um2_s": diffusion[track],
     })  # fmt: skip
-    return Wanderers(counts, truth)
+    return walk, truth
