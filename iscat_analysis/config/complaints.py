@@ -27,9 +27,13 @@ def complaint(item: Mapping[str, Any], called: Mapping[str, str]) -> str:
     str
         Half a sentence that names the key.
     """
-    location = [str(part) for part in item["loc"] if not _is_union_branch(part)]
+    unknown = item["type"] == "extra_forbidden"
+    named = len(item["loc"]) - 1 if unknown else len(item["loc"])  # an unknown key may be "str"
+    location = [
+        str(part) for i, part in enumerate(item["loc"]) if i == named or not _is_union_branch(part)
+    ]
     key = called.get(".".join(location), ".".join(location))
-    if item["type"] == "extra_forbidden":
+    if unknown:
         known = known_keys(location[:-1])
         near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
         hint = f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known)}"

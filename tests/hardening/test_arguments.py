@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from iscat_analysis import config as config_module
@@ -58,6 +58,8 @@ def one_line(error: Exception) -> None:
 
 @settings(max_examples=400)
 @given(values=TABLES)
+@example(values={"str": {}})
+@example(values={"optics": {"float": 1}})
 def test_any_mapping_is_a_configuration_or_refused(values: dict[str, Any]) -> None:
     with contextlib.suppress(ConfigError):
         found = parse_config(values)
