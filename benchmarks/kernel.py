@@ -77,14 +77,14 @@ def gradients(repeats, profile, lens, x, f, g):  # type: ignore[no-untyped-def]
 def values(repeats, kind, data, g):  # type: ignore[no-untyped-def]
     total = 0.0
     for k in range(repeats):
-        total += scoring._row_value(kind, data, k % data.shape[1], 1.0, g[0])
+        total += scoring.row_value(kind, data, k % data.shape[1], 1.0, g[0])
     return total
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def scores(repeats, kind, data, g, sums):  # type: ignore[no-untyped-def]
     for k in range(repeats):
-        scoring._row_score(kind, data, k % data.shape[1], 1.0, g, sums)
+        scoring.row_score(kind, data, k % data.shape[1], 1.0, g, sums)
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]

@@ -176,8 +176,9 @@ def main() -> int:
     }
     print(json.dumps(numbers, indent=2))
     RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "tracking.json").write_text(json.dumps(numbers, indent=2) + "\n", encoding="utf-8")
-    tracks.to_csv(RESULTS / "tracking.csv", index=False)
+    name = "tracking-median" if options.median else "tracking"
+    (RESULTS / f"{name}.json").write_text(json.dumps(numbers, indent=2) + "\n", encoding="utf-8")
+    tracks.to_csv(RESULTS / f"{name}.csv", index=False)
     mass, diffusion = numbers["mass"]["all"], numbers["diffusion"]["all"]
     kept = {
         "97 % of the positions": numbers["found"] >= 0.97,

@@ -14,6 +14,8 @@ from typing import Annotated
 import typer
 
 from iscat_cli import INTERRUPTED
+from iscat_cli.batch import EXAMPLE as BATCH_EXAMPLE
+from iscat_cli.batch import batch
 from iscat_cli.benchmark import EXAMPLE as BENCHMARK_EXAMPLE
 from iscat_cli.benchmark import benchmark
 from iscat_cli.bounds import EXAMPLE as BOUNDS_EXAMPLE
@@ -34,16 +36,26 @@ from iscat_cli.export import EXAMPLE as EXPORT_EXAMPLE
 from iscat_cli.export import export
 from iscat_cli.fit import EXAMPLE as FIT_EXAMPLE
 from iscat_cli.fit import fit
+from iscat_cli.kd import EXAMPLE as KD_EXAMPLE
+from iscat_cli.kd import kd
 from iscat_cli.simulate import EXAMPLE as SIMULATE_EXAMPLE
 from iscat_cli.simulate import simulate
+from iscat_cli.species import EXAMPLE as SPECIES_EXAMPLE
+from iscat_cli.species import species
+from iscat_cli.view import EXAMPLE as VIEW_EXAMPLE
+from iscat_cli.view import view
 
 # To add a command: its own file with a function and an EXAMPLE, and one line here.
 COMMANDS = (
     (fit, FIT_EXAMPLE),
+    (batch, BATCH_EXAMPLE),
     (simulate, SIMULATE_EXAMPLE),
     (bounds, BOUNDS_EXAMPLE),
     (benchmark, BENCHMARK_EXAMPLE),
+    (species, SPECIES_EXAMPLE),
+    (kd, KD_EXAMPLE),
     (export, EXPORT_EXAMPLE),
+    (view, VIEW_EXAMPLE),
     (config, CONFIG_EXAMPLE),
 )
 

@@ -93,6 +93,7 @@ def camera(
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
         from iscat_analysis.errors import ConfigError
+        from iscat_analysis.movie.addresses import beside
         from iscat_analysis.pipeline.calibrations import camera_calibration
 
         given = [*(stacks or ()), *([dark] if dark is not None else [])]
@@ -100,7 +101,7 @@ def camera(
             raise ConfigError("give a flat, the movie, or --dark")
         if dark is not None and offset is not None:
             raise ConfigError("--dark measures the offset: leave --offset out")
-        folder = out if out is not None else given[0].with_suffix(".camera")
+        folder = out if out is not None else beside(given[0], ".camera")
         with messages.progress() as progress:
             found = camera_calibration(
                 stacks or (),
@@ -248,9 +249,10 @@ def optics(
             return
         from iscat_analysis.config import load_config
         from iscat_analysis.errors import DataError
+        from iscat_analysis.movie.addresses import beside
         from iscat_analysis.pipeline.calibrations import optics_calibration
 
-        folder = out if out is not None else movie.with_suffix(".optics")
+        folder = out if out is not None else beside(movie, ".optics")
         with messages.progress() as progress:
             found = optics_calibration(
                 movie,
@@ -291,13 +293,14 @@ def _measure(
     """Measure the picture of a particle."""
     from iscat_analysis.config import load_config
     from iscat_analysis.errors import ConfigError, DataError
+    from iscat_analysis.movie.addresses import beside
     from iscat_analysis.pipeline.calibrations import template_calibration
 
     if free is not None or focus_step is not None:
         raise ConfigError(
             "--measured takes the picture as it is at one focus: leave out --free and --focus-step"
         )
-    folder = out if out is not None else movie.with_suffix(".optics")
+    folder = out if out is not None else beside(movie, ".optics")
     with messages.progress() as progress:
         found = template_calibration(
             movie, load_config(config, settings or ()), folder,

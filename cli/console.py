@@ -247,7 +247,7 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
             if debug:
                 _write(sys.stderr, traceback.format_exc())
             line, status = _verdict(error, debug=debug)
-            messages.error(_with_options(line))
+            messages.error(with_options(line))
             raise typer.Exit(status) from error
 
 
@@ -328,10 +328,17 @@ def _termination_interrupts() -> Iterator[None]:
 _OPTIONS = {
     **{
         name: name
-        for name in ("dark", "free", "inject", "landing", "maps", "optimize", "out", "overwrite",
-                     "scan", "target")
+        for name in ("dark", "draws", "free", "hold", "inactive", "inject", "k", "ladder",
+                     "landing", "maps", "model", "offset", "optimize", "out", "overwrite",
+                     "scan", "steps", "target")
     },
+    "above_kda": "above",
+    "frame_rate_hz": "frame-rate",
+    "landing_power": "landing",
+    "limit_kda": "limit",
+    "masses_kda": "masses",
     "offset_adu": "offset",
+    "sigma_kda": "sigma",
     "standards_kda": "standards",
 }  # fmt: skip
 """Argument of the library → option of a command."""
@@ -345,8 +352,19 @@ _KEYS_WITH_OPTIONS = (
 """How keys of the configuration are given on the command line."""
 
 
-def _with_options(text: str) -> str:
-    """Name options where the library names its arguments, which it writes in backquotes."""
+def with_options(text: str) -> str:
+    """Name options where the library names its arguments, which it writes in backquotes.
+
+    Parameters
+    ----------
+    text : str
+        What the library says.
+
+    Returns
+    -------
+    str
+        The same for whoever typed a command.
+    """
 
     def option(match: re.Match[str]) -> str:
         return f"--{_OPTIONS[match[1]]}{' ' if match[2] else ''}"

@@ -48,7 +48,8 @@ def fit(
     stacks: Annotated[
         list[Path],
         typer.Argument(
-            metavar="STACK", help="The movie: TIFF, OME-TIFF, ImageJ TIFF or Refeyn .mp."
+            metavar="STACK",
+            help="The movie: TIFF of any kind, Refeyn .mp, HDF5 (FILE::/DATASET), Zarr, .npy.",
         ),
     ],
     *,
@@ -59,6 +60,14 @@ def fit(
         typer.Option(
             metavar="DIR",
             help="Output folder; default the movie's name with .iscat.",
+            show_default=False,
+        ),
+    ] = None,
+    raw: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SHAPE,TYPE",
+            help="STACK is nothing but numbers, as in 1500x128x128,uint16; also STACK::SHAPE,TYPE.",
             show_default=False,
         ),
     ] = None,
@@ -127,9 +136,13 @@ def fit(
 
         changes = _changes(settings, mode, frames, background, posterior, workers)
         resolved = load_config(config, changes)
-        folder = stack.with_suffix(".iscat") if out is None else out
 
+        from iscat_analysis.movie.addresses import MARK, beside
         from iscat_analysis.pipeline import fit_stack
+
+        if raw is not None:
+            stack = Path(f"{stack}{MARK}{raw}")
+        folder = beside(stack, ".iscat") if out is None else out
 
         with messages.progress() as progress:
             analysis = fit_stack(

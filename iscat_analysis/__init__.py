@@ -15,6 +15,13 @@ Pieces, which take arrays and a microscope, and need neither a file nor a movie:
     ia.qcrb(...)                                                # whatever the camera
     ia.fit_diffusion(frames, positions_nm, sigma_nm, frame_rate_hz=331)  # of a track, with its CRB
 
+Answers, from any table of events::
+
+    ia.find_species("movie.iscat", ladder=66)       # masses, fractions, intervals
+    ia.compare_samples("a.csv", "b.csv", k=2)       # shifts, differences of fractions, p-values
+    ia.fit_kd("samples.csv", model="dimer")         # K_D with its profile interval
+    ia.fit_kinetics("movie.iscat")                  # rates of landing, depletion and leaving
+
 Whole jobs, from a movie to a report::
 
     setup = ia.configure("setup.toml", settings={"optics.na": 1.42})
@@ -26,6 +33,7 @@ Whole jobs, from a movie to a report::
     result.tracks               # of particles that move: mass, D, one row per track
     result.save("movie.iscat")  # report.html, fits.csv, fits.parquet, …
     ia.calibrate_optics("movie.tif", config=setup)  # focus, aberrations… from the movie itself
+    ia.batch("samples.csv", out="day", config=setup)  # a day's movies: calibrations, one picture
     ia.compute_bounds(setup)    # what no estimate from such frames can beat
     ia.forecast_optics(setup)   # how well they would tell focus, NA, aberrations…
 
@@ -54,6 +62,8 @@ if TYPE_CHECKING:
     from iscat_analysis.config import config_to_toml as config_to_toml
     from iscat_analysis.config import configure as configure
     from iscat_analysis.config import load_config as load_config
+    from iscat_analysis.day import Batch as Batch
+    from iscat_analysis.day import batch as batch
     from iscat_analysis.errors import ConfigError as ConfigError
     from iscat_analysis.errors import DataError as DataError
     from iscat_analysis.errors import IscatError as IscatError
@@ -72,6 +82,13 @@ if TYPE_CHECKING:
     from iscat_analysis.pieces import psf as psf
     from iscat_analysis.pieces import qcrb as qcrb
     from iscat_analysis.pipeline import fit_stack as fit_stack
+    from iscat_analysis.pipeline.answers import find_species as find_species
+    from iscat_analysis.pipeline.binding import Binding as Binding
+    from iscat_analysis.pipeline.binding import fit_kd as fit_kd
+    from iscat_analysis.pipeline.comparing import compare_samples as compare_samples
+    from iscat_analysis.pipeline.comparing import compare_tables as compare_tables
+    from iscat_analysis.pipeline.kinetics import Kinetics as Kinetics
+    from iscat_analysis.pipeline.kinetics import fit_kinetics as fit_kinetics
     from iscat_analysis.records import EVENT_COLUMNS as EVENT_COLUMNS
     from iscat_analysis.records import FREE_PARAMETERS as FREE_PARAMETERS
     from iscat_analysis.records import TRACK_COLUMNS as TRACK_COLUMNS
@@ -84,8 +101,10 @@ if TYPE_CHECKING:
     from iscat_analysis.result import Result as Result
     from iscat_analysis.schemas import schema as schema
     from iscat_analysis.species import AnomalousTest as AnomalousTest
+    from iscat_analysis.species import Comparison as Comparison
     from iscat_analysis.species import ConfinementTest as ConfinementTest
     from iscat_analysis.species import Diffusion as Diffusion
+    from iscat_analysis.species import Distribution as Distribution
     from iscat_analysis.species import anomalous_test as anomalous_test
     from iscat_analysis.species import confinement_test as confinement_test
     from iscat_analysis.species import fit_diffusion as fit_diffusion
@@ -114,10 +133,21 @@ _HOME = {
     "to_trackpy": "report.exchange",
     "to_napari": "report.exchange",
     "configure": "config",
+    "batch": "day",
+    "Batch": "day",
     "fit_movie": "notebook",
     "Result": "notebook",
     "simulate_movie": "notebook",
     "calibrate_optics": "notebook",
+    "find_species": "pipeline.answers",
+    "compare_samples": "pipeline.comparing",
+    "compare_tables": "pipeline.comparing",
+    "fit_kd": "pipeline.binding",
+    "Binding": "pipeline.binding",
+    "fit_kinetics": "pipeline.kinetics",
+    "Kinetics": "pipeline.kinetics",
+    "Comparison": "species",
+    "Distribution": "species",
     "compute_bounds": "notebook",
     "forecast_optics": "notebook",
     "Bounds": "notebook",
@@ -145,15 +175,20 @@ __all__ = [
     "TRACK_COLUMNS",
     "Analysis",
     "AnomalousTest",
+    "Batch",
+    "Binding",
     "Bounds",
     "Calibration",
     "Camera",
+    "Comparison",
     "Config",
     "ConfigError",
     "ConfinementTest",
     "DataError",
     "Diffusion",
+    "Distribution",
     "IscatError",
+    "Kinetics",
     "LogLikelihood",
     "Optics",
     "Particle",
@@ -162,13 +197,19 @@ __all__ = [
     "Status",
     "TrackStatus",
     "anomalous_test",
+    "batch",
     "calibrate_optics",
+    "compare_samples",
+    "compare_tables",
     "compute_bounds",
     "config_to_toml",
     "configure",
     "confinement_test",
     "crb",
+    "find_species",
     "fit_diffusion",
+    "fit_kd",
+    "fit_kinetics",
     "fit_movie",
     "fit_rois",
     "fit_stack",

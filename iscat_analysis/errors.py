@@ -1,4 +1,4 @@
-"""What can go wrong, in three kinds that map onto the exit status of the commands."""
+"""What can go wrong, in kinds that map onto the exit status of the commands."""
 
 from __future__ import annotations
 
@@ -13,6 +13,10 @@ class DataError(IscatError):
     """The data cannot be analysed: says which file, what is wrong and what to do (status 1)."""
 
     exit_status = 1
+
+
+class FloodError(DataError):
+    """More places pass the detection threshold than particles and expected noise explain."""
 
 
 class ConfigError(IscatError):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -135,6 +136,12 @@ class Pictures:
         kept = [n for n, largest in enumerate(size) if largest > _NEGLIGIBLE * max(size)]
         self._orders = [self._orders[n] for n in kept]
         self._spline = CubicSpline(r, -1j * np.array(tables)[kept], axis=1)
+        self._distances, self._nominal_nm = r, m.height_nm
+        self._rise = k * m.n_sample * (cos_s + 1)  # phase per height
+        self._rays = [
+            (-1j * 1j**h * whole[abs(h)] * (-1 if h < 0 and h % 2 else 1), harmonics[:, :, h])
+            for h in self._orders
+        ]
         near = np.linspace(-900.0, 900.0, 181)
         linear, _ = self._terms(near[None, :], near[:, None])
         top = linear.flat[np.argmax(np.abs(linear))]
@@ -161,6 +168,14 @@ class Pictures:
         linear, square = self._terms(dx_nm, dy_nm)
         amplitude = mass_kda * self._per_kda
         return amplitude * linear + amplitude**2 * square
+
+    def at_height(self, z_nm: float) -> Pictures:
+        """Put the particle at another height, and leave the focus where it was."""
+        turn = np.exp(1j * self._rise * (z_nm - self._nominal_nm))
+        tables = [np.einsum("rt,ct,t->rc", rays, pupil, turn) for rays, pupil in self._rays]
+        out = copy(self)
+        out._spline = CubicSpline(self._distances, np.array(tables), axis=1)
+        return out
 
     def scatterer(
         self, dx_nm: FloatArray, dy_nm: FloatArray, field_over_reference: complex

@@ -17,14 +17,27 @@ PAGES = (
     report,
     *(
         importlib.import_module(f"iscat_analysis.report.{name}")
-        for name in ("benchmark", "bounds", "calibration", "optics", "page", "paper", "template")
+        for name in (
+            "batch",
+            "benchmark",
+            "bounds",
+            "calibration",
+            "optics",
+            "page",
+            "paper",
+            "template",
+        )
     ),
 )
 """Modules that publish figures."""
 
 
 def sketch(
-    figures: Iterable[tuple[str, Figure]], folder: Path | None = None, *, pause_s: float = 0.0
+    figures: Iterable[tuple[str, Figure]],
+    folder: Path | None = None,
+    *,
+    printed: bool = False,
+    pause_s: float = 0.0,
 ) -> dict[str, Markup]:
     """Take the place of `publish`: files of a kilobyte stand for the figures.
 
@@ -34,6 +47,8 @@ def sketch(
         As `publish` is given them; a generator draws each.
     folder : Path, optional
         Where the files go.
+    printed : bool
+        Makes no difference here.
     pause_s : float
         A moment after each file, in which a process can be killed.
 
@@ -42,6 +57,7 @@ def sketch(
     dict of str to Markup
         An empty SVG element for each.
     """
+    del printed
     names = [name for name, _ in figures]
     for name in names if folder is not None else ():
         (folder / f"{name}.svg").write_bytes(b"<svg/>\n" * 150)

@@ -28,6 +28,13 @@ from iscat_analysis._kernels.lattice_rows import (
     lattice_signal,
     rows_needed,
 )
+from iscat_analysis._kernels.stamp import (
+    ROWS,
+    begin_stamp,
+    stamp_gradient,
+    stamp_signal,
+    stamp_width,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -54,6 +61,8 @@ class Lens(NamedTuple):
         Components of the field on the lattice.
     window : ndarray, shape (degree + 1, TAPS)
         Weights of the lattice's nodes.
+    fine : int
+        Samples per pixel of a picture at one height; 0 for profiles of the field.
     """
 
     inv_step: float
@@ -66,6 +75,7 @@ class Lens(NamedTuple):
     half: int
     components: int
     window: FloatArray
+    fine: int = 0
 
 
 class Pixels(NamedTuple):
@@ -221,6 +231,8 @@ def _row_signal(
 @njit(cache=True, nogil=True, error_model="numpy")
 def workspace(lens: Lens, pixels: Pixels) -> FloatArray:
     """Scratch for the rows of an image, wherever the particle is."""
+    if lens.fine:
+        return np.zeros((ROWS, stamp_width(lens, pixels.x.size)))
     rows = rows_needed(lens, pixels) if lens.half else SCRATCH
     return np.empty((rows, pixels.x.size))
 
@@ -236,7 +248,9 @@ def begin_image(
     f: FloatArray,
 ) -> None:
     """Prepare the scratch for the rows of one image."""
-    if lens.half:
+    if lens.fine:
+        begin_stamp(lens, pixels, x_p, y_p, f)
+    elif lens.half:
         interpolate_columns(profile, lens, pixels, x_p, y_p, with_gradient, f)
 
 
@@ -253,6 +267,9 @@ def row_gradient(
     out: FloatArray,
 ) -> None:
     """Fill `out` (5, nx) with signal and gradient of one row, averaged over the samples."""
+    if lens.fine:
+        stamp_gradient(profile, lens, row, amplitude, f, out)
+        return
     if lens.half:
         lattice_gradient(lens, pixels, row, y_p, amplitude, f, out)
         return
@@ -279,6 +296,9 @@ def row_signal(
     out: FloatArray,
 ) -> None:
     """Fill `out` (nx,) with the signal of one row, averaged over the samples in each pixel."""
+    if lens.fine:
+        stamp_signal(profile, lens, row, amplitude, f, out)
+        return
     if lens.half:
         lattice_signal(lens, pixels, row, y_p, amplitude, f, out)
         return

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 _LOG_2PI = math.log(2.0 * math.pi)
+_SURE = 9.0  # standard deviations above the threshold: a chance of 1 to the last digit
+_TINY = 1e-250  # a density below it is added up by logarithms
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -91,27 +93,34 @@ def mixture_score(
     """
     n, k = x.size, weight.size
     gradient = np.zeros((3, k))
-    share = np.empty(k)
+    share, slope, inverse = np.empty(k), np.empty(k), np.empty(k)
     value = 0.0
     for i in range(n):
-        top = -1e300
-        for j in range(k):
-            total = variance[j] + noise[i]
-            d = x[i] - mean[j]
-            share[j] = math.log(weight[j] + 1e-300) - 0.5 * (d * d / total + math.log(total))
-            top = max(top, share[j])
         norm = 0.0
         for j in range(k):
-            share[j] = math.exp(share[j] - top)
+            inverse[j] = 1.0 / (variance[j] + noise[i])
+            d = x[i] - mean[j]
+            slope[j] = d * inverse[j]
+            share[j] = weight[j] * math.sqrt(inverse[j]) * math.exp(-0.5 * d * slope[j])
             norm += share[j]
-        value += top + math.log(norm) - 0.5 * _LOG_2PI
+        if norm > _TINY:
+            value += math.log(norm) - 0.5 * _LOG_2PI
+        else:  # far from every species: by logarithms
+            top = -1e300
+            for j in range(k):
+                share[j] = math.log(weight[j] + 1e-300) + 0.5 * math.log(inverse[j])
+                share[j] -= 0.5 * slope[j] * slope[j] / inverse[j]
+                top = max(top, share[j])
+            norm = 0.0
+            for j in range(k):
+                share[j] = math.exp(share[j] - top)
+                norm += share[j]
+            value += top + math.log(norm) - 0.5 * _LOG_2PI
         for j in range(k):
             r = share[j] / norm
-            total = variance[j] + noise[i]
-            z = (x[i] - mean[j]) / total
             gradient[0, j] += r
-            gradient[1, j] += r * z
-            gradient[2, j] += 0.5 * r * (z * z - 1.0 / total)
+            gradient[1, j] += r * slope[j]
+            gradient[2, j] += 0.5 * r * (slope[j] * slope[j] - inverse[j])
     return value, gradient
 
 
@@ -156,25 +165,36 @@ def detection_score(
     """
     n, k = noise.size, weight.size
     gradient = np.zeros((3, k))
-    at, seen, part = np.empty(k), np.empty(k), np.empty(k)
+    at, reach, part, edge = np.empty(k), np.empty(k), np.empty(k), np.empty(k)
     value = 0.0
     for i in range(n):
-        top = -1e300
-        for j in range(k):
-            at[j] = (mean[j] - threshold) / math.sqrt(variance[j] + noise[i])
-            seen[j] = _log_normal_cdf(at[j])
-            part[j] = math.log(weight[j] + 1e-300) + seen[j]
-            top = max(top, part[j])
         total = 0.0
         for j in range(k):
-            part[j] = math.exp(part[j] - top)
+            reach[j] = 1.0 / math.sqrt(variance[j] + noise[i])
+            at[j] = (mean[j] - threshold) * reach[j]
+            if at[j] > _SURE:
+                part[j], edge[j] = weight[j], 0.0
+            else:
+                part[j] = weight[j] * 0.5 * math.erfc(-at[j] * math.sqrt(0.5))
+                edge[j] = weight[j] * math.exp(-0.5 * at[j] * at[j] - 0.5 * _LOG_2PI)
             total += part[j]
-        value += top + math.log(total)
+        if total > _TINY:
+            value += math.log(total)
+        else:  # hardly ever seen: by logarithms
+            top = -1e300
+            for j in range(k):
+                part[j] = math.log(weight[j] + 1e-300) + _log_normal_cdf(at[j])
+                top = max(top, part[j])
+            total = 0.0
+            for j in range(k):
+                density = math.log(weight[j] + 1e-300) - 0.5 * at[j] * at[j] - 0.5 * _LOG_2PI
+                edge[j] = math.exp(density - top)
+                part[j] = math.exp(part[j] - top)
+                total += part[j]
+            value += top + math.log(total)
         for j in range(k):
-            share = part[j] / total
-            spread = variance[j] + noise[i]
-            slope = math.exp(-0.5 * at[j] * at[j] - 0.5 * _LOG_2PI - seen[j])
-            gradient[0, j] += share
-            gradient[1, j] += share * slope / math.sqrt(spread)
-            gradient[2, j] -= 0.5 * share * slope * at[j] / spread
+            slope = edge[j] / total * reach[j]
+            gradient[0, j] += part[j] / total
+            gradient[1, j] += slope
+            gradient[2, j] -= 0.5 * slope * at[j] * reach[j]
     return times * value, times * gradient

@@ -8,7 +8,9 @@ others in its background, so that the result does not depend on how frames are s
 threads.
 
 The picture of a row is one of several, sharp or blurred, by its number in `group`: a table for the
-fit, which reaches over the fitted square, and one for drawing, which reaches farther.
+fit, which reaches over the fitted square, and one for drawing, which reaches farther.  What all
+rows of a frame add up to stays on a `Canvas` from one fit to the next: where a row moves by less
+than `Field.slack` only its fitted square is drawn anew, and its rings stay where they were.
 """
 
 from __future__ import annotations
@@ -21,15 +23,22 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.image import Lens, Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.radial import AxialTable, profile_at
-from iscat_analysis._kernels.scoring import POISSON, STALLED, maximize, scratch, span
+from iscat_analysis._kernels.radial import AxialTable
+from iscat_analysis._kernels.scoring import (
+    CONVERGED,
+    POISSON,
+    STALLED,
+    maximize,
+    picture_at,
+    row_score,
+    scoring_step,
+    scratch,
+    span,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-
-PART = 0.5
-"""Steps, in standard deviations, over which second derivatives are taken as differences."""
 
 
 class Pictures(NamedTuple):
@@ -37,12 +46,14 @@ class Pictures(NamedTuple):
 
     Attributes
     ----------
-    heights : ndarray, shape (groups, n, 3, channels, width)
+    heights : ndarray, shape (groups or 1, n, 3, channels, width)
         As in `AxialTable`.
     first_nm, step_nm, kappa : float
         As in `AxialTable`.
     lens : Lens
-        What turns a profile into a signal.
+        What turns a profile into a signal, but for its window.
+    windows : ndarray, shape (groups or 1, degree + 1, TAPS)
+        Those of the blurs.
     """
 
     heights: FloatArray
@@ -50,6 +61,7 @@ class Pictures(NamedTuple):
     step_nm: float
     kappa: float
     lens: Lens
+    windows: FloatArray
 
 
 class Light(NamedTuple):
@@ -87,12 +99,34 @@ class Field(NamedTuple):
         Side of a pixel [nm].
     side, drawn : int
         Sides of the square that is fitted and of that which is drawn [pixels].
+    slack : ndarray, shape (4,)
+        How far x, y, z [nm] and the amplitude, relative, may be from where the rings were drawn.
     """
 
     pixels: Pixels
     pixel_nm: float
     side: int
     drawn: int
+    slack: FloatArray
+
+
+class Canvas(NamedTuple):
+    """What the rows add up to in every frame.
+
+    Attributes
+    ----------
+    total : ndarray of float32, shape (t, y, x)
+        Signal of all rows of a frame.
+    rings, squares : ndarray, shape (rows, 5)
+        θ at which the rings and the fitted square of each row are drawn.
+    drawn : ndarray of bool, shape (t,)
+        Whether the frame holds these rows at all.
+    """
+
+    total: NDArray[np.float32]
+    rings: FloatArray
+    squares: FloatArray
+    drawn: BoolArray
 
 
 class Search(NamedTuple):
@@ -123,10 +157,39 @@ class Search(NamedTuple):
     passes: int
 
 
+class Response(NamedTuple):
+    """How the rows follow the background of their squares.
+
+    Attributes
+    ----------
+    squares : ndarray of int, shape (rows, 4)
+        First and last row and column of each, half-open; all 0 where a row does not follow.
+    slopes : ndarray of float32, shape (rows, k, side²)
+        w B ∂C for each free parameter [e per unit].
+    inverse : ndarray, shape (rows, k, k)
+        Inverse information on these parameters.
+    """
+
+    squares: IntArray
+    slopes: NDArray[np.float32]
+    inverse: FloatArray
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _table(pictures: Pictures, group: int) -> AxialTable:
+def table_of(pictures: Pictures, group: int) -> AxialTable:
     """Table of one blur."""
-    return AxialTable(pictures.heights[group], pictures.first_nm, pictures.step_nm, pictures.kappa)
+    k = min(group, pictures.heights.shape[0] - 1)
+    return AxialTable(pictures.heights[k], pictures.first_nm, pictures.step_nm, pictures.kappa)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lens_of(pictures: Pictures, group: int) -> Lens:
+    """Lens of one blur."""
+    one, window = pictures.lens, pictures.windows[min(group, pictures.windows.shape[0] - 1)]
+    return Lens(
+        one.inv_step, one.rho, one.cos_psi, one.sin_psi, one.co, one.cross, one.ring, one.half,
+        one.components, window, one.fine,
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -137,41 +200,121 @@ def box_of(centre_nm: float, pixel_nm: float, side: int, size: int) -> tuple[int
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cut(pixels: Pixels, r0: int, r1: int, c0: int, c1: int) -> Pixels:
+def square_of(
+    field: Field, theta: FloatArray, side: int, rows: int, columns: int
+) -> tuple[int, int, int, int]:
+    """Half-open ranges of rows and of columns around a particle; all 0 where none is left."""
+    r0, r1 = box_of(theta[1], field.pixel_nm, side, rows)
+    c0, c1 = box_of(theta[0], field.pixel_nm, side, columns)
+    if r1 <= r0 or c1 <= c0:
+        return 0, 0, 0, 0
+    return r0, r1, c0, c1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def cut(pixels: Pixels, r0: int, r1: int, c0: int, c1: int) -> Pixels:
     """Pixels of a part of the field."""
     return Pixels(pixels.x[c0:c1], pixels.y[r0:r1], pixels.offsets, pixels.weights)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(
+def draw(
     pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
     work: FloatArray, profile: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` with the signal of one row."""
-    table = _table(pictures, group)
-    start, stop = span(pictures.lens, pixels, theta, table.heights.shape[3])
-    profile_at(table, theta[2], start, stop, work, profile)
-    signal_image(profile, pictures.lens, pixels, theta[0], theta[1], theta[3], out)
+    table, lens = table_of(pictures, group), lens_of(pictures, group)
+    start, stop = span(lens, pixels, theta, table.heights.shape[3])
+    picture = picture_at(table, lens, theta[2], start, stop, work, profile)
+    signal_image(picture, lens, pixels, theta[0], theta[1], theta[3], out)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def draw_gradient(
+    pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
+    work: FloatArray, profile: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Fill `out` (ny, 5, nx) with the signal of one row and its gradient."""
+    table, lens = table_of(pictures, group), lens_of(pictures, group)
+    start, stop = span(lens, pixels, theta, table.heights.shape[3])
+    picture = picture_at(table, lens, theta[2], start, stop, work, profile)
+    signal_gradient(picture, lens, pixels, theta[0], theta[1], theta[3], out)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _stage(
-    light: Light, t: int, total: FloatArray, own: FloatArray,
-    r0: int, c0: int, data: FloatArray,
+def add(total: NDArray[np.float32], r0: int, c0: int, sign: float, image: FloatArray) -> None:
+    """Add an image, times a sign, to the part of a frame that begins at (r0, c0)."""
+    for i in range(image.shape[0]):
+        line, more = total[r0 + i, c0 : c0 + image.shape[1]], image[i]
+        for j in range(more.size):
+            line[j] += np.float32(sign * more[j])
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def stage(
+    light: Light, t: int, total: NDArray[np.float32], own: FloatArray, r0: int, c0: int,
+    data: FloatArray,
 ) -> None:  # fmt: skip
     """Fill the constants of a square's likelihood, with the other particles in its background."""
-    w = light.power[t]
+    w, n = light.power[t], data.shape[2]
     for i in range(data.shape[1]):
-        for j in range(data.shape[2]):
-            row, column = r0 + i, c0 + j
-            if light.used[row, column]:
-                level, v = w * light.background[row, column], light.read[row, column]
-                data[0, i, j] = light.counts[t, row, column] + v
-                data[1, i, j] = level * (1.0 + total[row, column] - own[i, j])
-                data[2, i, j] = level
-                data[3, i, j] = v
-            else:
-                data[:, i, j] = 0.0
+        row, here = r0 + i, slice(c0, c0 + n)
+        used, background, read = light.used[row, here], light.background[row, here], light.read
+        counts, others, mine, v = (
+            light.counts[t, row, here],
+            total[row, here],
+            own[i],
+            read[row, here],
+        )
+        d0, d1, d2, d3 = data[0, i], data[1, i], data[2, i], data[3, i]
+        for j in range(n):
+            seen = 1.0 if used[j] else 0.0
+            level = seen * w * background[j]
+            d2[j] = level
+            d1[j] = level * (1.0 + others[j] - mine[j])
+        for j in range(n):
+            seen = 1.0 if used[j] else 0.0
+            d0[j] = seen * (counts[j] + v[j])
+            d3[j] = seen * v[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def ready_frame(
+    field: Field, near: Pictures, far: Pictures, starts: IntArray, t: int, theta: FloatArray,
+    group: IntArray, canvas: Canvas, near_work: tuple[FloatArray, FloatArray],
+    far_work: tuple[FloatArray, FloatArray], image: FloatArray,
+) -> None:  # fmt: skip
+    """Bring a frame of the canvas to the rows as they are."""
+    total = canvas.total[t]
+    rows, columns = total.shape
+    first, last = starts[t], starts[t + 1]
+    stale = not canvas.drawn[t]
+    for r in range(first, last):
+        for k in range(4):
+            limit = field.slack[k] * (abs(canvas.rings[r, 3]) if k == 3 else 1.0)
+            stale |= abs(theta[r, k] - canvas.rings[r, k]) > limit
+    if stale:
+        total[:] = 0.0
+        canvas.drawn[t] = True
+    for r in range(first, last):
+        if stale:
+            canvas.rings[r] = canvas.squares[r] = theta[r]
+            r0, r1, c0, c1 = square_of(field, theta[r], field.drawn, rows, columns)
+            if r1 > r0:
+                out = image[: (r1 - r0) * (c1 - c0)].reshape(r1 - r0, c1 - c0)
+                pixels = cut(field.pixels, r0, r1, c0, c1)
+                draw(far, group[r], theta[r], pixels, far_work[0], far_work[1], out)
+                add(total, r0, c0, 1.0, out)
+        elif np.any(theta[r] != canvas.squares[r]):
+            r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
+            if r1 > r0:
+                out = image[: (r1 - r0) * (c1 - c0)].reshape(r1 - r0, c1 - c0)
+                pixels = cut(field.pixels, r0, r1, c0, c1)
+                draw(near, group[r], canvas.squares[r], pixels, near_work[0], near_work[1], out)
+                add(total, r0, c0, -1.0, out)
+                draw(near, group[r], theta[r], pixels, near_work[0], near_work[1], out)
+                add(total, r0, c0, 1.0, out)
+            canvas.squares[r] = theta[r]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -187,12 +330,13 @@ def fit_frames(
     sweeps: int,
     theta: FloatArray,
     group: IntArray,
+    canvas: Canvas,
+    response: Response,
     outcome: IntArray,
-    passes: IntArray,
     expected: FloatArray,
     stretch: FloatArray,
 ) -> None:
-    """Fit the rows of frames first…last − 1, each `sweeps` times, and draw them.
+    """Fit the rows of frames first…last − 1, each `sweeps` times.
 
     Parameters
     ----------
@@ -208,311 +352,198 @@ def fit_frames(
         Starts; overwritten with the estimates.
     group : ndarray of int, shape (rows,)
         Number of each row's picture.
-    outcome, passes : ndarray of int, shape (rows,)
-        Filled with how the last fit ended, and its passes over the data.
+    canvas : Canvas
+        Brought to the estimates.
+    response : Response
+        Filled by the last fit of each row.
+    outcome : ndarray of int, shape (rows,)
+        Filled with how the last fit ended.
     expected : ndarray, shape (t,)
         Filled with the photoelectrons expected in the used pixels at power 1.
     stretch : ndarray, shape (y, x)
         Added to: Σ w (1 + C) over the frames.
     """
     rows, columns = light.background.shape
-    work, profile = scratch(_table(far, 0), far.lens, 1)
-    most = 0
-    for t in range(first, last):
-        most = max(most, starts[t + 1] - starts[t])
-    drawn = np.zeros((most, field.drawn, field.drawn))
-    boxes = np.zeros((most, 4), dtype=np.int64)
-    total = np.zeros((rows, columns))
-    square = np.empty(4 * field.side * field.side)
-    mine = np.empty(field.side * field.side)
+    near_work = scratch(table_of(near, 0), near.lens, 1)
+    far_work = scratch(table_of(far, 0), far.lens, 1)
+    image = np.empty(max(field.drawn, field.side) ** 2)
+    square, before = np.empty(4 * field.side**2), np.empty(5 * field.side**2)
+    change, step = np.empty(field.side**2), np.empty(5)
+    index = np.flatnonzero(search.free[:4])
+    slope_work = scratch(table_of(near, 0), near.lens, 2)
     score, fisher = np.empty(5), np.empty((5, 5))
     lower, upper = np.empty(5), np.empty(5)
     for t in range(first, last):
-        total[:] = 0.0
-        for turn in range(sweeps + 1):
+        ready_frame(field, near, far, starts, t, theta, group, canvas, near_work, far_work, image)
+        total = canvas.total[t]
+        for _ in range(sweeps):
             for r in range(starts[t], starts[t + 1]):
-                k = r - starts[t]
-                p, own = theta[r], drawn[k]
-                if turn > 0:
-                    b0, b1, b2, b3 = boxes[k]
-                    r0, r1 = box_of(p[1], field.pixel_nm, field.side, rows)
-                    c0, c1 = box_of(p[0], field.pixel_nm, field.side, columns)
-                    if r1 <= r0 or c1 <= c0:
-                        outcome[r] = STALLED
-                        continue
-                    shape = (r1 - r0) * (c1 - c0)
-                    data = square[: 4 * shape].reshape(4, r1 - r0, c1 - c0)
-                    here = mine[:shape].reshape(r1 - r0, c1 - c0)
-                    for i in range(r1 - r0):
-                        for j in range(c1 - c0):
-                            y, x = r0 + i - b0, c0 + j - b2
-                            inside = 0 <= y < b1 - b0 and 0 <= x < b3 - b2
-                            here[i, j] = own[y, x] if inside else 0.0
-                    _stage(light, t, total, here, r0, c0, data)
+                p = theta[r]
+                r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
+                if r1 <= r0:
+                    outcome[r] = STALLED
+                    continue
+                ny, nx = r1 - r0, c1 - c0
+                pixels = cut(field.pixels, r0, r1, c0, c1)
+                here = before[: 5 * ny * nx].reshape(ny, 5, nx)
+                draw_gradient(near, group[r], p, pixels, slope_work[0], slope_work[1], here)
+                data = square[: 4 * ny * nx].reshape(4, ny, nx)
+                stage(light, t, total, here[:, 0], r0, c0, data)
+                moved = change[: ny * nx].reshape(ny, nx)
+                if _last_step(search, data, here, p, fisher, step):
+                    outcome[r] = CONVERGED
+                    _along(here, step, moved)
+                else:
                     for i in range(5):
                         lower[i] = max(search.lower[i], p[i] - search.reach[i])
                         upper[i] = min(search.upper[i], p[i] + search.reach[i])
                         if search.free[i]:
                             p[i] = min(max(p[i], lower[i]), upper[i])
-                    pixels = _cut(field.pixels, r0, r1, c0, c1)
-                    _, used, ended = maximize(
-                        _table(near, group[r]), near.lens, pixels, POISSON, data,
+                    _, _, outcome[r] = maximize(
+                        table_of(near, group[r]), lens_of(near, group[r]), pixels, POISSON, data,
                         search.free, lower, upper, search.max_step, search.tolerance,
                         search.passes, p, score, fisher,
                     )  # fmt: skip
-                    passes[r] = used
-                    outcome[r] = ended
-                    for i in range(b1 - b0):
-                        for j in range(b3 - b2):
-                            total[b0 + i, b2 + j] -= own[i, j]
-                b0, b1 = box_of(p[1], field.pixel_nm, field.drawn, rows)
-                b2, b3 = box_of(p[0], field.pixel_nm, field.drawn, columns)
-                boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = b0, b1, b2, b3
-                if b1 <= b0 or b3 <= b2:
-                    boxes[k] = 0
-                    continue
-                _draw(
-                    far, group[r], p, _cut(field.pixels, b0, b1, b2, b3), work, profile,
-                    own[: b1 - b0, : b3 - b2],
-                )  # fmt: skip
-                for i in range(b1 - b0):
-                    for j in range(b3 - b2):
-                        total[b0 + i, b2 + j] += own[i, j]
-        amount = 0.0
-        w = light.power[t]
-        for i in range(rows):
-            for j in range(columns):
-                if light.used[i, j]:
-                    amount += light.background[i, j] * (1.0 + total[i, j])
-                stretch[i, j] += w * (1.0 + total[i, j])
-        expected[t] = amount
+                    moved[:] = here[:, 0]
+                    draw_gradient(near, group[r], p, pixels, slope_work[0], slope_work[1], here)
+                    moved[:] = here[:, 0] - moved
+                add(total, r0, c0, 1.0, moved)
+                canvas.squares[r] = p
+                if _invert(fisher, index, response.inverse[r]):
+                    response.squares[r] = r0, r1, c0, c1
+                    _keep_slopes(data[2], here, index, response.slopes[r])
+        expected[t] = _add_stretch(light, t, total, stretch)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def residual_frames(
-    light: Light,
-    field: Field,
-    far: Pictures,
-    starts: IntArray,
-    first: int,
-    last: int,
-    theta: FloatArray,
-    group: IntArray,
-    out: NDArray[np.float32],
-) -> None:
-    """Fill `out` (last − first, y, x) with counts minus expectation; 0 where not used."""
-    rows, columns = light.background.shape
-    work, profile = scratch(_table(far, 0), far.lens, 1)
-    own = np.zeros((field.drawn, field.drawn))
-    total = np.zeros((rows, columns))
-    for t in range(first, last):
-        total[:] = 0.0
-        for r in range(starts[t], starts[t + 1]):
-            p = theta[r]
-            b0, b1 = box_of(p[1], field.pixel_nm, field.drawn, rows)
-            b2, b3 = box_of(p[0], field.pixel_nm, field.drawn, columns)
-            if b1 <= b0 or b3 <= b2:
-                continue
-            mine = own[: b1 - b0, : b3 - b2]
-            _draw(far, group[r], p, _cut(field.pixels, b0, b1, b2, b3), work, profile, mine)
-            for i in range(b1 - b0):
-                for j in range(b3 - b2):
-                    total[b0 + i, b2 + j] += mine[i, j]
-        w = light.power[t]
-        for i in range(rows):
-            for j in range(columns):
-                left = 0.0
-                if light.used[i, j]:
-                    left = light.counts[t, i, j] - w * light.background[i, j] * (1.0 + total[i, j])
-                out[t - first, i, j] = left
+def _last_step(
+    search: Search, data: FloatArray, here: FloatArray, theta: FloatArray, fisher: FloatArray,
+    step: FloatArray,
+) -> bool:  # fmt: skip
+    """Take the step of `maximize`, where its first is its last; tell whether it is."""
+    sums = np.zeros(20)
+    for i in range(data.shape[1]):
+        row_score(POISSON, data, i, 1.0, here[i], sums)
+    k = 5
+    for i in range(5):
+        for j in range(i, 5):
+            fisher[i, j] = fisher[j, i] = sums[k]
+            k += 1
+    if not scoring_step(sums[:5], fisher, search.free, 0.0, step):
+        return False
+    gain = 0.0
+    for i in range(5):
+        there = theta[i] + step[i]
+        if search.free[i] and not (
+            search.lower[i] <= there <= search.upper[i] and abs(step[i]) <= search.max_step[i]
+        ):
+            return False
+        gain += 0.5 * sums[i] * step[i]
+    if not gain < search.tolerance:
+        return False
+    for i in range(5):
+        theta[i] += step[i]
+    return True
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _score_of(data: FloatArray, g: FloatArray, score: FloatArray) -> None:
-    """Fill the four scores of a square whose signal and gradient are g (ny, 5, nx)."""
-    s0 = s1 = s2 = s3 = 0.0
-    for i in range(data.shape[1]):
-        for j in range(data.shape[2]):
-            beta = data[2, i, j]
-            if beta > 0:
-                rate = data[1, i, j] + beta * g[i, 0, j] + data[3, i, j]
-                pull = beta * (data[0, i, j] / rate - 1.0)
-                s0 += pull * g[i, 1, j]
-                s1 += pull * g[i, 2, j]
-                s2 += pull * g[i, 3, j]
-                s3 += pull * g[i, 4, j]
-    score[0], score[1], score[2], score[3] = s0, s1, s2, s3
+def _along(gradient: FloatArray, step: FloatArray, out: FloatArray) -> None:
+    """Fill `out` with the change of the signal along a small step."""
+    dx, dy, dz, da = step[0], step[1], step[2], step[3]
+    for i in range(out.shape[0]):
+        x, y, z, a = gradient[i, 1], gradient[i, 2], gradient[i, 3], gradient[i, 4]
+        line = out[i]
+        for j in range(line.size):
+            line[j] = dx * x[j] + dy * y[j] + dz * z[j] + da * a[j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _directions(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
-    """Fill the columns of `out` (4, n) with V, V Vᵀ the inverse of F on the free parameters."""
+def _invert(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
+    """Fill `out` with the inverse information on some parameters; tell whether there is one."""
     n = index.size
     scale = np.empty(n)
     for i in range(n):
         if not fisher[index[i], index[i]] > 0.0:
             return False
         scale[i] = 1.0 / np.sqrt(fisher[index[i], index[i]])
-    low = np.zeros((n, n))
+    scaled = np.empty((n, n))
     for i in range(n):
-        for j in range(i + 1):
-            total = fisher[index[i], index[j]] * scale[i] * scale[j]
-            for k in range(j):
-                total -= low[i, k] * low[j, k]
-            if i == j:
-                if not total > 1e-12:
-                    return False
-                low[i, i] = np.sqrt(total)
-            else:
-                low[i, j] = total / low[j, j]
-    out[:] = 0.0
-    for k in range(n):  # column k of L⁻ᵀ
-        for i in range(k, -1, -1):
-            total = 1.0 if i == k else 0.0
-            for j in range(i + 1, k + 1):
-                total -= low[j, i] * out[index[j], k] / scale[j]
-            out[index[i], k] = total / low[i, i] * scale[i]
+        for j in range(n):
+            scaled[i, j] = fisher[index[i], index[j]] * scale[i] * scale[j]
+    if not np.linalg.det(scaled) > 1e-9:
+        return False
+    inverse = np.linalg.inv(scaled)
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = inverse[i, j] * scale[i] * scale[j]
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def judge_frames(
-    light: Light,
-    field: Field,
-    near: Pictures,
-    far: Pictures,
-    free: BoolArray,
-    starts: IntArray,
-    first: int,
-    last: int,
-    theta: FloatArray,
-    group: IntArray,
-    fisher: FloatArray,
-    turned: FloatArray,
-    ways: FloatArray,
-    bias: FloatArray,
-    score: FloatArray,
-    numbers: FloatArray,
-    brief: bool,
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _keep_slopes(
+    level: FloatArray, gradient: FloatArray, index: IntArray, out: NDArray[np.float32]
 ) -> None:
-    """Say of the rows of frames first…last − 1 what their likelihoods know, at θ.
+    """Fill `out` (k, pixels) with level × gradient of the free parameters."""
+    ny, nx = level.shape
+    for k in range(index.size):
+        for i in range(ny):
+            light, slope = level[i], gradient[i, 1 + index[k]]
+            line = out[k, i * nx : (i + 1) * nx]
+            for j in range(nx):
+                line[j] = light[j] * slope[j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def follow_rows(
+    response: Response, first: int, last: int, move: FloatArray, out: FloatArray
+) -> None:
+    """Add what rows first…last − 1 take up of a change of the logarithm of the background.
 
     Parameters
     ----------
-    light, field, near, far, free, starts, first, last, theta, group
-        As in `fit_frames`.
-    fisher : ndarray, shape (rows, 4, 4)
-        Filled with the expected information in (x, y, z, a).
-    turned, ways : ndarray, shape (rows, 4, 4)
-        Filled with O V and V, the columns of V directions of one standard deviation in the free
-        parameters, and O the observed information; NaN where the information is singular.
-    bias : ndarray, shape (rows, 4)
-        Filled with what `score` is expected to be off by through curvature, −½ Σ V tr(F⁻¹∂²η) ∂η:
-        F⁻¹ times it is the bias of order 1/N (see `iscat_analysis.inference.bias`).
-    score : ndarray, shape (rows, 4)
-        Filled with the gradient of the log-likelihood.
-    numbers : ndarray, shape (rows, 5)
-        Filled with the log-likelihood over that without the particle, χ², pixels, the largest
-        residual in standard deviations, and mean background of the square [e].
-    brief : bool
-        Leave out what takes second derivatives: `turned`, `ways` and `bias`.
+    response : Response
+        From `fit_frames`.
+    first, last : int
+        Rows.
+    move : ndarray, shape (y, x)
+        Change.
+    out : ndarray, shape (y, x)
+        Σ Gᵀ F⁻¹ G move is added to it [e].
     """
-    rows, columns = light.background.shape
-    work, profile = scratch(_table(far, 0), far.lens, 1)
-    work2, profile2 = scratch(_table(near, 0), near.lens, 2)
-    index = np.flatnonzero(free[:4])
-    n = index.size
-    total = np.zeros((rows, columns))
-    drawn = np.zeros((field.drawn, field.drawn))
-    square = np.empty(4 * field.side**2)
-    blank = np.zeros((field.side, field.side))
-    g = np.empty(5 * field.side**2)
-    up, down = np.empty(5 * field.side**2), np.empty(5 * field.side**2)
-    ways_here, trial, ahead, behind = np.empty((4, n)), np.empty(5), np.empty(4), np.empty(4)
-    for t in range(first, last):
-        total[:] = 0.0
-        for r in range(starts[t], starts[t + 1]):
-            b0, b1 = box_of(theta[r, 1], field.pixel_nm, field.drawn, rows)
-            b2, b3 = box_of(theta[r, 0], field.pixel_nm, field.drawn, columns)
-            if b1 <= b0 or b3 <= b2:
-                continue
-            own = drawn[: b1 - b0, : b3 - b2]
-            _draw(far, group[r], theta[r], _cut(field.pixels, b0, b1, b2, b3), work, profile, own)
-            for i in range(b1 - b0):
-                for j in range(b3 - b2):
-                    total[b0 + i, b2 + j] += own[i, j]
-        for r in range(starts[t], starts[t + 1]):
-            p = theta[r]
-            fisher[r], turned[r], ways[r] = 0.0, np.nan, np.nan
-            bias[r], score[r], numbers[r] = 0.0, 0.0, 0.0
-            r0, r1 = box_of(p[1], field.pixel_nm, field.side, rows)
-            c0, c1 = box_of(p[0], field.pixel_nm, field.side, columns)
-            if r1 <= r0 or c1 <= c0:
-                continue
-            ny, nx = r1 - r0, c1 - c0
-            pixels = _cut(field.pixels, r0, r1, c0, c1)
-            table = _table(near, group[r])
-            profile_at(table, p[2], 0, table.heights.shape[3], work2, profile2)
-            here = g[: 5 * ny * nx].reshape(ny, 5, nx)
-            signal_gradient(profile2, near.lens, pixels, p[0], p[1], p[3], here)
-            data = square[: 4 * ny * nx].reshape(4, ny, nx)
-            _stage(light, t, total, blank, r0, c0, data)
-            value = chi2 = used = worst = level = 0.0
-            f = fisher[r]
-            for i in range(ny):
+    k = response.slopes.shape[1]
+    felt, step = np.empty(k), np.empty(k)
+    for r in range(first, last):
+        r0, r1, c0, c1 = response.squares[r]
+        nx = c1 - c0
+        for a in range(k):
+            total = np.float32(0.0)
+            for i in range(r1 - r0):
+                slope, here = response.slopes[r, a, i * nx : (i + 1) * nx], move[r0 + i, c0:c1]
                 for j in range(nx):
-                    beta = data[2, i, j]
-                    if beta > 0:
-                        data[1, i, j] -= beta * here[i, 0, j]
-                        base = data[1, i, j] + data[3, i, j]
-                        rate = base + beta * here[i, 0, j]
-                        value += data[0, i, j] * np.log(rate / base) - (rate - base)
-                        left = (data[0, i, j] - rate) / np.sqrt(rate)
-                        chi2 += left * left
-                        worst = max(worst, abs(left))
-                        used += 1.0
-                        level += beta
-                        bend = beta * beta / rate
-                        for a in range(4):
-                            for b in range(a + 1):
-                                f[a, b] += bend * here[i, 1 + a, j] * here[i, 1 + b, j]
-            for a in range(4):
-                for b in range(a):
-                    f[b, a] = f[a, b]
-            numbers[r, 0], numbers[r, 1], numbers[r, 2] = value, chi2, used
-            numbers[r, 3], numbers[r, 4] = worst, level / max(used, 1.0)
-            _score_of(data, here, score[r])
-            if brief or not _directions(f, index, ways_here):
-                continue
-            for k in range(n):
-                for sign in range(2):
-                    step = PART if sign == 0 else -PART
-                    trial[:] = p
-                    for a in range(4):
-                        trial[a] += step * ways_here[a, k]
-                    if free[2]:
-                        low = table.first_nm
-                        high = low + table.step_nm * (table.heights.shape[0] - 1)
-                        trial[2] = min(max(trial[2], low), high)
-                        profile_at(table, trial[2], 0, table.heights.shape[3], work2, profile2)
-                    there = (up if sign == 0 else down)[: 5 * ny * nx].reshape(ny, 5, nx)
-                    signal_gradient(
-                        profile2, near.lens, pixels, trial[0], trial[1], trial[3], there
-                    )
-                    _score_of(data, there, ahead if sign == 0 else behind)
-                plus = up[: 5 * ny * nx].reshape(ny, 5, nx)
-                minus = down[: 5 * ny * nx].reshape(ny, 5, nx)
-                for i in range(ny):
-                    for j in range(nx):
-                        beta = data[2, i, j]
-                        if beta > 0:
-                            rate = data[1, i, j] + beta * here[i, 0, j] + data[3, i, j]
-                            curved = (plus[i, 0, j] + minus[i, 0, j] - 2 * here[i, 0, j]) / PART**2
-                            for a in range(4):
-                                bias[r, a] -= 0.5 * beta * beta / rate * curved * here[i, 1 + a, j]
-                for a in range(4):
-                    turned[r, a, k] = -(ahead[a] - behind[a]) / (2 * PART)
-                    ways[r, a, k] = ways_here[a, k]
+                    total += slope[j] * np.float32(here[j])
+            felt[a] = total
+        for a in range(k):
+            step[a] = 0.0
+            for b in range(k):
+                step[a] += response.inverse[r, a, b] * felt[b]
+        for a in range(k):
+            for i in range(r1 - r0):
+                slope, here = response.slopes[r, a, i * nx : (i + 1) * nx], out[r0 + i, c0:c1]
+                for j in range(nx):
+                    here[j] += step[a] * slope[j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _add_stretch(light: Light, t: int, total: NDArray[np.float32], stretch: FloatArray) -> float:
+    """Add w (1 + C) of a frame to `stretch`; return what the used pixels expect at power 1."""
+    amount, w = 0.0, light.power[t]
+    for i in range(stretch.shape[0]):
+        line, out, background, used = total[i], stretch[i], light.background[i], light.used[i]
+        for j in range(out.size):
+            out[j] += w * (1.0 + line[j])
+        for j in range(out.size):
+            amount += background[j] * (1.0 + line[j]) if used[j] else 0.0
+    return amount
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -543,21 +574,18 @@ def common_modes(
         Filled with Σ w B ∂C over the frames, for (x, y, z, a) [e per unit].
     """
     rows, columns = light.background.shape
-    work, profile = scratch(_table(near, 0), near.lens, 2)
+    work, profile = scratch(table_of(near, 0), near.lens, 2)
     g = np.empty(5 * field.side**2)
     out[:] = 0.0
     for k in range(frame.size):
         p, w = theta[k], light.power[frame[k]]
-        r0, r1 = box_of(p[1], field.pixel_nm, field.side, rows)
-        c0, c1 = box_of(p[0], field.pixel_nm, field.side, columns)
-        if r1 <= r0 or c1 <= c0:
+        r0, r1, c0, c1 = square_of(field, p, field.side, rows, columns)
+        if r1 <= r0:
             continue
         ny, nx = r1 - r0, c1 - c0
-        table = _table(near, group[k])
-        profile_at(table, p[2], 0, table.heights.shape[3], work, profile)
         here = g[: 5 * ny * nx].reshape(ny, 5, nx)
-        pixels = _cut(field.pixels, r0, r1, c0, c1)
-        signal_gradient(profile, near.lens, pixels, p[0], p[1], p[3], here)
+        pixels = cut(field.pixels, r0, r1, c0, c1)
+        draw_gradient(near, group[k], p, pixels, work, profile, here)
         for i in range(ny):
             for j in range(nx):
                 if light.used[r0 + i, c0 + j]:

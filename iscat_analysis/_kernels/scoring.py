@@ -59,7 +59,7 @@ def _log1p(x: float) -> float:
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _row_value(kind: int, data: FloatArray, row: int, level: float, s: FloatArray) -> float:
+def row_value(kind: int, data: FloatArray, row: int, level: float, s: FloatArray) -> float:
     """Log-likelihood of one row of signals s, relative to the same row without a particle."""
     c0, c1, c2, c3 = data[0, row], data[1, row], data[2, row], data[3, row]
     total = 0.0
@@ -99,7 +99,7 @@ def _row_value(kind: int, data: FloatArray, row: int, level: float, s: FloatArra
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _row_score(
+def row_score(
     kind: int, data: FloatArray, row: int, level: float, g: FloatArray, sums: FloatArray
 ) -> None:
     """Add one row to the 5 scores and 15 Fisher entries in `sums`; g holds s and its gradient."""
@@ -189,8 +189,8 @@ def score_pass(
     total = 0.0
     for row in range(pixels.y.size):
         row_gradient(profile, lens, pixels, row, theta[0], theta[1], theta[3], f, g)
-        total += _row_value(kind, data, row, level, g[0])
-        _row_score(kind, data, row, level, g, sums)
+        total += row_value(kind, data, row, level, g[0])
+        row_score(kind, data, row, level, g, sums)
     k = 5
     for i in range(5):
         score[i] = sums[i]
@@ -217,13 +217,15 @@ def value_pass(
     total = 0.0
     for row in range(pixels.y.size):
         row_signal(profile, lens, pixels, row, theta[0], theta[1], theta[3], f, s)
-        total += _row_value(kind, data, row, level, s)
+        total += row_value(kind, data, row, level, s)
     return total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int, int]:
     """Range of the flattened profile, `width` long, that an image needs."""
+    if lens.fine:
+        return 0, width
     x, y = pixels.x, pixels.y
     margin = abs(pixels.offsets[-1])
     if lens.half:
@@ -236,11 +238,32 @@ def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def scratch(axial: AxialTable, lens: Lens, orders: int) -> tuple[FloatArray, FloatArray]:
-    """Work space and profile for `profile_at`."""
+    """Work space and profile for `picture_at`."""
     channels, width = axial.heights.shape[2:]
+    if lens.fine:
+        return np.empty((0, 0, 0)), np.empty((0, 0, 0))
     last = 2 * lens.half + 1 if lens.half else 6
     work = np.empty((channels, 2, width))
     return work, np.empty((orders * channels, width // last, last))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def picture_at(
+    axial: AxialTable,
+    lens: Lens,
+    z_nm: float,
+    start: int,
+    stop: int,
+    work: FloatArray,
+    profile: FloatArray,
+) -> FloatArray:
+    """Profile at a height, of which a range is filled; that of a stamp is the table's only one."""
+    if lens.fine:
+        rows = 2 * lens.half + 1
+        only: FloatArray = axial.heights[0, 0].reshape(2, rows, axial.heights.shape[3] // rows)
+        return only
+    profile_at(axial, z_nm, start, stop, work, profile)
+    return profile
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -288,12 +311,12 @@ def value_batch(
             if thetas[k, 2] == z:
                 start, stop = min(start, first), max(stop, last)
             z, first, last = thetas[k, 2], start, stop
-            profile_at(axial, z, first, last, work, profile)
+            profile = picture_at(axial, lens, z, first, last, work, profile)
         out[k] = value_pass(profile, lens, pixels, kind, data, thetas[k])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scoring_step(
+def scoring_step(
     score: FloatArray, fisher: FloatArray, active: BoolArray, damping: float, step: FloatArray
 ) -> bool:
     """Solve (F + damping·diag F) step = score on the active parameters; False if singular."""
@@ -397,7 +420,7 @@ def maximize(
     active = np.empty(5, dtype=np.bool_)
     damping = 0.0
     start, stop = (0, width) if not free[2] else span(lens, pixels, theta, width)
-    profile_at(axial, theta[2], start, stop, work, profile)
+    profile = picture_at(axial, lens, theta[2], start, stop, work, profile)
     value = score_pass(profile, lens, pixels, kind, data, theta, score, fisher)
     passes = 1
     while passes < iterations:
@@ -406,7 +429,7 @@ def maximize(
                 theta[i] >= upper[i] and score[i] > 0
             )
             active[i] = free[i] and not blocked
-        if not _scoring_step(score, fisher, active, damping, step):
+        if not scoring_step(score, fisher, active, damping, step):
             if damping > 1e6:
                 return value, passes, STALLED
             damping = max(10 * damping, 1e-3)

@@ -487,6 +487,11 @@ class TrackConfig(Section):
         3, description="frames in which a particle may be missed without losing its track"
     )
     min_frames: Annotated[int, Field(ge=1)] = Field(10, description="shorter tracks are left out")
+    block_frames: Literal["auto"] | Annotated[int, Field(ge=20)] = Field(
+        "auto",
+        description="frames with a background of their own, at most, tracks going on from block to "
+        'block | "auto": as many as fit into the memory and drift of the stage allows',
+    )
     viscosity_mpa_s: Positive = Field(
         0.89, description="of the medium, for hydrodynamic diameters; water at 25 °C: 0.89"
     )

@@ -27,9 +27,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.blas import dsyrk
 
-from iscat_analysis.inference.moving import Ground, Judged, MovingField, Rows
+from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.rows import Ground, Judged, Rows
 from iscat_analysis.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
@@ -38,8 +40,6 @@ MOST_PIXELS = 1800
 """Pixels of a track whose information is taken as a whole."""
 
 _SINGULAR = 1e-9
-_POLISH = 3  # steps
-_FARTHEST = 0.02  # step of the logarithm of the background
 _STEPS = 4  # of Newton's method; each leaves the square of the error before
 _SETTLED = 0.01  # standard deviations
 
@@ -110,103 +110,79 @@ def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged
     index = np.flatnonzero(field.free[:4])
     covariance, taken = np.zeros((len(rows.frame), 4, 4)), np.zeros(tracks)
     together: dict[int, tuple[IntArray, FloatArray]] = {}
-    for k in range(tracks):
+
+    def of_one(k: int) -> None:
         mine = np.flatnonzero(rows.track == k)
-        good = np.linalg.det(_scaled(judged.fisher[mine], index)[0]) > _SINGULAR
-        mine = mine[good]
+        mine = mine[np.linalg.det(_scaled(judged.fisher[mine], index)[0]) > _SINGULAR]
         if not mine.size:
-            continue
-        fisher = judged.fisher[mine]
-        of_track = rows.only(np.isin(np.arange(len(rows.frame)), mine))
-        square = np.ix_(mine, index, index)
+            return
+        fisher, of_track = judged.fisher[mine], rows.only(mine)
         if field.pixels_of(of_track) <= MOST_PIXELS:
             extra, amplitudes = _all_pixels(field, ground, of_track, fisher, index)
             together[k] = mine, amplitudes
         else:
             lost = field.lost(ground, of_track)
             extra, taken[k] = _common_modes(fisher, lost, index)
-        covariance[square] = extra
+        covariance[np.ix_(mine, index, index)] = extra
+
+    field.share(of_one, tracks)
     return Shared(covariance, taken, together)
 
 
-def polish(
-    field: MovingField, ground: Ground, rows: Rows, *, follow_power: bool
-) -> tuple[Rows, Ground, BoolArray]:
-    """Take the last steps to the maximum by Newton's method where turns are too slow.
-
-    A turn moves the background by δ = (n − Σ_t λ_t)/N, as if the rows stayed.  As they follow, the
-    whole way is M⁻¹ N δ: where particles hardly move it is many times as far.
+def variances_left(information: FloatArray, index: IntArray) -> FloatArray:
+    """Give the variances that matrices of information leave.
 
     Parameters
     ----------
-    field : MovingField
-        The movie.
-    ground : Ground
-        Where turns ended.
-    rows : Rows
-        Particles.
-    follow_power : bool
-        Whether the power is fitted too.
+    information : ndarray, shape (n, 4, 4)
+        In (x, y, z, a).
+    index : ndarray of int
+        Free parameters.
 
     Returns
     -------
-    rows : Rows
-        Estimates.
-    ground : Ground
-        Over which they are.
-    converged : ndarray of bool, shape (n,)
-        Which fits did.
+    ndarray, shape (n, 4)
+        NaN where not free, or where a matrix is not positive definite.
     """
-    judged = field.judge(ground, rows, brief=True)
-    index = np.flatnonzero(field.free[:4])
-    good = np.linalg.det(_scaled(judged.fisher, index)[0]) > _SINGULAR
-    factors = []
-    for k in np.unique(rows.track):
-        mine = np.flatnonzero((rows.track == k) & good)
-        of_track = rows.only((rows.track == k) & good)
-        if not mine.size or field.pixels_of(of_track) > MOST_PIXELS:
-            continue
-        patterns, weight = field.patterns(ground, of_track)
-        pixels = weight > 0
-        slopes = patterns[:, index][:, :, pixels]
-        flat = slopes.reshape(-1, slopes.shape[2])
-        follows = (_inverse(judged.fisher[mine], index) @ slopes).reshape(flat.shape)
-        left = _factor(np.diag(1 / weight[pixels]) - flat.T @ follows)
-        if left is not None:
-            factors.append((field.box(of_track), pixels, weight[pixels], left))
-    for _ in range(_POLISH if factors else 0):
-        rows, found, _ = field.fit(ground, rows)
-        move = np.log(found.level / ground.level)
-        for cut, pixels, weight, left in factors:
-            here = move[cut]
-            here[pixels] = np.clip(
-                cho_solve((left, True), here[pixels] / weight), -_FARTHEST, _FARTHEST
-            )
-        power = found.power if follow_power else ground.power
-        ground = Ground(ground.level * np.exp(move), power)
-    rows, _, done = field.fit(ground, rows)
-    return rows, ground, done
+    out = np.full(information.shape[:2], np.nan)
+    scaled, scale = _scaled(information, index)
+    good = np.flatnonzero(np.isfinite(scaled).all(axis=(1, 2)))
+    if not good.size:
+        return out
+    values = np.linalg.eigvalsh(scaled[good])
+    good = good[values[:, 0] > _SINGULAR]
+    inverse = np.einsum("nii->ni", np.linalg.inv(scaled[good])) * scale[good] ** 2
+    out[good[:, None], index[None]] = inverse
+    return out
 
 
 def _all_pixels(
     field: MovingField, ground: Ground, rows: Rows, fisher: FloatArray, index: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """Covariance of every row besides its own, and that of the amplitudes of all rows."""
-    patterns, weight = field.patterns(ground, rows)
-    pixels = weight > 0
-    slopes = patterns[:, index][:, :, pixels]  # (n, free, pixels)
     inverse = _inverse(fisher, index)
-    follows = inverse @ slopes  # F⁻¹ G
-    flat = slopes.reshape(-1, slopes.shape[2])
-    left = _factor(np.diag(1 / weight[pixels]) - flat.T @ follows.reshape(flat.shape))
+    follows, left = _undetermined(field, ground, rows, inverse, index)
     own = np.diag(inverse[:, -1, -1])
     if left is None:
         unknown = np.broadcast_to(np.diag(np.full(index.size, np.inf)), inverse.shape)
         return unknown, np.full_like(own, np.inf)
-    root = solve_triangular(left, follows.reshape(flat.shape).T, lower=True)
+    root = solve_triangular(left, follows.reshape(-1, follows.shape[2]).T, lower=True)
     root = root.T.reshape(follows.shape)
     extra = np.einsum("nip,njp->nij", root, root)
     return extra, own + root[:, -1] @ root[:, -1].T
+
+
+def _undetermined(
+    field: MovingField, ground: Ground, rows: Rows, inverse: FloatArray, index: IntArray
+) -> tuple[FloatArray, FloatArray | None]:
+    """Give F⁻¹ G of the pixels that have weight (n, free, pixels), and the lower factor of M."""
+    patterns, weight = field.patterns(ground, rows)
+    pixels = weight > 0
+    slopes = patterns[:, index][:, :, pixels]
+    root = np.linalg.cholesky(inverse)
+    felt = np.swapaxes(root, 1, 2) @ slopes
+    taken = dsyrk(1.0, felt.reshape(-1, felt.shape[2]).T, lower=True)
+    return root @ felt, _factor(np.diag(1 / weight[pixels]) - taken)
 
 
 def _factor(matrix: FloatArray) -> FloatArray | None:

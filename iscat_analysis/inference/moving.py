@@ -8,8 +8,9 @@ score with the background that is most likely given the particles,
     B̂_p = Σ_t n_tp / Σ_t w_t (1 + C_tp),
 
 put in (envelope theorem), so that fitting the particles over B̂ and B̂ under the particles in turn
-ends at its maximum, and nothing is left of the particles in their background.  The turns converge
-as slowly as the particles move; `_Mixer` sees them through (Anderson's mixing).
+ends at its maximum, and nothing is left of the particles in their background.  Turns alone converge
+as slowly as the particles move.  How the rows follow a change of the background is known from their
+informations, so that Newton's method sees where the turns would end (`MovingField.settle`).
 """
 
 from __future__ import annotations
@@ -17,30 +18,29 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import pairwise
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, cg
 
+from iscat_analysis._kernels.judging import judge_frames
 from iscat_analysis._kernels.moving import (
+    Canvas,
     Field,
     Light,
-    Pictures,
+    Response,
     Search,
     common_modes,
     fit_frames,
-    judge_frames,
-    residual_frames,
+    follow_rows,
 )
 from iscat_analysis._kernels.scoring import CONVERGED
 from iscat_analysis.inference.fit import window_nm
-from iscat_analysis.optics.blur import blurred
+from iscat_analysis.inference.pictures import PictureBook
+from iscat_analysis.inference.rows import Ground, Judged, Rows
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
-from iscat_analysis.optics.waves import axial_table
 from iscat_analysis.records import BoolArray, FloatArray
-
-IntArray = NDArray[np.int64]
 
 DRAWN = 4
 """Side of the square in which a particle is drawn, over that in which it is fitted."""
@@ -49,111 +49,26 @@ COARSE = 2
 """Of the fitted square's side, by which it is cut while particles are still being looked for."""
 
 SETTLED = 0.02
-"""Change of the background from turn to turn, in its own standard deviations, that ends them."""
+"""Step of the background, in its own standard deviations, that is the last one."""
 
-MOST_TURNS = 60
-"""Turns at most."""
+MOST_TURNS = 12
+"""Steps at most."""
+
+NEAR, FAR = 0.5, 5.0
+"""A step of less than `NEAR` after one of more than `FAR` calls for new rings."""
 
 _BLOCK = 32  # frames that one thread takes at a time
 _TOLERANCE = 2e-4  # as in `Likelihood.maximize`
+_PASSING = 0.02  # the same, of a fit that the next turn goes on with
 _PASSES = 40
-_SWEEPS = 2  # fits of the particles of a frame in each turn
-_MEMORY = 8  # earlier turns that the mixing remembers
+_SLACK = np.array([0.1, 0.1, 0.01, 0.05])
+"""How far particles may go from their rings: pixels, wavelengths, relative."""
+_PARTS = 8  # of the rows, that threads take in turn
+_RESIDUE = 0.02  # of a step that is left to the next
+_MOST_STEPS = 40  # of the conjugate gradients
+_FARTHEST = 0.05  # step of the logarithm of the background
 _ANY = 1e300
 _BEYOND = 0.5  # resolutions λ/NA outside the field, from where a particle is still seen
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Particles in frames, in the order of the frames.
-
-    Attributes
-    ----------
-    frame : ndarray of int, shape (n,)
-        Frame, not decreasing.
-    track : ndarray of int, shape (n,)
-        Whose it is; -1 where that is not known yet.
-    theta : ndarray, shape (n, 5)
-        x, y, z [nm], amplitude, 0.
-    group : ndarray of int, shape (n,)
-        Number of the blur.
-    """
-
-    frame: IntArray
-    track: IntArray
-    theta: FloatArray
-    group: IntArray
-
-    @classmethod
-    def of(
-        cls, frame: IntArray, track: IntArray, theta: FloatArray, group: IntArray | None = None
-    ) -> Rows:
-        """Put rows into the order of their frames."""
-        order = np.lexsort((track, frame))
-        blur = np.zeros(len(frame), dtype=np.int64) if group is None else group
-        return cls(frame[order], track[order], np.ascontiguousarray(theta[order]), blur[order])
-
-    def starts(self, frames: int) -> IntArray:
-        """First row of each frame, and the number of rows."""
-        first: IntArray = np.searchsorted(self.frame, np.arange(frames + 1)).astype(np.int64)
-        return first
-
-    def only(self, kept: BoolArray) -> Rows:
-        """Take some of the rows."""
-        return Rows(self.frame[kept], self.track[kept], self.theta[kept], self.group[kept])
-
-
-@dataclass(frozen=True)
-class Ground:
-    """The light without the particles.
-
-    Attributes
-    ----------
-    level : ndarray, shape (y, x)
-        Photoelectrons in a frame of power 1 [e].
-    power : ndarray, shape (t,)
-        Power of each frame, 1 on average.
-    """
-
-    level: FloatArray
-    power: FloatArray
-
-
-@dataclass(frozen=True)
-class Judged:
-    """What the likelihood says of each row.
-
-    Attributes
-    ----------
-    fisher : ndarray, shape (n, 4, 4)
-        Expected information in (x, y, z, a).
-    observed : ndarray, shape (n, 4, 4)
-        Observed information of the free parameters, NaN elsewhere.
-    bias : ndarray, shape (n, 4)
-        Bias of order 1/N of θ, 0 where not free.
-    score : ndarray, shape (n, 4)
-        Gradient of the log-likelihood at θ.
-    gain : ndarray, shape (n,)
-        Log-likelihood over that without the particle.
-    chi2 : ndarray, shape (n,)
-        Pearson's.
-    pixels : ndarray, shape (n,)
-        How many.
-    worst : ndarray, shape (n,)
-        Largest residual [standard deviations].
-    level : ndarray, shape (n,)
-        Mean light of the square [e].
-    """
-
-    fisher: FloatArray
-    observed: FloatArray
-    bias: FloatArray
-    score: FloatArray
-    gain: FloatArray
-    chi2: FloatArray
-    pixels: FloatArray
-    worst: FloatArray
-    level: FloatArray
 
 
 class MovingField:
@@ -197,20 +112,25 @@ class MovingField:
     ) -> None:
         self.counts_e, self.used = counts_e, used
         self.read_e2 = np.ascontiguousarray(np.broadcast_to(read_e2, used.shape), dtype=float)
-        self._models = near, far
         self._pool = pool
         rows, columns = used.shape
         grid = PixelGrid.region((0, rows), (0, columns), pixel_nm)
         self.pixel_nm, self.roi_px = pixel_nm, roi_px
         pixels = near.pixels(grid)
-        self._whole = Field(pixels, pixel_nm, roi_px, DRAWN * roi_px)
-        self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, roi_px)
+        wavelength = near.optics.wavelength_nm
+        slack = _SLACK * np.array([pixel_nm, pixel_nm, wavelength, 1.0])
+        self._whole = Field(pixels, pixel_nm, roi_px, DRAWN * roi_px, slack)
+        self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, roi_px, slack)
+        if z_range_nm is not None:  # the rings tell one fringe from the next, and reach far
+            self._coarse = self._whole
+        self._canvas: _Sheet | None = None
         self.free = np.array([True, True, z_range_nm is not None, True, False])
         reach = window_nm(pixel_nm)
-        half = pixel_nm / 2 + _BEYOND * near.optics.wavelength_nm / near.optics.na
+        half = pixel_nm / 2 + _BEYOND * wavelength / near.optics.na
+        if z_range_nm is not None:  # rings reach farther
+            half = max(half, roi_px * pixel_nm / 4)
         low, high = z_range_nm or (near.height_nm, near.height_nm)
         sign_kept = z_range_nm is not None
-        wavelength = near.optics.wavelength_nm
         self._search = Search(
             self.free,
             np.array([reach, reach, _ANY, _ANY, 0.0]),
@@ -222,8 +142,14 @@ class MovingField:
             _TOLERANCE,
             _PASSES,
         )
-        self._z_range = z_range_nm
-        self._pictures = self._pictures_of(np.zeros(1))
+        farthest = max(rows, columns) + _BEYOND * wavelength / (near.optics.na * pixel_nm)
+        self._book = PictureBook(
+            near, far,
+            pixel_nm=pixel_nm,
+            half_px=min((self._whole.drawn + 1) / 2, farthest) + 1,
+            z_range_nm=z_range_nm,
+        )  # fmt: skip
+        self._pictures = self._book.of(np.zeros(1))
 
     @property
     def frames(self) -> int:
@@ -238,7 +164,8 @@ class MovingField:
         variances_nm2 : ndarray, shape (groups,)
             Variance of a path about its mean [nm²].
         """
-        self._pictures = self._pictures_of(variances_nm2)
+        self._pictures = self._book.of(variances_nm2)
+        self._canvas = None
 
     def first_ground(self, *, follow_power: bool) -> Ground:
         """Median of the frames, each over its power.
@@ -268,9 +195,11 @@ class MovingField:
         return np.asarray(self.counts_e.sum(axis=0, dtype=np.float64))
 
     def fit(
-        self, ground: Ground, rows: Rows, *, sweeps: int = _SWEEPS, coarse: bool = False
+        self, ground: Ground, rows: Rows, *, sweeps: int = 1, coarse: bool = False
     ) -> tuple[Rows, Ground, BoolArray]:
         """Fit every row over a background, and give the background under the rows.
+
+        How the rows follow their background is kept for the next step of `settle`.
 
         Parameters
         ----------
@@ -297,20 +226,24 @@ class MovingField:
         theta = rows.theta.copy()
         starts = rows.starts(self.frames)
         outcome = np.full(len(theta), CONVERGED, dtype=np.int64)
-        passes = np.zeros(len(theta), dtype=np.int64)
-        expected = np.zeros(self.frames)
+        canvas = self._canvas_for(rows, coarse=coarse)
         field = self._coarse if coarse else self._whole
+        search = self._search if sweeps > 1 else self._search._replace(tolerance=_PASSING)
+        response = self._response_of(len(theta), field.side if sweeps else 0)
+        expected = np.zeros(self.frames)
 
         def block(first: int) -> FloatArray:
             stretch = np.zeros(self.used.shape)
             fit_frames(
-                light, field, near, far, self._search, starts, first,
-                min(first + _BLOCK, self.frames), sweeps, theta, rows.group, outcome, passes,
-                expected, stretch,
+                light, field, near, far, search, starts, first,
+                min(first + _BLOCK, self.frames), sweeps, theta, rows.group, canvas, response,
+                outcome, expected, stretch,
             )  # fmt: skip
             return stretch
 
         stretch = self._sum_of(block)
+        if sweeps:
+            self._response = response
         level = np.where(stretch > 0, self._total / np.where(stretch > 0, stretch, 1.0), 1.0)
         totals = self._frame_totals
         power = np.where(expected > 0, totals / np.where(expected > 0, expected, 1.0), 1.0)
@@ -328,7 +261,7 @@ class MovingField:
         coarse: bool = False,
         tell: Callable[[int, float], None] | None = None,
     ) -> tuple[Rows, Ground, BoolArray, float]:
-        """Fit rows and background in turn.
+        """Fit rows and background in turn, to the maximum of their likelihood.
 
         Parameters
         ----------
@@ -356,33 +289,66 @@ class MovingField:
         change : float
             Largest change of the background in the last turn [its standard deviations].
         """
-        mixer = _Mixer()
         sigma = 1 / np.sqrt(np.maximum(self._total, 1.0))
-        change = np.inf
+        change = largest = 0.0
         done = np.ones(len(rows.frame), dtype=bool)
-        sweeps = 1 if coarse else _SWEEPS
         for turn in range(turns):
-            rows, found, done = self.fit(ground, rows, sweeps=sweeps, coarse=coarse)
+            rows, found, done = self.fit(ground, rows, coarse=coarse)
             power = found.power if follow_power else ground.power
             if not follow_level:
                 settled = bool(np.abs(power - ground.power).max() < 1e-7)
-                ground = replace(ground, power=power)
-                change = 0.0
+                ground, change = replace(ground, power=power), 0.0
                 if settled or turn >= 2:
                     break
                 continue
-            moved = np.where(self.used, np.log(found.level / ground.level), 0.0)
-            change = float(np.abs(moved / sigma).max())
+            step = self._newton(np.where(self.used, np.log(found.level / ground.level), 0.0))
+            change = float(np.abs(step / sigma)[self.used].max(initial=0.0))
             if tell is not None:
                 tell(turn, change)
-            if change < SETTLED:
-                ground = Ground(found.level, power)
-                break
-            mixed = mixer.next(np.log(ground.level[self.used]), moved[self.used])
-            level = found.level.copy()
-            level[self.used] = np.exp(mixed)
+            level = np.where(self.used, ground.level * np.exp(step), found.level)
             ground = Ground(level, power)
+            largest = max(largest, change)
+            if change < NEAR and largest > FAR and not coarse:
+                self._canvas, largest = None, change
+            elif change < SETTLED:
+                break
         return rows, ground, done, change
+
+    def _newton(self, move: FloatArray) -> FloatArray:
+        """Where turns would end, of which one changes the logarithm of the background by `move`.
+
+        The rows follow the background and the background them: what a step δ leaves over is
+        move − δ + N⁻¹ Σ Gᵀ F⁻¹ G δ.  It vanishes where M δ = N move; the conjugate gradients that
+        solve it see M only by what it does to an image.
+        """
+        response, counts = self._response, np.where(self.used, self._total, 0.0)
+        rows = len(response.squares)
+        share = max(rows // _PARTS, 1)
+
+        def part(first: int, image: FloatArray) -> FloatArray:
+            out = np.zeros(self.used.shape)
+            follow_rows(response, first, min(first + share, rows), image, out)
+            return out
+
+        def undetermined(step: FloatArray) -> FloatArray:
+            image = step.reshape(self.used.shape)
+            out = counts * image
+            for taken in self._pool.map(partial(part, image=image), range(0, rows, share)):
+                out -= taken
+            return np.where(self.used, out, image).ravel()
+
+        weight = np.where(self.used, np.maximum(counts, 1.0), 1.0).ravel()
+        step, _ = cg(
+            LinearOperator((move.size, move.size), undetermined, dtype=np.float64),
+            (counts * move).ravel(),
+            x0=move.ravel(),
+            rtol=_RESIDUE,
+            maxiter=_MOST_STEPS,
+            M=LinearOperator(
+                (move.size, move.size), lambda v: v.ravel() / weight, dtype=np.float64
+            ),
+        )
+        return np.asarray(np.clip(step.reshape(move.shape), -_FARTHEST, _FARTHEST))
 
     def residual(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
         """Give the counts of some frames minus what is expected.
@@ -401,12 +367,19 @@ class MovingField:
         ndarray of float32, shape (last - first, y, x)
             Photoelectrons [e]; 0 in pixels that are not used.
         """
-        out = np.empty((last - first, *self.used.shape), dtype=np.float32)
-        residual_frames(
-            self._light(ground), self._coarse, self._pictures[1], rows.starts(self.frames),
-            first, last, rows.theta, rows.group, out,
+        within = rows.only((rows.frame >= first) & (rows.frame < last))
+        canvas, (near, far) = self._blank(last - first, within), self._pictures
+        light = self._light(ground)
+        part = light._replace(counts=light.counts[first:last], power=light.power[first:last])
+        starts = np.searchsorted(within.frame, np.arange(first, last + 1)).astype(np.int64)
+        n = len(within.frame)
+        fit_frames(
+            part, self._coarse, near, far, self._search, starts, 0, last - first, 0, within.theta,
+            within.group, canvas, self._response_of(n, 0), np.zeros(n, dtype=np.int64),
+            np.zeros(last - first), np.zeros(self.used.shape),
         )  # fmt: skip
-        return out
+        expected = (1.0 + canvas.total) * (part.power[:, None, None] * ground.level)
+        return np.where(self.used, part.counts - expected, 0.0).astype(np.float32)
 
     def judge(
         self, ground: Ground, rows: Rows, *, brief: bool = False, coarse: bool = False
@@ -437,12 +410,13 @@ class MovingField:
         field = self._coarse if coarse else self._whole
         bias, score = np.empty((2, n, 4))
         numbers = np.empty((n, 5))
+        canvas = self._canvas_for(rows, coarse=coarse)
 
         def block(first: int) -> FloatArray:
             judge_frames(
                 light, field, near, far, self.free, starts, first,
-                min(first + _BLOCK, self.frames), rows.theta, rows.group, fisher, turned, ways,
-                bias, score, numbers, brief,
+                min(first + _BLOCK, self.frames), rows.theta, rows.group, canvas, fisher, turned,
+                ways, bias, score, numbers, brief,
             )  # fmt: skip
             return np.zeros(1)
 
@@ -465,22 +439,27 @@ class MovingField:
             fisher, observed, np.nan_to_num(shift), score, gain, chi2, pixels, worst, level
         )
 
-    def holds(self, theta: FloatArray) -> bool:
-        """Tell whether a particle is in the field.
+    def share(self, task: Callable[[int], None], count: int) -> None:
+        """Run a numbered task for every number below `count`, several at a time."""
+        list(self._pool.map(task, range(count)))
+
+    def holds(self, theta: FloatArray) -> BoolArray:
+        """Tell which particles are in the field.
 
         Parameters
         ----------
-        theta : ndarray, shape (5,)
-            Of a row.
+        theta : ndarray, shape (..., 5)
+            Of rows.
 
         Returns
         -------
-        bool
-            Whether its centre lies on a pixel.
+        ndarray of bool, shape (...)
+            Whether the centre of each lies on a pixel.
         """
         rows, columns = self.used.shape
-        x, y = theta[:2] / self.pixel_nm
-        return bool(-0.5 <= x < columns - 0.5 and -0.5 <= y < rows - 0.5)
+        places = theta[..., :2] / self.pixel_nm
+        within = (places >= -0.5) & (places < np.array([columns, rows]) - 0.5)
+        return np.asarray(within.all(axis=-1))
 
     def refit(
         self, ground: Ground, rows: Rows, *, sweeps: int
@@ -507,21 +486,24 @@ class MovingField:
         """
         light = self._light(ground)
         near, far = self._pictures
-        theta, starts, n = rows.theta.copy(), rows.starts(self.frames), len(rows.frame)
-        outcome, passes = np.zeros((2, n), dtype=np.int64)
-        expected, stretch = np.zeros(self.frames), np.zeros(self.used.shape)
+        times, frame = np.unique(rows.frame, return_inverse=True)
+        light = light._replace(counts=light.counts[times], power=light.power[times])
+        starts = np.searchsorted(frame, np.arange(times.size + 1)).astype(np.int64)
+        theta, n = rows.theta.copy(), len(frame)
+        canvas = self._blank(times.size, rows)
+        outcome = np.zeros(n, dtype=np.int64)
+        expected, stretch = np.zeros(times.size), np.zeros(self.used.shape)
         fisher, turned, ways = np.zeros((3, n, 4, 4))
         bias, score = np.zeros((2, n, 4))
         numbers = np.zeros((n, 5))
-        for t in np.unique(rows.frame).tolist():
-            fit_frames(
-                light, self._coarse, near, far, self._search, starts, t, t + 1, sweeps, theta,
-                rows.group, outcome, passes, expected, stretch,
-            )  # fmt: skip
-            judge_frames(
-                light, self._coarse, near, far, self.free, starts, t, t + 1, theta, rows.group,
-                fisher, turned, ways, bias, score, numbers, True,
-            )  # fmt: skip
+        fit_frames(
+            light, self._coarse, near, far, self._search, starts, 0, times.size, sweeps, theta,
+            rows.group, canvas, self._response_of(n, self._coarse.side), outcome, expected, stretch,
+        )  # fmt: skip
+        judge_frames(
+            light, self._coarse, near, far, self.free, starts, 0, times.size, theta, rows.group,
+            canvas, fisher, turned, ways, bias, score, numbers, True,
+        )  # fmt: skip
         snr = np.sqrt(2 * np.maximum(numbers[:, 0], 0.0))
         return replace(rows, theta=theta), outcome == CONVERGED, snr
 
@@ -648,45 +630,51 @@ class MovingField:
             total += part
         return total
 
-    def _pictures_of(self, variances_nm2: FloatArray) -> tuple[Pictures, Pictures]:
-        near, far = (_stacked(model, variances_nm2, self._z_range) for model in self._models)
-        return near, far
+    def _canvas_for(self, rows: Rows, *, coarse: bool) -> Canvas:
+        """Give the canvas, with the frames marked in which it holds other rows than these."""
+        last = self._canvas
+        if last is None or last.coarse != coarse:
+            total = last.canvas.total if last else np.empty(self.counts_e.shape, dtype=np.float32)
+            canvas = self._blank(self.frames, rows, total)
+        else:
+            canvas = last.moved(rows, self.frames)
+        self._canvas = _Sheet(rows, canvas, coarse)
+        return canvas
+
+    def _response_of(self, rows: int, side: int) -> Response:
+        """Room for a response."""
+        free = int(self.free[:4].sum())
+        return Response(
+            np.zeros((rows, 4), dtype=np.int64),
+            np.empty((rows, free, side**2), dtype=np.float32),
+            np.empty((rows, free, free)),
+        )
+
+    def _blank(self, frames: int, rows: Rows, total: NDArray[np.float32] | None = None) -> Canvas:
+        """Canvas on which nothing is drawn."""
+        if total is None:
+            total = np.empty((frames, *self.used.shape), dtype=np.float32)
+        nothing = np.zeros(frames, dtype=bool)
+        return Canvas(total, np.zeros_like(rows.theta), np.zeros_like(rows.theta), nothing)
 
 
-def _stacked(
-    model: ForwardModel, variances_nm2: FloatArray, z_range_nm: tuple[float, float] | None
-) -> Pictures:
-    """Tables of a model for every blur."""
-    span = z_range_nm or (model.height_nm, model.height_nm)
-    tables = [
-        axial_table(blurred(model, float(q), upwards=z_range_nm is not None).wave, span)
-        for q in variances_nm2
-    ]
-    heights = np.stack([table.heights for table in tables])
-    one = tables[0]
-    return Pictures(heights, one.first_nm, one.step_nm, one.kappa, model.lens)
+@dataclass(frozen=True)
+class _Sheet:
+    """A canvas and the rows that are on it."""
 
+    rows: Rows
+    canvas: Canvas
+    coarse: bool
 
-class _Mixer:
-    """Anderson's mixing for a fixed point x = g(x), of which g(x) − x is seen.
-
-    D. G. Anderson, J. ACM 12, 547 (1965); H. F. Walker & P. Ni, SIAM J. Numer. Anal. 49, 1715
-    (2011).
-    """
-
-    def __init__(self) -> None:
-        self._places: list[FloatArray] = []
-        self._moves: list[FloatArray] = []
-
-    def next(self, place: FloatArray, move: FloatArray) -> FloatArray:
-        """Where to go from `place`, from which the plain turn goes on by `move`."""
-        places, moves = self._places, self._moves
-        places.append(place)
-        moves.append(move)
-        del places[: -(_MEMORY + 1)], moves[: -(_MEMORY + 1)]
-        if len(moves) == 1:
-            return place + move
-        dx = np.stack([b - a for a, b in pairwise(places)])
-        df = np.stack([b - a for a, b in pairwise(moves)])
-        weights, *_ = np.linalg.lstsq(df @ df.T, df @ move, rcond=1e-10)
-        return np.asarray(place + move - weights @ (dx + df))
+    def moved(self, rows: Rows, frames: int) -> Canvas:
+        """Turn to other rows; frames in which they are not the same ones are marked."""
+        old, canvas = self.rows, self.canvas
+        here, there = rows.starts(frames), old.starts(frames)
+        same = np.diff(here) == np.diff(there)
+        mine = np.flatnonzero(np.repeat(same, np.diff(here)))
+        theirs = np.flatnonzero(np.repeat(same, np.diff(there)))
+        other = (rows.group[mine] != old.group[theirs]) | (rows.track[mine] != old.track[theirs])
+        same[rows.frame[mine[other]]] = False
+        rings, squares = np.zeros((2, *rows.theta.shape))
+        rings[mine], squares[mine] = canvas.rings[theirs], canvas.squares[theirs]
+        return Canvas(canvas.total, rings, squares, canvas.drawn & same)

@@ -12,32 +12,41 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.movie.addresses import MARK, beside, split_address
+from iscat_analysis.movie.datasets import open_hdf5
 from iscat_analysis.movie.hdf5 import SIGNATURE
-from iscat_analysis.movie.refeyn import open_refeyn
+from iscat_analysis.movie.mapped_frames import NPY_SIGNATURE, open_npy, open_raw
+from iscat_analysis.movie.ome_zarr import is_zarr, open_zarr
 from iscat_analysis.movie.stack import ArrayFrames, ArrayLike, Frames, Stack
 from iscat_analysis.movie.tiff import open_tiff
+from iscat_analysis.movie.tiff_set import TiffSet
 from iscat_analysis.records import StackMetadata
 
-__all__ = ["ArrayLike", "Frames", "Stack", "open_stack"]
+__all__ = ["ArrayLike", "Frames", "Stack", "beside", "open_stack"]
 
 _READERS: Mapping[bytes, Callable[[Path], Frames]] = {
     b"II\x2a\x00": open_tiff,
     b"MM\x00\x2a": open_tiff,
     b"II\x2b\x00": open_tiff,
     b"MM\x00\x2b": open_tiff,
-    SIGNATURE[:4]: open_refeyn,
+    NPY_SIGNATURE[:4]: open_npy,
 }
 """The first bytes of a file and what opens it."""
 
+_LOSSY = "which keeps no counts: its compression leaves out what the eye does not see"
+_LAZY = "export it as OME-TIFF, or give the array that a reader makes of it to fit_movie"
 _FOREIGN: Mapping[bytes, str] = {
-    b"\x93NUMPY": "a NumPy array",
     b"\x89PNG": "a PNG picture",
     b"\xff\xd8\xff": "a JPEG picture",
     b"PK\x03\x04": "a ZIP archive",
     b"\x1f\x8b": "a gzip archive",
-    b"RIFF": "an AVI or WAV file",
+    b"RIFF": f"an AVI film, {_LOSSY}",
+    b"\x1aE\xdf\xa3": f"a Matroska film, {_LOSSY}",
     b"SIMPLE": "a FITS file",
+    b"\xda\xce\xbe\x0a": f"a Nikon ND2 file; {_LAZY}",
+    b"ZISRAWFI": f"a Zeiss CZI file; {_LAZY}",
 }
+_FILM = b"ftyp"  # of MP4 and QuickTime, behind four bytes
 _SIGNATURE_BYTES = 8
 
 
@@ -53,8 +62,10 @@ def open_stack(
 
     TIFF, BigTIFF, OME-TIFF, ImageJ and Micro-Manager stacks are read; strips or tiles;
     uncompressed, LZW, Deflate, Zstandard, PackBits or LZMA.  So are Refeyn's ``.mp`` movies, of
-    OneMP and TwoMP, compressed or not, and arrays: of NumPy, memory-mapped or not, of Dask, Zarr or
-    h5py, or whatever has a shape and a dtype and can be sliced.
+    OneMP and TwoMP, compressed or not; datasets of HDF5 files, as ``"day.h5::/run 3/movie"``;
+    images and arrays of Zarr folders, OME-Zarr among them; ``.npy`` files; files of plain numbers,
+    as ``"movie.bin::1500x128x128,uint16"``; and arrays: of NumPy, memory-mapped or not, of Dask,
+    Zarr or h5py, or whatever has a shape and a dtype and can be sliced.
 
     Parameters
     ----------
@@ -105,29 +116,46 @@ def open_stack(
             raise ConfigError(f"{key} = {value:g} must be positive")
     source = "arguments" if any(value is not None for value in said.values()) else "none"
     name = name or "array"
-    return Stack(Path(name), ArrayFrames(movie, name, StackMetadata(**said, source=source)))
+    return Stack(
+        Path(name), ArrayFrames(movie, name, StackMetadata(**said, source=source)), files=()
+    )
 
 
-def _open_file(path: Path) -> Stack:
+def _open_file(address: Path) -> Stack:
+    path, part = split_address(address)
+    if path.is_dir():
+        if not is_zarr(path):
+            raise DataError(f"{path}: is a folder; give the path of one movie file")
+        files = [file for file in sorted(path.rglob("*")) if file.is_file()]
+        return Stack(path, open_zarr(path, part), part=part, files=files)
     try:
         with path.open("rb") as file:
             signature = file.read(_SIGNATURE_BYTES)
     except FileNotFoundError:
         raise DataError(f"{path}: there is no such file; check the path") from None
-    except IsADirectoryError:
-        raise DataError(f"{path}: is a folder; give the path of one movie file") from None
     except OSError as error:
-        if path.is_dir():
-            raise DataError(f"{path}: is a folder; give the path of one movie file") from None
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     if not signature:
         raise DataError(f"{path}: is empty (0 bytes); copy it again or export it again")
+    if signature == SIGNATURE:
+        return Stack(path, open_hdf5(path, part), part=part)
+    if part:
+        return Stack(path, open_raw(path, part), part=part)
     reader = _READERS.get(signature[:4])
     if reader is None:
-        names = (name for mark, name in _FOREIGN.items() if signature.startswith(mark))
-        found = next(names, "not one")
-        raise DataError(
-            f"{path}: needs to be a TIFF file or a Refeyn .mp movie but is {found}; "
-            "export the movie as TIFF"
-        )
-    return Stack(path, reader(path))
+        raise DataError(f"{path}: {_refusal(path, signature)}")
+    frames = reader(path)
+    return Stack(path, frames, files=frames.files if isinstance(frames, TiffSet) else None)
+
+
+def _refusal(path: Path, signature: bytes) -> str:
+    """Say what a file is that is not read, and what to do."""
+    known = (what for mark, what in _FOREIGN.items() if signature.startswith(mark))
+    found = f"a film, {_LOSSY}" if signature[4:] == _FILM else next(known, "")
+    needed = "needs to be a TIFF file, a Refeyn .mp movie, HDF5, Zarr or a NumPy array"
+    if found:
+        return f"{needed} but is {found}; export the movie as TIFF"
+    return (
+        f"{needed} but is not one; export the movie as TIFF or, if it is plain numbers, say so, "
+        f'as in "{path}{MARK}1500x128x128,uint16"'
+    )

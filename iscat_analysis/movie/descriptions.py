@@ -31,8 +31,8 @@ LENGTH_NM = {
 """Nanometres in one unit of length, by its lower-case name (both Unicode micro signs)."""
 
 TIME_S = {
-    "ns": 1e-9, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "ms": 1e-3, "msec": 1e-3, "s": 1.0, "sec": 1.0,
-    "min": 60.0, "h": 3600.0,
+    "ns": 1e-9, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "microsecond": 1e-6, "ms": 1e-3, "msec": 1e-3,
+    "millisecond": 1e-3, "s": 1.0, "sec": 1.0, "second": 1.0, "min": 60.0, "h": 3600.0,
 }  # fmt: skip
 """Seconds in one unit of time, by its lower-case name."""
 

@@ -44,6 +44,25 @@ class OmeMovie:
     hints: Hints
 
 
+@dataclass(frozen=True)
+class OmeSet:
+    """What OME-XML says of a movie in several files.
+
+    Attributes
+    ----------
+    files : tuple of str
+        Their names; empty for the file that says so.
+    where : ndarray of int64, shape (t, 2)
+        File and image that hold each frame.
+    hints : Hints
+        Pixel size and timing.
+    """
+
+    files: tuple[str, ...]
+    where: NDArray[np.int64]
+    hints: Hints
+
+
 def is_ome(text: str) -> bool:
     """Whether a description is OME-XML.
 
@@ -80,34 +99,100 @@ def read_ome(text: str, n_images: int, path: Path) -> OmeMovie:
     Raises
     ------
     DataError
-        The XML is damaged or declares entities, describes several files or several series, more
-        or fewer frames than the file holds, or more than one axis besides y and x.
+        The XML is damaged or declares entities, describes several series, more or fewer frames
+        than the file holds, or more than one axis besides y and x.
     """
-    root = _parse(text, path)
-    if next(_children(root, "BinaryOnly"), None) is not None:
-        raise DataError(
-            f"{path}: is one part of an OME set of several files; "
-            "save the whole set as one TIFF file and open that"
-        )
-    images = [
-        (image, pixels)
-        for image in _children(root, "Image")
-        for pixels in _children(image, "Pixels")
-    ]
-    if not images:
-        raise _damaged(path, "it describes no image")
-    _refuse_sets([pixels for _, pixels in images], path)
-    first = images[0][1]
+    images = _images(text, path)
+    first = images[0]
     if len(images) == 1:
         order, axis = _order(first, n_images, path)
     else:
-        order, axis = _order_of_series([pixels for _, pixels in images], n_images, path)
+        order, axis = _order_of_series(images, n_images, path)
     if not np.array_equal(np.sort(order), np.arange(n_images)):
         raise DataError(
             f"{path}: its OME-XML assigns {len(np.unique(order))} of the file's {n_images} images "
             f"to {len(order)} frames; export it again so that both agree"
         )
     return OmeMovie(order, _hints(first, axis))
+
+
+def read_ome_set(text: str, path: Path) -> OmeSet | None:
+    """Read the OME-XML of a movie that lies in several files.
+
+    Parameters
+    ----------
+    text : str
+        The XML of one of them.
+    path : Path
+        Of that file.
+
+    Returns
+    -------
+    OmeSet or None
+        Where every frame lies; None where all of them lie in one file.
+
+    Raises
+    ------
+    DataError
+        The XML is damaged, names files elsewhere, describes several series, or leaves frames out.
+    """
+    images = _images(text, path)
+    files = _files(images)
+    if len(files) < 2:
+        return None
+    if len(images) > 1:
+        raise DataError(
+            f"{path}: is one part of an OME set of {len(images)} image series; export the one to "
+            "analyse to its own file"
+        )
+    if any(not name or Path(name).name != name for name in files):
+        raise _damaged(path, "it names files in other folders")
+    pixels = images[0]
+    sizes = _sizes(pixels, path)
+    axis = time_axis(sizes, path) or "T"
+    where = np.full((sizes[axis], 2), -1, dtype=np.int64)
+    for block in _children(pixels, "TiffData"):
+        frame = _integer(block, f"First{axis}", path) or 0
+        image = _integer(block, "IFD", path) or 0
+        planes = _integer(block, "PlaneCount", path)
+        planes = 1 if planes is None else planes
+        if frame + planes > len(where):
+            raise _damaged(path, f"a TiffData block reaches frame {frame + planes} of {len(where)}")
+        where[frame : frame + planes, 0] = files.index(_file_of(block))
+        where[frame : frame + planes, 1] = np.arange(image, image + planes)
+    missing = int((where < 0).any(axis=1).sum())
+    if missing:
+        raise DataError(
+            f"{path}: its OME-XML does not say where {missing} of {len(where)} frames lie; "
+            "the recording or the copy was interrupted: export it again"
+        )
+    return OmeSet(tuple(files), where, _hints(pixels, axis))
+
+
+def _images(text: str, path: Path) -> list[ElementTree.Element]:
+    """Give the pixels of every image that is described."""
+    root = _parse(text, path)
+    elsewhere = next(_children(root, "BinaryOnly"), None)
+    if elsewhere is not None:
+        name = elsewhere.get("MetadataFile") or "the first file of the set"
+        raise DataError(
+            f"{path}: is one part of an OME set of several files; open {name}, which describes it"
+        )
+    images = [pixels for image in _children(root, "Image") for pixels in _children(image, "Pixels")]
+    if not images:
+        raise _damaged(path, "it describes no image")
+    return images
+
+
+def _files(images: list[ElementTree.Element]) -> list[str]:
+    """Name the files that hold the planes of images; one without a name is the file itself."""
+    found = {_file_of(block): None for pixels in images for block in _children(pixels, "TiffData")}
+    return list(found)
+
+
+def _file_of(block: ElementTree.Element) -> str:
+    uuid = next(_children(block, "UUID"), None)
+    return "" if uuid is None else uuid.get("FileName") or (uuid.text or "").strip()
 
 
 def _parse(text: str, path: Path) -> ElementTree.Element:
@@ -124,21 +209,6 @@ def _parse(text: str, path: Path) -> ElementTree.Element:
 
 def _children(parent: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]:
     return (child for child in parent if child.tag.rpartition("}")[2] == name)
-
-
-def _refuse_sets(pixels: list[ElementTree.Element], path: Path) -> None:
-    files = {
-        uuid.get("FileName") or (uuid.text or "").strip(): None
-        for element in pixels
-        for block in _children(element, "TiffData")
-        for uuid in _children(block, "UUID")
-    }
-    if len(files) > 1:
-        shown = ", ".join(list(files)[:3]) + (", …" if len(files) > 3 else "")
-        raise DataError(
-            f"{path}: is one part of an OME set of {len(files)} files ({shown}); "
-            "save the whole set as one TIFF file and open that"
-        )
 
 
 def _integer(element: ElementTree.Element, name: str, path: Path) -> int | None:

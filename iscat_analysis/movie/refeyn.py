@@ -220,6 +220,22 @@ def open_refeyn(path: Path) -> RefeynFrames:
             raise
 
 
+def is_refeyn(reader: Hdf5Reader) -> bool:
+    """Tell whether a file has frames where one of Refeyn's has them.
+
+    Parameters
+    ----------
+    reader : Hdf5Reader
+        Of the file.
+
+    Returns
+    -------
+    bool
+        Whether it does.
+    """
+    return any(reader.array(dialect.frames) is not None for dialect in _DIALECTS)
+
+
 def _open(reader: Hdf5Reader, path: Path) -> RefeynFrames:
     found = [dialect for dialect in _DIALECTS if reader.array(dialect.frames) is not None]
     if not found:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self, runtime_checkable
@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.addresses import MARK, fingerprint
 from iscat_analysis.records import StackMetadata
 
 _MB = 1_000_000
+_BLOCK_BYTES = 2**20
 
 
 class Frames(Protocol):
@@ -141,11 +143,19 @@ class Stack:
         The file, or the name of the array.
     frames : Frames
         Its pixels.
+    part : str
+        What the movie is of the file, where it is not all: a dataset, or the shape of numbers.
+    files : sequence of Path, optional
+        The files that hold it; default `path`, none for an array.
     """
 
-    def __init__(self, path: Path, frames: Frames) -> None:
+    def __init__(
+        self, path: Path, frames: Frames, *, part: str = "", files: Sequence[Path] | None = None
+    ) -> None:
         self._path = path
         self._frames = frames
+        self._part = part
+        self._files = (path,) if files is None else tuple(files)
         self._closed = False
 
     def __repr__(self) -> str:
@@ -172,7 +182,12 @@ class Stack:
     @property
     def name(self) -> str:
         """The file's name, without its folder, as text that can be written."""
-        return printable(self._path.name)
+        return printable(self._path.name + (MARK + self._part if self._part else ""))
+
+    @property
+    def identity(self) -> str:
+        """What tells this movie from others without reading all of it; empty for an array."""
+        return fingerprint(self._files, self._part) if self._files else ""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -193,6 +208,21 @@ class Stack:
     def notes(self) -> tuple[str, ...]:
         """One sentence for each thing that the file implies but does not state."""
         return self._frames.notes
+
+    def seen_as(self, frames: Frames) -> Stack:
+        """Give the same movie with other frames, which were made from its own.
+
+        Parameters
+        ----------
+        frames : Frames
+            As many.
+
+        Returns
+        -------
+        Stack
+            Under the same name.
+        """
+        return Stack(self._path, frames, part=self._part, files=self._files)
 
     def close(self) -> None:
         """Release the file; closing twice is harmless."""
@@ -268,24 +298,30 @@ class Stack:
         Returns
         -------
         str
-            SHA-256 as 64 hexadecimal digits: of the bytes of a file; of an array's type, shape and
-            counts in the order of the axes.
+            SHA-256 as 64 hexadecimal digits: of the bytes of a file, followed by those of further
+            files of a set and by the name of a part; of an array's type, shape and counts in the
+            order of the axes.
 
         Raises
         ------
         DataError
             The file can no longer be read.
         """
-        if isinstance(self._frames, ArrayFrames):
+        if not self._files:
             digest = hashlib.sha256(f"{self.dtype.str} {self.shape}".encode())
             for _, block in self.chunks():
                 digest.update(block.data)
             return digest.hexdigest()
-        try:
-            with self._path.open("rb") as file:
-                return hashlib.file_digest(file, "sha256").hexdigest()
-        except OSError as error:
-            raise DataError(f"{self._path}: cannot be read ({error.strerror})") from None
+        digest = hashlib.sha256()
+        for path in self._files:
+            try:
+                with path.open("rb") as file:
+                    while data := file.read(_BLOCK_BYTES):
+                        digest.update(data)
+            except OSError as error:
+                raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+        digest.update(self._part.encode("utf-8", "backslashreplace"))
+        return digest.hexdigest()
 
     def _check_range(self, start: int, stop: int) -> None:
         total = self.shape[0]

@@ -16,6 +16,7 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,8 @@ from iscat_analysis.movie.descriptions import (
     time_axis,
 )
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, map_file, refuse_changed, release
-from iscat_analysis.movie.ome import is_ome, read_ome
+from iscat_analysis.movie.ome import is_ome, read_ome, read_ome_set
+from iscat_analysis.movie.tiff_set import TiffSet, open_set
 from iscat_analysis.records import StackMetadata
 
 _DESCRIPTION, _MICRO_MANAGER = 270, 51123
@@ -193,17 +195,19 @@ class TiffFrames:
                 ) from None
 
 
-def open_tiff(path: Path) -> TiffFrames:
+def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | TiffSet:
     """Open a TIFF movie.
 
     Parameters
     ----------
     path : Path
-        The file.
+        The file, or one of a set that OME-XML describes.
+    member : bool
+        Take all images of the file for frames, whatever it says of a set.
 
     Returns
     -------
-    TiffFrames
+    TiffFrames or TiffSet
         Every frame of it.
 
     Raises
@@ -214,7 +218,7 @@ def open_tiff(path: Path) -> TiffFrames:
     data = map_file(path)
     try:
         with _unheard(), tifffile.TiffFile(path, **_PLAIN) as file:
-            return _open(file, data, path)
+            return _open(file, data, path, member)
     except DataError:
         data.close()
         raise
@@ -227,12 +231,19 @@ def open_tiff(path: Path) -> TiffFrames:
         ) from None
 
 
-def _open(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> TiffFrames:
+def _open(
+    file: tifffile.TiffFile, data: mmap.mmap, path: Path, member: bool
+) -> TiffFrames | TiffSet:
     images = list(_images(file, data, path))
     texts = images[0].texts
     ome_text = next((text for text in texts if is_ome(text)), None)
     notes: tuple[str, ...] = ()
-    if ome_text is not None:
+    if member:
+        order, n_frames, hints = list(range(len(images))), len(images), []
+    elif ome_text is not None and (several := read_ome_set(ome_text, path)) is not None:
+        data.close()
+        return open_set(several, path, partial(open_tiff, member=True))
+    elif ome_text is not None:
         ome = read_ome(ome_text, len(images), path)
         order = ome.order.tolist()
         n_frames, hints = len(order), [ome.hints]
@@ -247,7 +258,7 @@ def _open(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> TiffFrames:
     first = file.pages[order[0]]
     dtype = _dtype(first, path).newbyteorder(file.byteorder)
     _refuse_differences(frames, path)
-    if n_frames < 2:
+    if n_frames < 2 and not member:
         raise DataError(
             f"{path}: holds a single frame; a movie needs frames before and after a particle binds"
         )
@@ -261,7 +272,7 @@ def _open(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> TiffFrames:
     stamps = [file.pages[k].tags.valueof(_MICRO_MANAGER) for k in (order[0], order[-1])]
     if stamps[0] is not None or _MICRO_MANAGER in first.tags:
         summary = _micro_manager_summary(path)
-        if ome_text is None:
+        if ome_text is None and not member:
             time_axis(micro_manager_axes(summary), path)
         hints.append(micro_manager_hints(stamps[0], stamps[1], len(frames), summary))
     resolution = _resolution(file.pages[0])

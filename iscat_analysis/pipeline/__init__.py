@@ -19,12 +19,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config, config_to_toml
-from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.errors import ConfigError, FloodError
 from iscat_analysis.inference.achieved import Achieved
 from iscat_analysis.inference.noise import compile_kernels
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.inference.prior import Prior
-from iscat_analysis.movie import Stack, open_stack
+from iscat_analysis.movie import Stack, beside, open_stack
 from iscat_analysis.movie.background import measure_windows
 from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts, refuse_ratio
 from iscat_analysis.movie.lines import Lines, SteadyFrames
@@ -36,6 +36,8 @@ from iscat_analysis.pipeline.achieved import (
     with_measured_sigma,
     with_repeats,
 )
+from iscat_analysis.pipeline.block_store import BlockStore
+from iscat_analysis.pipeline.blocks import plan_blocks
 from iscat_analysis.pipeline.diagnosis import (
     EXCESS_NOISE,
     drift_warning,
@@ -49,7 +51,7 @@ from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.landing import analyse_landings, has_landings, inject_and_recover
 from iscat_analysis.pipeline.learning import learn_optics
 from iscat_analysis.pipeline.moving import track_scene
-from iscat_analysis.pipeline.ranges import frame_ranges, tracked_frames
+from iscat_analysis.pipeline.ranges import fitted_frames, frame_ranges, tracked_frames
 from iscat_analysis.pipeline.recognise import (
     as_landing,
     as_moving,
@@ -58,7 +60,7 @@ from iscat_analysis.pipeline.recognise import (
 )
 from iscat_analysis.pipeline.repeats import field_repeats
 from iscat_analysis.pipeline.results import Found, Row, summary_of, table_of, view_of
-from iscat_analysis.pipeline.resume import fingerprint, is_resumable, partial_folder
+from iscat_analysis.pipeline.resume import is_resumable, partial_folder
 from iscat_analysis.pipeline.scene import Scene, field_likelihood, make_scene
 from iscat_analysis.pipeline.systematic import with_systematic
 from iscat_analysis.pipeline.tracking import (
@@ -146,7 +148,7 @@ def fit_stack(
     KeyboardInterrupt
         The user stopped it; what was finished is in the folder.
     """
-    folder = stack.with_suffix(".iscat") if out is None else out
+    folder = beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
     with claim_output(folder, overwrite):
         with open_stack(stack) as movie:
@@ -192,8 +194,8 @@ def analyse(
     progress, notify, command
         As in `fit_stack`.
     partial : Path, optional
-        Folder that keeps the finished chunks of a landing movie, so that an interrupted run can be
-        resumed; without it nothing is kept.
+        Folder that keeps the finished chunks of a landing movie, or blocks of one in mode track,
+        so that an interrupted run can be resumed; without it nothing is kept.
     inject : int
         As in `fit_stack`.
 
@@ -243,7 +245,7 @@ def analyse(
     if lines is not None:
         tell(f"{movie.name}: {lines.message}")
         further["lines"] = lines.summary
-        steady = Stack(movie.path, SteadyFrames(movie, lines, camera))
+        steady = movie.seen_as(SteadyFrames(movie, lines, camera))
     config, learned = learn_optics(steady, config, camera, tell=tell)
     if learned:
         further["optics"] = learned
@@ -251,8 +253,7 @@ def analyse(
     landing, tracked = has_landings(config), config.fit.mode == "track"
     other = ""
     if landing or tracked:
-        background = config.background.frames
-        span = config.fit.frames or (background[1] if background else 0, movie.shape[0])
+        span = fitted_frames(movie, config, config.background.frames)
         changes = look_at_changes(steady, config, camera, span)
         further["changes"] = changes_summary(changes)
         other = (as_landing if tracked else as_moving)(changes, movie.name)
@@ -268,11 +269,11 @@ def analyse(
                 progress=progress,
                 prepare=lambda scene: _warm_up(scene, notify),
                 partial=partial,
-                identity=fingerprint(movie.path) if partial else "",
+                identity=movie.identity if partial else "",
                 lines=lines,
             )
-        except DataError as error:  # what seems to be noise is then particles
-            raise DataError(other) if other else error from None
+        except FloodError as error:  # what seems to be noise is then particles
+            raise FloodError(other) if other else error from None
         scene, image = result.scene, result.image
         further["landing"] = result.summary
         found = Found(
@@ -296,12 +297,15 @@ def analyse(
                 'interferometric scheme and background.method = "sliding"; leave it out'
             )
         scene, found, image, measured = _measured_background(
-            steady, config, camera, clock, lines=lines, tell=tell, notify=notify, progress=progress
-        )
+            steady, config, camera, clock, partial,
+            lines=lines, tell=tell, notify=notify, progress=progress,
+        )  # fmt: skip
         further |= measured
     windows = found.windows
+    gathering = progress
     if found.interrupted:  # what was finished is now gathered and kept, which takes a moment
         progress("report", 0, 1)
+        gathering = silent  # another stage would end the time that writing is given
     found = replace(found, table=with_systematic(config, found.table))
     achieved: dict[str, Achieved] = {}
     if found.repeats:
@@ -321,10 +325,10 @@ def analyse(
     films: tuple[Film, ...] = ()
     if scene.mode == "track":
         tracks, said = tracks_of(
-            scene, found.table, windows, masses=found.masses, tell=tell, progress=progress
+            scene, found.table, windows, masses=found.masses, tell=tell, progress=gathering
         )
         further |= said
-        films = make_films(scene, steady, camera, windows, found.table, tracks)
+        films = make_films(scene, steady, camera, found.parts or (windows,), found.table, tracks)
         clock.lap("tracks")
     summary = summary_of(scene, found.table, windows, clock.seconds, achieved)
     sampled = config.samples_posterior
@@ -369,6 +373,7 @@ def _measured_background(
     config: Config,
     camera: Camera,
     clock: _Clock,
+    partial: Path | None,
     *,
     lines: Lines | None,
     tell: Notify,
@@ -379,7 +384,9 @@ def _measured_background(
     further: dict[str, Any] = {}
     shape = (movie.shape[1], movie.shape[2])
     if learns_background(config):
-        return _moving_particles(movie, config, camera, clock, notify=notify, progress=progress)
+        return _moving_particles(
+            movie, config, camera, clock, partial, tell=tell, notify=notify, progress=progress
+        )
     before, after = frame_ranges(movie, config)
     searches = after[1] - after[0] if config.fit.mode == "track" else 1
     scene = make_scene(config, shape, searches=searches, lines=lines)
@@ -441,24 +448,36 @@ def _moving_particles(
     config: Config,
     camera: Camera,
     clock: _Clock,
+    partial: Path | None,
     *,
+    tell: Notify,
     notify: Notify,
     progress: Progress,
 ) -> tuple[Scene, Found, FloatArray, dict[str, Any]]:
-    """Track particles over a background that is learnt with them."""
+    """Track particles over backgrounds that are learnt with them."""
     first, last = config.fit.frames or (0, movie.shape[0])
-    scene = track_scene(config, (movie.shape[1], movie.shape[2]), max(last - first, 1))
+    shape = (movie.shape[1], movie.shape[2])
+    scene = track_scene(config, shape, max(last - first, 1))
     _warm_up(scene, notify)
     clock.lap("model")
 
     def check(counts: NDArray[Any], first: int) -> None:
         check_counts(counts, first, movie.name, camera=camera)
 
+    plan = plan_blocks(movie, config, camera, check=check)
+    if message := plan.message(movie.name):
+        tell(message)
+    clock.lap("background")
+    identity = movie.identity if partial else ""
+    store = BlockStore(partial, config, identity, shape, (first, last), camera)
     with threads(config.compute.workers) as pool:
-        found = track_movie(scene, movie, camera, check=check, pool=pool, progress=progress)
+        found = track_movie(
+            scene, movie, camera, plan, store, check=check, pool=pool, progress=progress
+        )
     clock.lap("track")
     image = found.windows.after_e / found.windows.before_e - 1
-    return replace(scene, mode="track", config=config), found, image, {}
+    further = {"blocks": plan.summary}
+    return replace(scene, mode="track", config=config), found, image, further
 
 
 def _bound_particles(

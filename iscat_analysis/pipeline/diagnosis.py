@@ -82,7 +82,8 @@ def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
     config : Config
         Its background frames, or the first that are analysed, are looked at; nothing is where
         ``background.power_normalization`` is false, the background is dark or known, or the fixed
-        pattern is followed as it moves: it changes the light of the lines far more than flicker.
+        pattern is followed as it moves: it changes the light of the lines far more than flicker, as
+        nanoparticles that move in a volume do, which are there in every frame.
     camera : Camera
         Counts → photoelectrons.
 
@@ -97,6 +98,7 @@ def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
         or background.method == "known"
         or (background.method == "sliding" and background.drift_correction)
         or config.optics.scheme == "darkfield"
+        or (config.fit.mode == "track" and config.track.free == "joint" and not background.frames)
     ):
         return None
     first, last = background.frames or config.fit.frames or (0, movie.shape[0])

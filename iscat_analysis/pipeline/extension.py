@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iscat_analysis.inference.moving import Ground, MovingField, Rows
+from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.records import FloatArray
 
 LEAST_SNR = 4.0

@@ -8,14 +8,16 @@ steps that it implies, is the largest (A. J. Viterbi, IEEE Trans. Inf. Theory 13
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
-from iscat_analysis.inference.moving import Ground, MovingField, Rows
-from iscat_analysis.records import FloatArray
+from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.pipeline.linking import typical
+from iscat_analysis.records import BoolArray, FloatArray
 
+_BLOCK = 64  # frames at a time
 _LEAST_STEP = 0.05  # fringes: no particle is taken to move less between two frames
 
 
@@ -36,7 +38,7 @@ def decide_heights(
     ground : Ground
         The background.
     rows : Rows
-        Particles with their tracks.
+        Particles with their tracks; each of those without is decided alone.
     fringe_nm : float
         Distance of the fringes [nm].
     z_range_nm : tuple of float
@@ -49,24 +51,22 @@ def decide_heights(
     """
     if not len(rows.frame):
         return rows
-    low, high = z_range_nm
-    most = math.ceil((high - low) / fringe_nm)
-    thetas, gains = [], []
-    for k in range(-most, most + 1):
-        theta = rows.theta.copy()
-        theta[:, 2] += k * fringe_nm
-        inside = (theta[:, 2] > low - fringe_nm / 2) & (theta[:, 2] < high + fringe_nm / 2)
-        if not inside.any():
-            continue
-        theta[:, 2] = np.clip(np.where(inside, theta[:, 2], rows.theta[:, 2]), low, high)
-        fitted, _, done = field.fit(ground, replace(rows, theta=theta), sweeps=1, coarse=True)
-        gain = field.judge(ground, fitted, brief=True, coarse=True).gain
-        thetas.append(fitted.theta)
-        gains.append(np.where(inside & done, gain, -np.inf))
-    places, values = np.stack(thetas, axis=1), np.stack(gains, axis=1)
+    starts = rows.starts(field.frames)
+    rank = np.arange(len(rows.frame)) - starts[rows.frame]
+    ladders = []
+    for turn in range(int(rank.max()) + 1):  # one particle of each frame climbs at a time
+        ladders.append(_ladder(field, ground, rows, rank == turn, fringe_nm, z_range_nm))
+    steps = max(places.shape[1] for places, _ in ladders)
+    places = np.repeat(rows.theta[:, None], steps, axis=1)
+    values = np.full((len(rows.frame), steps), -np.inf)
+    for turn, (heights, gains) in enumerate(ladders):
+        places[rank == turn, : heights.shape[1]] = heights
+        values[rank == turn, : gains.shape[1]] = gains
     values[~np.isfinite(values).any(axis=1)] = 0.0  # no fit converged: its neighbours decide
     out = rows.theta.copy()
-    for k in np.unique(rows.track):
+    single = np.flatnonzero(rows.track < 0)
+    out[single] = places[single, values[single].argmax(axis=1)]
+    for k in np.unique(rows.track[rows.track >= 0]):
         mine = np.flatnonzero(rows.track == k)
         steps = np.diff(rows.theta[mine, :2], axis=0)
         apart = np.diff(rows.frame[mine])
@@ -78,6 +78,60 @@ def decide_heights(
         path = _best_path(places[mine, :, 2], values[mine], per_frame * apart)
         out[mine] = places[mine, path]
     return replace(rows, theta=out)
+
+
+def _ladder(
+    field: MovingField,
+    ground: Ground,
+    rows: Rows,
+    climbs: BoolArray,
+    fringe_nm: float,
+    z_range_nm: tuple[float, float],
+) -> tuple[FloatArray, FloatArray]:
+    """Fit some rows in every fringe, one rung from the next, with the others of their frames.
+
+    Returns what was fitted, shape (n, rungs, 5), and its log-likelihood, (n, rungs).
+    """
+    low, high = z_range_nm
+    frames = np.zeros(field.frames, dtype=bool)
+    frames[rows.frame[climbs]] = True
+    with_others = frames[rows.frame]
+    rows, mine = rows.only(with_others), climbs[with_others]
+    usual = typical(rows).theta[:, 3]
+    gain = _values(field, ground, rows)
+    thetas, gains = [rows.theta[mine]], [gain[mine]]
+    for way in (1, -1):
+        here = rows.theta.copy()
+        here[mine, 3] = usual[mine]  # in a wrong fringe a fit ends with no mass, and finds none
+        while True:
+            here[mine, 2] += way * fringe_nm
+            inside = (here[:, 2] > low - fringe_nm / 2) & (here[:, 2] < high + fringe_nm / 2) & mine
+            if not inside.any():
+                break
+            start = np.where(inside[:, None], here, rows.theta)
+            start[:, 2] = np.clip(start[:, 2], low, high)
+            fitted, _, done = field.fit(ground, replace(rows, theta=start), sweeps=1)
+            gain = _values(field, ground, fitted)
+            thetas.append(fitted.theta[mine])
+            gains.append(np.where(inside & done, gain, -np.inf)[mine])
+            stayed = inside & (np.abs(fitted.theta[:, 2] - start[:, 2]) < fringe_nm / 2)
+            here[stayed, 2] = fitted.theta[stayed, 2]
+    return np.stack(thetas, axis=1), np.stack(gains, axis=1)
+
+
+def _values(field: MovingField, ground: Ground, rows: Rows) -> FloatArray:
+    """Log-likelihood of the whole frame of each row, but for a constant of the frame.
+
+    Squares around fits in two fringes do not hold the same pixels, and one more column of rings
+    counts for more than a fringe does.
+    """
+    out = np.zeros(field.frames)
+    for first in range(0, field.frames, _BLOCK):
+        last = min(first + _BLOCK, field.frames)
+        left = field.residual(ground, rows, first, last)
+        noise = ground.power[first:last, None, None] * ground.level + field.read_e2
+        out[first:last] = -np.einsum("tyx,tyx->t", left, left / noise) / 2
+    return out[rows.frame]
 
 
 def _best_path(heights: FloatArray, gains: FloatArray, variances: FloatArray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -9,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
-from iscat_analysis.inference.moving import Ground, Judged, MovingField, Rows
+from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.rows import Ground, Judged, Rows
 from iscat_analysis.pipeline.extension import LEAST_SHARE
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import BoolArray, FloatArray
@@ -22,13 +24,21 @@ AS_FOUND = 0.9
 """Of the threshold, that a fit must keep to have found its particle."""
 
 _STEP = 0.1  # of the farthest that a particle goes: what an error of the mass counts in linking
+_UNSURE = 0.25  # of the mass, where z is free
 _BESIDE = 0.75  # resolutions λ/NA within which two rows may be one particle
 _BRIDGE_FRAMES = 100  # that a slow particle may hide
 
 IntArray = NDArray[np.int64]
 
 
-def linked(config: Config, rows: Rows, places: FloatArray, *, bridged: bool = False) -> Rows:
+def linked(
+    config: Config,
+    rows: Rows,
+    places: FloatArray,
+    *,
+    bridged: bool = False,
+    inner: tuple[int, int] | None = None,
+) -> Rows:
     """Link, drop what is too short, and fill gaps; tracks are numbered by first frame and place.
 
     Parameters
@@ -41,6 +51,9 @@ def linked(config: Config, rows: Rows, places: FloatArray, *, bridged: bool = Fa
         From `mass_places`.
     bridged : bool
         Join tracks of slow particles over gaps longer than the memory too.
+    inner : (int, int), optional
+        Half-open range of frames; a track that reaches out of it may go on in the next block of
+        frames, and is kept however short it is here.
 
     Returns
     -------
@@ -51,19 +64,24 @@ def linked(config: Config, rows: Rows, places: FloatArray, *, bridged: bool = Fa
         rows.frame, places,
         reach_nm=config.track.max_step_nm, memory=config.track.memory_frames,
     )  # fmt: skip
-    counts = np.bincount(track, minlength=1)
-    rows = replace(rows, track=track).only(counts[track] >= config.track.min_frames)
+    rows = replace(rows, track=track)
+    rows = rows.only((np.bincount(track, minlength=1) >= _least(config, rows, inner))[track])
     if bridged:
-        rows = replace(rows, track=_bridged(config, rows))
+        rows = replace(rows, track=bridge(config, rows))
     missed, before, after, share = gaps(rows.frame, rows.track)
     between = (1 - share)[:, None] * rows.theta[before] + share[:, None] * rows.theta[after]
-    rows = Rows.of(
-        np.concatenate([rows.frame, missed]),
-        np.concatenate([rows.track, rows.track[before]]),
-        np.concatenate([rows.theta, between]),
-        np.concatenate([rows.group, rows.group[before]]),
-    )
-    return _numbered(rows)
+    return numbered(rows.joined(missed, rows.track[before], between, rows.group[before]))
+
+
+def _least(config: Config, rows: Rows, inner: tuple[int, int] | None) -> IntArray:
+    """Frames that each track must have: one that may go on elsewhere, no more than it has here."""
+    counts = np.bincount(rows.track, minlength=1)
+    least = np.full(counts.size, config.track.min_frames)
+    if inner is not None:
+        outer = (rows.frame < inner[0]) | (rows.frame >= inner[1])
+        open_ = np.bincount(rows.track[outer], minlength=counts.size) > 0
+        least = np.where(open_, np.minimum(least, counts), least)
+    return least
 
 
 def mass_places(config: Config, field: MovingField, ground: Ground, rows: Rows) -> FloatArray:
@@ -90,11 +108,68 @@ def mass_places(config: Config, field: MovingField, ground: Ground, rows: Rows) 
     """
     if not len(rows.frame):
         return rows.theta[:, :2]
-    fisher = field.judge(ground, rows, brief=True, coarse=True).fisher
-    error = 1 / np.sqrt(max(float(np.median(fisher[:, 3, 3])), 1e-300))
-    return np.column_stack(
-        [rows.theta[:, :2], rows.theta[:, 3] * (_STEP * config.track.max_step_nm / error)]
+    return with_mass(
+        config, rows, typical_error(field.judge(ground, rows, brief=True, coarse=True))
     )
+
+
+def with_mass(config: Config, rows: Rows, error: float) -> FloatArray:
+    """Add the mass to the places, as a length.
+
+    Parameters
+    ----------
+    config : Config
+        Its ``[track]``.
+    rows : Rows
+        Particles.
+    error : float
+        Of the amplitude in a frame, from `typical_error`.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        As lengths [nm].
+    """
+    length = _STEP * config.track.max_step_nm / mass_error(config, rows, error)
+    return np.column_stack([rows.theta[:, :2], rows.theta[:, 3] * length])
+
+
+def mass_error(config: Config, rows: Rows, error: float) -> float:
+    """Say by how much the amplitude of one particle may change from frame to frame.
+
+    Parameters
+    ----------
+    config : Config
+        Its ``[track]``.
+    rows : Rows
+        Particles.
+    error : float
+        Of the amplitude in a frame, from `typical_error`.
+
+    Returns
+    -------
+    float
+        More where z is free: motion along z, and a fringe that is not decided yet, change it.
+    """
+    if config.track.free == "joint" and len(rows.frame):
+        return max(error, _UNSURE * float(np.median(rows.theta[:, 3])))
+    return error
+
+
+def typical_error(judged: Judged) -> float:
+    """Give the error of an amplitude in one frame, at known places.
+
+    Parameters
+    ----------
+    judged : Judged
+        Of all rows.
+
+    Returns
+    -------
+    float
+        1/√F, F the median information.
+    """
+    return 1 / math.sqrt(max(float(np.median(judged.fisher[:, 3, 3])), 1e-300))
 
 
 def typical(rows: Rows) -> Rows:
@@ -117,7 +192,14 @@ def typical(rows: Rows) -> Rows:
     return replace(rows, theta=theta)
 
 
-def alone(scene: Scene, field: MovingField, ground: Ground, rows: Rows) -> Rows:
+def alone(
+    scene: Scene,
+    field: MovingField,
+    ground: Ground,
+    rows: Rows,
+    *,
+    inner: tuple[int, int] | None = None,
+) -> Rows:
     """Leave out tracks that are hardly ever alone, or seen: they may be parts of neighbours.
 
     Parameters
@@ -130,6 +212,8 @@ def alone(scene: Scene, field: MovingField, ground: Ground, rows: Rows) -> Rows:
         The background.
     rows : Rows
         Particles with their tracks.
+    inner : (int, int), optional
+        As in `linked`.
 
     Returns
     -------
@@ -144,8 +228,8 @@ def alone(scene: Scene, field: MovingField, ground: Ground, rows: Rows) -> Rows:
     free = np.bincount(rows.track[~near], minlength=tracks)
     snr = np.where(rows.theta[:, 3] > 0, field.snr_of(ground, rows), 0.0)
     median = np.array([np.median(snr[rows.track == k]) for k in range(tracks)])
-    kept = (free >= config.track.min_frames) & (median > AS_FOUND * scene.templates.threshold)
-    return _numbered(rows.only(kept[rows.track]))
+    kept = (free >= _least(config, rows, inner)) & (median > AS_FOUND * scene.templates.threshold)
+    return numbered(rows.only(kept[rows.track]))
 
 
 def held(config: Config, field: MovingField, rows: Rows) -> tuple[Rows, int]:
@@ -184,14 +268,8 @@ def held(config: Config, field: MovingField, rows: Rows) -> tuple[Rows, int]:
                 group.append(int(mine.group[end]))
     if not frame:
         return rows, 0
-    more = (np.array(v, dtype=np.int64) for v in (frame, track, group))
-    frames, tracks, groups = more
-    return Rows.of(
-        np.concatenate([rows.frame, frames]),
-        np.concatenate([rows.track, tracks]),
-        np.concatenate([rows.theta, np.array(theta)]),
-        np.concatenate([rows.group, groups]),
-    ), len(frame)
+    frames, tracks, groups = (np.array(v, dtype=np.int64) for v in (frame, track, group))
+    return rows.joined(frames, tracks, np.array(theta), groups), len(frame)
 
 
 def trimmed(rows: Rows) -> Rows:
@@ -232,11 +310,29 @@ def shares_mass(rows: Rows, judged: Judged) -> BoolArray:
     ndarray of bool, shape (n,)
         Where the mass is `OUTLYING` standard deviations, as its track scatters, from the median.
     """
-    out = np.zeros(len(rows.frame), dtype=bool)
     error = 1 / np.sqrt(np.maximum(judged.fisher[:, 3, 3], 1e-300))
-    for k in np.unique(rows.track):
-        mine = rows.track == k
-        off = (rows.theta[mine, 3] - np.median(rows.theta[mine, 3])) / error[mine]
+    return unlike(rows.track, rows.theta[:, 3], error)
+
+
+def unlike(track: IntArray, mass: FloatArray, error: FloatArray) -> BoolArray:
+    """Tell which rows have a mass that is not that of their track.
+
+    Parameters
+    ----------
+    track : ndarray of int, shape (n,)
+        Of each row.
+    mass, error : ndarray, shape (n,)
+        Its mass, or amplitude, and the error of that.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        Where it is `OUTLYING` standard deviations, as the track scatters, from the median.
+    """
+    out = np.zeros(len(track), dtype=bool)
+    for k in np.unique(track):
+        mine = track == k
+        off = (mass[mine] - np.median(mass[mine])) / error[mine]
         scale = max(1.0, float(np.median(np.abs(off))) / 0.6745)
         out[mine] = np.abs(off) > OUTLYING * scale
     return out
@@ -270,11 +366,23 @@ def crowded(rows: Rows, field: MovingField, limit_nm: float) -> BoolArray:
     return out
 
 
-def _bridged(config: Config, rows: Rows) -> IntArray:
+def bridge(config: Config, rows: Rows) -> IntArray:
     """Join tracks of a particle that hardly moved while it was not seen.
 
     What moves slowly hides in the first background, which is that of most of the frames; it is seen
     again near where it was.  In the gap it must not have gone farther than a resolution.
+
+    Parameters
+    ----------
+    config : Config
+        Its optics.
+    rows : Rows
+        Particles with their tracks.
+
+    Returns
+    -------
+    ndarray of int, shape (n,)
+        Track of each row.
     """
     reach = config.optics.wavelength_nm / config.optics.na
     again = link(rows.frame, rows.theta[:, :2], reach_nm=reach, memory=_BRIDGE_FRAMES)
@@ -299,8 +407,19 @@ def _step_nm2(rows: Rows) -> float:
     return float(np.median((steps**2).sum(axis=1)) / np.log(2)) if len(steps) else np.inf
 
 
-def _numbered(rows: Rows) -> Rows:
-    """Give tracks numbers by their first frame and place."""
+def numbered(rows: Rows) -> Rows:
+    """Give tracks numbers by their first frame and place.
+
+    Parameters
+    ----------
+    rows : Rows
+        Particles with their tracks.
+
+    Returns
+    -------
+    Rows
+        The same, tracks numbered from 0.
+    """
     _, first = np.unique(rows.track, return_index=True)
     numbers = np.full(int(rows.track.max(initial=0)) + 1, -1)
     order = np.lexsort((rows.theta[first, 0], rows.theta[first, 1], rows.frame[first]))

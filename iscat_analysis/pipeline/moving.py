@@ -19,25 +19,30 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.inference.common import (
     CommonAmplitudes,
     common_amplitudes,
-    polish,
     shared_errors,
+    variances_left,
 )
-from iscat_analysis.inference.moving import Ground, Judged, MovingField, Rows
+from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.rows import Ground, Judged, Rows
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.blur import path_variance_nm2
 from iscat_analysis.pipeline.extension import extended
 from iscat_analysis.pipeline.heights import decide_heights
+from iscat_analysis.pipeline.identity import identified
 from iscat_analysis.pipeline.linking import (
     AS_FOUND,
     alone,
     crowded,
     held,
     linked,
+    mass_error,
     mass_places,
+    numbered,
     shares_mass,
     trimmed,
     typical,
+    typical_error,
 )
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress
@@ -50,15 +55,20 @@ LEAST_FRAMES = 20
 ROUNDS = 8
 """Searches of the whole movie; each sees what the fits so far leave over."""
 
-_FIRST_TURNS = 3  # of background and particles between two searches
-_NEXT_TURNS = 8  # between two extensions of the tracks
+RING_SLOPE = 1.7
+"""Distance of the outer rings of a particle over its height, tan 60°: within it, what is much
+fainter than the particle may be what the model leaves over of them."""
+
+_FIRST_TURNS = 2  # of background and particles between two searches
+_NEXT_TURNS = 2  # between two extensions of the tracks
 _BLOCK = 64  # frames that are searched at a time
 _LEAST_POSITIONS = 4  # of a track whose D is fitted
+_USELESS = 300.0  # times the median error of a track: such a place says nothing
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
 _FEW = 2e-3  # of all rows: a search that adds no more is the last
+_FIRST_HEIGHTS = 1  # searches after which every row is put into its fringe
 _HELD_ROUNDS = 2  # in which slow particles are tried where they were not seen
-_BYTES = 6  # of memory for each pixel and frame
 
 IntArray = NDArray[np.int64]
 
@@ -77,12 +87,12 @@ class Moving:
         What the likelihood says of each row.
     converged : ndarray of bool, shape (n,)
         Which fits did.
+    close : ndarray of bool, shape (n,)
+        Which rows are so near to another, or so unlike their track, that masses may be shared.
     variances_nm2 : ndarray, shape (groups,)
         Variance of the path about its mean, of every group of rows.
     diffusion : ndarray, shape (tracks, 2)
         D and its standard error, as the blur was made of [µm²/s].
-    change : float
-        What the last turn changed of the background [its standard deviations].
     field : MovingField
         The movie.
     shared : ndarray, shape (n, 4, 4)
@@ -95,9 +105,9 @@ class Moving:
     ground: Ground
     judged: Judged
     converged: BoolArray
+    close: BoolArray
     variances_nm2: FloatArray
     diffusion: FloatArray
-    change: float
     field: MovingField
     shared: FloatArray
     common: CommonAmplitudes
@@ -153,6 +163,7 @@ def follow(
     check: Callable[[NDArray[Any], int], None],
     pool: ThreadPoolExecutor,
     progress: Progress,
+    inner: tuple[int, int] | None = None,
 ) -> Moving:
     """Find and fit every particle in every frame.
 
@@ -172,6 +183,9 @@ def follow(
         Runs blocks of frames; the result does not depend on its size.
     progress : Progress
         Told the stages.
+    inner : (int, int), optional
+        Frames of the span, counted from its first, beyond which tracks may go on in other spans: a
+        track that reaches out of them is kept however short it is.
 
     Returns
     -------
@@ -181,10 +195,9 @@ def follow(
     Raises
     ------
     DataError
-        The movie is too short, or larger than `compute.memory_limit_mb`.
+        The span is too short.
     """
     config = scene.config
-    _, exposure = exposure_of(config)
     field = _load(scene, movie, camera, span, check, pool, progress)
     follow_power = config.background.power_normalization
     follow_level = config.background.method != "median"
@@ -207,11 +220,21 @@ def follow(
             turns=_FIRST_TURNS,
             coarse=True,
         )
+        if scene.mode == "joint" and number < _FIRST_HEIGHTS:
+            rows = _in_their_fringes(scene, field, ground, rows)
         rows = _credible(scene, field, ground, rows, done)
+        if scene.mode == "joint" and number == 0:  # sharp pictures leave over of gold what is seen
+            rows = linked(config, rows, mass_places(config, field, ground, rows))
+            rows, variances, _ = _moved(config, field, ground, rows)
+            field.set_blurs(variances)
+            rows, ground, done, _ = field.settle(
+                ground, rows, follow_power=follow_power, follow_level=follow_level,
+                turns=_NEXT_TURNS, coarse=True,
+            )  # fmt: skip
         if number and len(rows.frame) <= (1 + _FEW) * before:
             break
     progress("track", ROUNDS, total)
-    rows = linked(config, rows, mass_places(config, field, ground, rows))
+    rows = linked(config, rows, mass_places(config, field, ground, rows), inner=inner)
     resolution = config.optics.wavelength_nm / config.optics.na
     for number in range(ROUNDS):
         rows, ground, done, _ = field.settle(
@@ -222,8 +245,10 @@ def follow(
         rows, added = extended(
             field, ground, rows, resolution_nm=resolution, reach_nm=config.track.max_step_nm
         )
-        rows = linked(config, rows, mass_places(config, field, ground, rows), bridged=True)
-        rows = alone(scene, field, ground, rows)
+        rows = linked(
+            config, rows, mass_places(config, field, ground, rows), bridged=True, inner=inner
+        )
+        rows = alone(scene, field, ground, rows, inner=inner)
         if number < _HELD_ROUNDS and follow_level:
             rows, tried = held(config, field, rows)
             added += tried
@@ -232,38 +257,30 @@ def follow(
         ground = replace(ground, level=found_ground.level) if follow_level else ground
         if added <= _FEW * len(rows.frame):
             break
-    rows = trimmed(rows)
-    if scene.mode == "joint":
-        rows = decide_heights(
-            field, ground, rows,
-            fringe_nm=scene.model.fringe_nm, z_range_nm=config.fit.z_range_nm,
-        )  # fmt: skip
+    rows = _told_apart(config, field, ground, trimmed(rows))
     for stage in range(2):
-        rows, ground, done, change = field.settle(
+        if scene.mode == "joint":
+            rows = _in_their_fringes(scene, field, ground, rows)
+        rows, ground, done, _ = field.settle(
             ground, rows, follow_power=follow_power, follow_level=follow_level,
             coarse=stage == 0,
         )  # fmt: skip
         progress("track", ROUNDS + 1 + stage, total)
         if stage == 0:
-            judged = field.judge(ground, rows)
-            diffusion = _diffusion(config, field, rows, judged)
-            rows, variances = _blurred(rows, diffusion, exposure)
+            rows, variances, diffusion = _moved(config, field, ground, rows)
             field.set_blurs(variances)
-    if follow_level:
-        rows, ground, done = polish(field, ground, rows, follow_power=follow_power)
     judged = field.judge(ground, rows)
     shared = shared_errors(field, ground, rows, judged)
-    inside = np.array([field.holds(theta) for theta in rows.theta], dtype=bool)
-    counted = (
-        done
-        & inside
-        & ~shares_mass(rows, judged)
-        & ~crowded(rows, field, config.detection.min_separation_nm)
-    )
+    near = crowded(rows, field, config.detection.min_separation_nm)
+    unlike = shares_mass(rows, judged)
+    close = near | unlike
+    if scene.mode == "joint":  # a path along z takes as much of the mass, and must count
+        unlike = unlike & crowded(rows, field, scene.roi_px * scene.pixel_nm)
+    counted = done & field.holds(rows.theta) & ~near & ~unlike
     common = common_amplitudes(field, ground, rows, judged, counted, shared)
     progress("track", total, total)
     return Moving(
-        rows, ground, judged, done, variances, diffusion, change, field, shared.covariance, common
+        rows, ground, judged, done, close, variances, diffusion, field, shared.covariance, common
     )
 
 
@@ -283,13 +300,6 @@ def _load(
         raise DataError(
             f"{movie.name}: {frames} frames are too few to tell particles that move from what they "
             f"move over; {LEAST_FRAMES} are needed, or background.frames without particles"
-        )
-    need = _BYTES * frames * shape[0] * shape[1] / 1e6
-    if need > scene.config.compute.memory_limit_mb:
-        raise DataError(
-            f"{movie.name}: {frames} frames take {need:.0f} MB of memory together, more than "
-            f"compute.memory_limit_mb = {scene.config.compute.memory_limit_mb}: raise it, or take "
-            "a part of the movie with fit.frames"
         )
     counts = np.empty((frames, *shape), dtype=np.float32)
     saturated = np.zeros(shape, dtype=bool)
@@ -317,9 +327,12 @@ def _search(
 ) -> Sightings:
     """Find candidates in what the rows leave over."""
     polarity = {"both": 0, "bright": 1, "dark": -1}[scene.config.detection.polarity]
+    side = scene.roi_px
+    if scene.mode == "joint":
+        side += round(2 * RING_SLOPE * scene.config.fit.z_range_nm[1] / field.pixel_nm)
     search = FrameFilter(
         scene.templates, ground.level, field.read_e2, field.used,
-        polarity=polarity, roi_px=scene.roi_px,
+        polarity=polarity, roi_px=side,
     )  # fmt: skip
     starts = rows.starts(field.frames)
     pixel = field.pixel_nm
@@ -339,6 +352,24 @@ def _search(
     )  # fmt: skip
 
 
+def _in_their_fringes(scene: Scene, field: MovingField, ground: Ground, rows: Rows) -> Rows:
+    """Put every row into the fringe that its track says."""
+    return decide_heights(
+        field, ground, rows,
+        fringe_nm=scene.model.fringe_nm, z_range_nm=scene.config.fit.z_range_nm,
+    )  # fmt: skip
+
+
+def _told_apart(config: Config, field: MovingField, ground: Ground, rows: Rows) -> Rows:
+    """Give particles that met their own numbers again."""
+    if not len(rows.frame):
+        return rows
+    error = typical_error(field.judge(ground, rows, brief=True, coarse=True))
+    resolution = config.optics.wavelength_nm / config.optics.na
+    told = identified(rows, near_nm=resolution, error=mass_error(config, rows, error))
+    return numbered(told)
+
+
 def _joined(scene: Scene, rows: Rows, found: Sightings) -> Rows:
     """Add candidates to the rows."""
     n = len(found.frame)
@@ -346,12 +377,9 @@ def _joined(scene: Scene, rows: Rows, found: Sightings) -> Rows:
     theta = np.column_stack([
         found.x_px * pixel, found.y_px * pixel, found.z_nm, found.strength, np.zeros(n),
     ])  # fmt: skip
-    return Rows.of(
-        np.concatenate([rows.frame, found.frame]),
-        np.full(n + len(rows.frame), -1),
-        np.concatenate([rows.theta, theta]),
-        np.concatenate([rows.group, np.zeros(n, dtype=np.int64)]),
-    )
+    unknown = replace(rows, track=np.full(len(rows.frame), -1))
+    blur = int(np.bincount(rows.group).argmax()) if len(rows.group) else 0
+    return unknown.joined(found.frame, np.full(n, -1), theta, np.full(n, blur, dtype=np.int64))
 
 
 def _credible(
@@ -364,7 +392,7 @@ def _credible(
     kept = done & (rows.theta[:, 3] > 0) & (snr > AS_FOUND * scene.templates.threshold)
     near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na)
     starts = rows.starts(field.frames)
-    for t in np.flatnonzero(np.diff(starts) > 1):
+    for t in np.unique(rows.frame[crowded(rows, field, near)]):
         order = starts[t] + np.argsort(-snr[starts[t] : starts[t + 1]])
         for i, a in enumerate(order):
             for b in order[:i]:
@@ -374,17 +402,28 @@ def _credible(
     return rows.only(kept)
 
 
+def _moved(
+    config: Config, field: MovingField, ground: Ground, rows: Rows
+) -> tuple[Rows, FloatArray, FloatArray]:
+    """Give tracks their blurs, with the variances that these number and the D they are made of."""
+    judged = field.judge(ground, rows, brief=True)
+    diffusion = _diffusion(config, field, rows, judged)
+    _, exposure = exposure_of(config)
+    return *_blurred(rows, diffusion, exposure), diffusion
+
+
 def _diffusion(config: Config, field: MovingField, rows: Rows, judged: Judged) -> FloatArray:
     """D of every track and its standard error [µm²/s]; 0 where a track is too short to tell."""
     tracks = int(rows.track.max(initial=-1)) + 1
     out = np.zeros((tracks, 2))
     index = np.flatnonzero(field.free[:4])
-    sigma = np.sqrt(_inverse_diagonal(judged.fisher, index))
+    sigma = np.sqrt(variances_left(judged.fisher, index))
     axes = [0, 1]
     rate, exposure = exposure_of(config)
     for k in range(tracks):
         mine = rows.track == k
-        mine &= np.isfinite(sigma[:, axes]).all(axis=1)
+        error = sigma[:, axes].max(axis=1)
+        mine &= error < _USELESS * np.nanmedian(error[mine])
         if mine.sum() < _LEAST_POSITIONS:
             continue
         found = fit_diffusion(
@@ -393,19 +432,6 @@ def _diffusion(config: Config, field: MovingField, rows: Rows, judged: Judged) -
             exposure_ms=1e3 * exposure,
         )  # fmt: skip
         out[k] = found.d_um2_s, found.sigma_d_um2_s
-    return out
-
-
-def _inverse_diagonal(fisher: FloatArray, index: IntArray) -> FloatArray:
-    """Diagonal of the inverse information (n, 4); NaN where not free or singular."""
-    out = np.full(fisher.shape[:2], np.nan)
-    part = fisher[:, index][:, :, index]
-    scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", part), 1e-300))
-    scaled = part * scale[:, :, None] * scale[:, None, :]
-    good = np.isfinite(scaled).all(axis=(1, 2)) & (np.abs(np.linalg.det(scaled)) > 1e-12)
-    inverse = np.einsum("nii->ni", np.linalg.inv(scaled[good])) * scale[good] ** 2
-    where = np.flatnonzero(good)
-    out[where[:, None], index[None]] = np.where(inverse > 0, inverse, np.nan)
     return out
 
 

@@ -7,11 +7,12 @@ import pandas as pd
 from scipy.special import gammainc, gammaincc, ndtr
 
 from iscat_analysis.bounds.quantum import quantum_information
+from iscat_analysis.inference.common import variances_left
 from iscat_analysis.inference.fit import POOR_FIT_P
 from iscat_analysis.optics.blur import PATH_SPREAD, blurred
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
-from iscat_analysis.pipeline.linking import crowded, shares_mass
 from iscat_analysis.pipeline.moving import Moving
+from iscat_analysis.pipeline.paths import path_covariances
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import EVENT_COLUMNS, PARAMETERS, BoolArray, FloatArray, Status, verdict
 
@@ -20,13 +21,14 @@ LARGEST_LOSS = 0.2
 over a normal spread no longer describes the path: it is too dark by a fifth of the square of this
 share, 1 %."""
 
+_FAINTEST = 1e-3  # of the brightest row: a fit that ended fainter tells nothing of its path
 _HEIGHTS = 65  # at which quantum bounds are computed where z is free; linear in between
 _TESTS = 2
 _APART = 0.05  # relative step of a blur
 
 
 def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame:
-    """Make the rows of ``fits.csv``.
+    """Make a line of ``fits.csv`` for every row.
 
     Parameters
     ----------
@@ -40,14 +42,14 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     Returns
     -------
     pandas.DataFrame
-        Columns `EVENT_COLUMNS`, and ``track``; ``event`` is the track too.  Rows whose particle is
-        outside the field are left out: they were fitted for the sake of the others.  So are tracks
-        with fewer than `track.min_frames` in the field.
+        Columns `EVENT_COLUMNS`, and ``track``; ``event`` is the track too.  In the order of the
+        rows, those outside the field too.
 
     Notes
     -----
-    Errors of the mass hold what is not known of the path in a single frame, `PATH_SPREAD`; all
-    errors hold what the background takes.
+    Errors hold what is not known of the path in a single frame, on a membrane that of the mass,
+    `PATH_SPREAD`, in a volume those of the place too, `path_covariances`; and what the background
+    takes.
     """
     rows, judged, field = moving.rows, moving.judged, moving.field
     model, pixel, free = scene.model, scene.pixel_nm, moving.field.free[:4]
@@ -55,21 +57,21 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     n, amplitude = len(rows.frame), rows.theta[:, 3]
     slope = np.array([abs(model.scale.slope(float(a))) for a in amplitude])
     units = np.column_stack([np.ones((n, 3)), slope])
-    sigma = np.sqrt(diagonal(judged.observed, index)) * units
-    crb = np.sqrt(diagonal(judged.fisher, index)) * units
+    sigma = np.sqrt(variances_left(judged.observed, index)) * units
+    crb = np.sqrt(variances_left(judged.fisher, index)) * units
     small = np.all(np.abs(judged.bias * units)[:, index] <= sigma[:, index], axis=1)
     shift = (small & ~field.on_wall(rows)).astype(float)  # else the expansion means nothing
     estimate = rows.theta[:, :4] - judged.bias * shift[:, None]
     mass = model.scale.mass(estimate[:, 3])
     losses = losses_to_blur(scene, moving)[rows.group]
-    path = PATH_SPREAD * losses * np.abs(mass)
-    sigma[:, 3], crb[:, 3] = np.hypot(sigma[:, 3], path), np.hypot(crb[:, 3], path)
+    path = _path_errors(scene, moving, losses) * units
+    sigma, crb = np.hypot(sigma, path), np.hypot(crb, path)
     own = np.sqrt(np.einsum("nii->ni", moving.shared)) * units
     sigma, crb = np.hypot(sigma, own), np.hypot(crb, own)
     freedom = np.maximum(judged.pixels - index.size, 1)
     p_value = _p_values(judged.chi2, freedom, judged.worst, judged.pixels)
     collected = judged.level / pixel**2 * _areas(model, estimate[:, 2], mass)
-    statuses = [verdict(flags) for flags in _flags(scene, moving, sigma, p_value, losses)]
+    statuses = [verdict(flags) for flags in _flags(moving, sigma, p_value, losses)]
     columns: dict[str, object] = {
         "event": rows.track, "frame": rows.frame + first_frame,
         "n_before": np.full(n, field.frames), "n_after": np.ones(n, dtype=int),
@@ -85,13 +87,29 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     for k, name in enumerate(PARAMETERS):
         columns[f"sigma_{name}"], columns[f"crb_{name}"] = sigma[:, k], crb[:, k]
         columns[f"qcrb_{name}"] = quantum[:, k]
-    table = pd.DataFrame(columns)[list(EVENT_COLUMNS)].assign(track=rows.track)
-    size = np.array([field.used.shape[1], field.used.shape[0]])
-    places = rows.theta[:, :2] / pixel
-    inside = np.all((places >= -0.5) & (places < size - 0.5), axis=1)
+    return pd.DataFrame(columns)[list(EVENT_COLUMNS)].assign(track=rows.track)
+
+
+def tracks_seen(table: pd.DataFrame, inside: BoolArray, min_frames: int) -> pd.DataFrame:
+    """Keep the lines of tracks that were seen long enough.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        From `moving_table`.
+    inside : ndarray of bool, shape (n,)
+        Which particles are in the field: the others were fitted for the sake of these.
+    min_frames : int
+        Lines of a track in the field, at least.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Track by track, in the order of the frames.
+    """
     table = table[inside]
     seen = table.groupby("track")["frame"].transform("size")
-    table = table[seen >= scene.config.track.min_frames]
+    table = table[seen >= min_frames]
     return table.sort_values(["track", "frame"], kind="stable").reset_index(drop=True)
 
 
@@ -110,6 +128,7 @@ def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
     pandas.DataFrame
         By track: ``mass_kda``, ``sigma_mass_kda`` and ``crb_mass_kda``.  The errors hold what the
         background takes, the paths of single frames and the error of D, which sets the blur.
+        ``blur`` is 1 where D, and with it the blur, was told from 0, else 0.
     """
     common, scale = moving.common, scene.model.scale
     known = np.isfinite(common.amplitude)
@@ -121,10 +140,17 @@ def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
     group[moving.rows.track] = moving.rows.group
     loss = losses_to_blur(scene, moving)[group] if len(mass) else np.zeros(0)
     d, sigma_d = np.nan_to_num(moving.diffusion).T if len(mass) else np.zeros((2, 0))
-    path = (PATH_SPREAD * loss) ** 2 / np.maximum(common.frames, 1.0)
+    rows = moving.rows
+    each = _path_errors(scene, moving, losses_to_blur(scene, moving)[rows.group])[:, 3]
+    strength = np.abs(rows.theta[:, 3])
+    share = (each / np.maximum(strength, _FAINTEST * strength.max(initial=1e-9))) ** 2
+    count = np.maximum(np.bincount(rows.track, minlength=len(mass)), 1)
+    path = np.bincount(rows.track, weights=share, minlength=len(mass)) / count
+    path /= np.maximum(common.frames, 1.0)
     blur = (loss * np.where(d > 0, sigma_d / np.where(d > 0, d, 1.0), 0.0)) ** 2
     sigma = np.sqrt(common.variance * slope**2 + mass**2 * (path + blur))
     table = pd.DataFrame({"mass_kda": mass, "sigma_mass_kda": sigma, "crb_mass_kda": sigma})
+    table["blur"] = (d > 0).astype(float)
     return table.set_index(pd.Index(tracks, name="track"))
 
 
@@ -159,32 +185,12 @@ def losses_to_blur(scene: Scene, moving: Moving) -> FloatArray:
     return np.abs(np.array(out, dtype=np.float64))
 
 
-def diagonal(information: FloatArray, index: np.ndarray) -> FloatArray:
-    """Variances that matrices of information leave, shape (n, 4).
-
-    Parameters
-    ----------
-    information : ndarray, shape (n, 4, 4)
-        In (x, y, z, a).
-    index : ndarray of int
-        Free parameters.
-
-    Returns
-    -------
-    ndarray, shape (n, 4)
-        NaN where not free, or where a matrix is not positive definite.
-    """
-    out = np.full(information.shape[:2], np.nan)
-    part = information[:, index][:, :, index]
-    scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", part), 1e-300))
-    scaled = part * scale[:, :, None] * scale[:, None, :]
-    good = np.flatnonzero(np.isfinite(scaled).all(axis=(1, 2)))
-    if not good.size:
-        return out
-    values = np.linalg.eigvalsh(scaled[good])
-    good = good[values[:, 0] > 1e-9]
-    inverse = np.einsum("nii->ni", np.linalg.inv(scaled[good])) * scale[good] ** 2
-    out[good[:, None], index[None]] = inverse
+def _path_errors(scene: Scene, moving: Moving, losses: FloatArray) -> FloatArray:
+    """Errors of (x, y, z, a) of each row that the unknown path of its exposure makes, (n, 4)."""
+    out = np.zeros((len(losses), 4))
+    if moving.field.free[2]:
+        return np.asarray(np.sqrt(np.einsum("nii->ni", path_covariances(scene, moving))))
+    out[:, 3] = PATH_SPREAD * losses * np.abs(moving.rows.theta[:, 3])
     return out
 
 
@@ -200,18 +206,16 @@ def _p_values(
 
 
 def _flags(
-    scene: Scene, moving: Moving, sigma: FloatArray, p_value: FloatArray, losses: FloatArray
+    moving: Moving, sigma: FloatArray, p_value: FloatArray, losses: FloatArray
 ) -> list[list[Status]]:
     """Gather what is to be remarked on each row."""
     rows, free = moving.rows, np.flatnonzero(moving.field.free[:4])
     lost = ~moving.converged | ~np.isfinite(sigma[:, free]).all(axis=1)
     poor = (p_value < POOR_FIT_P) | (losses > LARGEST_LOSS)
-    close = crowded(rows, moving.field, scene.config.detection.min_separation_nm)
-    close |= shares_mass(rows, moving.judged)
     bound = moving.field.on_wall(rows)
     marks = (
         (lost, Status.NOT_CONVERGED), (bound, Status.AT_BOUND), (poor, Status.POOR_FIT),
-        (close, Status.TOO_CLOSE),
+        (moving.close, Status.TOO_CLOSE),
     )  # fmt: skip
     return [[mark for told, mark in marks if told[i]] for i in range(len(rows.frame))]
 
@@ -228,10 +232,10 @@ def _contrasts(model: ForwardModel, z_nm: FloatArray, amplitude: FloatArray) -> 
 
 
 def _heights(z_nm: FloatArray) -> FloatArray:
-    """Heights between which smooth functions of z are interpolated."""
+    """Heights between which smooth functions of z are interpolated; noise may put z below 0."""
     if not len(z_nm):
         return np.zeros(1)
-    low, high = float(z_nm.min()), float(z_nm.max())
+    low, high = np.maximum([z_nm.min(), z_nm.max()], 0.0).tolist()
     return np.array([low]) if low == high else np.linspace(low, high, _HEIGHTS)
 
 
@@ -251,10 +255,9 @@ def _quantum(
     heights = _heights(z_nm)
     kept = np.array([np.diag(quantum_information(model, float(z)).real) for z in heights])
     out = np.full((len(z_nm), 4), np.nan)
-    for k in np.flatnonzero(free):
-        light = collected * np.interp(z_nm, heights, kept[:, k])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            out[:, k] = 1 / np.sqrt(light)
-    if free[3]:
-        out[:, 3] *= np.abs(mass)  # of a relative step
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for k in np.flatnonzero(free):
+            out[:, k] = 1 / np.sqrt(collected * np.interp(z_nm, heights, kept[:, k]))
+        if free[3]:
+            out[:, 3] *= np.abs(mass)  # of a relative step
     return out

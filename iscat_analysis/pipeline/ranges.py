@@ -40,13 +40,33 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
             'background.frames = [0, 200], or a known level with background.method = "known"'
         )
     start = before[1] if before else 0
-    after = config.fit.frames or (start, movie.shape[0])
+    after = fitted_frames(movie, config, before)
     if after[1] <= after[0]:
         raise DataError(
             f"{movie.name}: has {movie.shape[0]} frames and the background takes "
             f"{start} of them, so none is left to fit; change background.frames"
         )
     return before, after
+
+
+def fitted_frames(movie: Stack, config: Config, before: tuple[int, int] | None) -> tuple[int, int]:
+    """Which frames are looked at: ``fit.frames``, or all after the background.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        ``fit.frames``.
+    before : (int, int) or None
+        The background's frames, None where it has none.
+
+    Returns
+    -------
+    (int, int)
+        Half-open; it may be empty.
+    """
+    return config.fit.frames or (before[1] if before else 0, movie.shape[0])
 
 
 def tracked_frames(movie: Stack, config: Config) -> int:
@@ -64,7 +84,5 @@ def tracked_frames(movie: Stack, config: Config) -> int:
     int
         At least 0.
     """
-    before = config.background.frames
-    first = before[1] if before else 0
-    first, last = config.fit.frames or (first, movie.shape[0])
+    first, last = fitted_frames(movie, config, config.background.frames)
     return max(min(last, movie.shape[0]) - first, 0)

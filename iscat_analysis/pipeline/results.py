@@ -27,7 +27,8 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.search.empty import EmptySpread
-from iscat_analysis.species import Efficiency, describe
+from iscat_analysis.species import describe
+from iscat_analysis.species.tables import filter_efficiency, shared_error
 
 _HEIGHTS = 65
 """Heights at which the Holevo bound is computed for a table; linear in between."""
@@ -65,6 +66,8 @@ class Found:
     masses : pandas.DataFrame or None
         Of tracks over a background that was learnt with them: ``mass_kda``, ``sigma_mass_kda`` and
         ``crb_mass_kda`` by the exact likelihood of all frames, indexed by track.
+    parts : tuple of Windows
+        The backgrounds of blocks of frames, where there are several.
     """
 
     table: pd.DataFrame
@@ -74,6 +77,7 @@ class Found:
     repeats: tuple[FloatArray, ...] = ()
     empty: EmptySpread | None = None
     masses: pd.DataFrame | None = None
+    parts: tuple[Windows, ...] = ()
 
 
 def collected_photons(scene: Scene, windows: Windows, event: Event) -> float:
@@ -266,17 +270,13 @@ def _distribution(scene: Scene, good: pd.DataFrame) -> dict[str, Any] | None:
     """
     if "mass_kda" not in FREE_PARAMETERS[scene.mode] or scene.mode == "track":
         return None
-    mass, sigma, snr = (
-        good[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda", "snr")
-    )
-    filter_sigma = _median(np.abs(mass[snr > 0]) / snr[snr > 0])
-    efficiency = Efficiency(scene.templates.threshold, filter_sigma) if filter_sigma else None
+    mass, sigma = (good[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
     found = describe(
         mass,
         sigma,
-        efficiency=efficiency,
+        efficiency=filter_efficiency(good, scene.templates.threshold),
         seed=scene.config.compute.seed,
-        scale_error=_scale_error(good),
+        scale_error=shared_error(good),
         window_frames=int(good["n_after"].max()) if len(good) else None,
     )
     return found.to_dict()
@@ -309,22 +309,6 @@ def _across(
         over = np.hypot(1.0, one["width_kda"] / sigma_median)
         across.append({**{key: one[key] for key in keys}, "spread_over_sigma": float(over)})
     return across
-
-
-def _scale_error(good: pd.DataFrame) -> Callable[[FloatArray], FloatArray] | None:
-    """Read the error that all events share, as a function of mass, off the events themselves.
-
-    Without calibration the species are contrasts in units of the model, and share their error.
-    """
-    if "systematic_mass_kda" not in good or good.empty:
-        return None
-    size = good["mass_kda"].abs().to_numpy(dtype=float)
-    error = good["systematic_mass_kda"].to_numpy(dtype=float)
-    if "systematic_contrast" in good:
-        relative = good["systematic_contrast"] / good["contrast"].abs()
-        error = size * relative.to_numpy(dtype=float)
-    order = np.argsort(size)
-    return lambda masses: np.interp(masses, size[order], error[order])
 
 
 def _median(values: pd.Series[float] | FloatArray) -> float | None:

@@ -1,14 +1,15 @@
-"""Finished chunks on disk, so that an interrupted run can go on where it stopped."""
+"""Finished parts of a movie on disk, so that an interrupted run can go on where it stopped."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import zipfile
 import zlib
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,8 +22,8 @@ from iscat_analysis.records import EventView, FloatArray
 from iscat_analysis.search.empty import EmptySpread
 
 
-class Store:
-    """Finished chunks on disk.
+class Shelf:
+    """Tables and arrays of finished parts on disk.
 
     Parameters
     ----------
@@ -61,72 +62,49 @@ class Store:
             digest.update(np.asarray(value, dtype=np.float64).tobytes())
         self._key = digest.hexdigest()[:32]
 
-    def load(self, number: int) -> Done | None:
-        """Give a finished chunk, or None."""
+    def read(self, number: int) -> tuple[pd.DataFrame, dict[str, Any]] | None:
+        """Give the table and the arrays of a finished part, or None.
+
+        Parameters
+        ----------
+        number : int
+            Of the part.
+
+        Returns
+        -------
+        (pandas.DataFrame, dict of str to ndarray) or None
+            None where it was never finished, or cut short.
+        """
         if self._folder is None:
             return None
         table_path, path = self._paths(number)
         try:
             with np.load(path, allow_pickle=False) as data:
-                table = pd.read_parquet(table_path)
-                images = data["images"]
-                corners = data["corners"]
-                sizes = data["sizes"]
-                views, at = [], 0
-                for i, (row, column) in enumerate(corners):
-                    rows, columns = (int(n) for n in sizes[i])
-                    stack = images[:, at : at + rows * columns].reshape(3, rows, columns)
-                    at += rows * columns
-                    views.append(EventView(i, int(row), int(column), stack[0], stack[1], stack[2]))
-                low, high = (int(n) for n in data["core"])
-                return Done(
-                    core=(low, high),
-                    table=table,
-                    views=tuple(views),
-                    good=data["good"],
-                    light=data["light"],
-                    masked=data["masked"],
-                    saturated=data["saturated"],
-                    strongest=data["strongest"],
-                    ends_e=data["ends_e"],
-                    trajectory=_trajectory(data["trajectory"]),
-                    cause=str(data["cause"]),
-                    empty=_empty(data["squares"], data["number"], data["shared"]),
-                )
+                return pd.read_parquet(table_path), dict(data)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
-            return None  # never finished, or cut short
+            return None
 
-    def save(self, number: int, done: Done) -> None:
-        """Keep a finished chunk; a full disk costs the resumption, not the run."""
+    def write(self, number: int, table: pd.DataFrame, arrays: Mapping[str, Any]) -> None:
+        """Keep a finished part; a full disk costs the resumption, not the run.
+
+        Parameters
+        ----------
+        number : int
+            Of the part.
+        table : pandas.DataFrame
+            One of its tables.
+        arrays : mapping of str to ndarray
+            Everything else.
+        """
         if self._folder is None:
             return
         table_path, path = self._paths(number)
-        flat = [np.stack([v.contrast, v.model, v.residual]).reshape(3, -1) for v in done.views] or [
-            np.empty((3, 0))
-        ]
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            done.table.to_parquet(table_path, index=False)
+            table.to_parquet(table_path, index=False)
             building = path.with_suffix(".tmp")
             with building.open("wb") as file:
-                np.savez(
-                    file,
-                    core=np.array(done.core),
-                    images=np.concatenate(flat, axis=1),
-                    corners=np.array([(v.row_px, v.column_px) for v in done.views]).reshape(-1, 2),
-                    sizes=np.array([v.contrast.shape for v in done.views]).reshape(-1, 2),
-                    good=done.good,
-                    light=done.light,
-                    masked=done.masked,
-                    saturated=done.saturated,
-                    strongest=done.strongest,
-                    ends_e=done.ends_e,
-                    trajectory=_columns(done.trajectory),
-                    cause=np.array(done.cause),
-                    squares=np.empty(0) if done.empty is None else done.empty.squares,
-                    number=np.empty(0) if done.empty is None else done.empty.counts,
-                    shared=np.empty(0) if done.empty is None else done.empty.shared,
-                )
+                np.savez(file, **arrays)
             building.replace(path)
         except OSError:
             self._folder = None
@@ -135,6 +113,97 @@ class Store:
         folder = self._folder or Path()
         stem = f"{self._key}-{number:05d}"
         return folder / f"{stem}.parquet", folder / f"{stem}.npz"
+
+
+class Store(Shelf):
+    """Finished chunks of a landing movie on disk."""
+
+    def load(self, number: int) -> Done | None:
+        """Give a finished chunk, or None."""
+        found = self.read(number)
+        if found is None:
+            return None
+        table, data = found
+        try:
+            low, high = (int(n) for n in data["core"])
+            return Done(
+                core=(low, high),
+                table=table,
+                views=unpacked_views(data),
+                good=data["good"],
+                light=data["light"],
+                masked=data["masked"],
+                saturated=data["saturated"],
+                strongest=data["strongest"],
+                ends_e=data["ends_e"],
+                trajectory=_trajectory(data["trajectory"]),
+                cause=str(data["cause"]),
+                empty=_empty(data["squares"], data["number"], data["shared"]),
+            )
+        except (ValueError, KeyError):
+            return None
+
+    def save(self, number: int, done: Done) -> None:
+        """Keep a finished chunk."""
+        arrays = {
+            "core": np.array(done.core),
+            **packed_views(done.views),
+            "good": done.good,
+            "light": done.light,
+            "masked": done.masked,
+            "saturated": done.saturated,
+            "strongest": done.strongest,
+            "ends_e": done.ends_e,
+            "trajectory": _columns(done.trajectory),
+            "cause": np.array(done.cause),
+            "squares": np.empty(0) if done.empty is None else done.empty.squares,
+            "number": np.empty(0) if done.empty is None else done.empty.counts,
+            "shared": np.empty(0) if done.empty is None else done.empty.shared,
+        }
+        self.write(number, done.table, arrays)
+
+
+def packed_views(views: Sequence[EventView]) -> dict[str, FloatArray]:
+    """Put images into arrays that a file holds.
+
+    Parameters
+    ----------
+    views : sequence of EventView
+        Without posteriors.
+
+    Returns
+    -------
+    dict of str to ndarray
+        For `unpacked_views`.
+    """
+    flat = [np.stack([v.contrast, v.model, v.residual]).reshape(3, -1) for v in views]
+    return {
+        "images": np.concatenate(flat or [np.empty((3, 0))], axis=1),
+        "corners": np.array([(v.row_px, v.column_px) for v in views]).reshape(-1, 2),
+        "sizes": np.array([v.contrast.shape for v in views]).reshape(-1, 2),
+    }
+
+
+def unpacked_views(data: Mapping[str, Any]) -> tuple[EventView, ...]:
+    """Take images out of such arrays.
+
+    Parameters
+    ----------
+    data : mapping of str to ndarray
+        From `packed_views`.
+
+    Returns
+    -------
+    tuple of EventView
+        Numbered from 0.
+    """
+    views, at = [], 0
+    for i, (row, column) in enumerate(data["corners"]):
+        rows, columns = (int(n) for n in data["sizes"][i])
+        stack = data["images"][:, at : at + rows * columns].reshape(3, rows, columns)
+        at += rows * columns
+        views.append(EventView(i, int(row), int(column), stack[0], stack[1], stack[2]))
+    return tuple(views)
 
 
 def _columns(way: Trajectory | None) -> FloatArray:
@@ -185,25 +254,3 @@ def is_resumable(folder: Path) -> bool:
         return bool(summary["interrupted"]) and partial_folder(folder).is_dir()
     except (OSError, ValueError, KeyError, TypeError):
         return False
-
-
-def fingerprint(path: Path) -> str:
-    """Tell a movie's content from another's without reading all of it.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    str
-        Hash of its size, its time of change and its two ends.
-    """
-    with path.open("rb") as file:
-        state = os.fstat(file.fileno())
-        digest = hashlib.sha256(f"{state.st_size} {state.st_mtime_ns}".encode())
-        digest.update(file.read(2**20))
-        file.seek(max(state.st_size - 2**20, 0))
-        digest.update(file.read(2**20))
-    return digest.hexdigest()

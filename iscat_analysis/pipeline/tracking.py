@@ -1,32 +1,31 @@
 """Mode ``track``: every frame is fitted, and the positions are linked into tracks.
 
-`track_movie` learns the background from the frames in which the particles move; `track_particles`
-takes one that was recorded or is known.
+`track_movie` learns the background from the frames in which the particles move, block by block;
+`track_particles` takes one that was recorded or is known.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from iscat_analysis._kernels.moving import box_of
 from iscat_analysis.config import Config
-from iscat_analysis.errors import DataError
-from iscat_analysis.inference.moving import Ground
 from iscat_analysis.movie.background import Check, add_frames, start_power
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.blank import FrameNoise
+from iscat_analysis.pipeline.block_store import Block, BlockStore, analyse_block
+from iscat_analysis.pipeline.blocks import Plan
 from iscat_analysis.pipeline.field import Event, fit_field
-from iscat_analysis.pipeline.moving import Moving, follow
-from iscat_analysis.pipeline.moving_table import common_masses, moving_table
+from iscat_analysis.pipeline.joining import join_blocks
 from iscat_analysis.pipeline.results import Found, Row, table_of, view_of
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import EventView, FloatArray, FrameSource, Progress, Windows
 from iscat_analysis.search.moving import link
+
+_STEPS = 100  # of the progress of a block
 
 
 def learns_background(config: Config) -> bool:
@@ -52,12 +51,14 @@ def track_movie(
     scene: Scene,
     movie: FrameSource,
     camera: Camera,
+    plan: Plan,
+    store: BlockStore,
     *,
     check: Check,
     pool: ThreadPoolExecutor,
     progress: Progress,
 ) -> Found:
-    """Track particles that are there in all frames, over a background learnt with them.
+    """Track particles that are there in all frames, over backgrounds learnt with them.
 
     Parameters
     ----------
@@ -67,87 +68,64 @@ def track_movie(
         The movie.
     camera : Camera
         Counts → photoelectrons.
+    plan : Plan
+        Its blocks of frames.
+    store : BlockStore
+        Keeps the finished ones, and has those of a run that was interrupted.
     check : callable
         Refuses impossible counts.
     pool : ThreadPoolExecutor
-        Runs blocks of frames.
+        Runs parts of blocks.
     progress : Progress
         Told the stages.
 
     Returns
     -------
     Found
-        One row per particle and frame; one view per track, of its clearest frame.
+        One row per particle and frame; one view per track, of its clearest frame.  An interrupt
+        keeps the blocks that are finished.
 
     Raises
     ------
     DataError
-        The frames are not there, or too few, or too many for the memory.
+        There are too few frames.
+    KeyboardInterrupt
+        The user stopped it before the first block was finished.
     """
-    span = scene.config.fit.frames or (0, movie.shape[0])
-    if span[1] > movie.shape[0]:
-        raise DataError(
-            f"{movie.name}: has {movie.shape[0]} frames, but fit.frames asks for "
-            f"{span[0]}:{span[1]}; change fit.frames"
-        )
-    moving = follow(scene, movie, camera, span, check=check, pool=pool, progress=progress)
-    table = moving_table(scene, moving, span[0])
-    windows = _windows(moving, camera, span)
-    views = []
-    if len(table):
-        best = table.loc[table.groupby("track")["snr"].idxmax()]
-        views = [_view(moving, row, span[0]) for row in best.itertuples()]
-    masses = common_masses(scene, moving)
-    return Found(table=table, views=tuple(views), windows=windows, masses=masses)
+    blocks: list[Block] = []
+    count = len(plan.spans)
+    interrupted = False
+    try:
+        for number, span in enumerate(plan.spans):
+            told = progress if count == 1 else _part_of(progress, number, count)
+            block = store.load(number, span)
+            if block is None:
+                block = analyse_block(
+                    scene, movie, camera, span,
+                    goes_on=(number > 0, number + 1 < count),
+                    check=check, pool=pool, progress=told,
+                )  # fmt: skip
+                store.save(number, block)
+            else:
+                told("track", 1, 1)
+            blocks.append(block)
+    except KeyboardInterrupt:
+        if not blocks:
+            raise
+        progress("report", 0, 1)  # what was finished is now gathered and kept, which takes a moment
+        pool.shutdown(wait=False, cancel_futures=True)
+        interrupted = True
+    return join_blocks(scene.config, blocks, camera, interrupted=interrupted)
 
 
-def _windows(moving: Moving, camera: Camera, span: tuple[int, int]) -> Windows:
-    """Put the background and the sum of all frames side by side."""
-    field, ground = moving.field, moving.ground
-    frames = field.frames
-    read = frames * camera.read_variance_e2(field.used.shape)
-    return Windows(
-        before_e=ground.level * ground.power.sum(),
-        after_e=field.counts_e.sum(axis=0, dtype=np.float64),
-        n_before=frames,
-        n_after=frames,
-        power_ratio=1.0,
-        read_variance_before_e2=read,
-        read_variance_after_e2=read,
-        masked=~field.used,
-        saturated=np.zeros_like(field.used),
-        frames_before=span,
-        frames_after=span,
-        power=np.concatenate([ground.power, ground.power]),
-    )
+def _part_of(progress: Progress, number: int, count: int) -> Progress:
+    """Tell the progress of one block as that of all; reading is no stage of its own."""
 
+    def told(stage: str, done: int, total: int) -> None:
+        if stage == "track":
+            progress(stage, round(_STEPS * (number + done / total)), _STEPS * count)
 
-def _view(moving: Moving, row: Any, first_frame: int) -> EventView:
-    """Images of one row: what was measured, the model and what it leaves over."""
-    field, frame = moving.field, int(row.frame) - first_frame
-    rows = moving.rows
-    mine = int(np.flatnonzero((rows.frame == frame) & (rows.track == row.track))[0])
-    theta = rows.theta[mine]
-    spans = [
-        box_of(float(centre), field.pixel_nm, field.roi_px, size)
-        for centre, size in zip((theta[1], theta[0]), field.used.shape, strict=True)
-    ]
-    cut = slice(*spans[0]), slice(*spans[1])
-    others = rows.only(np.arange(len(rows.frame)) != mine)
-    ground: Ground = moving.ground
-    left, alone = (field.residual(ground, r, frame, frame + 1)[0][cut] for r in (rows, others))
-    light = ground.power[frame] * ground.level[cut]
-    used = field.used[cut]
-    noise = np.sqrt(light + (alone - left) + field.read_e2[cut])
-    blank = np.where(used, 1.0, np.nan)
-    return EventView(
-        event=int(row.track),
-        row_px=spans[0][0],
-        column_px=spans[1][0],
-        contrast=blank * alone / light,
-        model=(alone - left) / light,
-        residual=blank * left / noise,
-    )
+    return told
 
 
 def track_particles(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterator
-from typing import Any
+import math
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -42,6 +43,8 @@ FILM_FRAMES = 40
 
 _ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
 _NAMED = 3  # of pairs of tracks that met, in a message
+_TRUNCATED = 0.01  # of D, that is lost with the steps that are too long to be linked
+_ENOUGH = 5.0  # steps of one axis: 4 in 10⁶ in the plane are longer
 _ABSORBS = 1e-6  # of a permittivity, where a refractive index says it all no more
 
 
@@ -136,6 +139,9 @@ def tracks_of(
     met = tracks[tracks["nearest_nm"] < setup.near_nm]
     if len(met):
         tell(_crossings(met, setup))
+    cut = cut_steps(tracks, setup, scene.config.track.max_step_nm)
+    if cut:
+        tell(cut)
     return tracks, {"tracks": len(tracks), "motion": _summary(tracks, setup)}
 
 
@@ -233,6 +239,41 @@ def _crossings(met: pd.DataFrame, setup: TrackSetup) -> str:
     )
 
 
+def cut_steps(tracks: pd.DataFrame, setup: TrackSetup, reach_nm: float) -> str:
+    """Say where steps are left out that make D too small; empty where hardly any are.
+
+    Steps in the plane of variance s² along each axis exceed R with p = exp(−R²/2s²), and without
+    these their mean square is less by R²/2s² p/(1 − p) of itself.
+
+    Parameters
+    ----------
+    tracks : pandas.DataFrame
+        From `describe_tracks`.
+    setup : TrackSetup
+        Knows the frame rate.
+    reach_nm : float
+        ``track.max_step_nm`` [nm].
+
+    Returns
+    -------
+    str
+        One line.
+    """
+    d = tracks.loc[tracks["status"] == TrackStatus.OK, "d_um2_s"].max()
+    if setup.frame_rate_hz is None or not d > 0:
+        return ""
+    step = 1e3 * float(np.sqrt(2 * d / setup.frame_rate_hz))
+    ratio = reach_nm**2 / (2 * step**2)
+    longer = float(np.exp(-ratio))
+    if ratio * longer / (1 - longer) < _TRUNCATED:
+        return ""
+    return (
+        f"particles move {step:.0f} nm from frame to frame along each axis, so that "
+        f"{100 * longer:.2g} % of steps are longer than track.max_step_nm = {reach_nm:g}: they cut "
+        f"tracks and make D too small; set it to {_ENOUGH * step:.0f}"
+    )
+
+
 def _summary(tracks: pd.DataFrame, setup: TrackSetup) -> dict[str, Any]:
     """Count and take medians over the tracks that are ok."""
     good = tracks[tracks["status"] == TrackStatus.OK]
@@ -261,7 +302,7 @@ def make_films(
     scene: Scene,
     movie: FrameSource,
     camera: Camera,
-    windows: Windows,
+    windows: Sequence[Windows],
     fits: pd.DataFrame,
     tracks: pd.DataFrame,
 ) -> tuple[Film, ...]:
@@ -275,8 +316,8 @@ def make_films(
         The movie.
     camera : Camera
         Counts → photoelectrons.
-    windows : Windows
-        The background.
+    windows : sequence of Windows
+        The background, or those of blocks of frames.
     fits : pandas.DataFrame
         One row per particle and frame, with its track.
     tracks : pandas.DataFrame
@@ -288,11 +329,16 @@ def make_films(
         The best first.
     """
     numbers = track_numbers(fits)
-    fits = fits.assign(model=numbers.map(_models(scene, tracks)))
+    models = _models(scene, tracks)
+    seen: dict[int, list[_Seen]] = defaultdict(list)
+    known = fits[numbers.isin(models.keys()) & fits["mass_kda"].notna()]
+    columns = [known[name].tolist() for name in ("frame", "x_nm", "y_nm", "z_nm", "mass_kda")]
+    for track, frame, *theta in zip(numbers[known.index], *columns, strict=True):
+        seen[frame].append(_Seen(models[track], *theta))
     films = []
     for track, why, worst in _chosen(tracks):
         rows = fits[numbers == track].sort_values("frame")
-        films.append(_film(scene, movie, camera, windows, fits, rows, track, why, worst))
+        films.append(_film(scene, movie, camera, windows, seen, rows, track, why, worst))
     return tuple(film for film in films if film is not None)
 
 
@@ -333,8 +379,8 @@ def _film(
     scene: Scene,
     movie: FrameSource,
     camera: Camera,
-    windows: Windows,
-    fits: pd.DataFrame,
+    windows: Sequence[Windows],
+    seen: Mapping[int, Sequence[_Seen]],
     rows: pd.DataFrame,
     track: int,
     why: str,
@@ -349,14 +395,16 @@ def _film(
         start = int(np.nanargmax(rows["chi2_reduced"].to_numpy(float))) - FILM_FRAMES // 2
     start = max(0, min(start, frames.size - FILM_FRAMES))
     shown = rows.iloc[start : start + FILM_FRAMES]
-    region = _square(scene, windows, shown)
+    region = _square(scene, windows[0], shown)
     pictures = []
     for frame in shown["frame"].to_numpy(int):
-        single = add_frames(windows, camera, movie.read(frame, frame + 1), frame)
+        here = next(
+            (w for w in windows if w.frames_after[0] <= frame < w.frames_after[1]), windows[0]
+        )
+        single = add_frames(here, camera, movie.read(frame, frame + 1), frame)
         if scene.config.background.power_normalization:
             single = start_power(single)
-        here = fits[(fits["frame"] == frame) & fits["mass_kda"].notna() & fits["model"].notna()]
-        pictures.append(_picture(scene, single, region, here))
+        pictures.append(_picture(scene, single, region, seen.get(frame, ())))
     contrast, model, residual = (np.array(part) for part in zip(*pictures, strict=True))
     return Film(track, tuple(shown["frame"].astype(int)), why, contrast, model, residual)
 
@@ -372,21 +420,35 @@ def _square(scene: Scene, windows: Windows, rows: pd.DataFrame) -> Region:
     return Region(*spans)
 
 
+class _Seen(NamedTuple):
+    """A particle in a frame [nm, kDa]."""
+
+    model: ForwardModel
+    x: float
+    y: float
+    z: float
+    mass: float
+
+    def image(self, grid: PixelGrid) -> FloatArray | float:
+        """Draw it; 0 where it is too far away."""
+        far = [
+            max(abs(place - axis[0]), abs(place - axis[-1])) + grid.pixel_nm
+            for place, axis in ((self.x, grid.x_nm), (self.y, grid.y_nm))
+        ]
+        if math.hypot(*far) >= self.model.reach_nm:
+            return 0.0
+        height = float(np.clip(self.z, *self.model.z_range_nm))
+        return self.model.image(grid, self.x, self.y, height, self.mass)
+
+
 def _picture(
-    scene: Scene, single: Windows, region: Region, here: pd.DataFrame
+    scene: Scene, single: Windows, region: Region, here: Sequence[_Seen]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Draw data, model and residual of one frame, with all particles whose light is known there."""
     likelihood = region_likelihood(scene, single, region, None)
     model, grid = np.zeros(region.shape), likelihood.grid
-    far = [
-        np.maximum(np.abs(here[name] - axis[0]), np.abs(here[name] - axis[-1])) + grid.pixel_nm
-        for name, axis in (("x_nm", grid.x_nm), ("y_nm", grid.y_nm))
-    ]
-    here = here[np.hypot(*far) < scene.wide.reach_nm]
-    low, high = scene.wide.z_range_nm
-    for row in here.itertuples():
-        height = float(np.clip(row.z_nm, low, high))
-        model += row.model.image(grid, row.x_nm, row.y_nm, height, row.mass_kda)
+    for particle in here:
+        model += particle.image(grid)
     data = likelihood.measured_signal()
     residual = (data - model) * np.sqrt(likelihood.signal_information(model))
     unit = likelihood.data[2] if scene.additive else 1.0

@@ -164,8 +164,16 @@ def species_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
         corrected = width * np.array(curves["model_corrected"])
         panels[0].plot(mass, corrected, "--", color=PURPLE, label="corrected for what was missed")
         panels[1].plot(mass, efficiency, color=INK)
-        at = [s["mass_kda"] for s in found["species"]]
-        panels[1].plot(at, [s["efficiency"] for s in found["species"]], "o", color=VERMILLION)
+        known = [s for s in found["species"] if not s.get("background")]
+        at = [s["mass_kda"] for s in known]
+        panels[1].plot(at, [s["efficiency"] for s in known], "o", color=VERMILLION)
         panels[1].set(xlabel="|mass| [kDa]", title="Chance of detection", ylim=(0, 1.05))
+    for rung in found["species"]:
+        if rung.get("n"):
+            panels[0].axvline(rung["mass_kda"], color=GREY, lw=0.8, ls=":", zorder=0)
+            panels[0].annotate(
+                str(rung["n"]), (rung["mass_kda"], 1.0), xycoords=("data", "axes fraction"),
+                ha="center", va="bottom", color=INK,
+            )  # fmt: skip
     panels[0].legend()
     yield "species", figure

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+from markupsafe import Markup
 
 from iscat_analysis.records import Analysis
 from iscat_analysis.report.context import report_context
@@ -128,4 +129,6 @@ def _cell(value: Any) -> str:
         plain = value.is_integer() or float(f"{value:.2g}") == value
         short = f"{value:.4g}" if plain else f"{value:#.4g}".rstrip(".")
         return short.replace("-", "−")
+    if isinstance(value, Markup):
+        return value
     return str(value).replace("-", "−") if isinstance(value, int) else str(value)

@@ -18,6 +18,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 DPI = 140
 """Resolution of the PNG files."""
 
+PRINT_DPI = 300
+"""The same of figures that have the size of print."""
+
 VERMILLION, BLUE, PURPLE, GREY, INK = "#D55E00", "#0072B2", "#CC79A7", "#8A8F96", "#1B1D21"
 GRID = "#E7E4DD"
 
@@ -46,10 +49,12 @@ STYLE: Any = {
     "legend.frameon": False,
     "svg.fonttype": "none",
     "svg.hashsalt": "iscat-analysis",
+    "pdf.fonttype": 42,  # letters, which can be edited
 }
 """Settings of Matplotlib to draw and save under."""
 
 _NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+_NO_PDF_METADATA = dict.fromkeys(("Creator", "CreationDate", "Producer"))
 
 
 def new_figure(width: float, height: float, *, constrained: bool = True) -> Figure:
@@ -72,7 +77,9 @@ def new_figure(width: float, height: float, *, constrained: bool = True) -> Figu
     return figure
 
 
-def publish(figures: Iterable[tuple[str, Figure]], folder: Path | None = None) -> dict[str, Markup]:
+def publish(
+    figures: Iterable[tuple[str, Figure]], folder: Path | None = None, *, printed: bool = False
+) -> dict[str, Markup]:
     """Write figures as PNG and SVG files, and as SVG for a page.
 
     Equal figures give equal files at any time.
@@ -83,6 +90,8 @@ def publish(figures: Iterable[tuple[str, Figure]], folder: Path | None = None) -
         Each with the name of its files; a generator draws under the style of this package.
     folder : Path, optional
         An existing folder; nothing is written without it.
+    printed : bool
+        The figures have the size that they are printed in: PNG at `PRINT_DPI`, and PDF as well.
 
     Returns
     -------
@@ -97,7 +106,10 @@ def publish(figures: Iterable[tuple[str, Figure]], folder: Path | None = None) -
                 figure.set_layout_engine("none")  # laid out once, not again for each file
             if folder is not None:
                 path = folder / f"{name}.png"
-                figure.savefig(path, dpi=DPI, pil_kwargs={"compress_level": 3})
+                dpi = PRINT_DPI if printed else DPI
+                figure.savefig(path, dpi=dpi, pil_kwargs={"compress_level": 3})
+            if folder is not None and printed:
+                figure.savefig(folder / f"{name}.pdf", metadata=_NO_PDF_METADATA)
             buffer = io.StringIO()
             figure.savefig(buffer, format="svg", metadata=_NO_METADATA)
             if folder is not None:

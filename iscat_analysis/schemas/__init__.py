@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.schemas.answers import Kd, Species, SpeciesComparison
 from iscat_analysis.schemas.bounds import Bounds, Comparison, OpticsBounds
 from iscat_analysis.schemas.calibration import Camera, MassCalibration, Optics, Template
 from iscat_analysis.schemas.fit import Fit, Simulate, Summary
@@ -30,9 +31,12 @@ _DOCUMENTS: Mapping[str, type[BaseModel]] = {
     "camera": Camera,
     "comparison": Comparison,
     "fit": Fit,
+    "kd": Kd,
     "optics": Optics,
     "optics_bounds": OpticsBounds,
     "simulate": Simulate,
+    "species": Species,
+    "species_comparison": SpeciesComparison,
     "summary": Summary,
     "template": Template,
 }
@@ -56,9 +60,11 @@ def schema(name: str) -> dict[str, Any]:
     ----------
     name : str
         ``"fit"``, ``"simulate"`` or ``"bounds"`` for what the command prints with ``--json``, and
-        ``"comparison"`` and ``"optics_bounds"`` for ``iscat bounds --preset`` and ``--for optics``;
-        ``"summary"``, ``"benchmark"``, ``"camera"``, ``"optics"``, ``"template"`` or
-        ``"calibration"`` for the file of that name and what is printed beside it.
+        ``"comparison"`` and ``"optics_bounds"`` for ``iscat bounds --preset`` and ``--for optics``,
+        ``"species_comparison"`` for ``iscat species`` of several tables;
+        ``"summary"``, ``"benchmark"``, ``"camera"``, ``"optics"``, ``"template"``,
+        ``"calibration"``, ``"species"`` or ``"kd"`` for the file of that name and what is printed
+        beside it.
 
     Returns
     -------

@@ -257,6 +257,20 @@ class Changes(Closed):
     undone: Share = key("Share that are undone at once: particles that move")
 
 
+class Blocks(Closed):
+    """Mode track without background frames: blocks of frames that have a background each."""
+
+    number: Count = key("How many")
+    frames: Count = key("Frames of the longest")
+    drift_px: tuple[float, float] | None = key(
+        "Shift of the fixed pattern from the first frames to the last (y, x) [px]; null where it "
+        "was not looked at, or there is none to follow"
+    )
+    drift_over_counting: Number = key(
+        "What that changes of a background within its block, over its counting noise: variances"
+    )
+
+
 class Learned(Closed):
     """What ``optics.calibrate`` did: the test of the optics, and what was learned of them."""
 
@@ -324,11 +338,12 @@ class Summary(Document):
     seed: int | None = key("Seed of the posterior sampler")
     versions: Versions = key("Of this program, Python and the numerical libraries")
     warnings: list[str] = key("What the user should know, one line each")
-    interrupted: bool = maybe("Landing movies: whether an interrupt ended the run early")
+    interrupted: bool = maybe("Whether an interrupt ended the run early")
     background: Background = maybe("Movies with background frames: noise and drift")
     landing: Landing = maybe("Landing movies: windows, search, noise and drift")
     injection: Injection = maybe("With --inject: known particles added to the movie")
     changes: Changes = maybe("Landing movies and mode track: whether particles land or move")
+    blocks: Blocks = maybe("Mode track: blocks of frames that have a background each")
     tracks: Count = maybe("Mode track: tracks found")
     motion: Motion = maybe("Mode track: what the tracks come to")
     across_particles: list[Across] = maybe(

@@ -17,6 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
+from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.search.peaks import SAMPLED, summits
 from iscat_analysis.search.templates import FAR_LOBE, NEAR, SIDELOBE, Templates
@@ -208,6 +209,11 @@ def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int
     ndarray of int, shape (n,)
         Number of the track, from 0.
 
+    Raises
+    ------
+    DataError
+        More particles than can be told apart are in reach of each other.
+
     Notes
     -----
     trackpy (D. B. Allan et al., doi:10.5281/zenodo.4682814), after J. C. Crocker and D. G. Grier,
@@ -227,8 +233,15 @@ def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int
         search_range=reach_nm,
         memory=memory,
     )
-    for span, (_, numbers) in zip(spans, linked, strict=True):
-        tracks[span] = numbers
+    try:
+        for span, (_, numbers) in zip(spans, linked, strict=True):
+            tracks[span] = numbers
+    except trackpy.SubnetOversizeException as trouble:
+        raise DataError(
+            f"too many particles are within track.max_step_nm = {reach_nm:g} of each other to tell "
+            "which is which from frame to frame: lower it to the farthest that one goes, or record "
+            "fewer particles or more frames a second"
+        ) from trouble
     return tracks
 
 

@@ -19,7 +19,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import maximum_filter
 
 from iscat_analysis.config import Detection
-from iscat_analysis.errors import DataError
+from iscat_analysis.errors import FloodError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.random_field import extent, height_reached
 from iscat_analysis.movie.spectrum import NoiseSpectrum
@@ -355,11 +355,13 @@ def refuse_flood(candidates: int, excess_noise: str, frames: str = "") -> None:
 
     Raises
     ------
-    DataError
+    FloodError
         There is such noise, and there are more than `FLOOD` places.
     """
     if excess_noise and candidates > FLOOD:
-        raise DataError(f"{candidates} places{frames} pass the detection threshold: {excess_noise}")
+        raise FloodError(
+            f"{candidates} places{frames} pass the detection threshold: {excess_noise}"
+        )
 
 
 def _lift(

@@ -19,9 +19,13 @@ s_i = max(σ_d, σ_i), and the weights w_k are those of the particles that came,
 The number of species has the least BIC; a parametric bootstrap gives the intervals and says how
 often it would choose that number again.
 
-`describe` is the whole of it.  `events` says what is seen and what is missed, `mixture` maximises
-the likelihood above, `search` tries numbers of species, `bootstrap` repeats the measurement, and
-`curves` holds what is drawn.
+`describe` is the whole of it.  `events` says what is seen and what is missed, `mixture` holds the
+species, `structure` maximises the likelihood above where species or samples share parameters,
+`search` tries numbers of species, `choices` are a number, given masses or a ladder, `bootstrap`
+repeats the measurement, and `curves` holds what is drawn.  `tables` reads events of any program.
+
+`comparison` asks whether two samples are one.  `equilibrium` fits a constant to a series of
+concentrations, with the law of `mass_action`, and `kinetics` the rates of landing and leaving.
 
 A track tells a diffusion coefficient: `displacements` has the likelihood of its steps, with errors
 and motion blur, `diffusion` the estimate and the size that follows, and `motion` asks whether the
@@ -31,6 +35,8 @@ track, with the refractive index (`refraction`) of particles in a volume.
 
 from __future__ import annotations
 
+from iscat_analysis.species.choices import Given, Ladder, LadderFit, Number, Searched
+from iscat_analysis.species.comparison import Comparison
 from iscat_analysis.species.describe import (
     LEAST_EVENTS,
     LEAST_SPECIES,
@@ -54,10 +60,16 @@ __all__ = [
     "LEAST_SPECIES",
     "SPECIES_COLUMNS",
     "AnomalousTest",
+    "Comparison",
     "ConfinementTest",
     "Diffusion",
     "Distribution",
     "Efficiency",
+    "Given",
+    "Ladder",
+    "LadderFit",
+    "Number",
+    "Searched",
     "TrackSetup",
     "anomalous_test",
     "confinement_test",

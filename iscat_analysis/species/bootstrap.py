@@ -10,8 +10,9 @@ from scipy.special import log_ndtr, ndtri_exp
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.mixture import Mixture, climb, height, polish
+from iscat_analysis.species.mixture import Mixture, climb, height
 from iscat_analysis.species.search import joined_starts, split_starts
+from iscat_analysis.species.structure import Limits, Structure, polish, settle
 
 _SUPPORT_DRAWS = 20
 _RIVAL_EVALUATIONS = 150
@@ -36,7 +37,14 @@ class Repeat:
 
 
 def bootstrap(
-    events: Events, best: Mixture, *, draws: int, least: int, seed: int
+    events: Events,
+    best: Mixture,
+    *,
+    draws: int,
+    least: int,
+    seed: int,
+    structure: tuple[Structure, Limits] | None = None,
+    searched: bool = True,
 ) -> tuple[list[Repeat], float]:
     """Fit simulated repetitions; in some of them let BIC choose between neighbouring numbers.
 
@@ -52,6 +60,10 @@ def bootstrap(
         Events in a repetition, at least.
     seed : int
         Chooses the random numbers.
+    structure : (Structure, Limits), optional
+        Which mixtures to fit; default all of as many species.
+    searched : bool
+        Whether BIC chose the number, and shall choose again.
 
     Returns
     -------
@@ -65,9 +77,12 @@ def bootstrap(
     for number in range(draws):
         drawn = draw_events(events, best, max(least, int(rng.poisson(events.x.size))), rng)
         # from the estimate, so that species keep their places
-        fit = polish(drawn, best, tolerance=_TOLERANCE)
+        if structure is None:
+            fit = polish(drawn, best, tolerance=_TOLERANCE)
+        else:
+            fit = settle(drawn, best, *structure, tolerance=_TOLERANCE)
         repeats.append(Repeat(fit, fit.shares(drawn).sum(axis=0), fit.weight * fit.arrived(drawn)))
-        if number < _SUPPORT_DRAWS:
+        if searched and number < _SUPPORT_DRAWS:
             n = drawn.x.size
             agreed.append(
                 all(fit.bic(n) <= rival.bic(n) for rival in _rivals(drawn, fit.by_mass()))

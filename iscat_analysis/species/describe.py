@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.bootstrap import Repeat, bootstrap
+from iscat_analysis.species.choices import Choice, Chosen, Ladder, LadderFit, Searched
 from iscat_analysis.species.curves import (
     CURVE_COLUMNS,
     HISTOGRAM_COLUMNS,
@@ -22,7 +23,6 @@ from iscat_analysis.species.curves import (
 )
 from iscat_analysis.species.events import Efficiency, Events
 from iscat_analysis.species.mixture import Mixture
-from iscat_analysis.species.search import fit_species
 
 Branch = Literal["magnitude", "landing", "leaving"]
 
@@ -48,7 +48,10 @@ particles that came, the other counts of those that were seen; `outlier` where t
 `LEAST_SPECIES`."""
 
 _TWO_SIDED_95 = 1.959964
+_ENDS = (0.025, 0.975)
+_UNBIASED: Literal["weibull"] = "weibull"  # of few draws other quantiles lie too far inside
 _BROAD = 0.4  # width over mass
+_NO_LADDER = 0.01  # p-value
 _DIGITS = 6  # of the curves in summary.json
 
 
@@ -79,6 +82,8 @@ class Distribution:
         Of the bootstrap.
     notes : tuple of str
         What the user should know, one sentence each.
+    ladder : LadderFit or None
+        The monomer, where species are a ladder.
     """
 
     species: pd.DataFrame
@@ -92,6 +97,7 @@ class Distribution:
     draws: int
     seed: int
     notes: tuple[str, ...] = ()
+    ladder: LadderFit | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Give what ``summary.json`` holds under ``distribution``.
@@ -101,7 +107,9 @@ class Distribution:
         dict
             Nested plain values, curves by column.
         """
+        ladder = {} if self.ladder is None else {"ladder": asdict(self.ladder)}
         return {
+            **ladder,
             "branch": self.branch,
             "events": self.events,
             "species": self.species.to_dict("records"),
@@ -130,6 +138,7 @@ def describe(
     draws: int = 100,
     scale_error: Callable[[FloatArray], FloatArray] | None = None,
     window_frames: int | None = None,
+    choice: Choice | None = None,
 ) -> Distribution:
     """Describe a set of masses as a mixture of species.
 
@@ -155,6 +164,8 @@ def describe(
     window_frames : int, optional
         Frames that the search averages: the efficiency is that of particles that stay as long.  A
         visitor of fewer frames d changes their mean by d/window_frames of its contrast only.
+    choice : Searched, Number, Given or Ladder, optional
+        Which species to look for; default as many as BIC likes, up to `max_species`.
 
     Returns
     -------
@@ -191,18 +202,26 @@ def describe(
         notes.append(f"{events.x.size} events are too few for species; {LEAST_EVENTS} are needed")
         return _undescribed(events, branch, draws, seed, notes)
 
-    fits = fit_species(events, max_species)
-    bic = [fit.bic(events.x.size) for fit in fits]
-    best = fits[int(np.argmin(bic))].by_mass()
-    repeats, support = bootstrap(events, best, draws=draws, least=LEAST_EVENTS, seed=seed)
+    choice = Searched(max_species) if choice is None else choice
+    found = choice.choose(events)
+    best = found.best
+    structure = None
+    if found.structure is not None and found.limits is not None:
+        structure = (found.structure, found.limits)
+    repeats, support = bootstrap(
+        events, best, draws=draws, least=LEAST_EVENTS, seed=seed, structure=structure,
+        searched=found.searched,
+    )  # fmt: skip
     scale = np.zeros(best.mean.shape) if scale_error is None else scale_error(best.mean)
-    species = _table(events, best, repeats, mass[usable] > 0, scale, window_frames)
+    species = _table(events, found, repeats, mass[usable] > 0, scale, window_frames)
+    ladder = _ladder(choice, found, repeats, scale_error) if isinstance(choice, Ladder) else None
+    fits, bic = found.tried, [fit.bic(events.x.size) for fit in found.tried]
     bandwidth = bandwidth_of(events, len(species))
     return Distribution(
         species=species,
         selection=pd.DataFrame(
             {
-                "species": [fit.weight.size for fit in fits],
+                "species": [fit.weight.size - int(found.background) for fit in fits],
                 "log_likelihood": [fit.log_likelihood for fit in fits],
                 "bic": bic,
                 "delta_bic": np.subtract(bic, min(bic)),
@@ -216,19 +235,22 @@ def describe(
         branch=branch,
         draws=draws,
         seed=seed,
-        notes=(*notes, *_remarks(species), *_brief(species, window_frames)),
+        notes=(*notes, *_remarks(species), *_brief(species, window_frames), *_doubts(ladder)),
+        ladder=ladder,
     )
 
 
 def _table(
     events: Events,
-    best: Mixture,
+    found: Chosen,
     repeats: Sequence[Repeat],
     lands: BoolArray,
     scale: FloatArray,
     window_frames: int | None,
 ) -> pd.DataFrame:
     """Lay out the species, with intervals from the repetitions and from the mass scale."""
+    best = found.best
+    known = best.weight.size - int(found.background)
     share = best.shares(events)
     seen = share.sum(axis=0)
 
@@ -236,16 +258,16 @@ def _table(
         if not values:
             nothing = np.full(best.weight.size, math.nan)
             return nothing, nothing
-        low, high = np.quantile(np.array(values), [0.025, 0.975], axis=0)
+        low, high = np.quantile(np.array(values), _ENDS, axis=0, method=_UNBIASED)
         return low, high
 
     mass_low, mass_high = interval([r.mixture.mean for r in repeats])
     width_low, width_high = interval([np.sqrt(r.mixture.variance) for r in repeats])
-    part_low, part_high = interval([r.mixture.weight for r in repeats])
+    part_low, part_high = interval([_fractions(r.mixture.weight, known) for r in repeats])
     count_low, count_high = interval([r.count for r in repeats])
     came_low, came_high = interval([r.corrected for r in repeats])
     means = np.array([r.mixture.mean for r in repeats])
-    return pd.DataFrame(
+    table = pd.DataFrame(
         {
             "mass_kda": best.mean,
             "mass_se": means.std(axis=0, ddof=1) if len(repeats) > 1 else math.nan,
@@ -255,7 +277,7 @@ def _table(
             "width_kda": np.sqrt(best.variance),
             "width_low": width_low,
             "width_high": width_high,
-            "fraction": best.weight,
+            "fraction": _fractions(best.weight, known),
             "fraction_low": part_low,
             "fraction_high": part_high,
             "count": seen,
@@ -272,6 +294,53 @@ def _table(
         },
         columns=list(SPECIES_COLUMNS),
     )
+    if found.structure is not None:
+        table["background"] = np.arange(best.weight.size) >= known
+    if found.steps:
+        table.insert(0, "n", [*found.steps, *[0] * (best.weight.size - known)])
+    return table
+
+
+def _fractions(weight: FloatArray, known: int) -> FloatArray:
+    """Shares among the species; a background has none."""
+    parts = np.full(weight.shape, math.nan)
+    parts[:known] = weight[:known] / weight[:known].sum()
+    return parts
+
+
+def _ladder(
+    choice: Ladder,
+    found: Chosen,
+    repeats: Sequence[Repeat],
+    scale_error: Callable[[FloatArray], FloatArray] | None,
+) -> LadderFit:
+    """Say what the monomer weighs."""
+    monomer, offset = choice.values(found)
+    drawn = np.array([choice.values(found, r.mixture) for r in repeats]).reshape(-1, 2)
+    error, low, high = (np.full(2, math.nan) for _ in range(3))
+    if len(drawn) > 1:
+        error = drawn.std(axis=0, ddof=1)
+        low, high = np.quantile(drawn, _ENDS, axis=0, method=_UNBIASED)
+    scale = np.zeros(1) if scale_error is None else scale_error(np.array([monomer]))
+    below, above = (float(_widening(np.array([r]), scale)[0]) for r in
+                    (monomer - low[0], high[0] - monomer))  # fmt: skip
+    return LadderFit(
+        found.steps,
+        monomer, float(error[0]), float(low[0]) - below, float(high[0]) + above,
+        offset, float(error[1]), float(low[1]), float(high[1]),
+        choice.held, found.p_value,
+    )  # fmt: skip
+
+
+def _doubts(ladder: LadderFit | None) -> list[str]:
+    """Say where a ladder is none."""
+    if ladder is None or not ladder.p_value < _NO_LADDER:
+        return []
+    return [
+        f"the species do not lie at multiples of {ladder.monomer_kda:.4g} kDa (p = "
+        f"{ladder.p_value:.1g} against free masses): give them an `offset`, say what is missed of "
+        "the lightest with `limit_kda` or `above_kda`, or calibrate the mass scale anew"
+    ]
 
 
 def _stay(events: Events, best: Mixture, window_frames: int | None) -> FloatArray:
@@ -291,6 +360,8 @@ def _widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
 
 def _remarks(species: pd.DataFrame) -> list[str]:
     """Say of which species not to believe everything."""
+    if "background" in species:
+        species = species[~species["background"]]
     cases = (
         (
             species["efficiency"] < 0.5,

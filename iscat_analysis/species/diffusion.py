@@ -52,7 +52,7 @@ class Diffusion:
     log_likelihood : float
         At D, of the displacements in nm.
     n_positions : int
-        Frames with a position.
+        Displacements that count, and one.
     covariance_d_um2_s : float
         The covariance-based estimate, which uses neither errors nor exposure, and may be negative.
     covariance_sigma_d_um2_s : float
@@ -81,6 +81,7 @@ def fit_diffusion(
     *,
     frame_rate_hz: float,
     exposure_ms: float | None = None,
+    counted: ArrayLike | None = None,
     level: float = 0.95,
 ) -> Diffusion:
     """Diffusion coefficient of one track: maximum likelihood with errors and motion blur.
@@ -101,6 +102,10 @@ def fit_diffusion(
     exposure_ms : float, optional
         Time over which a frame collects light [ms]; absent, all of the time from frame to frame.
         0 is a flash.
+    counted : array_like of bool, shape (n − 1,), optional
+        Displacements that count, each by the position from which it goes; absent, all.  Where a
+        particle is seen only if it stays, as at the border of the field, the large displacements
+        are missing: those that begin there must be left out, or D comes out too small.  At least 3.
     level : float
         Coverage of the interval.
 
@@ -130,8 +135,9 @@ def fit_diffusion(
     estimate.
     """
     track = gather(
-        frames, positions_nm, sigma_nm, frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms
-    )
+        frames, positions_nm, sigma_nm,
+        frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms, counted=counted,
+    )  # fmt: skip
     if not 0 < level < 1:
         raise ConfigError(f"level = {level!r}: give a coverage between 0 and 1")
     best = most_likely(track)
@@ -147,7 +153,7 @@ def fit_diffusion(
         interval_um2_s=tuple(end / _UM2 for end in _interval(track, best, level)),  # type: ignore[arg-type]
         level=float(level),
         log_likelihood=there.value,
-        n_positions=track.frames.size,
+        n_positions=track.counted.size + 1,
         covariance_d_um2_s=other / _UM2,
         covariance_sigma_d_um2_s=other_sigma / _UM2,
         disagreement=(other - best) / math.sqrt(spare) if spare > 0 else math.nan,
@@ -295,11 +301,13 @@ def _covariance_based(track: Displacements, d_nm2_s: float) -> tuple[float, floa
     σ_k² + σ_{k+1}² of a square is what its two products take off, and so is the blur.  The sum
     d·Q·d has the variance 2 tr (QΣ)².
     """
-    steps, n = track.steps_nm, track.gaps_s.size
-    diagonal = np.ones(n)
-    diagonal[[0, -1]] = 0.0
-    beside = 0.5 * (diagonal[1:] + diagonal[:-1])
-    time = 2 * float(track.gaps_s[1:-1].sum()) * len(steps)
+    steps = track.steps_nm
+    diagonal = np.zeros(track.gaps_s.size)
+    diagonal[1:-1] = track.linked[1:] & track.linked[:-1]
+    if not diagonal.any():
+        return math.nan, math.nan
+    beside = np.where(track.linked, 0.5 * (diagonal[1:] + diagonal[:-1]), 0.0)
+    time = 2 * float(track.gaps_s @ diagonal) * len(steps)
     total = float(np.sum(diagonal * steps**2) + 2 * np.sum(beside * steps[:, 1:] * steps[:, :-1]))
     weights = sparse.diags([beside, diagonal, beside], [-1, 0, 1], format="csr")
     variance = 0.0

@@ -70,6 +70,8 @@ class Displacements:
         Δ, from frame to frame.
     exposure_s : float
         e.
+    counted : ndarray of int, shape (m,)
+        Displacements that count, by the position from which they go.
     """
 
     positions_nm: FloatArray
@@ -77,28 +79,35 @@ class Displacements:
     frames: NDArray[np.int64]
     interval_s: float
     exposure_s: float
+    counted: NDArray[np.int64]
 
     @cached_property
     def gaps_s(self) -> FloatArray:
-        """Time from each position to the next, shape (n − 1,) [s]."""
-        return np.asarray(np.diff(self.frames) * self.interval_s)
+        """Time that each displacement takes, shape (m,) [s]."""
+        return np.asarray(np.diff(self.frames)[self.counted] * self.interval_s)
 
     @cached_property
     def steps_nm(self) -> FloatArray:
-        """Displacements, shape (c, n − 1)."""
-        return np.ascontiguousarray(np.diff(self.positions_nm, axis=1))
+        """Displacements, shape (c, m)."""
+        return np.ascontiguousarray(np.diff(self.positions_nm, axis=1)[:, self.counted])
+
+    @cached_property
+    def linked(self) -> NDArray[np.bool_]:
+        """Whether a displacement ends where the next one begins, shape (m − 1,)."""
+        return np.asarray(np.diff(self.counted) == 1)
 
     @cached_property
     def error(self) -> tuple[FloatArray, FloatArray]:
-        """E: its diagonal, shape (c, n − 1), and the band beside it, (c, n − 2) [nm²]."""
-        variance = self.variance_nm2
-        return variance[:, :-1] + variance[:, 1:], np.ascontiguousarray(-variance[:, 1:-1])
+        """E: its diagonal, shape (c, m), and the band beside it, (c, m − 1) [nm²]."""
+        variance, k = self.variance_nm2, self.counted
+        band = np.where(self.linked, -variance[:, k[1:]], 0.0)
+        return variance[:, k] + variance[:, k + 1], np.ascontiguousarray(band)
 
     @cached_property
     def rate(self) -> tuple[FloatArray, FloatArray]:
-        """A: its diagonal, shape (n − 1,), and the band beside it, (n − 2,) [s]."""
+        """A: its diagonal, shape (m,), and the band beside it, (m − 1,) [s]."""
         blur = self.exposure_s / 3
-        return 2 * (self.gaps_s - blur), np.full(self.gaps_s.size - 1, blur)
+        return 2 * (self.gaps_s - blur), np.where(self.linked, blur, 0.0)
 
     def likelihood(self, d_nm2_s: float) -> Likelihood:
         """Log-likelihood of free diffusion.
@@ -123,6 +132,7 @@ def gather(
     *,
     frame_rate_hz: float,
     exposure_ms: float | None,
+    counted: ArrayLike | None = None,
 ) -> Displacements:
     """Check a track.
 
@@ -137,6 +147,8 @@ def gather(
     frame_rate_hz : float
         As in `fit_diffusion`.
     exposure_ms : float, optional
+        As in `fit_diffusion`.
+    counted : array_like of bool, optional
         As in `fit_diffusion`.
 
     Returns
@@ -212,10 +224,21 @@ def gather(
             "that say nothing beside the others"
         )
     variance = np.broadcast_to(columns**2, places.shape).T
+    going = np.ones(when.size - 1, dtype=bool) if counted is None else np.asarray(counted)
+    if going.shape != (when.size - 1,) or going.dtype != bool:
+        raise DataError(
+            f"counted: has shape {going.shape} of {going.dtype}; give ({when.size - 1},) of bool, "
+            "one for each displacement"
+        )
+    if going.sum() < LEAST_POSITIONS - 1:
+        raise DataError(
+            f"counted: leaves {going.sum()} displacements of {LEAST_POSITIONS - 1} that are needed"
+        )
     return Displacements(
         positions_nm=np.ascontiguousarray(places.T),
         variance_nm2=np.ascontiguousarray(variance),
         frames=when.astype(np.int64),
         interval_s=interval,
         exposure_s=min(exposure, interval),
+        counted=np.flatnonzero(going),
     )

@@ -8,12 +8,13 @@ import numpy as np
 from scipy.special import ndtr
 
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.mixture import Mixture, climb, height, polish
+from iscat_analysis.species.mixture import Mixture, climb, height
+from iscat_analysis.species.structure import polish
 
 _POLISHED = 2  # starts, the best after climbing
 
 
-def fit_species(events: Events, max_species: int) -> list[Mixture]:
+def fit_species(events: Events, max_species: int, *, least: int = 1) -> list[Mixture]:
     """Fit 1, 2, … species; stop after two numbers that BIC likes no better.
 
     Parameters
@@ -22,6 +23,8 @@ def fit_species(events: Events, max_species: int) -> list[Mixture]:
         What was seen.
     max_species : int
         Largest number to try.
+    least : int
+        Smallest number to try all the same.
 
     Returns
     -------
@@ -40,7 +43,7 @@ def fit_species(events: Events, max_species: int) -> list[Mixture]:
         tried = [polish(events, start) for start in climbed[-_POLISHED:]]
         fits.append(max(tried, key=lambda fit: fit.log_likelihood))
         bic = [fit.bic(events.x.size) for fit in fits]
-        if len(fits) - 1 - int(np.argmin(bic)) >= 2:
+        if k >= least and len(fits) - 1 - int(np.argmin(bic)) >= 2:
             break
     return fits
 

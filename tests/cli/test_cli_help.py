@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+from event_tables import draw_series
 from scenes import write_bright_landings
 from sketches import sketch_figures
 from walkers import SETUP, fits_of, walk
@@ -75,6 +76,11 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory, sample_configs) -> Path
     table = table.assign(mass_kda=mass, sigma_mass_kda=8.0, contrast=-3.1e-5 * mass)
     (folder / "standards.iscat").mkdir()
     table.assign(status="ok", flags="").to_csv(folder / "standards.iscat/fits.csv", index=False)
+    totals = np.array([[3.0], [30.0]])
+    for number, one in enumerate(draw_series(random, "dimer", totals, 10.0, [66.0], number=200)):
+        one.to_csv(folder / f"{number}.csv", index=False)
+    rows = pd.DataFrame({"path": ["0.csv", "1.csv"], "concentration_nm": totals[:, 0]})
+    rows.to_csv(folder / "series.csv", index=False)
     (folder / "moving.iscat").mkdir()
     fits = fits_of([walk(random, 30, 0.3)], random)
     fits.to_csv(folder / "moving.iscat/fits.csv", index=False)
@@ -103,6 +109,14 @@ def test_every_example_runs(
     redirected: Path | None = None
     if ">" in arguments:
         arguments, redirected = arguments[:-2], Path(arguments[-1])
+    monkeypatch.setattr("webbrowser.open", lambda _: True)
+    if "view" in arguments:
+        Path("movie.iscat").mkdir()
+        Path("movie.iscat/report.html").write_text("<title>a page</title>", encoding="utf-8")
+    if "samples.csv" in arguments:
+        sketch_figures(monkeypatch)
+        Path("samples.csv").write_text("path,sample\nmovie.tif,protein\n", encoding="utf-8")
+        assert main(["simulate", "--config", "setup.toml", "--out", "movie.tif"]) == 0
     if "movie.tif" in arguments and "simulate" not in arguments:
         assert main(["simulate", "--config", "setup.toml", "--out", "movie.tif"]) == 0
         arguments = [a.replace("0:200", "0:30") for a in arguments]

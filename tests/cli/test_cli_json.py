@@ -57,8 +57,8 @@ def _printed(capsys, *arguments: str) -> Any:
 
 def test_schemas_are_schemas() -> None:
     assert set(schema_names()) == {
-        "benchmark", "bounds", "calibration", "camera", "comparison", "fit", "optics",
-        "optics_bounds", "simulate", "summary", "template",
+        "benchmark", "bounds", "calibration", "camera", "comparison", "fit", "kd", "optics",
+        "optics_bounds", "simulate", "species", "species_comparison", "summary", "template",
     }  # fmt: skip
     for name in schema_names():
         jsonschema.Draft202012Validator.check_schema(schema(name))

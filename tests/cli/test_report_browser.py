@@ -21,6 +21,7 @@ from iscat_analysis.report.style import BLUE, VERMILLION, new_figure, publish
 from iscat_cli import main
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from batch_factory import make_batch_page
 from report_factory import make_analysis, without_events
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -161,6 +162,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory, written: dict[str, Path]) ->
         "one": make_analysis(1),
     }
     texts = {name: render_report(analysis) for name, analysis in analyses.items()}
+    texts |= {f"batch_{n}": make_batch_page(n) for n in (1, 3, 60)}
     texts["document"] = render_page("document.html", DOCUMENT)
     found = dict(written)
     for name, text in texts.items():
@@ -221,7 +223,9 @@ def click(browser: Any, selector: str) -> None:
 
 
 REPORTS = ("mass", "joint", "localize", "track", "darkfield", "one", "landing")
-DOCUMENTS = ("document", "calibration", "camera", "benchmark", "comparison")
+DOCUMENTS = (
+    "document", "calibration", "camera", "benchmark", "comparison", "batch_1", "batch_3", "batch_60"
+)  # fmt: skip
 NAMES = (*REPORTS, "none", *DOCUMENTS)
 
 
@@ -449,3 +453,40 @@ def test_written_tables_sort(browser: Any, pages: dict[str, Path], name: str) ->
         assert sorted(rising) == sorted(falling)
         if len(set(rising)) > 1:
             assert rising != falling
+
+
+QUALITY = "#quality table"
+
+
+def quality_cells(browser: Any, column: int) -> list[str]:
+    script = (
+        "return [...document.querySelectorAll('#quality tbody tr:not([hidden])')]"
+        ".map((row) => row.cells[arguments[0]].textContent)"
+    )
+    return list(browser.execute_script(script, column))
+
+
+def test_a_batch_sorts_narrows_and_links(browser: Any, pages: dict[str, Path]) -> None:
+    show(browser, pages["batch_60"])
+    heads = browser.execute_script(
+        "return [...document.querySelectorAll('#quality th')].map((h) => h.textContent)"
+    )
+    at = heads.index("events")
+    click(browser, f"{QUALITY} th:nth-child({at + 1}) button")
+    counts = [value(text) for text in quality_cells(browser, at)]
+    assert counts == sorted(counts)
+    assert len(counts) == 60
+    browser.execute_script(
+        "const input = document.querySelector('#quality .narrow input');"
+        "input.value = 'cut short'; input.dispatchEvent(new Event('input'));"
+    )
+    assert quality_cells(browser, 0) == ["day/pH 9/movie_59"]
+    links = browser.execute_script(
+        "return [...document.querySelectorAll('#quality a')].map((a) => a.getAttribute('href'))"
+    )
+    assert len(links) == 59
+    assert "movies/day/pH%206/movie_0.iscat/report.html" in links
+    addresses = browser.execute_script(
+        "return [...document.querySelectorAll('[src], link')].map((e) => e.src || e.href)"
+    )
+    assert all(address.startswith("data:") for address in addresses)

@@ -380,7 +380,7 @@ def test_nothing_that_is_read_can_run_code() -> None:
 def test_a_pickle_is_not_a_movie_nor_a_table(tmp_path: Path) -> None:
     path = tmp_path / "movie.npy"
     np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    refuse(path, "NumPy array")
+    refuse(path, "is object of shape")
     refuse(path, "neither an HDF5 file nor a text file", read_events)
 
 

@@ -200,7 +200,7 @@ def test_what_is_no_movie_is_refused(tmp_path: Path, shape: tuple[int, ...]) -> 
 
 
 def test_an_event_table_is_no_movie(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="not a Refeyn movie"):
+    with pytest.raises(DataError, match="no Refeyn movie"):
         open_stack(write_events(tmp_path / "events.h5", "2021"))
     with pytest.raises(DataError, match="without an event table"):
         read_events(write_one_mp(tmp_path / "m.mp", movie()))

@@ -152,13 +152,10 @@ def pseudo_true(track: Displacements, d: float, told: Displacements) -> float:
 def test_what_is_ignored_shows(d: float, ignored: str) -> None:
     """Controls that must fail: the bias is as predicted, far beyond 3 %, and is noticed."""
     track = still(100, 11)
-    wrong = {
+    told = {
         "blur": replace(track, exposure_s=0.0),
         "errors": replace(track, variance_nm2=np.full_like(track.variance_nm2, 1e-2)),
     }[ignored]
-    told = Displacements(
-        wrong.positions_nm, wrong.variance_nm2, wrong.frames, wrong.interval_s, wrong.exposure_s
-    )
     expected = pseudo_true(track, d, told)
     found = repeat(track, d, 200, seed=5, told=told)
     print(

@@ -11,7 +11,8 @@ import pytest
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.inference.common import common_amplitudes, shared_errors
-from iscat_analysis.inference.moving import Ground, MovingField, Rows
+from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.pipeline.extension import extended
 

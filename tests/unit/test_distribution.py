@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, logsumexp
 from scipy.stats import ks_2samp, norm
 
 from iscat_analysis._kernels.mixture import detection_score, mixture_em, mixture_score
@@ -78,6 +78,23 @@ def test_what_detection_takes_off_is_that_of_scipy_and_so_is_its_slope(same_nois
     assert value == pytest.approx(expected, rel=1e-10)
     numerical = approx_fprime(theta, lambda theta: found(theta)[0], 1e-6)
     assert np.allclose(slope, numerical, rtol=1e-4, atol=1e-4)
+
+
+def test_far_from_every_species_the_likelihood_goes_on() -> None:
+    """Where densities vanish in double precision, sums of logarithms take their place."""
+    noise, x = np.array([4.0, 9.0]), np.array([500.0, 15.0])
+    w, m, v = np.array([0.3, 0.7]), np.array([10.0, 20.0]), np.array([1.0, 4.0])
+    spread = np.sqrt(v + noise[:, None])
+    expected = logsumexp(np.log(w) + norm.logpdf(x[:, None], m, spread), axis=1).sum()
+    value, slope = mixture_score(x, noise, w, m, v)
+    assert value == pytest.approx(expected, rel=1e-12)
+    numerical = approx_fprime(m, lambda m: mixture_score(x, noise, w, m, v)[0], 1e-5)
+    assert np.allclose(slope[1], numerical, rtol=1e-3)
+    expected = logsumexp(np.log(w) + log_ndtr((m - 200) / spread), axis=1).sum()
+    value, slope = detection_score(noise, 200.0, 1, w, m, v)
+    assert value == pytest.approx(expected, rel=1e-12)
+    numerical = approx_fprime(m, lambda m: detection_score(noise, 200.0, 1, w, m, v)[0], 1e-5)
+    assert np.allclose(slope[1], numerical, rtol=1e-3, atol=1e-6)
 
 
 def test_em_never_goes_down() -> None:

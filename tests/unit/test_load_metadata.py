@@ -155,13 +155,13 @@ def test_ome_must_cover_every_image_once(path: Path, body: str) -> None:
         open_stack(ome(path, body=body))
 
 
-def test_ome_sets_of_files_are_refused(path: Path) -> None:
+def test_ome_sets_without_their_files_are_refused(path: Path) -> None:
     body = "".join(
         f'<TiffData FirstT="{t}" IFD="0"><UUID FileName="part{t}.ome.tif">urn:uuid:{t}</UUID>'
         "</TiffData>"
         for t in range(5)
     )
-    with pytest.raises(DataError, match=r"set of 5 files \(part0.ome.tif"):
+    with pytest.raises(DataError, match=r"one of 5 files of a movie, of which part0\.ome\.tif"):
         open_stack(ome(path, body=body))
 
 

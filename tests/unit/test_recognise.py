@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from scenes import make_config
 from scipy.ndimage import shift
+from wanderers import wander
 
+from iscat_analysis import fit_movie
+from iscat_analysis.errors import DataError, FloodError
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline.recognise import BLOCK, DOUBT, as_landing, as_moving
 from iscat_analysis.search.changes import Changes, find_changes, spot_of
@@ -120,3 +123,17 @@ def test_few_changes_say_nothing() -> None:
     assert as_landing(Changes(6, 1.0, 0.0), "movie.tif") != ""
     assert as_moving(Changes(1, 0.0, 1.0), "movie.tif") == ""
     assert find_changes(np.ones((4, 8, 8)), SPOT).number == 0
+
+
+def test_what_is_wrong_with_a_moving_movie_is_said_all_the_same() -> None:
+    """That its particles move explains a flood of candidates, and no other error."""
+    movie = wander((200, 64, 64), seed=3, species=((400.0, 0.15, 3), (400.0, 0.8, 2)))
+    with pytest.raises(DataError, match=r"background\.window_frames = 150") as raised:
+        fit_movie(
+            movie.counts,
+            settings={
+                "background.window_frames": 150, "camera.pixel_size_nm": 84.0,
+                "camera.gain_e_per_adu": 20.0, "fit.mode": "mass", "optics.calibrate": "never",
+            },
+        )  # fmt: skip
+    assert not isinstance(raised.value, FloodError)

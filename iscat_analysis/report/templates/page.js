@@ -38,6 +38,16 @@
     });
   });
 
+  document.querySelectorAll(".tall").forEach((box) => {
+    const label = Object.assign(document.createElement("label"), { className: "narrow", textContent: "Rows that contain" });
+    const input = Object.assign(document.createElement("input"), { type: "search" });
+    label.append(input);
+    box.before(label);
+    input.addEventListener("input", () => {
+      [...box.querySelectorAll("tbody tr")].forEach((row) => { row.hidden = !row.textContent.includes(input.value.trim()); });
+    });
+  });
+
   const table = document.getElementById("table");
   if (!table) return;
   const images = JSON.parse(document.getElementById("images").textContent);

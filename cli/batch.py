@@ -1,0 +1,158 @@
+"""`iscat batch`: many movies, one picture."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from iscat_cli.console import Messages, failures, print_result, short, table
+from iscat_cli.options import ConfigOption, DebugOption, QuietOption, SetOption
+
+if TYPE_CHECKING:
+    from iscat_analysis.day import Batch
+
+INCOMPLETE = 3
+ROWS_SHOWN = 40
+
+EXAMPLE = """Example: a table with one row per movie, the standards' masses in it.
+
+    iscat batch samples.csv --config setup.toml --out day
+
+samples.csv: columns path, sample, condition, concentration_nm, replicate,
+role (sample, calibrant, blank, flat), standards; any other is kept, and one
+named as a key of the configuration, as background.frames, sets it.
+
+Job array: --only K/N in every job, then --merge once.
+
+Exit status: 0 done; 2 usage, table or configuration; 3 done, but some movies
+or calibrations failed, which are listed; 130 interrupted, and the same
+command goes on.
+"""
+
+
+def batch(
+    context: typer.Context,
+    samples: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SAMPLES",
+            help="A table of movies, CSV or TOML, or a folder of movies.",
+            show_default=False,
+        ),
+    ],
+    *,
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of the batch; an earlier one is brought up to date.",
+            show_default=False,
+        ),
+    ],
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    standards: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MASSES",
+            help="Masses in the calibrants [kDa], beside those of the table, as in 66,146,480; "
+            "66:0.5 gives one its standard error, otherwise 1 %.",
+            show_default=False,
+        ),
+    ] = None,
+    only: Annotated[
+        str | None,
+        typer.Option(
+            metavar="K/N",
+            help="Analyse the K-th of N parts of the movies, and the calibrations unless another "
+            "part does; no page.",
+            show_default=False,
+        ),
+    ] = None,
+    merge: Annotated[
+        bool, typer.Option("--merge", help="Analyse nothing; make the page of what is finished.")
+    ] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Threads.", show_default=False)
+    ] = None,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Analyse the movies of a day and set them side by side.
+
+    Flats give the camera and calibrants the optics and the mass scale of all other movies. Writes
+    batch.html, movies.csv, species.csv, shifts.csv, events.parquet and figures to the folder, with
+    the result of each movie in movies. What is finished and has not changed is left alone.
+    """
+    messages = Messages(context.command_path, quiet=quiet)
+    with failures(messages, debug=debug):
+        part = _part(only)
+        changes = [*(settings or ()), *([f"compute.workers={workers}"] if workers else [])]
+
+        from iscat_analysis.day import batch as run
+
+        with messages.progress() as progress:
+            found = run(
+                samples,
+                out=out,
+                config=config,
+                settings=changes,
+                standards=standards,
+                only=part,
+                merge=merge,
+                progress=progress,
+                notify=messages.notify,
+                command=context.obj,
+            )
+        _print(found, part)
+        for name, why in found.failed:
+            messages.error(f"{name}: {why}")
+        if found.failed:
+            raise typer.Exit(INCOMPLETE)
+
+
+def _part(text: str | None) -> tuple[int, int] | None:
+    """Read ``K/N``."""
+    from iscat_analysis.errors import ConfigError
+
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*(\d+)\s*/\s*(\d+)\s*", text, flags=re.ASCII)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise ConfigError(f"--only {text}: write it as K/N, as in --only 1/4 for the first of four")
+    return int(match[1]), int(match[2])
+
+
+def _print(found: Batch, part: tuple[int, int] | None) -> None:
+    """Print a line per movie, and what there is now."""
+    done = int((found.movies["state"] == "done").sum())
+    if part is not None:
+        print_result(
+            f"part {part[0]} of {part[1]}: {done} of {len(found.movies)} movies done, "
+            f"{len(found.analysed)} of them now; results in {found.out}"
+        )
+        return
+    shown = table("movie")
+    shown.add_column("sample", no_wrap=True)
+    for heading in ("events", "landings", "species", "main mass [kDa]"):
+        shown.add_column(heading, justify="right", no_wrap=True)
+    shown.add_column("cautions")
+    for row in found.movies.head(ROWS_SHOWN).to_dict("records"):
+        numbers = ("events", "landings", "species", "main_mass_kda")
+        cautions = row["why"] if row["state"] == "failed" else row["cautions"]
+        shown.add_row(
+            str(row["movie"]),
+            str(row["sample"]),
+            *(short(row[name]) for name in numbers),
+            cautions if isinstance(cautions, str) else "",
+        )
+    print_result(shown)
+    if len(found.movies) > ROWS_SHOWN:
+        print_result(f"… and {len(found.movies) - ROWS_SHOWN} more in {found.out / 'movies.csv'}")
+    print_result(
+        f"{done} of {len(found.movies)} movies done, {len(found.analysed)} of them now; "
+        f"results in {found.out}, open {found.page}"
+    )

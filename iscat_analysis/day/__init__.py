@@ -1,0 +1,242 @@
+"""A laboratory's day: many movies, their calibrations, one picture.
+
+`table` reads what there is, `plan` names the results and resolves the configurations, `calibrate`
+makes the calibrations of the day, `run` does one job after another and leaves alone what is
+finished, `gather` and `compare` make tables of all results, and ``report.batch`` the page.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from iscat_analysis.config import Config, configure
+from iscat_analysis.day.calibrate import Day, calibrate_day
+from iscat_analysis.day.gather import Found, read_movie
+from iscat_analysis.day.plan import Movie, Plan, configured, make_plan, part_of
+from iscat_analysis.day.publish import publish_day
+from iscat_analysis.day.run import Outcome, Runner
+from iscat_analysis.day.state import Records, claim_folder
+from iscat_analysis.day.table import read_standards, read_table
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.records import Progress, silent
+
+__all__ = ["Batch", "batch", "read_table"]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What a batch found.
+
+    Attributes
+    ----------
+    out : Path
+        Its folder; ``batch.html`` is in it, unless only a part was analysed.
+    movies : pandas.DataFrame
+        One row per movie: ``movies.csv``; of a part, movie, state and why.
+    species : pandas.DataFrame
+        One row per species and movie: ``species.csv``; empty of a part.
+    analysed : tuple of str
+        Movies that were analysed now; the others were finished before.
+    failed : tuple of (str, str)
+        Movies and calibrations that could not be analysed, or are not yet, each with its reason.
+    """
+
+    out: Path
+    movies: pd.DataFrame
+    species: pd.DataFrame
+    analysed: tuple[str, ...]
+    failed: tuple[tuple[str, str], ...]
+
+    @property
+    def page(self) -> Path:
+        """The page that shows everything."""
+        return self.out / "batch.html"
+
+
+def batch(
+    samples: str | Path,
+    *,
+    out: str | Path,
+    config: str | Path | Mapping[str, Any] | Config | None = None,
+    settings: Mapping[str, Any] | Iterable[str] | None = None,
+    standards: str | Sequence[float] | None = None,
+    only: tuple[int, int] | None = None,
+    merge: bool = False,
+    progress: Progress = silent,
+    notify: Callable[[str], None] | None = None,
+    command: str = "",
+) -> Batch:
+    """Analyse the movies of a day with its calibrations, and put them into one picture.
+
+    Flats come first (camera), then calibrants (optics, line of the masses), then everything else
+    with these.  What is finished and has not changed is left alone; what fails costs only itself.
+
+    Parameters
+    ----------
+    samples : str or Path
+        A table, CSV or TOML, one row per movie; or a folder, whose movies are samples.  Columns:
+        path (relative to the table), sample, condition, concentration_nm, replicate, role
+        (``sample``, ``calibrant``, ``blank`` or ``flat``) and standards, the masses in a calibrant;
+        one named as a key of the configuration, as ``background.frames``, sets it for that movie,
+        and any other is kept.
+    out : str or Path
+        Folder of the batch; it may hold an earlier one, which is brought up to date.
+    config : str, Path, mapping or Config, optional
+        As for `configure`; of all movies.
+    settings : mapping of str to Any, or iterable of str, optional
+        As for `configure`; they win over `config`, the day's calibrations over both, and the table
+        over all.
+    standards : str or sequence of float, optional
+        Masses in the calibrants [kDa], beside those of the table; as text with standard errors, as
+        in ``"66,146:1.5,480"``, otherwise 1 %.
+    only : (int, int), optional
+        Analyse the K-th of N parts of the movies, and make no picture; several parts may be
+        analysed at the same time, on machines that share the folder.
+    merge : bool
+        Make the picture of what is finished, and analyse nothing.
+    progress : Progress
+        Called with the stage and the steps done and in all.
+    notify : callable, optional
+        Told in one line what was done.
+    command : str
+        The command line, for the reports.
+
+    Returns
+    -------
+    Batch
+        Tables, and what failed.
+
+    Raises
+    ------
+    ConfigError
+        The table or the configuration is wrong; row and column are named.
+    DataError
+        The folder holds something else.
+    KeyboardInterrupt
+        The user stopped it; finished movies are kept, and the same call goes on.
+    """
+    if only is not None and (merge or not 1 <= only[0] <= only[1]):
+        raise ConfigError(
+            f"`only` = {only[0]}/{only[1]}: "
+            + ("parts are analysed first, and merged when all are" if merge else "write it as K/N")
+            + ", as in 1/4 for the first of four parts"
+        )
+    table = read_table(Path(samples))
+    try:
+        named = read_standards(standards) if standards is not None else ()
+    except ValueError as error:
+        raise ConfigError(f"`standards`: {error}") from None
+    plan = make_plan(table, configure(config, settings=settings), named)
+    folder = Path(out)
+    claim_folder(folder)
+    tell = notify or (lambda _: None)
+    said = command or f"iscat_analysis.batch({str(samples)!r}, out={str(out)!r})"
+    runner = Runner(folder, Records(folder), merge, progress, tell, said)
+    outcomes: dict[str, Outcome] = {}
+    try:
+        day = calibrate_day(plan, runner)
+        wanted = part_of(plan.movies, only)
+        for number, movie in enumerate(wanted, 1):
+            progress("movies", number - 1, len(wanted))
+            outcomes[movie.name] = _analyse(plan, day, movie, runner)
+            if outcomes[movie.name].ran:
+                tell(f"{number} of {len(wanted)}: {movie.name}: {_short(outcomes[movie.name])}")
+        progress("movies", len(wanted), len(wanted))
+    except KeyboardInterrupt:
+        done = sum(outcome.state == "done" for outcome in outcomes.values())
+        raise KeyboardInterrupt(
+            f"{done} of {len(plan.movies)} movies are finished; the same command goes on"
+        ) from None
+    outcomes = {**{name: day.outcomes[name] for name in _flats(plan)}, **outcomes}
+    failed = [(f"calibration of the {what}", why) for what, why in day.failed]
+    failed += [
+        (name, outcome.why or "not analysed yet")
+        for name, outcome in outcomes.items()
+        if outcome.state != "done"
+    ]
+    flats = _flats(plan)
+    ran = tuple(name for name, each in outcomes.items() if each.ran and name not in flats)
+    if only is not None:
+        rows = [(name, each.state, each.why) for name, each in outcomes.items()]
+        movies = pd.DataFrame(rows, columns=["movie", "state", "why"])
+        return Batch(folder, movies, pd.DataFrame(), ran, tuple(failed))
+    return _gathered(plan, day, outcomes, runner, ran, tuple(failed))
+
+
+def _flats(plan: Plan) -> list[str]:
+    return [flat.name for flat in plan.flats]
+
+
+def _short(outcome: Outcome) -> str:
+    if outcome.state != "done" or outcome.record is None:
+        return f"failed: {outcome.why}"
+    events = outcome.record["events"]
+    return f"{events} event{'' if events == 1 else 's'}"
+
+
+def _result(out: Path, movie: Movie) -> Path:
+    return out / "movies" / f"{movie.name}.iscat"
+
+
+def _analyse(plan: Plan, day: Day, movie: Movie, runner: Runner) -> Outcome:
+    """Analyse a movie with the calibrations of the day."""
+    if movie.name in day.outcomes:  # a calibrant that could not be analysed without, either
+        return day.outcomes[movie.name]
+    try:
+        config = configured(plan.config, day.settings, movie.row)
+    except ConfigError as error:
+        return Outcome("failed", f"{movie.row.path}: with the calibrations of the day: {error}")
+    folder = _result(runner.out, movie)
+    return runner.analyse(f"movies/{movie.name}", movie.row.path, config, folder)
+
+
+def _gathered(
+    plan: Plan,
+    day: Day,
+    outcomes: Mapping[str, Outcome],
+    runner: Runner,
+    ran: tuple[str, ...],
+    failed: tuple[tuple[str, str], ...],
+) -> Batch:
+    """Make tables and page of everything, unless they are there already."""
+    out = runner.out
+    by_path = {movie.row.path: movie for movie in (*plan.flats, *plan.movies)}
+    ordered = [by_path[row.path] for row in plan.table.rows]
+    key = _page_key(plan, day, ordered, outcomes)
+    with runner.records.held("page", runner.notify):
+        page = out / "batch.html"
+        if ran or not page.is_file() or runner.records.read("page").get("key") != key:
+            runner.records.drop("page")
+            found: list[Found] = []
+            for movie in ordered:
+                found.append(read_movie(movie, outcomes[movie.name], _result(out, movie)))
+                runner.progress("gather", len(found), len(ordered))
+            publish_day(plan, day, found, failed, out)
+            runner.records.write("page", {"key": key})
+    text = {"movie": str, "sample": str, "condition": str, "replicate": str}
+    movies, species = (
+        pd.read_csv(out / f"{name}.csv", dtype=text, keep_default_na=True)
+        for name in ("movies", "species")
+    )
+    return Batch(out, movies, species, ran, failed)
+
+
+def _page_key(
+    plan: Plan, day: Day, movies: Sequence[Movie], outcomes: Mapping[str, Outcome]
+) -> str:
+    """Hash what the page is made of."""
+    rows = [
+        [m.name, repr(m.row), o.state, o.why, dict(o.record or {}).get("key")]
+        for m in movies
+        for o in (outcomes[m.name],)
+    ]
+    text = json.dumps([version("iscat-analysis"), str(plan.table.source), repr(day.failed), rows])
+    return hashlib.sha256(text.encode()).hexdigest()

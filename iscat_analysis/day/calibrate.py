@@ -1,0 +1,200 @@
+"""The calibrations of a day: camera from flats, optics and mass from calibrants.
+
+What cannot be calibrated stays as configured, and is told: the movies go on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from iscat_analysis.config import Config
+from iscat_analysis.config.files import read_toml
+from iscat_analysis.day.plan import Movie, Plan, configured
+from iscat_analysis.day.run import Outcome, Runner
+from iscat_analysis.day.state import sha256_of
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie import open_stack
+from iscat_analysis.pipeline.calibrations import camera_calibration, mass_calibration
+
+_OPTICS = (
+    "polarization", "polarization_deg", "analyzer", "na", "attenuation", "mask_na", "focus_nm",
+    "reference_phase_deg", "aberrations_nm", "covariance",
+)  # fmt: skip
+"""What a calibration of the optics measures."""
+
+
+@dataclass(frozen=True)
+class Day:
+    """What the calibrations of a day found.
+
+    Attributes
+    ----------
+    settings : mapping of str to Any
+        Keys of the configuration that they set.
+    outcomes : mapping of str to Outcome
+        Of flats and of calibrants whose first analysis failed, by the movie's name.
+    camera, optics, mass : str
+        Where each comes from, for people.
+    failed : tuple of (str, str)
+        Calibrations that could not be made, each with its reason.
+    standards_kda : tuple of float
+        Standards that the line of the masses goes through [kDa].
+    """
+
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    outcomes: Mapping[str, Outcome] = field(default_factory=dict)
+    camera: str = "as configured"
+    optics: str = "as configured"
+    mass: str = "as configured"
+    failed: tuple[tuple[str, str], ...] = ()
+    standards_kda: tuple[float, ...] = ()
+
+
+def calibrate_day(plan: Plan, runner: Runner) -> Day:
+    """Make the calibrations of a day, as far as they are not made yet.
+
+    Parameters
+    ----------
+    plan : Plan
+        What is to be done.
+    runner : Runner
+        Does it.
+
+    Returns
+    -------
+    Day
+        What every movie is analysed with.
+    """
+    settings: dict[str, Any] = {}
+    outcomes: dict[str, Outcome] = {}
+    failed: list[tuple[str, str]] = []
+    origins = {
+        "mass": "as configured" if plan.config.calibration else "none: the model's own scale"
+    }
+    if plan.flats:
+        measured, found = _camera(plan, runner)
+        outcomes |= found
+        settings |= measured
+        if measured:
+            origins["camera"] = f"flats: {', '.join(n for n, o in found.items() if not o.why)}"
+        else:
+            failed.append(("camera", next(o.why for o in found.values() if o.why)))
+    tables: dict[str, Path] = {}
+    learned: dict[str, Any] | None = None
+    for movie in plan.calibrants:
+        config = configured(plan.config, {**settings, **(learned or {})}, movie.row)
+        folder = runner.out / "calibration" / f"{movie.name}.iscat"
+        outcome = runner.analyse(f"calibrants/{movie.name}", movie.row.path, config, folder)
+        if outcome.state != "done":
+            outcomes[movie.name] = outcome
+            continue
+        tables[movie.name] = folder / "fits.csv"
+        if learned is None and (told := _optics(folder, plan.config)) is not None:
+            learned, origin = told
+            origins["optics"] = f"{origin} by {movie.name}"
+    settings |= learned or {}
+    standards: tuple[float, ...] = ()
+    if plan.standards:
+        outcome, calibration = _mass(plan, tables, runner)
+        if outcome.state == "done":
+            standards = tuple(outcome.record["standards_kda"]) if outcome.record else ()
+            settings["calibration"] = calibration
+            origins["mass"] = f"calibrants: {', '.join(tables)}"
+        else:
+            failed.append(("mass", outcome.why or "not made yet"))
+    return Day(settings, outcomes, failed=tuple(failed), standards_kda=standards, **origins)
+
+
+def _key(*parts: Any) -> str:
+    text = json.dumps([version("iscat-analysis"), *parts])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _camera(plan: Plan, runner: Runner) -> tuple[dict[str, Any], dict[str, Outcome]]:
+    """Measure the camera on the flats that can be read."""
+    outcomes: dict[str, Outcome] = {}
+    good: list[Movie] = []
+    for flat in plan.flats:
+        try:
+            with open_stack(flat.row.path):
+                good.append(flat)
+        except DataError as error:
+            outcomes[flat.name] = Outcome("failed", str(error))
+    if not good:
+        return {}, outcomes
+    configured_offset = plan.config.camera.offset_adu
+    # Zero, the default, and a map say nothing of the level in the dark: the flats have to.
+    known = configured_offset if isinstance(configured_offset, float) else 0.0
+    offset = known or None
+    out = runner.out / "calibration" / "camera"
+    paths = {flat.name: flat.row.path for flat in good}
+
+    def work() -> dict[str, Any]:
+        camera_calibration(
+            list(paths.values()),
+            out,
+            offset_adu=offset,
+            overwrite=True,
+            progress=runner.progress,
+        )
+        return {"inputs": {name: {"sha256": sha256_of(path)} for name, path in paths.items()}}
+
+    outcome = runner.job("camera", _key(offset), paths, out / "camera.toml", work)
+    outcomes |= dict.fromkeys(paths, outcome)
+    if outcome.state != "done":
+        return {}, outcomes
+    measured = read_toml(out / "camera.toml")["camera"]
+    return {f"camera.{key}": value for key, value in measured.items()}, outcomes
+
+
+def _optics(folder: Path, config: Config) -> tuple[dict[str, Any], str] | None:
+    """Read what a calibrant's analysis says of the optics; None where it could not tell."""
+    if config.optics.file is not None:
+        return None
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    told = summary.get("optics", {})
+    if not told or told.get("reason"):
+        return None
+    if not told["calibrated"]:
+        return {}, "confirmed"
+    learned = read_toml(folder / "config.toml")["optics"]
+    keys = {f"optics.{key}": learned[key] for key in _OPTICS if key in learned}
+    return {**keys, "optics.calibrate": "auto"}, "learned"
+
+
+def _mass(plan: Plan, tables: Mapping[str, Path], runner: Runner) -> tuple[Outcome, dict[str, Any]]:
+    """Put the events of all calibrants together and fit the line through the standards."""
+    if not tables:
+        return Outcome("failed", "no calibrant could be analysed"), {}
+    folder = runner.out / "calibration"
+    out = folder / "mass"
+
+    def work() -> dict[str, Any]:
+        events = folder / "calibrants.csv"
+        frames = [pd.read_csv(path) for path in tables.values()]
+        joined = pd.concat([f for f in frames if len(f)] or frames, ignore_index=True)
+        joined.to_csv(events, index=False, lineterminator="\n")
+        found = mass_calibration(
+            events,
+            [mass for mass, _ in plan.standards],
+            out,
+            standards_se_kda=[se for _, se in plan.standards],
+            overwrite=True,
+        )
+        masses = [float(mass) for mass in found.standards["mass_kda"]]
+        hashes = {name: {"sha256": sha256_of(path)} for name, path in tables.items()}
+        return {"standards_kda": masses, "inputs": hashes}
+
+    key = _key(plan.standards)
+    outcome = runner.job("mass", key, tables, out / "calibration.toml", work)
+    if outcome.state != "done":
+        return outcome, {}
+    return outcome, read_toml(out / "calibration.toml")["calibration"]

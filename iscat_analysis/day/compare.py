@@ -1,0 +1,258 @@
+"""Species of many movies that are the same, and whether they shift from sample to sample.
+
+Movies of one sample differ by more than their counting errors: focus, temperature, the surface.
+That scatter τ² is common to the samples and measured on their replicates (DerSimonian and Laird,
+Control. Clin. Trials 7, 177, 1986), for each kind of species.  A sample's value is the mean of its
+movies' weighted by 1/(se² + τ²).  The errors of a shift are widened by what the replicates still
+scatter more than that, and judged by Student's t of their degrees of freedom where they scatter at
+all (Hartung and Knapp, Stat. Med. 20, 3875, 2001).  Without replicates, τ cannot be known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+from scipy.special import ndtr, ndtri, stdtr, stdtrit
+
+from iscat_analysis.records import FloatArray
+
+SAME_MASS = 0.1
+"""Relative distance of the masses up to which species of different movies are the same."""
+
+SHIFT_COLUMNS = (
+    "kind", "kind_mass_kda", "sample", "condition", "reference", "quantity", "value", "se", "low",
+    "high", "movies", "shift", "shift_se", "shift_low", "shift_high", "p_value", "p_holm",
+    "scatter",
+)  # fmt: skip
+"""Columns of ``shifts.csv``: a species' mass [kDa] or share in a sample, the 95 % interval, its
+difference from the reference sample with its interval, the chance of at least that difference where
+there is none, alone and among all that are compared (Holm), and the scatter τ between replicates
+that the errors hold; NaN where there are no replicates."""
+
+_SIGMAS = 3.0  # standard errors within which two masses are the same
+_Z95 = 1.959964
+
+
+def match_species(species: pd.DataFrame) -> pd.DataFrame:
+    """Give species of one mass in different movies one number, their kind.
+
+    The two nearest groups are joined, again and again, as long as they are within `SAME_MASS` or
+    three standard errors, and hold no two species of one movie.
+
+    Parameters
+    ----------
+    species : pandas.DataFrame
+        Columns movie, mass_kda, mass_se, outlier.
+
+    Returns
+    -------
+    pandas.DataFrame
+        The same with the column kind: 1, 2, … by rising mass, 0 for outliers.
+    """
+    real = species[~species["outlier"]].sort_values(["mass_kda", "movie"])
+    masses = real["mass_kda"].to_numpy(float)
+    errors = np.nan_to_num(real["mass_se"].to_numpy(float))
+    groups: list[_Group] = [
+        _Group([i], {movie}, mass, se)
+        for i, movie, mass, se in zip(real.index, real["movie"], masses, errors, strict=True)
+    ]
+    while len(groups) > 1:
+        pairs = [(b.mass / a.mass, k) for k, (a, b) in enumerate(pairwise(groups)) if a.joins(b)]
+        if not pairs:
+            break
+        _, k = min(pairs)
+        groups[k : k + 2] = [groups[k].with_(groups[k + 1])]
+    kind = pd.Series(0, index=species.index, dtype="int64")
+    for number, group in enumerate(groups, 1):
+        kind[group.rows] = number
+    return species.assign(kind=kind)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Species of different movies with one mass."""
+
+    rows: list[int]
+    movies: set[str]
+    mass: float
+    se: float
+
+    def joins(self, other: _Group) -> bool:
+        reach = max(SAME_MASS * self.mass, _SIGMAS * math.hypot(self.se, other.se))
+        return abs(other.mass - self.mass) <= reach and not self.movies & other.movies
+
+    def with_(self, other: _Group) -> _Group:
+        n, m = len(self.rows), len(other.rows)
+        mass = (n * self.mass + m * other.mass) / (n + m)
+        # A group is as wide as one of its members: it shall not creep over its neighbours.
+        rows, movies = self.rows + other.rows, self.movies | other.movies
+        return _Group(rows, movies, mass, min(self.se, other.se))
+
+
+@dataclass(frozen=True)
+class Means:
+    """Means of samples, with errors that hold the scatter between their movies.
+
+    Attributes
+    ----------
+    value, se : ndarray, shape (samples,)
+        Weighted mean and standard error.
+    movies : ndarray, shape (samples,)
+        How many.
+    scatter : float
+        τ, between movies of one sample; NaN without replicates.
+    freedom : float
+        Degrees of freedom of the errors; infinite where they are counting errors alone.
+    """
+
+    value: FloatArray
+    se: FloatArray
+    movies: FloatArray
+    scatter: float
+    freedom: float
+
+
+def sample_means(values: FloatArray, errors: FloatArray, sample: Sequence[int]) -> Means:
+    """Average the movies of each sample.
+
+    Parameters
+    ----------
+    values, errors : ndarray, shape (n,)
+        Of each movie, and standard errors; an error of zero is not known, and the movie is left
+        out.
+    sample : sequence of int
+        The sample of each movie, 0, 1, ….
+
+    Returns
+    -------
+    Means
+        NaN for a sample without movies.
+    """
+    known = np.isfinite(values) & np.isfinite(errors) & (errors > 0)
+    groups = np.asarray(sample)
+    count = int(groups.max(initial=-1)) + 1
+    y, s, g = values[known], errors[known], groups[known]
+    number = np.bincount(g, minlength=count)
+    freedom = int(y.size - np.count_nonzero(number))
+    tau2 = 0.0
+    if freedom > 0:
+        w = 1 / s**2
+        total = np.bincount(g, w, count)
+        mean = np.bincount(g, w * y, count)[g] / total[g]
+        excess = float(np.sum(w * (y - mean) ** 2)) - freedom
+        filled = total > 0
+        squares = np.bincount(g, w**2, count)
+        spread = float(w.sum() - np.sum(squares[filled] / total[filled]))
+        tau2 = max(0.0, excess / spread)
+    w = 1 / (s**2 + tau2)
+    total = np.bincount(g, w, count)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = np.bincount(g, w * y, count) / total
+        variance = np.where(total > 0, 1 / total, math.nan)
+    widening = 1.0
+    if freedom > 0 and tau2 > 0:
+        widening = max(1.0, float(np.sum(w * (y - mean[g]) ** 2)) / freedom)
+    return Means(
+        value=mean,
+        se=np.sqrt(widening * variance),
+        movies=number.astype(np.float64),
+        scatter=math.sqrt(tau2) if freedom > 0 else math.nan,
+        freedom=float(freedom) if tau2 > 0 else math.inf,
+    )
+
+
+def shifts(species: pd.DataFrame, reference: str) -> pd.DataFrame:
+    """Compare every kind of species between the samples.
+
+    Parameters
+    ----------
+    species : pandas.DataFrame
+        With kind, sample, condition, mass_kda, mass_se, share and its interval; one row per
+        species and movie.
+    reference : str
+        The sample that the others are compared with.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns `SHIFT_COLUMNS`, for mass and share; masses are compared without the error of
+        the mass scale, which movies of one day share.
+    """
+    found: list[pd.DataFrame] = []
+    width = (species["share_high"] - species["share_low"]) / (2 * _Z95)
+    species = species.assign(share_se=width)
+    for kind, rows in species[species["kind"] > 0].groupby("kind", sort=True):
+        names = list(dict.fromkeys(rows["sample"]))
+        number = [names.index(name) for name in rows["sample"]]
+        conditions = [rows["condition"][rows["sample"] == name].iloc[0] for name in names]
+        mass = float(np.average(rows["mass_kda"]))
+        for quantity, error in (("mass_kda", "mass_se"), ("share", "share_se")):
+            means = sample_means(
+                rows[quantity].to_numpy(float), rows[error].to_numpy(float), number
+            )
+            table = pd.DataFrame(
+                {
+                    "kind": kind,
+                    "kind_mass_kda": mass,
+                    "sample": names,
+                    "condition": conditions,
+                    "reference": reference,
+                    "quantity": quantity,
+                    "value": means.value,
+                    "se": means.se,
+                    "movies": means.movies,
+                    "scatter": means.scatter,
+                }
+            )
+            found.append(_compared(table, means, reference))
+    if not found:
+        return pd.DataFrame(columns=list(SHIFT_COLUMNS))
+    joined = pd.concat(found, ignore_index=True)
+    return joined.assign(p_holm=holm(joined["p_value"].to_numpy(float)))[list(SHIFT_COLUMNS)]
+
+
+def _compared(table: pd.DataFrame, means: Means, reference: str) -> pd.DataFrame:
+    finite = math.isfinite(means.freedom)
+    reach = float(stdtrit(means.freedom, 0.975)) if finite else float(ndtri(0.975))
+    table["low"], table["high"] = (means.value + sign * reach * means.se for sign in (-1, 1))
+    at = table.index[(table["sample"] == reference) & table["value"].notna()]
+    shift = error = np.full(len(table), math.nan)
+    if len(at):
+        others = (table["sample"] != reference).to_numpy()
+        shift = np.where(others, means.value - means.value[at[0]], math.nan)
+        error = np.where(others, np.hypot(means.se, means.se[at[0]]), math.nan)
+    size = -np.abs(shift / error)
+    tail = stdtr(means.freedom, size) if finite else ndtr(size)
+    return table.assign(
+        shift=shift,
+        shift_se=error,
+        shift_low=shift - reach * error,
+        shift_high=shift + reach * error,
+        p_value=np.minimum(1.0, 2 * tail),
+    )
+
+
+def holm(p_values: FloatArray) -> FloatArray:
+    """Correct p-values for their number (Holm, Scand. J. Stat. 6, 65, 1979).
+
+    Parameters
+    ----------
+    p_values : ndarray, shape (n,)
+        NaN where nothing is compared.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        The smallest family-wise level at which each is rejected; NaN where it was.
+    """
+    corrected = np.full(p_values.shape, math.nan)
+    known = np.flatnonzero(np.isfinite(p_values))
+    order = known[np.argsort(p_values[known], kind="stable")]
+    steps = p_values[order] * np.arange(order.size, 0, -1)
+    corrected[order] = np.minimum(1.0, np.maximum.accumulate(steps))
+    return corrected

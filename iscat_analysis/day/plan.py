@@ -1,0 +1,165 @@
+"""From the table to a plan: what each movie is called, and its configuration."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from iscat_analysis.config import Config, configure
+from iscat_analysis.day.table import Row, Table
+from iscat_analysis.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Movie:
+    """One movie and where its results go.
+
+    Attributes
+    ----------
+    name : str
+        Of its result, with slashes where the movie lies in folders beside the table.
+    row : Row
+        What the table says of it.
+    """
+
+    name: str
+    row: Row
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be done.
+
+    Attributes
+    ----------
+    table : Table
+        As it was read.
+    config : Config
+        Of the day, before its calibrations.
+    flats, calibrants, movies : tuple of Movie
+        By name; `movies` is everything with particles, the calibrants included.
+    standards : tuple of (float, float)
+        Masses in the calibrants and their standard errors [kDa].
+    """
+
+    table: Table
+    config: Config
+    flats: tuple[Movie, ...]
+    calibrants: tuple[Movie, ...]
+    movies: tuple[Movie, ...]
+    standards: tuple[tuple[float, float], ...]
+
+
+def make_plan(
+    table: Table, config: Config, standards: tuple[tuple[float, float], ...] = ()
+) -> Plan:
+    """Lay out the work of a day.
+
+    Parameters
+    ----------
+    table : Table
+        From `read_table`.
+    config : Config
+        Of the day.
+    standards : tuple of (float, float)
+        Masses in the calibrants, beside those that the table names [kDa].
+
+    Returns
+    -------
+    Plan
+        Independent of the order of the rows.
+
+    Raises
+    ------
+    ConfigError
+        A row sets a key that does not exist or to what is impossible, or standards are given where
+        there is no calibrant.
+    """
+    for row in table.rows:
+        try:
+            configured(config, {}, row)
+        except ConfigError as error:
+            raise ConfigError(f"{table.source}: {row.where}: {error}") from None
+    movies = sorted(
+        (Movie(name, row) for name, row in zip(_names(table), table.rows, strict=True)),
+        key=lambda movie: movie.name,
+    )
+    calibrants = tuple(m for m in movies if m.row.role == "calibrant")
+    if standards and not calibrants:
+        raise ConfigError(
+            f"{table.source}: standards are given, but no movie has the role calibrant; give the "
+            "movie of the standards that role"
+        )
+    known = dict(standard for movie in calibrants for standard in movie.row.standards)
+    return Plan(
+        table=table,
+        config=config,
+        flats=tuple(m for m in movies if m.row.role == "flat"),
+        calibrants=calibrants,
+        movies=tuple(m for m in movies if m.row.role != "flat"),
+        standards=tuple(sorted({**known, **dict(standards)}.items())),
+    )
+
+
+def configured(config: Config, day: Mapping[str, Any], row: Row) -> Config:
+    """Give the configuration of one movie: the day's calibrations, then what its row says.
+
+    Parameters
+    ----------
+    config : Config
+        Of the day.
+    day : mapping of str to Any
+        Keys that calibrations of the day set.
+    row : Row
+        Of the movie.
+
+    Returns
+    -------
+    Config
+        Validated.
+    """
+    calibrated = configure(config, settings=day) if day else config
+    return configure(calibrated, settings=row.settings) if row.settings else calibrated
+
+
+def part_of(movies: tuple[Movie, ...], only: tuple[int, int] | None) -> tuple[Movie, ...]:
+    """Give one of several equal parts of the movies.
+
+    Parameters
+    ----------
+    movies : tuple of Movie
+        By name.
+    only : (int, int), optional
+        Which part, from 1, of how many; all without it.
+
+    Returns
+    -------
+    tuple of Movie
+        Every N-th movie.
+    """
+    return movies if only is None else movies[only[0] - 1 :: only[1]]
+
+
+def _names(table: Table) -> list[str]:
+    """Name each result after its movie, with as many folders as it takes to tell it from others."""
+    paths = [row.path for row in table.rows]
+    same = Counter(path.with_suffix("") for path in paths)
+    ends = [
+        f"{path.stem}-{path.suffix[1:]}" if same[path.with_suffix("")] > 1 else path.stem
+        for path in paths
+    ]
+    folders = [
+        len(path.relative_to(table.root).parts) - 1 if path.is_relative_to(table.root) else 0
+        for path in paths
+    ]
+    while True:
+        names = [
+            "/".join([*path.parent.parts[len(path.parent.parts) - n :], end])
+            for path, end, n in zip(paths, ends, folders, strict=True)
+        ]
+        many = Counter(names)
+        if len(many) == len(names):
+            return names
+        folders = [n + (many[name] > 1) for n, name in zip(folders, names, strict=True)]

@@ -1,0 +1,174 @@
+"""One job at a time: what is finished is left alone, what fails costs only itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from iscat_analysis.config import Config
+from iscat_analysis.day.state import Records, key_of, saw, seen
+from iscat_analysis.errors import IscatError
+from iscat_analysis.movie import open_stack
+from iscat_analysis.pipeline import fit_stack
+from iscat_analysis.records import Progress
+
+Notify = Callable[[str], None]
+
+State = Literal["done", "failed", "missing"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a job.
+
+    Attributes
+    ----------
+    state : str
+        ``"done"``, ``"failed"``, or ``"missing"``: not yet run as it is now asked for.
+    why : str
+        One line that says what went wrong.
+    ran : bool
+        Whether it was run now.
+    record : mapping of str to Any
+        What is kept of it.
+    """
+
+    state: State
+    why: str = ""
+    ran: bool = False
+    record: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Runner:
+    """Runs jobs that are not finished yet.
+
+    Attributes
+    ----------
+    out : Path
+        Folder of the batch.
+    records : Records
+        What is finished.
+    dry : bool
+        Run nothing, and say what is missing.
+    progress : Progress
+        Told how far the stages of a movie are.
+    notify : callable
+        Told in one line what was done.
+    command : str
+        The command line, for the reports.
+    """
+
+    out: Path
+    records: Records
+    dry: bool
+    progress: Progress
+    notify: Notify
+    command: str
+
+    def job(
+        self,
+        name: str,
+        key: str,
+        inputs: Mapping[str, Path],
+        result: Path,
+        work: Callable[[], Mapping[str, Any]],
+    ) -> Outcome:
+        """Do a job unless it is done.
+
+        Parameters
+        ----------
+        name : str
+            Of its record.
+        key : str
+            Hash of what it is asked for.
+        inputs : mapping of str to Path
+            Files that it reads, by name.
+        result : Path
+            A file that is there once it is done.
+        work : callable
+            Does it, and gives what is to be kept in its record; a fingerprint of every input is
+            added.
+
+        Returns
+        -------
+        Outcome
+            Of the job.
+        """
+        with self.records.held(name, self.notify):
+            record = self.records.read(name)
+            files = record.get("inputs", {})
+            current = record.get("key") == key and set(files) == set(inputs)
+            current = current and all(saw(files[each], path) for each, path in inputs.items())
+            if current and record["state"] == "done" and result.is_file():
+                return Outcome("done", record=record)
+            if self.dry:
+                failed = current and record["state"] == "failed"
+                return Outcome("failed" if failed else "missing", record.get("why", ""))
+            self.records.drop(name)
+            before = {each: {"fingerprint": seen(path)} for each, path in inputs.items()}
+            kept: Mapping[str, Any] = {}
+            why = ""
+            try:
+                kept = work()
+            except IscatError as error:
+                why = str(error)
+            except Exception as error:  # noqa: BLE001  (the other movies go on)
+                if isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+                    raise KeyboardInterrupt from None  # as it looks out of compiled code
+                why = f"unexpected {type(error).__name__}: {error}"
+            state: State = "failed" if why else "done"
+            hashes = kept.get("inputs", {})
+            record = {
+                **kept,
+                "key": key,
+                "state": state,
+                "why": why,
+                "inputs": {
+                    each: {**found, **hashes.get(each, {})} for each, found in before.items()
+                },
+            }
+            self.records.write(name, record)
+            return Outcome(state, why, ran=True, record=record)
+
+    def analyse(self, name: str, movie: Path, config: Config, folder: Path) -> Outcome:
+        """Fit a movie unless that is done.
+
+        Parameters
+        ----------
+        name : str
+            Of its record.
+        movie : Path
+            The file.
+        config : Config
+            As it is to be analysed.
+        folder : Path
+            For the result.
+
+        Returns
+        -------
+        Outcome
+            Its record has `shape` of the movie and the number of `events`.
+        """
+
+        def work() -> dict[str, Any]:
+            with open_stack(movie) as stack:
+                shape = [int(n) for n in stack.shape]
+            analysis = fit_stack(
+                movie,
+                config,
+                out=folder,
+                overwrite=True,
+                progress=self.progress,
+                command=self.command,
+            )
+            summary = analysis.summary
+            return {
+                "shape": shape,
+                "events": summary["events"],
+                "inputs": {"movie": {"sha256": summary["input"]["sha256"]}},
+            }
+
+        return self.job(name, key_of(config), {"movie": movie}, folder / "summary.json", work)

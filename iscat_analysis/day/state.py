@@ -1,0 +1,269 @@
+"""What is finished, on disk: records beside the results, and locks for runs at the same time.
+
+A result is as its job asks for if its record holds the job's key, a hash of the program's version
+and the resolved configuration, and the movie is the one that the record saw: of the same size, time
+and ends, or, where it was copied, of the same SHA-256.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from iscat_analysis.config import Config, config_to_toml
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie.addresses import fingerprint
+
+STATE = ".batch"
+"""Folder of records and locks; it marks a folder as that of a batch."""
+
+_POLL_S = 0.2  # between two looks at a lock that another run holds
+_PATIENCE_S = 2.0  # after which the waiting is told
+_MAPS = ("gain_e_per_adu", "offset_adu", "read_noise_e")
+
+
+class Records:
+    """Records and locks of one batch.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the batch.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self._folder = out / STATE
+
+    def read(self, name: str) -> dict[str, Any]:
+        """Give the record of a job.
+
+        Parameters
+        ----------
+        name : str
+            Of the job.
+
+        Returns
+        -------
+        dict
+            Empty where there is none, or it cannot be read.
+        """
+        try:
+            found = json.loads(self._path(name).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    def write(self, name: str, values: Mapping[str, Any]) -> None:
+        """Keep the record of a job, whole or not at all.
+
+        Parameters
+        ----------
+        name : str
+            Of the job.
+        values : mapping
+            Plain values.
+        """
+        path = self._path(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, json.dumps(dict(values), indent=1, sort_keys=True) + "\n")
+
+    def drop(self, name: str) -> None:
+        """Forget a job, before its result is changed.
+
+        Parameters
+        ----------
+        name : str
+            Of the job.
+        """
+        self._path(name).unlink(missing_ok=True)
+
+    @contextmanager
+    def held(self, name: str, notify: Callable[[str], None]) -> Iterator[None]:
+        """Wait until no other run does a job, and keep others from it.
+
+        Parameters
+        ----------
+        name : str
+            Of the job.
+        notify : callable
+            Told where it takes long.
+
+        Yields
+        ------
+        None
+        """
+        path = self._path(name).with_suffix(".lock")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            _wait(handle, lambda: notify(f"waiting for another run, which is at {name}"))
+            yield
+        finally:
+            os.close(handle)  # the system releases the lock however the process ends
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}.json"
+
+
+if sys.platform == "win32":  # without locks two runs may do the same job, with the same result
+
+    def _wait(handle: int, tell: Callable[[], None]) -> None:
+        del handle, tell
+
+else:
+    import fcntl
+
+    def _wait(handle: int, tell: Callable[[], None]) -> None:
+        """Take a lock; go on without where the disk knows none."""
+        due = time.monotonic() + _PATIENCE_S
+        while True:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if time.monotonic() > due:
+                    tell()
+                    due = float("inf")
+                time.sleep(_POLL_S)
+            except OSError:
+                return
+            else:
+                return
+
+
+def claim_folder(out: Path) -> None:
+    """Make the folder of a batch, and refuse one that holds something else.
+
+    Parameters
+    ----------
+    out : Path
+        May hold an earlier batch.
+
+    Raises
+    ------
+    DataError
+        It is a file, holds something else, or cannot be made.
+    """
+    state = out / STATE
+    try:
+        if out.is_dir() and not state.is_dir() and (held := sorted(p.name for p in out.iterdir())):
+            raise DataError(
+                f"{out}: holds {held[0]!r} and is no earlier batch, and is left alone; choose "
+                "another `out`"
+            )
+        state.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise DataError(f"{out}: is a file, not a folder; choose another `out`") from None
+    except OSError as error:
+        raise DataError(f"{out}: cannot be made ({error.strerror}); choose another `out`") from None
+
+
+def write_whole(path: Path, content: str) -> None:
+    """Write a text file that is there whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        Replaced once everything is written.
+    content : str
+        In UTF-8.
+    """
+    building = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        building.write_text(content, encoding="utf-8")
+        building.replace(path)
+    finally:
+        building.unlink(missing_ok=True)
+
+
+def key_of(config: Config, *further: Any) -> str:
+    """Hash what an analysis is asked for.
+
+    Parameters
+    ----------
+    config : Config
+        Workers and memory do not count: they change no result.
+    *further : Any
+        Plain values that count as well.
+
+    Returns
+    -------
+    str
+        In hexadecimal.
+    """
+    compute = type(config.compute)(seed=config.compute.seed)
+    settings = config.model_copy(update={"compute": compute})
+    maps = [sha256_of(Path(v)) for n in _MAPS if isinstance(v := getattr(config.camera, n), str)]
+    text = json.dumps(
+        [version("iscat-analysis"), config_to_toml(settings, comments=False), maps, *further]
+    )
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def sha256_of(path: Path) -> str:
+    """Hash a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    str
+        In hexadecimal; empty where it cannot be read, which whoever opens it will say.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return ""
+
+
+def saw(record: Mapping[str, Any], path: Path) -> bool:
+    """Tell whether a movie is the one that a record is of.
+
+    Parameters
+    ----------
+    record : mapping
+        With `fingerprint` and `sha256`.
+    path : Path
+        The movie.
+
+    Returns
+    -------
+    bool
+        By its size, time and ends; where these differ, by its SHA-256.
+    """
+    try:
+        if record.get("fingerprint") == fingerprint([path]):
+            return True
+    except OSError:
+        return False
+    return bool(record.get("sha256")) and record["sha256"] == sha256_of(path)
+
+
+def seen(path: Path) -> str:
+    """Hash a movie's size, time and ends; empty where it cannot be read.
+
+    Parameters
+    ----------
+    path : Path
+        The movie.
+
+    Returns
+    -------
+    str
+        In hexadecimal.
+    """
+    try:
+        return fingerprint([path])
+    except OSError:
+        return ""

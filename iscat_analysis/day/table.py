@@ -1,0 +1,349 @@
+"""The table of a day: one row per movie, as CSV, as TOML, or the movies of a folder.
+
+What is wrong is said by row and column, before any movie is opened, and all of it at once.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import io
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from iscat_analysis.calibration.mass import STANDARD_ERROR
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
+
+ROLES = ("sample", "calibrant", "blank", "flat")
+"""What a movie is for."""
+
+COLUMNS = (
+    "path", "sample", "condition", "concentration_nm", "replicate", "role", "standards",
+)  # fmt: skip
+"""The columns that have a meaning; others are kept, or set keys of the configuration."""
+
+SUFFIXES = (".tif", ".tiff", ".btf", ".tf8", ".mp", ".npy")
+"""Files of a folder that are taken for movies."""
+
+_DELIMITERS = ",;\t"
+_CLOSE = 0.85  # likeness of a column's name to one that has a meaning
+_SAID = 5  # complaints in one line
+
+
+@dataclass(frozen=True)
+class Row:
+    """One movie of the table.
+
+    Attributes
+    ----------
+    where : str
+        What messages call it, as in ``"line 5"``.
+    path : Path
+        The movie, absolute.
+    given : str
+        The path as it was written.
+    sample, condition, replicate : str
+        Of the table; the sample is the movie's name where it is not given.
+    concentration_nm : float
+        Concentration [nmol/l]; NaN where it is not given.
+    role : str
+        One of `ROLES`.
+    standards : tuple of (float, float)
+        Masses in a calibrant and their standard errors [kDa].
+    settings : mapping or tuple of str
+        Keys of the configuration for this movie, as `configure` takes them.
+    further : mapping of str to Any
+        Every other column.
+    """
+
+    where: str
+    path: Path
+    given: str
+    sample: str
+    condition: str
+    replicate: str
+    concentration_nm: float
+    role: str
+    standards: tuple[tuple[float, float], ...] = ()
+    settings: Mapping[str, Any] | tuple[str, ...] = ()
+    further: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Table:
+    """All rows, and the folder that their paths are relative to.
+
+    Attributes
+    ----------
+    source : Path
+        The file or the folder.
+    root : Path
+        Folder that the paths are relative to, absolute.
+    rows : tuple of Row
+        In the order of the table.
+    """
+
+    source: Path
+    root: Path
+    rows: tuple[Row, ...]
+
+
+def read_table(source: Path) -> Table:
+    """Read the table of a day.
+
+    Parameters
+    ----------
+    source : Path
+        ``.toml`` with ``[[movies]]``; a folder, whose movies are samples named by their files; or
+        CSV with a heading, separated by commas, semicolons or tabs.
+
+    Returns
+    -------
+    Table
+        Checked: every movie is there, and none twice.
+
+    Raises
+    ------
+    ConfigError
+        One line that names file, row and column of whatever is wrong.
+    """
+    if source.is_dir():
+        found = [p for p in sorted(source.iterdir()) if _is_movie(p)]
+        if not found:
+            raise ConfigError(
+                f"{source}: holds no movie ({', '.join(SUFFIXES)}); give the folder that does, or "
+                "a table of movies"
+            )
+        records = [(path.name, {"path": path.name}) for path in found]
+        root, toml = source.resolve(), False
+    else:
+        text = _text(source)
+        toml = source.suffix.lower() == ".toml"
+        records = _from_toml(source, text) if toml else _from_csv(source, text)
+        root = source.resolve().parent
+    rows, problems = [], []
+    for where, values in records:
+        row, wrong = _row(where, values, root, written=not toml)
+        problems += [f"{where}, {complaint}" for complaint in wrong]
+        if row is not None:
+            rows.append(row)
+    first: dict[Path, str] = {}
+    for row in rows:
+        if row.path in first:
+            problems.append(
+                f"{row.where}, path: {row.given} is the movie of {first[row.path]} already; leave "
+                "one of the rows out"
+            )
+        first.setdefault(row.path, row.where)
+    if not records:
+        problems.append("it lists no movie")
+    if problems:
+        more = f"; and {len(problems) - _SAID} more" if len(problems) > _SAID else ""
+        raise ConfigError(f"{source}: {'; '.join(problems[:_SAID])}{more}")
+    return Table(source, root, tuple(rows))
+
+
+def read_standards(text: str | Sequence[float]) -> tuple[tuple[float, float], ...]:
+    """Read the masses of standards.
+
+    Parameters
+    ----------
+    text : str or sequence of float
+        As in ``"66,146:1.5,480"``, separated by commas, semicolons or spaces; a number after a
+        colon is the standard error, otherwise 1 %.
+
+    Returns
+    -------
+    tuple of (float, float)
+        Mass and standard error of each [kDa].
+
+    Raises
+    ------
+    ValueError
+        Something in it is not a mass.
+    """
+    parts = text.replace(";", " ").replace(",", " ").split() if isinstance(text, str) else text
+    found = []
+    for part in parts:
+        value, colon, error = str(part).partition(":")
+        try:
+            mass = float(value)
+            se = float(error) if colon else STANDARD_ERROR * mass
+        except ValueError:
+            mass = se = math.nan
+        if not (0 < mass < math.inf and 0 <= se < math.inf):
+            raise ValueError(f"{part!r} is not a mass in kDa; write it as 66,146,480")
+        found.append((mass, se))
+    return tuple(found)
+
+
+def _is_movie(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
+def _text(source: Path) -> str:
+    try:
+        return source.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise ConfigError(
+            f"{source}: there is no such table or folder; give a CSV or TOML file with one movie "
+            "a row, or a folder of movies"
+        ) from None
+    except OSError as error:
+        raise ConfigError(f"{source}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise ConfigError(
+            f"{source}: is not a text file in UTF-8: give a table of movies, saved as CSV in UTF-8"
+        ) from None
+
+
+Records = list[tuple[str, dict[str, Any]]]
+
+
+def _from_csv(source: Path, text: str) -> Records:
+    lines = text.splitlines()
+    heading = next((line for line in lines if line.strip() and line[0] != "#"), "")
+    delimiter = max(_DELIMITERS, key=heading.count)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
+    names: list[str] = []
+    records: Records = []
+    try:
+        for cells in reader:
+            stripped = [cell.strip() for cell in cells]
+            if not any(stripped) or stripped[0].startswith("#"):
+                continue
+            where = f"line {reader.line_num}"
+            if not names:
+                names = _names(source, stripped)
+                continue
+            if len(stripped) > len(names):
+                raise ConfigError(
+                    f"{source}: {where} has {len(stripped)} cells, but the heading names "
+                    f"{len(names)} columns: put a cell that holds {delimiter!r} into quotes"
+                )
+            records.append((where, dict(zip(names, stripped, strict=False))))
+    except csv.Error as error:
+        raise ConfigError(f"{source}: line {reader.line_num} is not CSV ({error})") from None
+    return records
+
+
+def _names(source: Path, cells: list[str]) -> list[str]:
+    """Read the heading: known columns in any case, the others as they are."""
+    names = [cell.lower() if cell.lower() in COLUMNS else cell for cell in cells]
+    _check_names(source, names, "the heading")
+    twice = [name for name in names if name and names.count(name) > 1]
+    if twice:
+        raise ConfigError(f"{source}: the heading names the column {twice[0]} twice")
+    return names
+
+
+def _check_names(source: Path, names: Sequence[str], where: str) -> None:
+    """Refuse a table without paths, and a column that is nearly one with a meaning."""
+    for name in names:
+        near = difflib.get_close_matches(name.lower(), COLUMNS, n=1, cutoff=_CLOSE)
+        if near and name not in COLUMNS and near[0] not in names:
+            raise ConfigError(
+                f"{source}: {where} has the column {name}: did you mean {near[0]}? If not, give it "
+                "another name"
+            )
+    if "path" not in names:
+        raise ConfigError(
+            f"{source}: {where} lacks the column path, the movie's file; columns are "
+            f"{', '.join(COLUMNS)}, and any other"
+        )
+
+
+def _from_toml(source: Path, text: str) -> Records:
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{source}: is not valid TOML: {error}") from None
+    other = [name for name in values if name != "movies"]
+    movies = values.get("movies", [])
+    if other or not isinstance(movies, list) or not all(isinstance(m, dict) for m in movies):
+        what = f"has {other[0]!r}" if other else "is not a list of movies"
+        raise ConfigError(
+            f"{source}: {what}: a table of movies holds [[movies]] and nothing else; a "
+            "configuration is given with --config"
+        )
+    records: Records = []
+    for number, movie in enumerate(movies, 1):
+        _check_names(source, list(movie), f"[[movies]] number {number}")
+        records.append((f"[[movies]] number {number}", movie))
+    return records
+
+
+def _row(
+    where: str, values: Mapping[str, Any], root: Path, *, written: bool
+) -> tuple[Row | None, list[str]]:
+    """Check one row, of text where it is `written`; the complaints begin with the column."""
+    wrong: list[str] = []
+    known = {name: values.get(name, "") for name in COLUMNS}
+    given = str(known["path"])
+    path = root / Path(given).expanduser()
+    if not given:
+        return None, ["path: is empty"]
+    if not path.is_file():
+        what = "is a folder, and one movie is wanted" if path.is_dir() else "there is no such file"
+        wrong.append(f"path: {given}: {what}; paths are relative to {root}")
+    role = str(known["role"]).lower() or "sample"
+    if role not in ROLES:
+        near = difflib.get_close_matches(role, ROLES, n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        wrong.append(f"role: {known['role']!r} is none of {', '.join(ROLES)}{hint}")
+    concentration = math.nan
+    if known["concentration_nm"] != "":
+        try:
+            concentration = float(known["concentration_nm"])
+        except (TypeError, ValueError):
+            concentration = -1.0
+        if not 0 <= concentration < math.inf:
+            wrong.append(
+                f"concentration_nm: {known['concentration_nm']!r} is not a concentration in "
+                "nmol/l; write a number with a decimal point, or leave it empty"
+            )
+    standards: tuple[tuple[float, float], ...] = ()
+    try:
+        said = known["standards"]
+        standards = read_standards([said] if isinstance(said, (int, float)) else said)
+    except (TypeError, ValueError) as error:
+        wrong.append(f"standards: {error}")
+    if standards and role != "calibrant":
+        wrong.append(f"standards: are of a calibrant, but the movie's role is {role}")
+    settings, further = _divided(values, written)
+    row = Row(
+        where=where,
+        path=path.resolve(),
+        given=given,
+        sample=str(known["sample"]) or path.stem,
+        condition=str(known["condition"]),
+        replicate=str(known["replicate"]),
+        concentration_nm=concentration,
+        role=role,
+        standards=standards,
+        settings=settings,
+        further=further,
+    )
+    return (None if wrong else row), wrong
+
+
+def _divided(
+    values: Mapping[str, Any], written: bool
+) -> tuple[Mapping[str, Any] | tuple[str, ...], dict[str, Any]]:
+    """Tell keys of the configuration from columns that are only kept."""
+    settings: dict[str, Any] = {}
+    further: dict[str, Any] = {}
+    for name, value in values.items():
+        section, dot, _ = name.partition(".")
+        if section in Config.model_fields and (dot or isinstance(value, dict)):
+            settings[name] = value
+        elif name and name not in COLUMNS:
+            further[name] = value
+    if written:
+        return tuple(f"{name}={value}" for name, value in settings.items() if value), further
+    return settings, further

@@ -1,0 +1,85 @@
+"""Pictures of particles, sharp and blurred by their motion, to fit and to draw."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from iscat_analysis._kernels.moving import Pictures
+from iscat_analysis.optics.blur import blurred
+from iscat_analysis.optics.forward import ForwardModel
+from iscat_analysis.optics.stamp import sample_picture, weights_between
+from iscat_analysis.optics.waves import axial_table
+from iscat_analysis.records import FloatArray
+
+
+class PictureBook:
+    """Makes the pictures of particles with any blur.
+
+    Parameters
+    ----------
+    near, far : ForwardModel
+        Models of a sharp picture, for the fitted square and for that which is drawn.
+    pixel_nm : float
+        Side of a pixel [nm].
+    half_px : float
+        How far from a particle its picture is drawn at a fixed height [pixels].
+    z_range_nm : tuple of float or None
+        Range of the tables along z; None for the model's height alone [nm].
+    """
+
+    def __init__(
+        self,
+        near: ForwardModel,
+        far: ForwardModel,
+        *,
+        pixel_nm: float,
+        half_px: float,
+        z_range_nm: tuple[float, float] | None,
+    ) -> None:
+        self._near, self._far = near, far
+        self._pixel_nm, self._half_px, self._z_range = pixel_nm, half_px, z_range_nm
+
+    def of(self, variances_nm2: FloatArray) -> tuple[Pictures, Pictures]:
+        """Make the pictures of some blurs.
+
+        Parameters
+        ----------
+        variances_nm2 : ndarray, shape (groups,)
+            Variance of a path about its mean [nm²].
+
+        Returns
+        -------
+        near, far : Pictures
+            To fit, and to draw.
+        """
+        if self._z_range is not None:
+            return (
+                _along_z(self._near, variances_nm2, self._z_range),
+                _along_z(self._far, variances_nm2, self._z_range),
+            )
+        inverse = self._one_height.lens.inv_step
+        windows = [weights_between(float(q) * inverse**2) for q in variances_nm2]
+        one = self._one_height._replace(windows=np.stack(windows))
+        return one, one
+
+    @cached_property
+    def _one_height(self) -> Pictures:
+        """Sharp picture at the fixed height."""
+        lens, samples = sample_picture(self._far, self._pixel_nm, self._half_px)
+        return Pictures(samples.reshape(1, 1, 1, 2, -1), 0.0, 1.0, 0.0, lens, lens.window[None])
+
+
+def _along_z(
+    model: ForwardModel, variances_nm2: FloatArray, z_range_nm: tuple[float, float]
+) -> Pictures:
+    """Tables of a model for every blur, along z."""
+    tables = [
+        axial_table(blurred(model, float(q), upwards=True).wave, z_range_nm) for q in variances_nm2
+    ]
+    heights = np.stack([table.heights for table in tables])
+    one = tables[0]
+    return Pictures(
+        heights, one.first_nm, one.step_nm, one.kappa, model.lens, model.lens.window[None]
+    )

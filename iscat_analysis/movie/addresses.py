@@ -1,0 +1,103 @@
+"""Where a movie is: a file, or a part of one, as in ``day.h5::/run 3/movie``.
+
+What stands behind the two colons is the path of a dataset in an HDF5 file or a Zarr folder, or
+shape and type of the numbers of a file that says nothing of itself: ``movie.bin::128x128,uint16``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+MARK = "::"
+_END_BYTES = 2**20
+_SHAPE = re.compile(r"(?:(\d+)x)?(\d+)x(\d+),\s*(\S+)", flags=re.ASCII)
+
+
+def split_address(address: Path) -> tuple[Path, str]:
+    """Tell the file from the part of it.
+
+    Parameters
+    ----------
+    address : Path
+        As the user gives it.
+
+    Returns
+    -------
+    path : Path
+        The file.
+    part : str
+        What is named of it; empty where it is all.
+    """
+    head, mark, part = str(address).partition(MARK)
+    return (Path(head), part) if mark and not address.exists() else (address, "")
+
+
+def layout(part: str) -> tuple[int | None, int, int, str] | None:
+    """Read shape and type of plain numbers.
+
+    Parameters
+    ----------
+    part : str
+        ``"frames x rows x columns,type"``, without spaces around x; the frames may be left out.
+
+    Returns
+    -------
+    tuple or None
+        Frames, rows, columns and the name of the type; None where it is something else.
+    """
+    match = _SHAPE.fullmatch(part.strip())
+    if match is None:
+        return None
+    frames = int(match[1]) if match[1] else None
+    return frames, int(match[2]), int(match[3]), match[4]
+
+
+def beside(address: Path, suffix: str) -> Path:
+    """Name what is written about a movie, next to it.
+
+    Parameters
+    ----------
+    address : Path
+        Of the movie.
+    suffix : str
+        With its dot.
+
+    Returns
+    -------
+    Path
+        The movie's, with another suffix; the name of a dataset stays in it.
+    """
+    path, part = split_address(address)
+    if not part or layout(part) is not None:
+        return path.with_suffix(suffix)
+    return path.with_name(".".join([path.stem, *part.strip("/").split("/")]) + suffix)
+
+
+def fingerprint(files: Sequence[Path], part: str = "") -> str:
+    """Tell a movie's content from another's without reading all of it.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        That hold it.
+    part : str
+        What it is of them.
+
+    Returns
+    -------
+    str
+        Hash of the sizes, times of change and ends of the files, and of the part.
+    """
+    digest = hashlib.sha256(part.encode("utf-8", "backslashreplace"))
+    for path in files:
+        with path.open("rb") as file:
+            state = os.fstat(file.fileno())
+            digest.update(f"{state.st_size} {state.st_mtime_ns}".encode())
+            digest.update(file.read(_END_BYTES))
+            file.seek(max(state.st_size - _END_BYTES, 0))
+            digest.update(file.read(_END_BYTES))
+    return digest.hexdigest()

@@ -1,0 +1,112 @@
+"""A movie in several TIFF files, as Micro-Manager writes it beyond 4 GB and OME describes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie.descriptions import merge
+from iscat_analysis.movie.ome import OmeSet
+from iscat_analysis.movie.stack import Frames
+from iscat_analysis.records import StackMetadata
+
+
+class TiffSet:
+    """The frames of a set of files; `open_set` makes it.
+
+    Parameters
+    ----------
+    members : sequence of Frames
+        Every file, all of its images as frames.
+    files : sequence of Path
+        Their paths.
+    where : ndarray of int, shape (t, 2)
+        File and image of each frame.
+    metadata : StackMetadata
+        What the description says.
+    """
+
+    notes = ()
+
+    def __init__(
+        self,
+        members: Sequence[Frames],
+        files: Sequence[Path],
+        where: NDArray[np.int64],
+        metadata: StackMetadata,
+    ) -> None:
+        self._members, self._where = members, where
+        self.files = tuple(files)
+        self.shape = (len(where), *members[0].shape[1:])
+        self.dtype = members[0].dtype
+        self.metadata = metadata
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""
+        block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
+        where = self._where[start:stop]
+        goes_on = (np.diff(where, axis=0) == [0, 1]).all(axis=1)
+        runs = np.flatnonzero(~goes_on) + 1
+        for first, last in zip([0, *runs], [*runs, len(where)], strict=True):
+            if last > first:
+                member, image = where[first]
+                block[first:last] = self._members[member].read(image, image + last - first)
+        return block
+
+    def close(self) -> None:
+        """Release the files."""
+        for member in self._members:
+            member.close()
+
+
+def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames]) -> TiffSet:
+    """Open the files of a set, which lie beside each other.
+
+    Parameters
+    ----------
+    described : OmeSet
+        From the description in one of them.
+    path : Path
+        Of that one.
+    open_member : callable
+        Opens a file, whatever it says of itself, all of its images as frames.
+
+    Returns
+    -------
+    TiffSet
+        Every frame.
+
+    Raises
+    ------
+    DataError
+        A file is missing, is not like the others, or holds fewer images than the description says.
+    """
+    files = [path.with_name(name) if name else path for name in described.files]
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        raise DataError(
+            f"{path}: is one of {len(files)} files of a movie, of which {missing[0]} is not beside "
+            "it; keep the files of a set together, under their own names"
+        )
+    with ExitStack() as opened:
+        members = []
+        for file in files:
+            members.append(open_member(file))
+            opened.callback(members[-1].close)
+        for number, (file, member) in enumerate(zip(files, members, strict=True)):
+            if (member.shape[1:], member.dtype) != (members[0].shape[1:], members[0].dtype):
+                raise DataError(f"{file}: has other pixels than {files[0].name}; export it again")
+            needed = int(described.where[described.where[:, 0] == number, 1].max(initial=-1)) + 1
+            if needed > member.shape[0]:
+                raise DataError(
+                    f"{file}: holds {member.shape[0]} images, but the description of its set says "
+                    f"{needed}; the recording or the copy was interrupted: export it again"
+                )
+        opened.pop_all()
+    return TiffSet(members, files, described.where, merge([described.hints], path))

@@ -1,0 +1,122 @@
+"""The picture of a particle at one height, sampled on the pixels' own grid, sharp or blurred.
+
+What a pixel sees of a particle is band-limited, the interference at k·NA and the scattered light at
+twice that.  Between samples of it, `TAPS` of them along each axis give any place: the weights are
+those that err least, in the mean square over the band, against a wave moved to that place and
+dimmed by the blur,
+
+    w(t) = argmin ∫ |Σ_l w_l e^{iu(l − 3)} − e^{iut} e^{−q u²/2}|² du,
+
+with u the wavenumber times the distance of the samples, t the place between two of them and q the
+variance of the blur in units of that distance squared.  One set of samples so serves every blur,
+of the interference and of the scattered light alike.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+from iscat_analysis._kernels.image import Lens, Pixels, signal_image
+from iscat_analysis._kernels.lattice import DEGREE, TAPS
+from iscat_analysis.optics.model import ForwardModel
+from iscat_analysis.records import FloatArray
+
+BAND = 0.8
+"""Largest u of the interference: the sharp picture errs by 4e-6, its gradient by 1e-5."""
+
+_BEYOND = 1e-3  # weight of the band from there to twice that, where there is little light
+_POINTS = 24  # of the quadrature over each band
+
+
+def samples_per_pixel(model: ForwardModel, pixel_nm: float) -> int:
+    """Give how many samples per pixel the picture needs along each axis.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        The picture.
+    pixel_nm : float
+        Side of a pixel [nm].
+
+    Returns
+    -------
+    int
+        At least 1.
+    """
+    bandwidth = model.wavenumber * model.optics.na * (1 if model.rho else 2)
+    return max(1, math.ceil(bandwidth * pixel_nm / BAND))
+
+
+def sample_picture(model: ForwardModel, pixel_nm: float, half_px: float) -> tuple[Lens, FloatArray]:
+    """Sample the picture of a particle at the model's height.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        The picture.
+    pixel_nm : float
+        Side of a pixel [nm].
+    half_px : float
+        Largest distance of a pixel from the particle along an axis [pixels].
+
+    Returns
+    -------
+    lens : Lens
+        How the kernels take it; sharp.
+    samples : ndarray, shape (2, nodes, nodes)
+        P and Q of a P + a² Q, columns in the order that `iscat_analysis._kernels.stamp` needs; 0
+        beyond the model's reach.
+    """
+    fine = samples_per_pixel(model, pixel_nm)
+    step = pixel_nm / fine
+    half = math.ceil(half_px * fine) + TAPS
+    nodes = np.asarray(step * np.arange(-half, half + 1), dtype=np.float64)
+    offsets, weights = model.samples
+    offsets = np.asarray(offsets * pixel_nm)
+    profile, z = model.profile(model.height_nm, 1), 1.0 / abs(model.scale.amplitude(1.0))
+    reach = model.reach_nm - math.sqrt(2) * pixel_nm
+    both = np.zeros((2, nodes.size, nodes.size))
+    for row, y in enumerate(nodes):
+        inside = np.flatnonzero(nodes**2 + y**2 < reach**2)
+        if not inside.size:
+            continue
+        pixels = Pixels(nodes[inside], np.array([y]), offsets, weights)
+        for k, sign in enumerate((1.0, -1.0)):
+            out = np.empty((1, inside.size))
+            signal_image(profile, model.lens, pixels, 0.0, 0.0, sign * z, out)
+            both[k, row, inside] = out[0]
+    up, down = both
+    samples = np.stack([(up - down) / (2 * z), (up + down) / (2 * z**2)])
+    per_phase = math.ceil(nodes.size / fine)
+    padded = np.pad(samples, ((0, 0), (0, 0), (0, per_phase * fine - nodes.size)))
+    phased = padded.reshape(2, nodes.size, per_phase, fine).swapaxes(2, 3)
+    lens = Lens(1 / step, model.rho, 1.0, 0.0, 0.0, 0.0, 0.0, half, 1, weights_between(0.0), fine)
+    return lens, np.ascontiguousarray(phased.reshape(2, nodes.size, -1))
+
+
+@lru_cache(256)
+def weights_between(variance: float) -> FloatArray:
+    """Weights of the samples around a place, for a blur.
+
+    Parameters
+    ----------
+    variance : float
+        Of the blur, in units of the squared distance of the samples.
+
+    Returns
+    -------
+    ndarray, shape (degree + 1, TAPS)
+        Coefficients of the powers of t ∈ [0, 1), the place after the fourth sample.
+    """
+    points, quadrature = np.polynomial.legendre.leggauss(_POINTS)
+    u = BAND * np.concatenate([(points + 1) / 2, (points + 3) / 2])
+    root = np.sqrt(np.concatenate([quadrature, _BEYOND**2 * quadrature]))
+    waves = np.exp(1j * np.outer(u, np.arange(TAPS) - (TAPS // 2 - 1))) * root[:, None]
+    t = (1 - np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))) / 2
+    wanted = np.exp(1j * np.outer(u, t) - variance * u[:, None] ** 2 / 2) * root[:, None]
+    left, right = (np.concatenate([part.real, part.imag]) for part in (waves, wanted))
+    weights = np.linalg.lstsq(left, right, rcond=1e-15)[0]  # (TAPS, places)
+    return np.linalg.solve(np.vander(t, DEGREE + 1, increasing=True), weights.T)

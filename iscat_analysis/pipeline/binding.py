@@ -1,0 +1,374 @@
+"""Equilibrium constants over a series of concentrations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.report import atomic_folder, check_output
+from iscat_analysis.report.binding import binding_figure
+from iscat_analysis.report.style import publish
+from iscat_analysis.report.tables import CSV_DIGITS
+from iscat_analysis.schemas import jsonable, to_json
+from iscat_analysis.species import LEAST_EVENTS
+from iscat_analysis.species.choices import Ladder
+from iscat_analysis.species.equilibrium import EquilibriumFit, fit_equilibrium
+from iscat_analysis.species.events import Events
+from iscat_analysis.species.mass_action import LANDING_POWER, Model, landing_logits
+from iscat_analysis.species.tables import EventTable, event_table
+
+BINDING_FILES = frozenset({"kd.csv", "kd.json", "figures"})
+"""Everything `fit_kd` may leave in its folder."""
+
+CONCENTRATIONS: dict[Model, tuple[str, ...]] = {
+    "dimer": ("concentration_nm",),
+    "ab": ("a_nm", "b_nm"),
+}
+"""Columns of the samples that hold concentrations [nM]."""
+
+_WRONG = 0.01  # p-value below which the model is doubted
+_FAR = 3.0  # standard errors of a table that is named
+_POINTS = 200  # of the curve
+_MOST_POOLED = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Binding:
+    """An equilibrium constant and the tables it is from; `fit_kd` makes it.
+
+    Attributes
+    ----------
+    model : str
+        ``"dimer"`` or ``"ab"``.
+    fit : EquilibriumFit
+        K_D, its interval, and whether the model describes the tables.
+    samples : pandas.DataFrame
+        One row for each table: path, concentrations [nM], other columns, events; fraction of
+        complexes among the particles that came with its 95 % interval, the same by the
+        equilibrium, their distance in standard errors, and the share of background.
+    curve : pandas.DataFrame
+        Of monomers and dimers: concentration_nm, complexes; empty for two partners.
+    landing_power : float
+        p of landings ∝ concentration·mass^p.
+    notes : tuple of str
+        What the user should know, one sentence each.
+    """
+
+    model: Model
+    fit: EquilibriumFit
+    samples: pd.DataFrame
+    curve: pd.DataFrame
+    landing_power: float
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give the document ``kd``.
+
+        Returns
+        -------
+        dict
+            Nested plain values.
+        """
+        fit = self.fit
+        return {
+            "model": self.model,
+            "kd_nm": fit.kd_nm,
+            "kd_low": fit.kd_low,
+            "kd_high": fit.kd_high,
+            "inactive": fit.inactive,
+            "inactive_se": fit.inactive_se,
+            "inactive_p": fit.inactive_p,
+            "masses_kda": fit.masses_kda,
+            "width_kda": fit.width_kda,
+            "landing_power": self.landing_power,
+            "chi2": fit.chi2,
+            "dof": fit.dof,
+            "p_value": fit.p_value,
+            "samples": self.samples.to_dict("records"),
+            "curve": self.curve.to_dict("list"),
+            "profile": {"ln_kd_nm": fit.profile_ln_kd, "deviance": fit.profile_deviance},
+            "notes": list(self.notes),
+        }
+
+
+def fit_kd(
+    samples: str | Path | pd.DataFrame,
+    *,
+    model: Model,
+    masses_kda: Sequence[float] | None = None,
+    landing_power: float = LANDING_POWER,
+    inactive: bool = False,
+    sigma_kda: float | None = None,
+    limit_kda: float | None = None,
+    limit_sigma_kda: float | None = None,
+    above_kda: float | None = None,
+    tables: Sequence[EventTable | pd.DataFrame] | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    notify: Callable[[str], None] | None = None,
+) -> Binding:
+    """Fit an equilibrium constant to the events of a series of concentrations.
+
+    Parameters
+    ----------
+    samples : str, Path or pandas.DataFrame
+        One row for each table of events: ``path``, and ``concentration_nm`` (monomers in all), or
+        ``a_nm`` and ``b_nm`` (A and B in all) [nM]; further columns are kept.  Of a column
+        ``role`` only rows with ``sample`` are used.  Paths are as for `find_species`, beside the
+        file of the samples; a movie stands for its output folder.
+    model : {"dimer", "ab"}
+        2 M ⇌ D, K_D = [M]²/[D]; or A + B ⇌ AB, K_D = [A][B]/[AB].
+    masses_kda : sequence of float, optional
+        About the mass of the monomer, which is found otherwise, or of A and B [kDa]; fitted.
+    landing_power : float
+        Landings are as concentration·mass^p: −1/6, the default, for diffusion out of a drop at rest
+        onto an absorbing surface, −1/3 through a layer of liquid that flows, 0 for a surface that
+        takes all alike.
+    inactive : bool
+        Fit the part of monomers, or of A, that does not bind.
+    sigma_kda, limit_kda, limit_sigma_kda, above_kda : float, optional
+        What is known of errors and of what was missed, as for `find_species` [kDa].
+    tables : sequence of EventTable or pandas.DataFrame, optional
+        The tables of all rows themselves, in place of ``path``.
+    out : str or Path, optional
+        Folder for kd.csv, kd.json and a figure.
+    overwrite : bool
+        Replace an earlier result in `out`.
+    notify : callable, optional
+        Given each note, a sentence.
+
+    Returns
+    -------
+    Binding
+        K_D with its profile-likelihood interval, fractions of each table, and a test of the model.
+
+    Raises
+    ------
+    ConfigError
+        Options are impossible.
+    DataError
+        Samples or tables cannot be read, hold too little, or `out` may not be written.
+
+    Examples
+    --------
+    >>> import iscat_analysis as ia, numpy as np, pandas as pd
+    >>> random = np.random.default_rng(1)
+    >>> tables = []
+    >>> for dimers in (0.158, 0.308, 0.471):  # of landings at 3, 10 and 30 nM where K_D is 10 nM
+    ...     true = np.where(random.random(1500) < dimers, 132.0, 66.0)
+    ...     mass = random.normal(true, 8.0)
+    ...     tables.append(pd.DataFrame({"mass_kda": mass, "sigma_mass_kda": 8.0}))
+    >>> samples = pd.DataFrame({"concentration_nm": [3.0, 10.0, 30.0]})
+    >>> found = ia.fit_kd(samples, tables=tables, model="dimer", masses_kda=[66.0])
+    >>> found.fit.kd_low < 10 < found.fit.kd_high
+    True
+    """
+    _check(model, masses_kda, landing_power)
+    folder = None if out is None else Path(out)
+    if folder is not None:
+        check_output(folder, overwrite, known=BINDING_FILES)
+    name = "samples" if isinstance(samples, pd.DataFrame) else str(samples)
+    rows = samples if isinstance(samples, pd.DataFrame) else _read_samples(Path(samples))
+    rows, kept = _used(rows, name)
+    totals = _totals(rows, model, name)
+    base = None if isinstance(samples, pd.DataFrame) else Path(samples).parent
+    sources: Sequence[EventTable | pd.DataFrame | Path]
+    if tables is None:
+        sources = _paths(rows, base, name)
+    elif len(tables) == kept.size:
+        sources = [table for table, keep in zip(tables, kept, strict=True) if keep]
+    else:
+        raise ConfigError(f"`tables`: {len(tables)} for {kept.size} rows; give one for each")
+    found = [
+        table if isinstance(table, EventTable)
+        else event_table(
+            table, name=None if isinstance(table, Path) else f"table {number + 1}",
+            sigma_kda=sigma_kda, limit_kda=limit_kda, limit_sigma_kda=limit_sigma_kda,
+            above_kda=above_kda,
+        )
+        for number, table in enumerate(sources)
+    ]  # fmt: skip
+    for table in found:
+        if table.mass_kda.size < LEAST_EVENTS:
+            raise DataError(
+                f"{table.name}: holds {table.mass_kda.size} events, too few; {LEAST_EVENTS} are "
+                f"needed, or leave it out of {name}"
+            )
+    masses = _monomer(found) if masses_kda is None else tuple(map(float, masses_kda))
+    fit = fit_equilibrium(
+        [table.events for table in found], totals, model=model, masses_kda=masses,
+        power=landing_power, inactive=inactive,
+    )  # fmt: skip
+    result = Binding(
+        model,
+        fit,
+        _laid_out(rows, found, fit),
+        _curve(totals, fit, model, landing_power),
+        landing_power,
+        _notes(found, fit, totals, inactive=inactive),
+    )
+    if notify is not None:
+        for note in result.notes:
+            notify(note)
+    if folder is not None:
+        contents = {"source": name, **result.to_dict()}
+        with atomic_folder(folder, overwrite, known=BINDING_FILES) as building:
+            result.samples.to_csv(building / "kd.csv", index=False, float_format=f"%.{CSV_DIGITS}g")
+            (building / "kd.json").write_text(to_json("kd", contents) + "\n", "utf-8")
+            (building / "figures").mkdir()
+            publish(binding_figure(jsonable(contents)), building / "figures")
+    return result
+
+
+def _check(model: str, masses_kda: Sequence[float] | None, power: float) -> None:
+    if model not in get_args(Model):
+        raise ConfigError(f"`model` = {model!r}: must be dimer or ab")
+    parts = len(CONCENTRATIONS[model])  # type: ignore[index]
+    if masses_kda is None:
+        if parts > 1:
+            raise ConfigError("`masses_kda`: model ab needs the masses of A and B, as in 40,80")
+    elif len(masses_kda) != parts or not all(0 < m < math.inf for m in masses_kda):
+        wanted = (
+            "the mass of the monomer, as in 66" if parts == 1 else "those of A and B, as in 40,80"
+        )
+        raise ConfigError(f"`masses_kda`: model {model} takes {wanted} [kDa], above 0")
+    if not (math.isfinite(power) and abs(power) <= 1):
+        raise ConfigError(f"`landing_power` = {power:g}: must lie between -1 and 1, as in -0.167")
+
+
+def _read_samples(path: Path) -> pd.DataFrame:
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            first = next((line for line in file if line.strip() and line[0] != "#"), "")
+        sign = next((sign for sign in (",", ";", "\t") if sign in first), ",")
+        return pd.read_csv(path, sep=sign, encoding="utf-8-sig", comment="#")
+    except OSError as error:
+        what = "is a folder" if path.is_dir() else f"cannot be read ({error.strerror})"
+        raise DataError(f"{path}: {what}; give a CSV file with a row for each table") from None
+    except ValueError as error:
+        said = str(error).splitlines()[0] if str(error) else "it is empty"
+        raise DataError(f"{path}: is no CSV file with a first line of names ({said})") from None
+
+
+def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:
+    """Leave out what is no sample; which rows are left."""
+    rows = rows.rename(columns=lambda column: str(column).strip())
+    kept = np.ones(len(rows), bool)
+    if "role" in rows:
+        role = rows["role"].fillna("sample").astype(str).str.strip()
+        kept = role.eq("sample").to_numpy()
+    if not kept.any():
+        raise DataError(f"{name}: has no row of a sample")
+    return rows[kept].reset_index(drop=True), kept
+
+
+def _totals(rows: pd.DataFrame, model: Model, name: str) -> FloatArray:
+    columns = CONCENTRATIONS[model]
+    missing = [column for column in columns if column not in rows]
+    if missing:
+        raise DataError(
+            f"{name}: has no column {missing[0]}, which model {model} takes; it has "
+            f"{', '.join(map(str, rows.columns))}"
+        )
+    try:
+        totals = rows[list(columns)].to_numpy(dtype=np.float64)
+    except ValueError as error:
+        raise DataError(f"{name}: a concentration is no number ({error})") from None
+    bad = ~np.isfinite(totals).all(axis=1) | (totals < 0).any(axis=1) | (totals.sum(axis=1) <= 0)
+    if bad.any():
+        raise DataError(
+            f"{name}: row {int(np.argmax(bad)) + 1} has no concentration above 0 in "
+            f"{' and '.join(columns)}; give it in nM, or leave the row out"
+        )
+    if model == "ab" and not (totals > 0).all(axis=1).any():
+        raise DataError(f"{name}: no row has both partners; K_D needs tables of A with B")
+    return np.asarray(totals)
+
+
+def _paths(rows: pd.DataFrame, base: Path | None, name: str) -> list[Path]:
+    if "path" not in rows:
+        raise DataError(f"{name}: has no column path, which names a table of events in each row")
+    found = []
+    for given in rows["path"].astype(str):
+        path = Path(given.strip())
+        if base is not None and not path.is_absolute() and (base / path).exists():
+            path = base / path
+        folder = path.with_suffix(".iscat")
+        found.append(folder if path.suffix in _MOVIES and folder.is_dir() else path)
+    return found
+
+
+_MOVIES = (".tif", ".tiff", ".mp")
+
+
+def _monomer(tables: Sequence[EventTable]) -> tuple[float]:
+    """Find the monomer in the events of all tables."""
+    most = max(_MOST_POOLED // len(tables), LEAST_EVENTS)
+    thinned = [
+        (np.abs(table.mass_kda[::step]), table.sigma_kda[::step])
+        for table in tables
+        for step in [-(-table.mass_kda.size // most)]
+    ]
+    mass, sigma = (np.concatenate(parts) for parts in zip(*thinned, strict=True))
+    ladder = Ladder(None)
+    found = ladder.choose(Events(mass, sigma, tables[0].efficiency))
+    return (ladder.values(found)[0],)
+
+
+def _laid_out(
+    rows: pd.DataFrame, tables: Sequence[EventTable], fit: EquilibriumFit
+) -> pd.DataFrame:
+    kept = rows if "path" in rows else rows.assign(path=[table.name for table in tables])
+    return kept.assign(
+        events=[table.mass_kda.size for table in tables],
+        complexes=fit.complexes,
+        complexes_low=fit.complexes_low,
+        complexes_high=fit.complexes_high,
+        predicted=fit.predicted,
+        pull=fit.pull,
+        background=fit.background,
+    )
+
+
+def _curve(totals: FloatArray, fit: EquilibriumFit, model: Model, power: float) -> pd.DataFrame:
+    """Fraction of dimers among landings against the concentration."""
+    if model != "dimer":
+        return pd.DataFrame(columns=["concentration_nm", "complexes"])
+    low, high = float(totals.min()) / 3, float(totals.max()) * 3
+    grid = np.geomspace(low, high, _POINTS)[:, None]
+    logits = landing_logits(model, grid, fit.kd_nm, fit.inactive, fit.masses_kda, power)[:, 1]
+    return pd.DataFrame({"concentration_nm": grid[:, 0], "complexes": 1 / (1 + np.exp(-logits))})
+
+
+def _notes(
+    tables: Sequence[EventTable], fit: EquilibriumFit, totals: FloatArray, *, inactive: bool
+) -> tuple[str, ...]:
+    notes = list(dict.fromkeys(note for table in tables for note in table.notes))
+    if fit.p_value < _WRONG:
+        far = [t.name for t, pull in zip(tables, fit.pull, strict=True) if abs(pull) > _FAR]
+        named = f" (farthest: {', '.join(far[:3])})" if far else ""
+        notes.append(
+            f"the tables do not follow this equilibrium, p = {fit.p_value:.1g}{named}, and the "
+            "interval of K_D is too narrow: look at concentrations, replicates and what is missed "
+            "of the lightest"
+        )
+    if not inactive and fit.inactive_p < _WRONG:
+        notes.append(
+            f"an inactive part describes the tables better (p = {fit.inactive_p:.1g} without), and "
+            "K_D is wrong where there is one: fit it with `inactive`"
+        )
+    if not math.isfinite(fit.kd_high):
+        notes.append("complexes are too few for an upper end of K_D: measure higher concentrations")
+    if fit.kd_low == 0:
+        notes.append("free partners are too few for a lower end of K_D: dilute further")
+    if totals.shape[0] < 2:
+        notes.append("a single table tests no model: whether its K_D is one is not known")
+    return tuple(notes)

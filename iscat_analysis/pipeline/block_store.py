@@ -1,0 +1,256 @@
+"""What is kept of a finished block of frames, in memory and on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.moving import box_of
+from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.pipeline.linking import typical_error
+from iscat_analysis.pipeline.moving import Moving, follow
+from iscat_analysis.pipeline.moving_table import common_masses, moving_table
+from iscat_analysis.pipeline.resume import Shelf, packed_views, unpacked_views
+from iscat_analysis.pipeline.scene import Scene
+from iscat_analysis.records import BoolArray, EventView, FloatArray, FrameSource, Progress, Windows
+
+
+@dataclass(frozen=True)
+class Block:
+    """What was found in a block of frames.
+
+    Attributes
+    ----------
+    span : (int, int)
+        Half-open range of frames.
+    rows : Rows
+        Every particle in every frame of its life, numbered in the block; frames are the movie's.
+    error : float
+        Of an amplitude in one frame, for linking; 0 where there is no row.
+    table : pandas.DataFrame
+        From `iscat_analysis.pipeline.moving_table.moving_table`, a line for each of the rows.
+    inside : ndarray of bool, shape (n,)
+        Which of them are in the field.
+    masses : pandas.DataFrame
+        From `iscat_analysis.pipeline.moving_table.common_masses`.
+    views : tuple of EventView
+        The clearest frame of each track that was in the field.
+    level : ndarray, shape (y, x)
+        Light without particles, in a frame of power 1 [e].
+    power : ndarray, shape (t,)
+        Power of each frame, 1 on average.
+    total_e : ndarray, shape (y, x)
+        Sum of the frames [e].
+    used : ndarray of bool, shape (y, x)
+        Pixels that were used.
+    """
+
+    span: tuple[int, int]
+    rows: Rows
+    error: float
+    table: pd.DataFrame
+    inside: BoolArray
+    masses: pd.DataFrame
+    views: tuple[EventView, ...]
+    level: FloatArray
+    power: FloatArray
+    total_e: FloatArray
+    used: BoolArray
+
+    @property
+    def frames(self) -> int:
+        """Frames in the block."""
+        return self.span[1] - self.span[0]
+
+    def windows(self, camera: Camera) -> Windows:
+        """Put the background and the sum of all frames side by side.
+
+        Parameters
+        ----------
+        camera : Camera
+            Its read noise.
+
+        Returns
+        -------
+        Windows
+            Both of all frames.
+        """
+        read = self.frames * camera.read_variance_e2((self.used.shape[0], self.used.shape[1]))
+        return Windows(
+            before_e=self.level * self.power.sum(),
+            after_e=self.total_e,
+            n_before=self.frames,
+            n_after=self.frames,
+            power_ratio=1.0,
+            read_variance_before_e2=read,
+            read_variance_after_e2=read,
+            masked=~self.used,
+            saturated=np.zeros_like(self.used),
+            frames_before=self.span,
+            frames_after=self.span,
+            power=np.concatenate([self.power, self.power]),
+        )
+
+
+def analyse_block(
+    scene: Scene,
+    movie: FrameSource,
+    camera: Camera,
+    span: tuple[int, int],
+    *,
+    goes_on: tuple[bool, bool],
+    check: Callable[[NDArray[Any], int], None],
+    pool: ThreadPoolExecutor,
+    progress: Progress,
+) -> Block:
+    """Follow the particles of a block of frames.
+
+    Parameters
+    ----------
+    scene : Scene
+        From `iscat_analysis.pipeline.moving.track_scene`.
+    movie : FrameSource
+        The movie.
+    camera : Camera
+        Counts → photoelectrons.
+    span : (int, int)
+        Half-open range of frames.
+    goes_on : (bool, bool)
+        Whether there is a block before, and one after.
+    check : callable
+        Refuses impossible counts.
+    pool : ThreadPoolExecutor
+        Runs parts of the block.
+    progress : Progress
+        Told the stages.
+
+    Returns
+    -------
+    Block
+        The frames themselves are not kept.
+    """
+    first, frames = span[0], span[1] - span[0]
+    near = scene.config.track.memory_frames + 1  # of a border, from where a track may go on
+    inner = (near if goes_on[0] else 0, frames - near if goes_on[1] else frames)
+    moving = follow(
+        scene, movie, camera, span,
+        check=check, pool=pool, progress=progress, inner=inner,
+    )  # fmt: skip
+    table, inside = moving_table(scene, moving, first), moving.field.holds(moving.rows.theta)
+    best = table.loc[table[inside].groupby("track")["snr"].idxmax()]
+    field, rows = moving.field, moving.rows
+    return Block(
+        span=span,
+        rows=replace(rows, frame=rows.frame + first),
+        error=typical_error(moving.judged) if len(rows.frame) else 0.0,
+        table=table,
+        inside=inside,
+        masses=common_masses(scene, moving),
+        views=tuple(_view(moving, int(row)) for row in best.index),
+        level=moving.ground.level,
+        power=moving.ground.power,
+        total_e=field.counts_e.sum(axis=0, dtype=np.float64),
+        used=field.used,
+    )
+
+
+def _view(moving: Moving, mine: int) -> EventView:
+    """Images of one row: what was measured, the model and what it leaves over."""
+    field, rows = moving.field, moving.rows
+    frame, theta = int(rows.frame[mine]), rows.theta[mine]
+    spans = [
+        box_of(float(centre), field.pixel_nm, field.roi_px, size)
+        for centre, size in zip((theta[1], theta[0]), field.used.shape, strict=True)
+    ]
+    cut = slice(*spans[0]), slice(*spans[1])
+    others = rows.only(np.arange(len(rows.frame)) != mine)
+    ground: Ground = moving.ground
+    left, alone = (field.residual(ground, r, frame, frame + 1)[0][cut] for r in (rows, others))
+    light = ground.power[frame] * ground.level[cut]
+    used = field.used[cut]
+    noise = np.sqrt(light + (alone - left) + field.read_e2[cut])
+    blank = np.where(used, 1.0, np.nan)
+    return EventView(
+        event=int(rows.track[mine]),
+        row_px=spans[0][0],
+        column_px=spans[1][0],
+        contrast=blank * alone / light,
+        model=(alone - left) / light,
+        residual=blank * left / noise,
+    )
+
+
+class BlockStore(Shelf):
+    """Finished blocks of frames on disk."""
+
+    def load(self, number: int, span: tuple[int, int]) -> Block | None:
+        """Give a finished block, or None.
+
+        Parameters
+        ----------
+        number : int
+            Of the block.
+        span : (int, int)
+            Its frames, which it must have.
+
+        Returns
+        -------
+        Block or None
+            None where it was never finished.
+        """
+        found = self.read(number)
+        if found is None or tuple(found[1].get("span", ())) != span:
+            return None
+        table, data = found
+        try:
+            numbers = data["events"].tolist()
+            views = unpacked_views(data)
+            names = [str(name) for name in data["mass_names"]]
+            masses = pd.DataFrame(data["masses"], columns=names)
+            return Block(
+                span=span,
+                rows=Rows(data["frame"], data["track"], data["theta"], data["group"]),
+                error=float(data["error"]),
+                table=table,
+                inside=data["inside"],
+                masses=masses.set_index(pd.Index(np.arange(len(masses)), name="track")),
+                views=tuple(replace(v, event=n) for n, v in zip(numbers, views, strict=True)),
+                level=data["level"],
+                power=data["power"],
+                total_e=data["total_e"],
+                used=data["used"],
+            )
+        except (ValueError, KeyError):
+            return None
+
+    def save(self, number: int, block: Block) -> None:
+        """Keep a finished block.
+
+        Parameters
+        ----------
+        number : int
+            Of the block.
+        block : Block
+            What was found in it.
+        """
+        rows = block.rows
+        arrays = {
+            "span": np.array(block.span),
+            "frame": rows.frame, "track": rows.track, "theta": rows.theta, "group": rows.group,
+            "error": np.array(block.error),
+            "inside": block.inside,
+            "masses": block.masses.to_numpy(float),
+            "mass_names": np.array(list(block.masses.columns)),
+            "events": np.array([view.event for view in block.views], dtype=np.int64),
+            **packed_views(block.views),
+            "level": block.level, "power": block.power, "total_e": block.total_e,
+            "used": block.used,
+        }  # fmt: skip
+        self.write(number, block.table, arrays)

@@ -1,0 +1,445 @@
+"""The page of a batch: what many movies say, side by side.
+
+Everything arrives as the tables that are written beside it; nothing is computed here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pandas as pd
+from markupsafe import Markup
+
+from iscat_analysis.report.batch_figures import Curve, batch_figures
+from iscat_analysis.report.numbers import count, decimals_for, fixed, number
+from iscat_analysis.report.page import render_page
+from iscat_analysis.report.style import publish
+
+LONG = 30
+"""Rows above which a table scrolls, and can be narrowed."""
+
+_SHORT_NAME = 28  # characters
+
+_SHARE = "of the particles that came, corrected for those that were missed; without outliers"
+
+_CHARTS = {
+    "overlaid": (
+        "Masses, overlaid",
+        "Kernel density of each movie, in percent of its events; all panels have the same axes.",
+    ),
+    "stacked": (
+        "Masses, stacked",
+        "Mean over the movies of each sample, in percent of the events; all rows have the same "
+        "bins and the same scale. In brackets, the events.",
+    ),
+    "species": (
+        "Mass of every species",
+        "With 95 % intervals, statistical and of the mass scale; one colour for one kind.",
+    ),
+    "shares": (
+        "Share against concentration",
+        "Of the particles that came, outliers left out, with 95 % intervals.",
+    ),
+    "rates": ("Landing rate", "With 95 % Poisson intervals; not corrected for what was missed."),
+}
+
+
+def batch_page(
+    title: str,
+    *,
+    subtitle: str,
+    curves: Sequence[Curve],
+    movies: pd.DataFrame,
+    species: pd.DataFrame,
+    shifts: pd.DataFrame,
+    calibrations: Sequence[tuple[str, str, str]],
+    failed: Sequence[tuple[str, str]],
+    mass_label: str,
+    folder: Path | None = None,
+) -> str:
+    """Make the page of a batch, and write its figures.
+
+    Parameters
+    ----------
+    title, subtitle : str
+        Of the page.
+    curves : sequence of Curve
+        Masses of every movie.
+    movies : pandas.DataFrame
+        ``movies.csv``, with the columns group, rate, rate_from, rate_to and rate_unit.
+    species : pandas.DataFrame
+        ``species.csv``, with the column group.
+    shifts : pandas.DataFrame
+        ``shifts.csv``.
+    calibrations : sequence of (str, str, str)
+        What was calibrated, by what, and the page of it, relative to this one; empty without.
+    failed : sequence of (str, str)
+        What could not be analysed, and why.
+    mass_label : str
+        Of axes and columns.
+    folder : Path, optional
+        An existing folder for the figures; without it they are in the page only.
+
+    Returns
+    -------
+    str
+        HTML.
+    """
+    drawn = publish(
+        batch_figures(curves, movies, species, mass_label=mass_label), folder, printed=True
+    )
+    sections = [
+        _overview(movies, failed, calibrations),
+        _charts("masses", "Masses", drawn, ("overlaid", "stacked")),
+        _species(species, shifts, drawn, mass_label, movies),
+        _landing(movies, drawn),
+        _quality(movies),
+    ]
+    return render_page(
+        "document.html",
+        {
+            "title": title,
+            "subtitle": subtitle,
+            "sections": [section for section in sections if section is not None],
+        },
+    )
+
+
+def _overview(
+    movies: pd.DataFrame,
+    failed: Sequence[tuple[str, str]],
+    calibrations: Sequence[tuple[str, str, str]],
+) -> dict[str, Any]:
+    done = movies[movies["state"] == "done"]
+    analysed = done[done["role"] != "flat"]
+    told = int((done["cautions"].fillna("") != "").sum())
+    tables = []
+    if failed:
+        columns: list[Any] = ["not analysed", "why"]
+        tables.append({"columns": columns, "rows": [list(each) for each in failed]})
+    rows = [[_link(page, what), source] for what, source, page in calibrations]
+    tables.append({"columns": ["calibration", "from"], "rows": rows})
+    return {
+        "id": "day",
+        "title": "The day",
+        "facts": [
+            {
+                "label": "Movies",
+                "value": str(len(done)),
+                "note": f"of {len(movies)}" if len(done) < len(movies) else "all of the table",
+            },
+            {"label": "Samples", "value": str(analysed["sample"].nunique())},
+            {"label": "Events", "value": str(int(analysed["events"].sum()))},
+            {"label": "With cautions", "value": str(told), "note": "see the quality"},
+        ],
+        "tables": tables,
+    }
+
+
+def _charts(
+    name: str, title: str, drawn: Mapping[str, Markup], kinds: Sequence[str]
+) -> dict[str, Any] | None:
+    charts = []
+    for figure, svg in drawn.items():
+        kind, _, number_of = figure.partition("_")
+        if kind in kinds:
+            heading, caption = _CHARTS[kind]
+            charts.append(
+                {
+                    "id": f"figure-{figure.replace('_', '-')}",
+                    "title": f"{heading}, {number_of}" if number_of else heading,
+                    "caption": caption if not number_of else None,
+                    "svg": svg,
+                    "wide": True,
+                }
+            )
+    return {"id": name, "title": title, "charts": charts} if charts else None
+
+
+def _species(
+    species: pd.DataFrame,
+    shifts: pd.DataFrame,
+    drawn: Mapping[str, Markup],
+    mass_label: str,
+    movies: pd.DataFrame,
+) -> dict[str, Any] | None:
+    if species.empty:
+        return None
+    section = _charts("species", "Species", drawn, ("species", "shares")) or {
+        "id": "species", "title": "Species"
+    }  # fmt: skip
+    tables = []
+    if len(shifts):
+        tables.append(_shift_table(shifts, mass_label))
+    tables.append(_species_table(species, mass_label, dict(_links(movies))))
+    return {**section, "notes": _species_notes(shifts), "tables": tables}
+
+
+def _species_notes(shifts: pd.DataFrame) -> list[str]:
+    text = (
+        "Species of different movies are one kind where their masses are within 10 % or three "
+        "standard errors."
+    )
+    if shifts.empty:
+        return [text]
+    reference = shifts["reference"].iloc[0]
+    text += (
+        f" Samples are compared with {reference}, the first of the table: p is the chance of at "
+        "least such a shift where there is none, corrected for the number of comparisons (Holm)."
+        " The error of the mass scale, which all movies of the day share, is not in the shifts."
+    )
+    if shifts["scatter"].isna().any():
+        text += (
+            " Kinds without replicates are compared with their counting errors alone, which do not "
+            "hold how movies of one sample differ: record replicates before believing a small p."
+        )
+    return [text]
+
+
+def _shift_table(shifts: pd.DataFrame, mass_label: str) -> dict[str, Any]:
+    """Lay out one row for each kind and sample: mass, shift, share, shift."""
+    masses = shifts[shifts["quantity"] == "mass_kda"]
+    parts = shifts[shifts["quantity"] == "share"].set_index(["kind", "sample"])
+    rows = []
+    for row in masses.to_dict("records"):
+        part = parts.loc[(row["kind"], row["sample"])].to_dict()
+        rows.append(
+            [
+                f"{row['kind_mass_kda']:.3g}",
+                _name(row["sample"]),
+                _name(row["condition"] or "—"),
+                int(row["movies"]),
+                *_with_interval(row["value"], row["low"], row["high"]),
+                *_with_interval(row["shift"], row["shift_low"], row["shift_high"]),
+                _probability(row["p_holm"]),
+                *_with_interval(
+                    *(100 * part[name] for name in ("value", "low", "high")), unit=" %"
+                ),
+                *_with_interval(
+                    *(100 * part[name] for name in ("shift", "shift_low", "shift_high")), unit=" %"
+                ),
+                _probability(part["p_holm"]),
+            ]
+        )
+    columns = [
+        {"label": "kind [kDa]", "numeric": True},
+        "sample",
+        "condition",
+        {"label": "movies", "numeric": True},
+        {"label": mass_label, "numeric": True},
+        {"label": "95 %", "numeric": True, "title": "with the scatter between movies"},
+        {"label": "shift [kDa]", "numeric": True},
+        {"label": "95 %", "numeric": True},
+        {"label": "p", "numeric": True, "title": "corrected for the number of comparisons"},
+        {"label": "share", "numeric": True, "title": _SHARE},
+        {"label": "95 %", "numeric": True},
+        {"label": "shift", "numeric": True},
+        {"label": "95 %", "numeric": True},
+        {"label": "p", "numeric": True, "title": "corrected for the number of comparisons"},
+    ]
+    caption = "Species by sample, and their shifts"
+    return {"caption": caption, "columns": columns, "rows": rows, "tall": len(rows) > LONG}
+
+
+def _species_table(
+    species: pd.DataFrame, mass_label: str, links: Mapping[str, Any]
+) -> dict[str, Any]:
+    rows = []
+    for row in species.to_dict("records"):
+        rows.append(
+            [
+                "apart" if row["outlier"] else str(row["kind"]),
+                links.get(row["movie"], row["movie"]),
+                _name(row["sample"]),
+                _name(row["condition"] or "—"),
+                row["concentration_nm"],
+                *_with_interval(row["mass_kda"], row["mass_low"], row["mass_high"]),
+                *_with_interval(row["width_kda"], row["width_low"], row["width_high"]),
+                f"{row['count']:.0f}",
+                *_with_interval(
+                    *(100 * row[name] for name in ("share", "share_low", "share_high")),
+                    unit=" %",
+                ),
+                f"{100 * row['efficiency']:.0f} %",
+            ]
+        )
+    columns = [
+        {"label": "kind", "title": "one number for species of one mass; apart: an outlier"},
+        "movie",
+        "sample",
+        "condition",
+        {"label": "c [nM]", "numeric": True},
+        {"label": mass_label, "numeric": True},
+        {"label": "95 %", "numeric": True},
+        {"label": "width [kDa]", "numeric": True, "title": "beyond the events' errors"},
+        {"label": "95 %", "numeric": True},
+        {"label": "events", "numeric": True},
+        {"label": "share", "numeric": True, "title": _SHARE},
+        {"label": "95 %", "numeric": True},
+        {"label": "detected", "numeric": True},
+    ]
+    caption = "Species by movie"
+    return {"caption": caption, "columns": columns, "rows": rows, "tall": len(rows) > LONG}
+
+
+def _landing(movies: pd.DataFrame, drawn: Mapping[str, Markup]) -> dict[str, Any] | None:
+    known = movies[movies["rate"].notna()]
+    if known.empty:
+        return None
+    unit = known["rate_unit"].iloc[0]
+    links = dict(_links(movies))
+    rows = [
+        [
+            links[row["movie"]],
+            _name(row["sample"]),
+            _name(row["condition"] or "—"),
+            row["concentration_nm"],
+            int(row["landings"]),
+            int(row["leavings"]),
+            *_with_interval(row["rate"], row["rate_from"], row["rate_to"]),
+        ]
+        for row in known.to_dict("records")
+    ]
+    columns = [
+        "movie",
+        "sample",
+        "condition",
+        {"label": "c [nM]", "numeric": True},
+        {"label": "landed", "numeric": True},
+        {"label": "left", "numeric": True},
+        {"label": f"landings per {unit}", "numeric": True},
+        {"label": "95 %", "numeric": True},
+    ]
+    section = _charts("landing", "Landing", drawn, ("rates",)) or {}
+    table = {"caption": "Landings", "columns": columns, "rows": rows, "tall": len(rows) > LONG}
+    return {**section, "id": "landing", "title": "Landing", "tables": [table]}
+
+
+def _quality(movies: pd.DataFrame) -> dict[str, Any]:
+    """Say of every movie how far it can be trusted."""
+    links = dict(_links(movies))
+    further = list(movies.attrs.get("further", ()))
+    rows = []
+    for row in movies.to_dict("records"):
+        failed = row["state"] != "done"
+        said = row["why"] if failed else row["cautions"]
+        rows.append(
+            [
+                links[row["movie"]],
+                row["role"],
+                _name(row["sample"]),
+                *(_plain(row[name]) for name in further),
+                {"done": "done", "failed": "failed", "missing": "not yet"}[row["state"]],
+                said or "none",
+                _whole(row["events"]),
+                _share(row["ok"], row["events"]),
+                fixed(row["noise_over_shot"], 2),
+                fixed(row["drift_px"], 2),
+                fixed(row["focus_shift_nm"], 0),
+                _percent(row["small_p_values"]),
+                fixed(row["repeat_over_crb"], 2),
+                row["standards_seen"] or "—",
+                _name(row["optics"] or "—", 80),
+                _name(row["mass_scale"] or "—", 80),
+                _percent(row["outside_standards"]),
+            ]
+        )
+    columns = [
+        "movie",
+        "role",
+        "sample",
+        *further,
+        "state",
+        "cautions",
+        {"label": "events", "numeric": True},
+        {"label": "ok", "numeric": True, "title": "events with status ok"},
+        {"label": "noise", "numeric": True, "title": "variance over shot noise, in its windows"},
+        {"label": "drift [px]", "numeric": True, "title": "of the fixed pattern"},
+        {"label": "focus [nm]", "numeric": True, "title": "from the day's, where it was measured"},
+        {"label": "p < 0.01", "numeric": True, "title": "1 % where the model holds"},
+        {"label": "spread/CRB", "numeric": True, "title": "measured between parts of the frames"},
+        "standards",
+        "optics",
+        "mass scale",
+        {"label": "beyond", "numeric": True, "title": "masses beyond the standards"},
+    ]
+    table = {"columns": columns, "rows": rows, "tall": len(rows) > LONG}
+    return {"id": "quality", "title": "Movies and their quality", "tables": [table]}
+
+
+def _links(movies: pd.DataFrame) -> list[tuple[str, Any]]:
+    """Give every movie's name, as a link to its report where there is one."""
+    pages = zip(movies["movie"], movies["report"], strict=True)
+    return [(name, _link(report, name)) for name, report in pages]
+
+
+def _link(page: Any, name: str) -> str:
+    """Make a name a link, where there is a page."""
+    if not isinstance(page, str) or not page:
+        return name
+    return Markup('<a href="{}">{}</a>').format(quote(page), name)
+
+
+def _with_interval(
+    value: float | None, low: float | None, high: float | None, *, unit: str = ""
+) -> tuple[str, str]:
+    """Write a number, and its interval, with as many decimals as the interval supports."""
+    if value is None or not math.isfinite(value):
+        return "—", "—"
+    known = low is not None and high is not None and math.isfinite(low) and math.isfinite(high)
+    if not known or low is None or high is None:
+        return f"{number(value)}{unit}", "—"
+    decimals = decimals_for([(high - low) / 2])
+    return (
+        f"{fixed(value, decimals)}{unit}",
+        f"{fixed(low, decimals)} to {fixed(high, decimals)}{unit}",
+    )
+
+
+def _probability(p: float) -> str:
+    if not math.isfinite(p):
+        return "—"
+    return number(p, 2) if p >= 1e-6 else "0.000001 or less"
+
+
+def _percent(value: float | None) -> str:
+    return "—" if value is None or not math.isfinite(value) else f"{100 * value:.1f} %"
+
+
+def _share(part: float, whole: float) -> str:
+    return _percent(part / whole) if whole and math.isfinite(whole) else "—"
+
+
+def _name(text: Any, longest: int = _SHORT_NAME) -> Any:
+    """Keep a short text in one line."""
+    if not isinstance(text, str) or len(text) > longest:
+        return text
+    return text.replace(" ", "\N{NO-BREAK SPACE}")
+
+
+def _whole(value: float) -> Any:
+    return int(value) if value is not None and math.isfinite(value) else None
+
+
+def _plain(value: Any) -> Any:
+    return "—" if value is None or value != value or value == "" else value
+
+
+def summary_line(movies: pd.DataFrame) -> str:
+    """Say in one line what there is.
+
+    Parameters
+    ----------
+    movies : pandas.DataFrame
+        ``movies.csv``.
+
+    Returns
+    -------
+    str
+        As in ``"24 movies of 8 samples"``.
+    """
+    return f"{count(len(movies), 'movie')} of {count(movies['sample'].nunique(), 'sample')}"

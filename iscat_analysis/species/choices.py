@@ -1,0 +1,425 @@
+"""Which species to look for: as many as BIC likes, a number, given masses, or a ladder.
+
+A ladder is oligomers: n_k copies of one monomer at
+
+    μ_k = n_k m₁ + b,
+
+m₁ free or held, b free or zero.  Which n there are is given, or found: from all that the masses
+reach, the rung with the fewest events goes as long as BIC falls.  Where no monomer is named, masses
+of free species over small numbers are tried, and the heaviest that is within `_TIE` of the least
+BIC is taken, for half of a monomer's mass explains as much as the monomer.
+
+Given masses and ladders share one width τ unless widths are free, and stand on a background: a
+species of fixed, great width that takes what is none of them.
+
+Whether the masses are those of a ladder is asked by a likelihood ratio against the same species
+with every mean free: twice the gain is χ² with as many degrees of freedom as there are means more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.special import chdtrc
+
+from iscat_analysis.records import FloatArray
+from iscat_analysis.species.events import Events
+from iscat_analysis.species.mixture import Mixture, height
+from iscat_analysis.species.search import fit_species
+from iscat_analysis.species.structure import LOGIT_REACH, Limits, Structure, settle
+
+Widths = Literal["common", "free"]
+
+MOST_RUNGS = 12
+"""Rungs that a ladder without given steps may have."""
+
+_TIE = 6.0  # of BIC
+_SMALL = 4  # multiples that a free species may be
+_REACH = 0.97  # quantile of the masses that the ladder must reach
+_WIDEST = 0.35  # of the mass, or of a ladder's monomer: wider is no rung
+_SEARCH = np.linspace(0.85, 1.15, 31)  # of the monomer that was named
+
+
+@dataclass(frozen=True)
+class LadderFit:
+    """The monomer of a ladder.
+
+    Attributes
+    ----------
+    steps : tuple of int
+        n of each rung.
+    monomer_kda, monomer_se, monomer_low, monomer_high : float
+        m₁, its statistical standard error and its 95 % interval, which holds the error of the mass
+        scale [kDa].
+    offset_kda, offset_se, offset_low, offset_high : float
+        b, likewise [kDa].
+    held : bool
+        Whether m₁ was given and not fitted.
+    p_value : float
+        Chance of masses that are at least as far from a ladder if it is one; NaN where there are
+        no more rungs than parameters.
+    """
+
+    steps: tuple[int, ...]
+    monomer_kda: float
+    monomer_se: float
+    monomer_low: float
+    monomer_high: float
+    offset_kda: float
+    offset_se: float
+    offset_low: float
+    offset_high: float
+    held: bool
+    p_value: float
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """Species that were chosen.
+
+    Attributes
+    ----------
+    tried : tuple of Mixture
+        What else was fitted, and the chosen one.
+    best : Mixture
+        By rising mass, a background last.
+    structure, limits : Structure and Limits, or None
+        Of the chosen one; None where every parameter is free.
+    background : bool
+        Whether the last species is a background.
+    steps : tuple of int
+        n of each rung of a ladder, without the background.
+    searched : bool
+        Whether BIC chose the number of free species.
+    p_value : float
+        That the masses are those of the ladder; NaN without.
+    """
+
+    tried: tuple[Mixture, ...]
+    best: Mixture
+    structure: Structure | None = None
+    limits: Limits | None = None
+    background: bool = False
+    steps: tuple[int, ...] = ()
+    searched: bool = False
+    p_value: float = math.nan
+
+
+@dataclass(frozen=True)
+class Searched:
+    """As many species as BIC likes.
+
+    Attributes
+    ----------
+    most : int
+        Largest number to try.
+    """
+
+    most: int = 6
+
+    def choose(self, events: Events) -> Chosen:
+        """Fit one number after another.
+
+        Parameters
+        ----------
+        events : Events
+            What was seen.
+
+        Returns
+        -------
+        Chosen
+            The number with the least BIC.
+        """
+        fits = fit_species(events, self.most)
+        bic = [fit.bic(events.x.size) for fit in fits]
+        return Chosen(tuple(fits), fits[int(np.argmin(bic))].by_mass(), searched=True)
+
+
+@dataclass(frozen=True)
+class Number:
+    """So many species, all free.
+
+    Attributes
+    ----------
+    k : int
+        How many.
+    """
+
+    k: int
+
+    def choose(self, events: Events) -> Chosen:
+        """Fit so many species.
+
+        Parameters
+        ----------
+        events : Events
+            What was seen.
+
+        Returns
+        -------
+        Chosen
+            Fewer where there are fewer than five events for each.
+        """
+        fits = fit_species(events, self.k, least=self.k)
+        return Chosen(tuple(fits), fits[-1].by_mass())
+
+
+@dataclass(frozen=True)
+class Given:
+    """Species whose masses are known; shares and widths are fitted.
+
+    Attributes
+    ----------
+    masses_kda : tuple of float
+        Their masses [kDa].
+    widths : {"common", "free"}
+        One τ for all, or one for each.
+    background : bool
+        Whether something else may be there.
+    """
+
+    masses_kda: tuple[float, ...]
+    widths: Widths = "common"
+    background: bool = True
+
+    def choose(self, events: Events) -> Chosen:
+        """Fit shares and widths.
+
+        Parameters
+        ----------
+        events : Events
+            What was seen.
+
+        Returns
+        -------
+        Chosen
+            By rising mass.
+        """
+        masses = np.sort(np.array(self.masses_kda, dtype=np.float64))
+        structure, limits = rungs(
+            events, masses, np.zeros((masses.size, 0)), np.zeros((2, 0)), np.zeros(0),
+            widths=self.widths, background=self.background, unit_kda=float(masses[0]),
+        )  # fmt: skip
+        start = _start(events, masses, structure, self.background)
+        best = settle(events, start, structure, limits)
+        return Chosen((best,), best, structure, limits, self.background)
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """Oligomers of one monomer.
+
+    Attributes
+    ----------
+    monomer_kda : float or None
+        m₁, to begin with or to hold; None where it is to be found [kDa].
+    steps : tuple of int
+        Which n there are; none given, they are found.
+    offset : bool
+        Whether b is fitted; 0 otherwise.
+    held : bool
+        Whether m₁ is held where it was given.
+    widths : {"common", "free"}
+        One τ for all, or one for each.
+    background : bool
+        Whether something else may be there.
+    """
+
+    monomer_kda: float | None = None
+    steps: tuple[int, ...] = ()
+    offset: bool = False
+    held: bool = False
+    widths: Widths = "common"
+    background: bool = True
+
+    def choose(self, events: Events) -> Chosen:
+        """Fit the ladder, and find what is not given.
+
+        Parameters
+        ----------
+        events : Events
+            What was seen.
+
+        Returns
+        -------
+        Chosen
+            By rising n.
+        """
+        if self.monomer_kda is not None:
+            return self._from(events, self.monomer_kda)
+        free = Searched().choose(events).best
+        wanted = sorted({float(m / n) for m in free.mean for n in range(1, _SMALL + 1)})
+        least = 0.5 * float(events.x.min())
+        found = [self._from(events, m) for m in wanted if m >= least]
+        n = events.x.size
+        bic = np.array([one.best.bic(n) for one in found])
+        near = [one for one, value in zip(found, bic, strict=True) if value < bic.min() + _TIE]
+        return max(near, key=lambda one: one.best.mean[0] / one.steps[0])
+
+    def _from(self, events: Events, monomer: float) -> Chosen:
+        """Find the steps of a ladder whose monomer is about known."""
+        if self.steps:
+            steps = tuple(sorted(self.steps))
+        else:
+            top = round(float(np.quantile(events.x, _REACH)) / monomer)
+            steps = tuple(range(1, max(1, min(top, MOST_RUNGS)) + 1))
+        found = self._fit(events, monomer, steps)
+        tried = [found.best]
+        while not self.steps and len(found.steps) > 1:
+            seen = found.best.shares(events).sum(axis=0)[: len(found.steps)]
+            left = tuple(n for i, n in enumerate(found.steps) if i != int(np.argmin(seen)))
+            fewer = self._fit(events, self._monomer(found, monomer), left)
+            tried.append(fewer.best)
+            if fewer.best.bic(events.x.size) > found.best.bic(events.x.size):
+                break
+            found = fewer
+        return replace(found, tried=tuple(tried), p_value=self._against_free(events, found))
+
+    def _monomer(self, found: Chosen, given: float) -> float:
+        return given if self.held else self.values(found)[0]
+
+    def values(self, found: Chosen, mixture: Mixture | None = None) -> tuple[float, float]:
+        """Give m₁ and b of a ladder.
+
+        Parameters
+        ----------
+        found : Chosen
+            Which ladder.
+        mixture : Mixture, optional
+            Of this ladder's structure; default the chosen one.
+
+        Returns
+        -------
+        monomer, offset : float
+            m₁ and b [kDa].
+        """
+        mean = (found.best if mixture is None else mixture).mean[: len(found.steps)]
+        steps = np.array(found.steps, dtype=np.float64)
+        if self.held and self.monomer_kda is not None:
+            return self.monomer_kda, float(np.mean(mean - steps * self.monomer_kda))
+        if self.offset and steps.size > 1:
+            slope, offset = np.polyfit(steps, mean, 1)
+            return float(slope), float(offset)
+        return float(mean[0] / steps[0]), 0.0
+
+    def _fit(self, events: Events, monomer: float, steps: Sequence[int]) -> Chosen:
+        n = np.array(steps, dtype=np.float64)
+        columns, ranges, units = [], [], []
+        if not self.held:
+            columns.append(n)
+            ranges.append((0.5 * monomer, 2.0 * monomer))
+            units.append(float(np.median(events.sigma)))
+        if self.offset and (self.held or n.size > 1):
+            columns.append(np.ones(n.size))
+            ranges.append((-0.5 * monomer, 0.5 * monomer))
+            units.append(float(np.median(events.sigma)))
+        slopes = np.array(columns).T.reshape(n.size, len(columns))
+        structure, limits = rungs(
+            events, monomer * n if self.held else np.zeros(n.size), slopes,
+            np.array(ranges).reshape(-1, 2).T, np.array(units),
+            widths=self.widths, background=self.background, unit_kda=monomer,
+        )  # fmt: skip
+        begin = [1.0] if self.held else _SEARCH
+        starts = [_start(events, n * monomer * s, structure, self.background) for s in begin]
+        start = max(starts, key=lambda one: height(events, one))
+        best = settle(events, start, structure, limits)
+        return Chosen((best,), best, structure, limits, self.background, tuple(steps))
+
+    def _against_free(self, events: Events, found: Chosen) -> float:
+        """Ask whether free means describe the events better than a ladder's."""
+        k = len(found.steps)
+        means = (0 if self.held else 1) + int(self.offset and (self.held or k > 1))
+        if k <= means:
+            return math.nan
+        unit = float(np.median(events.sigma))
+        monomer = self.monomer_kda or self.values(found)[0]
+        centres = found.best.mean[:k]
+        structure, limits = rungs(
+            events, np.zeros(k), np.eye(k),
+            np.array([centres - 0.5 * monomer, centres + 0.5 * monomer]), np.full(k, unit),
+            widths=self.widths, background=self.background, unit_kda=monomer,
+        )  # fmt: skip
+        free = settle(events, found.best, structure, limits)
+        gain = max(2 * (free.log_likelihood - found.best.log_likelihood), 0.0)
+        return float(chdtrc(k - means, gain))
+
+
+Choice = Searched | Number | Given | Ladder
+
+
+def rungs(
+    events: Events,
+    origin: FloatArray,
+    slopes: FloatArray,
+    ranges: FloatArray,
+    units: FloatArray,
+    *,
+    widths: Widths,
+    background: bool,
+    unit_kda: float,
+) -> tuple[Structure, Limits]:
+    """Make a structure of species whose means are linear in few parameters.
+
+    Parameters
+    ----------
+    events : Events
+        What was seen; sets where a background lies.
+    origin : ndarray, shape (k,)
+        Means where the parameters are 0 [kDa].
+    slopes : ndarray, shape (k, p)
+        Of the means with respect to their parameters.
+    ranges : ndarray, shape (2, p)
+        Where these may lie.
+    units : ndarray, shape (p,)
+        In which a step of 1 matters.
+    widths : {"common", "free"}
+        One τ² for all, or one for each.
+    background : bool
+        Whether a species of fixed width stands behind them.
+    unit_kda : float
+        Smallest distance of species; no width is more than a part of it [kDa].
+
+    Returns
+    -------
+    Structure
+        θ = (logits from the second on, parameters of the means, τ² or τ_k²).
+    Limits
+        Of θ.
+    """
+    k, p = slopes.shape
+    q = 1 if widths == "common" else k
+    every = k + int(background)
+    design = np.zeros((3, every, every - 1 + p + q))
+    start = np.zeros((3, every))
+    design[0, 1:, : every - 1] = np.eye(every - 1)
+    design[1, :k, every - 1 : every - 1 + p] = slopes
+    design[2, :k, every - 1 + p :] = 1.0 if widths == "common" else np.eye(k)
+    start[1, :k] = origin
+    if background:
+        low, high = float(events.x.min()), float(events.x.max())
+        start[1, k] = (low + high) / 2
+        start[2, k] = max((high - low) / 2, unit_kda) ** 2
+    sigma = max(float(np.median(events.sigma)), 1e-9)
+    widest = (_WIDEST * unit_kda) ** 2
+    return Structure(design, start), Limits(
+        np.concatenate([np.full(every - 1, -LOGIT_REACH), ranges[0], np.zeros(q)]),
+        np.concatenate([np.full(every - 1, LOGIT_REACH), ranges[1], np.full(q, widest)]),
+        np.concatenate([np.ones(every - 1), units, np.full(q, sigma**2)]),
+    )
+
+
+def _start(events: Events, mean: FloatArray, structure: Structure, background: bool) -> Mixture:
+    """Take shares from the events near each mass, and the typical error as width."""
+    edges = (mean[:-1] + mean[1:]) / 2
+    near = np.searchsorted(edges, events.x)
+    size = np.bincount(near, minlength=mean.size) + 1.0
+    variance = np.full(mean.size, float(np.median(events.sigma)) ** 2)
+    if background:
+        size = np.append(size, 0.05 * size.sum())
+        mean = np.append(mean, structure.origin[1, -1])
+        variance = np.append(variance, structure.origin[2, -1])
+    return Mixture(size / size.sum(), mean, variance)

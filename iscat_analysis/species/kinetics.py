@@ -1,0 +1,281 @@
+"""How fast particles land, and how long they stay.
+
+Landings at times t_i in [0, T] come at the rate λ(t) = λ₀ exp(−kt): the drop, or the layer above
+the surface, runs out of particles at the rate k.  With λ₀ at its best, the log-likelihood is
+
+    ℓ(k) = n ln(k/(1 − exp(−kT))) − k Σ t_i + const,
+
+concave in k.  A ratio of likelihoods tests k = 0, and the distance of Kolmogorov and Smirnov
+between the times and the fitted law whether that law describes them; diffusion out of a drop at
+rest, λ ∝ t^(−1/2), does not look exponential.
+
+A landing is paired with a leaving at the same place, of the same mass, later; each is in one pair.
+Of landing i that stays at least d₀, the window of the search, a leaving is seen with the chance q_i
+if it leaves before the end, c_i after d₀:
+
+    paired, after d_i + d₀:  q_i κ exp(−κ d_i);      not:  1 − q_i (1 − exp(−κ c_i)),
+
+so that those that still stay at the end (censored) and those whose leaving was missed are accounted
+for.  How many pairs are chance is told by leavings whose places are moved by half of the field.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.spatial import cKDTree
+from scipy.special import chdtrc, kolmogorov
+
+from iscat_analysis.records import FloatArray
+
+IndexArray: TypeAlias = NDArray[np.int64]
+"""Rows of a table."""
+
+LEAST_LANDINGS = 10
+"""Fewer landings have no rate that depends on time."""
+
+_DROP = 1.920729  # of the log-likelihood at the ends of a 95 % interval
+_TWO_SIDED_95 = 1.959964
+_STEEPEST = 200.0  # of kT
+_SMALL = 1e-6  # of kT, below which series take over
+_ALIKE = 4.0  # standard errors between the masses of a pair
+
+
+@dataclass(frozen=True)
+class LandingRate:
+    """How fast particles land.
+
+    Attributes
+    ----------
+    landings : int
+        Landings that were seen.
+    seconds : float
+        Time in which they were [s].
+    per_second, per_second_low, per_second_high : float
+        λ₀, the rate in the beginning, and its 95 % interval [1/s].
+    depletion_per_s, depletion_low, depletion_high : float
+        k and its 95 % interval [1/s]; negative where the rate grows.
+    depletion_p : float
+        Chance of at least as much change if the rate is constant.
+    p_value : float
+        Chance of times at least as far from the fitted law if it is true.
+    """
+
+    landings: int
+    seconds: float
+    per_second: float
+    per_second_low: float
+    per_second_high: float
+    depletion_per_s: float
+    depletion_low: float
+    depletion_high: float
+    depletion_p: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class UnbindingRate:
+    """How fast particles leave.
+
+    Attributes
+    ----------
+    landings : int
+        Landings whose stay is known to be longer than the window.
+    pairs : int
+        Those with a leaving.
+    chance_pairs : int
+        Pairs that are found where leavings are moved by half of the field.
+    per_second, per_second_low, per_second_high : float
+        κ and its 95 % interval [1/s]; 0 without any pair.
+    """
+
+    landings: int
+    pairs: int
+    chance_pairs: int
+    per_second: float
+    per_second_low: float
+    per_second_high: float
+
+
+def landing_rate(times_s: FloatArray, seconds: float) -> LandingRate:
+    """Fit the rate of landings and its depletion.
+
+    Parameters
+    ----------
+    times_s : ndarray, shape (n,)
+        When particles landed, from the beginning of the observation [s].
+    seconds : float
+        How long it lasted [s].
+
+    Returns
+    -------
+    LandingRate
+        NaN where there are fewer than `LEAST_LANDINGS`.
+    """
+    n = times_s.size
+    if n < LEAST_LANDINGS:
+        return LandingRate(n, seconds, *([math.nan] * 8))
+    share = np.sort(times_s) / seconds
+    mean = float(share.mean())
+
+    def height(x: float) -> float:
+        return n * (_log_slope(x) - x * mean)
+
+    def rise(x: float) -> float:
+        return _middle(x) - mean
+
+    best = float(brentq(rise, -_STEEPEST, _STEEPEST, xtol=1e-10))
+    ends = _ends(height, best, -_STEEPEST, _STEEPEST)
+    flat = 2 * (height(best) - height(0.0))
+    # Information on ln λ₀ and x = kT: n, −n g', and that of ∫λ.
+    slope = -_middle(best)
+    curvature = (_middle(best + 1e-4) - _middle(best - 1e-4)) / -2e-4
+    error = math.sqrt((1 + slope**2 / curvature) / n)
+    rate = n / seconds * math.exp(_log_slope(best))
+    law = -np.expm1(-best * share) / -math.expm1(-best) if abs(best) > _SMALL else share
+    steps = np.arange(n + 1) / n
+    distance = float(max(np.max(steps[1:] - law), np.max(law - steps[:-1])))
+    return LandingRate(
+        landings=n,
+        seconds=seconds,
+        per_second=rate,
+        per_second_low=rate * math.exp(-_TWO_SIDED_95 * error),
+        per_second_high=rate * math.exp(_TWO_SIDED_95 * error),
+        depletion_per_s=best / seconds,
+        depletion_low=ends[0] / seconds,
+        depletion_high=ends[1] / seconds,
+        depletion_p=float(chdtrc(1, max(flat, 0.0))),
+        p_value=float(kolmogorov(math.sqrt(n) * distance)),
+    )
+
+
+def pair_events(
+    frame: FloatArray,
+    place_px: FloatArray,
+    mass_kda: FloatArray,
+    sigma_kda: FloatArray,
+    *,
+    radius_px: float,
+) -> tuple[IndexArray, IndexArray]:
+    """Pair landings with the leavings of the same particles.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (n,)
+        First frame of the new state.
+    place_px : ndarray, shape (n, 2)
+        Where [px].
+    mass_kda, sigma_kda : ndarray, shape (n,)
+        Signed mass and its error [kDa].
+    radius_px : float
+        Farthest that the two may lie apart [px].
+
+    Returns
+    -------
+    landing, leaving : ndarray of int, shape (pairs,)
+        Rows of the events; every event is in one pair at most.
+    """
+    lands, leaves = np.flatnonzero(mass_kda > 0), np.flatnonzero(mass_kda < 0)
+    if not lands.size or not leaves.size:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    tree = cKDTree(place_px[lands])
+    taken: dict[int, int] = {}
+    for leaving in leaves[np.argsort(frame[leaves], kind="stable")]:
+        near = lands[tree.query_ball_point(place_px[leaving], radius_px)]
+        error = np.hypot(sigma_kda[near], sigma_kda[leaving])
+        alike = np.abs(mass_kda[near] + mass_kda[leaving]) < _ALIKE * error
+        fit = [int(i) for i in near[alike & (frame[near] < frame[leaving])] if int(i) not in taken]
+        if fit:
+            taken[max(fit, key=lambda i: frame[i])] = int(leaving)
+    order = sorted(taken)
+    return np.array(order, np.int64), np.array([taken[i] for i in order], np.int64)
+
+
+def unbinding_rate(
+    stay_s: FloatArray, censor_s: FloatArray, detected: FloatArray, *, chance_pairs: int = 0
+) -> UnbindingRate:
+    """Fit the rate at which particles leave.
+
+    Parameters
+    ----------
+    stay_s : ndarray, shape (n,)
+        d_i, how long a particle stayed beyond d₀; NaN where no leaving was seen [s].
+    censor_s : ndarray, shape (n,)
+        c_i, how long its leaving could have been seen [s].
+    detected : ndarray, shape (n,)
+        q_i, the chance that a leaving is detected.
+    chance_pairs : int
+        Handed on to the result.
+
+    Returns
+    -------
+    UnbindingRate
+        With an upper end where nothing left.
+    """
+    paired = np.isfinite(stay_s)
+    number, stayed = int(paired.sum()), float(stay_s[paired].sum())
+    left, chance = censor_s[~paired], detected[~paired]
+    longest = float(censor_s.max(initial=0.0))
+    if not longest > 0:
+        return UnbindingRate(stay_s.size, number, chance_pairs, math.nan, math.nan, math.nan)
+
+    def height(ln_rate: float) -> float:
+        rate = math.exp(ln_rate)
+        with np.errstate(divide="ignore"):  # none can still be there
+            missing = float(np.sum(np.log1p(chance * np.expm1(-rate * left))))
+        return number * ln_rate - rate * stayed + missing
+
+    low, high = math.log(1e-6 / longest), math.log(1e6 / longest)
+    if not number:
+        end = _crossing(height, height(low), low, high)
+        return UnbindingRate(stay_s.size, 0, chance_pairs, 0.0, 0.0, math.exp(end))
+    grid = np.linspace(low, high, 400)
+    near = int(np.argmax([height(x) for x in grid]))
+    best = _peak(height, grid[max(near - 1, 0)], grid[min(near + 1, grid.size - 1)])
+    ends = _ends(height, best, low, high)
+    return UnbindingRate(
+        stay_s.size, number, chance_pairs, math.exp(best), math.exp(ends[0]), math.exp(ends[1])
+    )
+
+
+def _log_slope(x: float) -> float:
+    """ln(x/(1 − e^(−x)))."""
+    return x / 2 if abs(x) < _SMALL else math.log(x / -math.expm1(-x))
+
+
+def _middle(x: float) -> float:
+    """Mean of a time in [0, 1] whose density is as e^(−xt)."""
+    return 0.5 - x / 12 if abs(x) < 1e-3 else 1 / x - 1 / math.expm1(x)
+
+
+def _peak(height: Callable[[float], float], low: float, high: float) -> float:
+    """Golden section; the function has one maximum between."""
+    part = (math.sqrt(5) - 1) / 2
+    while high - low > 1e-7:
+        left, right = high - part * (high - low), low + part * (high - low)
+        if height(left) < height(right):
+            low = left
+        else:
+            high = right
+    return (low + high) / 2
+
+
+def _ends(
+    height: Callable[[float], float], best: float, low: float, high: float
+) -> tuple[float, float]:
+    """Where a likelihood has fallen by 1.92 on both sides."""
+    top = height(best)
+    return _crossing(height, top, best, low), _crossing(height, top, best, high)
+
+
+def _crossing(height: Callable[[float], float], top: float, start: float, far: float) -> float:
+    """Where it has, between a place where it has not and an end of the range."""
+    if top - height(far) < _DROP:
+        return far
+    return float(brentq(lambda x: top - height(x) - _DROP, start, far, xtol=1e-9))

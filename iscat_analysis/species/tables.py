@@ -1,0 +1,389 @@
+"""Events of any table: ours, those of Refeyn's programs, or columns of one's own.
+
+Light particles are missed, and what tells how many depends on the table.
+
+- With ``snr``, ours: the matched filter's σ_d is the median of |m|/snr clearly above the threshold,
+  which stands in ``summary.json`` beside the table, or else is where the snr of the table begins.
+- Given a limit M₅₀ and a spread: u σ_d = M₅₀, and σ_d is the spread.
+- Given a cut: events below it are left out, and the species are those of a distribution that is cut
+  there, which is exact whatever was missed below.
+- Otherwise the lightest event is taken for such a cut.
+
+Tables without errors of their own have σ = `UNKNOWN_SIGMA_KDA` for every event, less than any
+instrument's; the width of a species then holds its error.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy.optimize import minimize_scalar
+from scipy.special import log_ndtr
+
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.movie.event_tables import read_events
+from iscat_analysis.movie.hdf5 import SIGNATURE as HDF5
+from iscat_analysis.records import FloatArray, Status
+from iscat_analysis.species.events import Efficiency, Events
+
+UNKNOWN_SIGMA_KDA = 1.0
+"""Error of an event whose table has none [kDa]."""
+
+_CLEAR = 3.0  # standard deviations above the threshold, where hardly any is missed
+_LEAST_EXTRA = 0.05  # of σ_d: noise of the filter's estimate beyond that of the fit
+_ENOUGH = 10  # events to measure σ_d by
+_NEAR_EDGE = 10  # values that tell where a distribution begins
+_SHARP = 1e-6  # of a cut: its width
+_OURS = ("fits.parquet", "fits.csv")
+_LARGEST = 2_000_000_000  # bytes
+
+
+@dataclass(frozen=True, eq=False)
+class EventTable:
+    """Events that have a mass.
+
+    Attributes
+    ----------
+    name : str
+        What messages call it.
+    mass_kda, sigma_kda : ndarray, shape (n,)
+        Masses, negative for particles that leave, and their standard deviations [kDa].
+    frame : ndarray, shape (n,)
+        First frame of the new state; NaN where the table has none.
+    x_px, y_px : ndarray, shape (n,)
+        Where [px]; NaN where the table has no places.
+    efficiency : Efficiency or None
+        Of the detector; None where nothing is said to be missed.
+    window_frames : int or None
+        Frames that the search averaged.
+    scale_error : callable or None
+        Standard deviation of the mass scale at masses [kDa].
+    notes : tuple of str
+        What the user should know, one sentence each.
+    """
+
+    name: str
+    mass_kda: FloatArray
+    sigma_kda: FloatArray
+    frame: FloatArray
+    x_px: FloatArray
+    y_px: FloatArray
+    efficiency: Efficiency | None = None
+    window_frames: int | None = None
+    scale_error: Callable[[FloatArray], FloatArray] | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def events(self) -> Events:
+        """Magnitudes of the masses, as fits take them."""
+        return Events(np.abs(self.mass_kda), self.sigma_kda, self.efficiency)
+
+
+def event_table(
+    events: str | Path | pd.DataFrame,
+    *,
+    name: str | None = None,
+    sigma_kda: float | None = None,
+    limit_kda: float | None = None,
+    limit_sigma_kda: float | None = None,
+    above_kda: float | None = None,
+) -> EventTable:
+    """Take events from a file or a table in memory.
+
+    Parameters
+    ----------
+    events : str, Path or pandas.DataFrame
+        A folder of ``iscat fit``, ``fits.csv``, ``fits.parquet``, a table of Refeyn's (h5 or csv),
+        or any table with a column ``mass_kda`` and, if possible, ``sigma_mass_kda``, ``snr``,
+        ``frame`` and ``status``, of which only ``ok`` is used.
+    name : str, optional
+        What messages call it; default its path.
+    sigma_kda : float, optional
+        Standard deviation of every event, in place of the table's [kDa].
+    limit_kda : float, optional
+        Mass of which every other particle is detected [kDa].
+    limit_sigma_kda : float, optional
+        Standard deviation of the estimate that decides on detection [kDa]; default the median σ.
+    above_kda : float, optional
+        Use only events above this |mass|, and correct for the cut [kDa].
+
+    Returns
+    -------
+    EventTable
+        Its events, and what is known of those that were missed.
+
+    Raises
+    ------
+    DataError
+        The file cannot be read, or holds no masses.
+    ConfigError
+        An option is impossible.
+    """
+    for option, value in (
+        ("sigma_kda", sigma_kda),
+        ("limit_kda", limit_kda),
+        ("limit_sigma_kda", limit_sigma_kda),
+        ("above_kda", above_kda),
+    ):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ConfigError(f"`{option}` = {value:g}: must be a mass in kDa above 0")
+    if limit_kda is not None and above_kda is not None:
+        raise ConfigError(
+            "`limit_kda` and `above_kda` are two ways to say what is missed; give one of them"
+        )
+    if limit_sigma_kda is not None and limit_kda is None:
+        raise ConfigError("`limit_sigma_kda` is the spread of a limit; give `limit_kda` as well")
+    if isinstance(events, pd.DataFrame):
+        table, path, called = events, None, name or "table"
+    else:
+        table, path = _read(Path(events))
+        called = name or str(events)
+    found = _usable(table, called, sigma_kda)
+    efficiency, said = found.efficiency, list(found.notes)
+    if above_kda is not None:
+        found = _cut(found, above_kda)
+        efficiency = _sharp(above_kda)
+    elif limit_kda is not None:
+        spread = limit_sigma_kda or float(np.median(found.sigma_kda))
+        efficiency = Efficiency(limit_kda / spread, spread)
+    elif "snr" in table:
+        efficiency = _from_snr(table, path)
+    if efficiency is None:
+        edge = float(np.abs(found.mass_kda).min())
+        efficiency = _sharp(edge * (1 - 10 * _SHARP))
+        said.append(
+            f"{called}: what was missed is taken to lie below the lightest event, {edge:.3g} kDa; "
+            "`above_kda` cuts where all are still detected, `limit_kda` says where half are"
+        )
+    return replace(found, efficiency=efficiency, notes=tuple(said))
+
+
+def filter_efficiency(good: pd.DataFrame, threshold_snr: float) -> Efficiency | None:
+    """Read the matched filter's efficiency off the events that it found.
+
+    Parameters
+    ----------
+    good : pandas.DataFrame
+        With mass_kda [kDa] and snr.
+    threshold_snr : float
+        Of the filter [standard deviations].
+
+    Returns
+    -------
+    Efficiency or None
+        σ_d is the median of |m|/snr, of events clearly above the threshold where there are enough,
+        and otherwise that of the largest likelihood of what was selected; None where no event has
+        mass and snr.
+    """
+    mass, snr = (good[name].to_numpy(dtype=float) for name in ("mass_kda", "snr"))
+    known = np.isfinite(mass) & (mass != 0) & (snr > 0) & np.isfinite(snr)
+    mass, snr = np.abs(mass[known]), snr[known]
+    if not mass.size:
+        return None
+    each = mass / snr
+    # Near the threshold those are seen whose estimate is too large; they would make σ_d too small.
+    clear = mass > (threshold_snr + _CLEAR) * float(np.median(each))
+    if np.count_nonzero(clear) >= _ENOUGH:
+        each = each[clear]
+    elif "sigma_mass_kda" in good:
+        sigma = good["sigma_mass_kda"].to_numpy(dtype=float)[known]
+        return Efficiency(threshold_snr, _truncated(mass, snr, sigma, threshold_snr))
+    return Efficiency(threshold_snr, float(np.median(each)))
+
+
+def _truncated(mass: FloatArray, snr: FloatArray, sigma: FloatArray, threshold_snr: float) -> float:
+    """Find σ_d where all events lie near the threshold.
+
+    The filter's y = snr·σ_d is normal about the mass with the variance σ_d² − σ², and above u·σ_d:
+    the σ_d that makes the events seen most likely.
+    """
+    known = np.isfinite(sigma) & (sigma > 0)
+    mass, snr, sigma = mass[known], snr[known], sigma[known]
+    middle = float(np.median(mass / snr)) if mass.size else math.nan
+
+    def loss(scale: float) -> float:
+        extra = np.sqrt(np.maximum(scale**2 - sigma**2, (_LEAST_EXTRA * scale) ** 2))
+        off = (snr * scale - mass) / extra
+        seen = log_ndtr((mass - threshold_snr * scale) / extra)
+        return float(np.sum(0.5 * off**2 + np.log(extra / scale) + seen))
+
+    if not mass.size:
+        return middle
+    found = minimize_scalar(loss, bounds=(0.8 * middle, 2.0 * middle), method="bounded")
+    return float(found.x)
+
+
+def shared_error(good: pd.DataFrame) -> Callable[[FloatArray], FloatArray] | None:
+    """Read the error that all events share, as a function of mass, off the events themselves.
+
+    Without calibration the species are contrasts in units of the model, and share their error.
+
+    Parameters
+    ----------
+    good : pandas.DataFrame
+        With mass_kda and, where it is known, systematic_mass_kda [kDa].
+
+    Returns
+    -------
+    callable or None
+        Standard deviation of the mass scale at masses [kDa].
+    """
+    if "systematic_mass_kda" not in good or good.empty:
+        return None
+    size = good["mass_kda"].abs().to_numpy(dtype=float)
+    error = good["systematic_mass_kda"].to_numpy(dtype=float)
+    if "systematic_contrast" in good:
+        relative = good["systematic_contrast"] / good["contrast"].abs()
+        error = size * relative.to_numpy(dtype=float)
+    order = np.argsort(size)
+    return lambda masses: np.interp(masses, size[order], error[order])
+
+
+def _read(path: Path) -> tuple[pd.DataFrame, Path]:
+    """Read a table of whichever program; the path of the file that was read."""
+    if path.is_dir():
+        inside = next((path / name for name in _OURS if (path / name).exists()), None)
+        if inside is None:
+            raise DataError(
+                f"{path}: is a folder without fits.csv; give an output folder of iscat fit, or a "
+                "table of events"
+            )
+        path = inside
+    try:
+        with path.open("rb") as file:
+            first = file.readline(65536)
+        if path.stat().st_size > _LARGEST:
+            raise DataError(f"{path}: is too large for a table of events; check the path")
+    except OSError:
+        return read_events(path), path  # says what is wrong with it
+    try:
+        if first.startswith(b"PAR1"):
+            return pd.read_parquet(path), path
+        names = first.decode("utf-8", errors="replace").lstrip("\ufeff").strip().split(",")
+        if "mass_kda" in [name.strip() for name in names]:
+            return pd.read_csv(path, keep_default_na=False, na_values=["", "nan", "NaN"]), path
+    except (ValueError, OSError, MemoryError) as error:
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise DataError(f"{path}: cannot be read as a table ({said}); export it again") from None
+    try:
+        return read_events(path), path
+    except DataError:
+        if first.startswith(HDF5) or b"contrasts" in first:
+            raise
+        raise DataError(
+            f"{path}: is no table of events; give fits.csv, a table of Refeyn's (eventsFitted.csv "
+            "or h5), or a CSV file whose first line names a column mass_kda"
+        ) from None
+
+
+def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTable:
+    """Take the rows that have a mass and are fit to be used."""
+    if "mass_kda" not in table:
+        raise DataError(
+            f"{name}: has no column mass_kda; give fits.csv, a table of Refeyn's, or name the "
+            "column so"
+        )
+    good = table
+    if "status" in table:
+        good = table[table["status"] == Status.OK.value]
+        if good.empty:
+            raise DataError(f"{name}: holds no event with status ok")
+    mass, sigma, frame, x, y = (
+        _numbers(good, column, name)
+        for column in ("mass_kda", "sigma_mass_kda", "frame", "x_px", "y_px")
+    )
+    known = np.isfinite(mass) & (mass != 0)
+    notes = []
+    if sigma_kda is not None:
+        sigma = np.full(mass.shape, sigma_kda)
+    elif not np.isfinite(sigma[known]).any():
+        sigma = np.full(mass.shape, UNKNOWN_SIGMA_KDA)
+        notes.append(
+            f"{name}: its events have no errors of their own, so that the width of a species holds "
+            "them; `sigma_kda` gives them one"
+        )
+    known &= np.isfinite(sigma) & (sigma > 0)
+    if not known.any():
+        raise DataError(
+            f"{name}: holds no event with a mass and an error; fit the masses (mode mass or joint) "
+            "or export the table with masses"
+        )
+    if missing := int(np.count_nonzero(~known)):
+        notes.append(f"{name}: {missing} events without a mass and an error are left out")
+    rows = good[known]
+    window = (
+        int(rows["n_after"].max()) if "n_after" in rows and rows["n_after"].notna().any() else 0
+    )
+    return EventTable(
+        name,
+        mass[known],
+        sigma[known],
+        frame[known],
+        x[known],
+        y[known],
+        window_frames=window or None,
+        scale_error=shared_error(rows),
+        notes=tuple(notes),
+    )
+
+
+def _numbers(table: pd.DataFrame, column: str, name: str) -> FloatArray:
+    """Give a column as numbers; NaN where there is none."""
+    if column not in table:
+        return np.full(len(table), math.nan)
+    try:
+        return np.asarray(table[column].to_numpy(dtype=np.float64))
+    except (ValueError, TypeError) as error:
+        raise DataError(
+            f"{name}: holds in {column} what is no number ({error}); correct the table"
+        ) from None
+
+
+def _cut(found: EventTable, above_kda: float) -> EventTable:
+    """Leave out the events below a mass."""
+    kept = np.abs(found.mass_kda) > above_kda
+    if not kept.any():
+        raise DataError(f"{found.name}: no event lies above `above_kda` = {above_kda:g}")
+    return replace(
+        found,
+        mass_kda=found.mass_kda[kept],
+        sigma_kda=found.sigma_kda[kept],
+        frame=found.frame[kept],
+        x_px=found.x_px[kept],
+        y_px=found.y_px[kept],
+    )
+
+
+def _edge(values: FloatArray) -> float:
+    """Say where a distribution begins: the least value, less the mean distance of those near it."""
+    few = np.sort(values)[:_NEAR_EDGE]
+    return float(few[0] - (few[-1] - few[0]) / max(few.size - 1, 1))
+
+
+def _sharp(edge_kda: float) -> Efficiency:
+    """Everything above a mass is seen, and nothing below."""
+    return Efficiency(1 / _SHARP, edge_kda * _SHARP)
+
+
+def _from_snr(table: pd.DataFrame, path: Path | None) -> Efficiency | None:
+    """Read threshold and noise of the filter off a table of ours."""
+    good = table[table["status"] == Status.OK.value] if "status" in table else table
+    snr = good["snr"].to_numpy(dtype=float)
+    snr = snr[np.isfinite(snr) & (snr > 0)]
+    if not snr.size:
+        return None
+    threshold = _edge(snr)
+    if path is not None:
+        try:
+            text = (path.parent / "summary.json").read_text(encoding="utf-8")
+            stored = json.loads(text)["detection_threshold_snr"]
+            threshold = float(stored) if stored else threshold
+        except (OSError, ValueError, KeyError, TypeError):
+            pass  # no summary, or not ours: the table alone must do
+    return filter_efficiency(good, threshold)

@@ -1,0 +1,67 @@
+"""`iscat kd` as a user meets it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pandas as pd
+import pytest
+from event_tables import draw_series
+
+from iscat_analysis.schemas import schema
+from iscat_cli import main
+
+
+@pytest.fixture
+def samples(tmp_path: Path) -> Path:
+    totals = np.array([[3.0], [30.0], [100.0]])
+    random = np.random.default_rng(4)
+    for number, table in enumerate(draw_series(random, "dimer", totals, 10.0, [66.0], number=400)):
+        table.to_csv(tmp_path / f"{number}.csv", index=False)
+    rows = pd.DataFrame({"path": [f"{n}.csv" for n in range(3)], "concentration_nm": totals[:, 0]})
+    rows.to_csv(tmp_path / "samples.csv", index=False)
+    return tmp_path / "samples.csv"
+
+
+def test_the_table_and_kd(samples: Path, capsys) -> None:
+    assert main(["kd", str(samples), "--model", "dimer", "--masses", "66"]) == 0
+    heading, *rows, last = capsys.readouterr().out.splitlines()
+    assert heading.split()[:3] == ["table", "concentration", "[nM]"]
+    assert [row.split()[0] for row in rows] == ["0.csv", "1.csv", "2.csv"]
+    assert last.startswith("K_D = ")
+    assert "of the equilibrium" in last
+
+
+def test_json_follows_the_schema(samples: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    command = ["kd", str(samples), "--model", "dimer", "--masses", "66", "--inactive"]
+    assert main([*command, "--out", str(out), "--json", "--quiet"]) == 0
+    printed = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    jsonschema.validate(printed, schema("kd"))
+    assert printed.pop("out") == str(out)
+    assert json.loads((out / "kd.json").read_text()) == printed
+    assert printed["inactive_se"] is not None
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "said"),
+    [
+        ("--model ab", 2, "--masses: model ab needs the masses of A and B"),
+        ("--model ab --masses 40,80", 1, "no column a_nm"),
+        ("--model dimer --masses 66,80", 2, "--masses: model dimer takes the mass of the monomer"),
+        ("--model dimer --masses x", 2, "--masses x: write masses in kDa"),
+        ("--model dimer --landing 3", 2, "--landing 3: must lie between -1 and 1"),
+        ("--model trimer", 2, "'trimer' is not one of 'dimer', 'ab'"),
+        ("", 2, "Missing option '--model'"),
+    ],
+)
+def test_what_is_wrong_is_said_with_the_option(
+    options: str, status: int, said: str, samples: Path, capsys
+) -> None:
+    assert main(["kd", str(samples), *options.split()]) == status
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.splitlines()) == 1

@@ -1,0 +1,420 @@
+"""A day of small movies: what is run, what is left alone, and what failing costs."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import threading
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import tifffile
+
+import iscat_analysis as ia
+from iscat_analysis.day import Batch, run
+from iscat_analysis.day.state import STATE, Records
+from iscat_cli import main
+
+pytestmark = pytest.mark.usefixtures("all_sketched")
+
+SETUP = {
+    "optics.focus_nm": -300.0,
+    "optics.calibrate": "never",
+    "camera.pixel_size_nm": 84.4,
+    "particle.mass_kda": 900.0,
+    "background.frames": (0, 30),
+    "fit.frames": (30, 60),
+    "posterior.enabled": False,
+    "calibration.gradient_per_kda": -3.1e-5,
+    "simulation.shape": [64, 64],
+    "simulation.frames": 60,
+}
+LINE = SETUP["calibration.gradient_per_kda"]
+NAMES = ("a", "b", "c")
+
+
+def _simulate(path: Path, *, seed: int, masses: tuple[float, ...] = (900.0, 1500.0)) -> None:
+    """Write a movie of particles 32 pixels apart."""
+    side = int(np.ceil(np.sqrt(len(masses))))
+    events = [
+        {"frame": 30, "x_px": 20.3 + 32 * (k % side), "y_px": 20.8 + 32 * (k // side),
+         "mass_kda": mass}
+        for k, mass in enumerate(masses)
+    ]  # fmt: skip
+    shape = [8 + 32 * side] * 2
+    changes = {"simulation.shape": shape, "simulation.events": events}
+    ia.simulate_movie({**SETUP, **changes}, str(path), seed=seed)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """Simulate the movies once: three samples, and one that is cut short."""
+    folder = tmp_path_factory.mktemp("made")
+    for number, name in enumerate(NAMES):
+        _simulate(folder / f"{name}.tif", seed=number + 1)
+    whole = (folder / "a.tif").read_bytes()
+    (folder / "cut.tif").write_bytes(whole[: len(whole) // 2])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(made: Path, tmp_path_factory) -> Path:
+    """Analyse the samples once."""
+    folder = tmp_path_factory.mktemp("done") / "lab"
+    shutil.copytree(made, folder)
+    _table(folder, NAMES)
+    assert _run(folder).analysed == NAMES
+    return folder
+
+
+@pytest.fixture
+def finished(done: Path, tmp_path: Path) -> Path:
+    """Return a copy of a folder whose samples are analysed."""
+    folder = tmp_path / "lab"
+    shutil.copytree(done, folder)
+    return folder
+
+
+@pytest.fixture
+def lab(made: Path, tmp_path: Path) -> Path:
+    """Return a folder with the movies and tables of them."""
+    folder = tmp_path / "lab"
+    shutil.copytree(made, folder)
+    _table(folder, NAMES)
+    return folder
+
+
+def _table(folder: Path, names: tuple[str, ...], name: str = "samples.csv") -> Path:
+    lines = "".join(f"{n}.tif,{n},pH 7,{k + 1},{k},x\n" for k, n in enumerate(names))
+    path = folder / name
+    path.write_text(f"path,sample,condition,concentration_nm,batch,operator\n{lines}")
+    return path
+
+
+def _run(lab: Path, **options: object) -> Batch:
+    given: dict = {"out": lab / "out", "config": SETUP, **options}
+    return ia.batch(lab / "samples.csv", **given)
+
+
+def test_every_movie_has_an_ordinary_result_and_the_day_its_tables(done: Path) -> None:
+    found = _run(done)
+    assert found.failed == ()
+    for name in NAMES:
+        folder = done / "out" / "movies" / f"{name}.iscat"
+        assert len(pd.read_csv(folder / "fits.csv")) == 2
+        assert (folder / "report.html").is_file()
+    assert found.movies["movie"].tolist() == list(NAMES)
+    assert found.movies["events"].tolist() == [2, 2, 2]
+    assert found.movies["operator"].tolist() == ["x"] * 3
+    assert found.movies["report"].tolist() == [f"movies/{n}.iscat/report.html" for n in NAMES]
+    events = pd.read_parquet(done / "out" / "events.parquet")
+    assert events["sample"].tolist() == [name for name in NAMES for _ in range(2)]
+    assert events["concentration_nm"].tolist() == [1, 1, 2, 2, 3, 3]
+    assert events["batch"].tolist() == [0, 0, 1, 1, 2, 2]
+    alone = pd.read_parquet(done / "out" / "movies" / "b.iscat" / "fits.parquet")
+    own = events[events["sample"] == "b"][list(alone.columns)].reset_index(drop=True)
+    pd.testing.assert_frame_equal(own, alone, check_dtype=False)
+    page = found.page.read_text(encoding="utf-8")
+    assert 'href="movies/b.iscat/report.html"' in page
+    assert "://" not in page.replace("http://www.w3.org/2000/svg", "")
+
+
+def test_what_has_not_changed_is_left_alone(finished: Path) -> None:
+    _run(finished)  # the page tells where the table lies
+    page = finished / "out" / "batch.html"
+    before = page.stat().st_mtime_ns
+    assert _run(finished).analysed == ()
+    assert page.stat().st_mtime_ns == before
+    assert _run(finished, settings={"compute.workers": 1}).analysed == ()
+    os.utime(finished / "b.tif")  # copied: another time, the same bytes
+    assert _run(finished).analysed == ()
+
+
+def test_what_is_said_of_a_movie_is_told_without_analysing_it(finished: Path) -> None:
+    table = finished / "samples.csv"
+    table.write_text(table.read_text().replace("b.tif,b,pH 7", "b.tif,renamed,pH 9"))
+    again = _run(finished)
+    assert again.analysed == ()
+    assert again.movies["sample"].tolist() == ["a", "renamed", "c"]
+
+
+def test_a_movie_more_is_the_only_one_analysed(finished: Path) -> None:
+    _simulate(finished / "d.tif", seed=9)
+    _table(finished, (*NAMES, "d"))
+    again = _run(finished)
+    assert again.analysed == ("d",)
+    assert len(again.movies) == 4
+
+
+def test_a_movie_that_changed_is_analysed_again(finished: Path) -> None:
+    _simulate(finished / "b.tif.new", seed=7)
+    (finished / "b.tif.new").replace(finished / "b.tif")
+    assert _run(finished).analysed == ("b",)
+
+
+def test_a_changed_configuration_analyses_all_and_a_changed_row_its_movie(finished: Path) -> None:
+    assert _run(finished, settings={"fit.roi_nm": 2000.0}).analysed == NAMES
+    lines = "path,sample,fit.roi_nm\na.tif,a,\nb.tif,b,1900\nc.tif,c,\n"
+    (finished / "samples.csv").write_text(lines)
+    assert _run(finished, settings={"fit.roi_nm": 2000.0}).analysed == ("b",)
+    config = ia.load_config(finished / "out" / "movies" / "b.iscat" / "config.toml")
+    assert config.fit.roi_nm == 1900.0
+
+
+def test_a_movie_that_fails_costs_only_itself(lab: Path, capsys, tmp_path: Path) -> None:
+    _table(lab, ("a", "cut", "b"))
+    setup = tmp_path / "setup.toml"
+    setup.write_text(ia.config_to_toml(ia.configure(SETUP)), encoding="utf-8")
+    command = ["batch", str(lab / "samples.csv"), "--out", str(lab / "out")]
+    assert main([*command, "--config", str(setup), "--quiet"]) == 3
+    said = capsys.readouterr()
+    (line,) = said.err.splitlines()
+    assert line.startswith("iscat batch: error: cut: ")
+    assert "2 of 3 movies done, 3 of them now" in said.out
+    movies = pd.read_csv(lab / "out" / "movies.csv")
+    assert movies["state"].tolist() == ["done", "failed", "done"]
+    assert "cut.tif" in movies["why"][1]
+    assert movies["why"][1] in (lab / "out" / "batch.html").read_text(encoding="utf-8")
+    assert not (lab / "out" / "movies" / "cut.iscat").exists()
+    (lab / "cut.tif").write_bytes((lab / "c.tif").read_bytes())  # copied again
+    assert _run(lab).analysed == ("cut",)
+
+
+def test_an_unexpected_error_costs_only_its_movie(lab: Path, monkeypatch) -> None:
+    real = run.fit_stack
+
+    def broken(stack: Path, *arguments: object, **options: object) -> object:
+        if stack.name == "b.tif":
+            raise ZeroDivisionError("by chance")
+        return real(stack, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(run, "fit_stack", broken)
+    assert _run(lab).failed == (("b", "unexpected ZeroDivisionError: by chance"),)
+
+
+def test_an_interrupt_keeps_what_is_finished(lab: Path, monkeypatch) -> None:
+    real = run.fit_stack
+
+    def stopped(stack: Path, *arguments: object, **options: object) -> object:
+        if stack.name == "b.tif":
+            raise KeyboardInterrupt
+        return real(stack, *arguments, **options)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "fit_stack", stopped)
+        with pytest.raises(KeyboardInterrupt, match="1 of 3 movies are finished"):
+            _run(lab)
+    assert _run(lab).analysed == ("b", "c")
+
+
+def test_an_interrupt_that_reached_compiled_code_is_one(lab: Path, monkeypatch) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+    monkeypatch.setattr(run, "fit_stack", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        _run(lab)
+
+
+def test_a_result_that_was_interrupted_under_another_configuration_is_not_taken(
+    finished: Path, monkeypatch
+) -> None:
+    """Back at the first configuration, the folder holds what the second one left."""
+
+    def stopped(*_: object, out: Path, **__: object) -> None:
+        (out / "summary.json").write_text('{"interrupted": true}')
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "fit_stack", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            _run(finished, settings={"fit.roi_nm": 2000.0})
+    assert _run(finished).analysed == ("a",)
+
+
+def test_a_day_on_which_everything_failed_has_a_page(lab: Path) -> None:
+    _table(lab, ("cut",))
+    found = _run(lab)
+    assert [name for name, _ in found.failed] == ["cut"]
+    assert "not analysed" in found.page.read_text(encoding="utf-8")
+    assert len(pd.read_parquet(lab / "out" / "events.parquet")) == 0
+    assert found.species.empty
+
+
+def test_heights_have_no_species(lab: Path) -> None:
+    found = _run(lab, settings={"fit.mode": "localize", "fit.z_range_nm": [0.0, 300.0]})
+    assert found.movies["state"].tolist() == ["done"] * 3
+    assert found.species.empty
+    assert len(pd.read_parquet(lab / "out" / "events.parquet")) > 0
+
+
+def _tables(out: Path) -> dict[str, bytes]:
+    names = ("movies.csv", "species.csv", "shifts.csv", "events.parquet", "batch.html")
+    fits = {p.relative_to(out).as_posix(): p.read_bytes() for p in out.rglob("fits.csv")}
+    return {name: (out / name).read_bytes() for name in names} | fits
+
+
+def test_parts_give_the_bytes_of_one_run(finished: Path) -> None:
+    parts = {"out": finished / "parts"}
+    assert _run(finished, **parts, only=(2, 2)).analysed == ("b",)
+    early = _run(finished, **parts, merge=True)
+    assert early.failed == (("a", "not analysed yet"), ("c", "not analysed yet"))
+    assert _run(finished, **parts, only=(1, 2)).analysed == ("a", "c")
+    assert not (finished / "parts" / "figures" / "nothing").exists()
+    assert _run(finished, **parts, merge=True).failed == ()
+    assert _tables(finished / "parts") == _tables(finished / "out")
+
+
+def test_more_parts_than_movies_leave_some_without_work(lab: Path) -> None:
+    assert _run(lab, only=(9, 9)).analysed == ()
+
+
+def test_wrong_parts_are_refused(lab: Path, capsys) -> None:
+    command = ["batch", str(lab / "samples.csv"), "--out", str(lab / "out"), "--only"]
+    for text in ("3/2", "0/2", "x", "1"):
+        assert main([*command, text]) == 2
+        assert "write it as K/N" in capsys.readouterr().err
+    assert main([*command, "1/2", "--merge"]) == 2
+    assert "merged when all are" in capsys.readouterr().err
+
+
+def test_a_wrong_table_is_refused_before_anything_is_written(lab: Path, capsys) -> None:
+    (lab / "samples.csv").write_text("path,role\na.tif,smaple\n")
+    assert main(["batch", str(lab / "samples.csv"), "--out", str(lab / "out")]) == 2
+    assert "line 2, role" in capsys.readouterr().err
+    assert not (lab / "out").exists()
+
+
+def test_a_folder_of_something_else_is_left_alone(lab: Path) -> None:
+    with pytest.raises(ia.DataError, match=r"is no earlier batch"):
+        _run(lab, out=lab)
+    (lab / "file").write_text("mine")
+    with pytest.raises(ia.DataError, match="is a file"):
+        _run(lab, out=lab / "file")
+
+
+def test_a_job_is_done_by_one_run_at_a_time(tmp_path: Path) -> None:
+    first, second = Records(tmp_path), Records(tmp_path)
+    order: list[str] = []
+    told: list[str] = []
+    inside = threading.Event()
+
+    def other() -> None:
+        inside.wait(10)
+        with second.held("job", told.append):
+            order.append("second")
+
+    thread = threading.Thread(target=other)
+    with first.held("job", told.append):
+        thread.start()
+        inside.set()
+        thread.join(2.6)
+        assert thread.is_alive()
+        order.append("first")
+    thread.join(10)
+    assert order == ["first", "second"]
+    assert told == ["waiting for another run, which is at job"]
+
+
+def test_a_damaged_record_costs_its_movie_only(finished: Path) -> None:
+    (finished / "out" / STATE / "movies" / "b.json").write_text("{")
+    assert _run(finished).analysed == ("b",)
+
+
+# ---- calibrations of the day -----------------------------------------------------------------
+
+STANDARDS = (600.0, 1200.0, 2400.0)
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory) -> Path:
+    """Make a day: a flat, a calibrant of three standards, a sample."""
+    folder = tmp_path_factory.mktemp("day")
+    _simulate(folder / "standards.tif", seed=4, masses=12 * STANDARDS)
+    _simulate(folder / "sample.tif", seed=5)
+    random = np.random.default_rng(6)
+    level = np.linspace(2e3, 2e4, 64)
+    flat = random.poisson(level, (60, 64, 64))  # its gain is one photoelectron per count
+    tifffile.imwrite(folder / "flat.tif", flat.astype("uint16"))
+    (folder / "samples.csv").write_text(
+        "path,role,standards\nsample.tif,sample,\nflat.tif,flat,\n"
+        "standards.tif,calibrant,600 1200 2400\n"
+    )
+    _calibrated(folder)
+    return folder
+
+
+def _calibrated(day: Path, **options: object) -> Batch:
+    setup = {key: value for key, value in SETUP.items() if not key.startswith("calibration")}
+    given: dict = {"out": day / "out", "config": {**setup, "camera.offset_adu": 0.0}, **options}
+    return ia.batch(day / "samples.csv", **given)
+
+
+def test_the_day_is_calibrated_before_its_samples(day: Path) -> None:
+    found = _calibrated(day)
+    assert (found.failed, found.analysed) == ((), ())
+    config = ia.load_config(day / "out" / "movies" / "sample.iscat" / "config.toml")
+    camera = json.loads((day / "out" / "calibration" / "camera" / "camera.json").read_text())
+    low, high = camera["gain_e_per_adu"]["ci95"]
+    assert config.camera.gain_e_per_adu == pytest.approx(
+        camera["gain_e_per_adu"]["value"], rel=1e-5
+    )
+    assert low - (high - low) < 1.0 < high + (high - low)
+    line = json.loads((day / "out" / "calibration" / "mass" / "calibration.json").read_text())
+    assert config.calibration is not None
+    assert config.calibration.gradient_per_kda == pytest.approx(line["gradient_per_kda"], rel=1e-5)
+    assert abs(line["gradient_per_kda"] - LINE) < 5 * line["gradient_se"]
+    rows = found.movies.set_index("movie")
+    assert rows.loc["standards", "standards_seen"] == "3 of 3"
+    assert rows.loc["sample", "mass_scale"] == "of the day"
+    assert rows.loc["flat", "state"] == "done"
+    fits = pd.read_csv(day / "out" / "movies" / "sample.iscat" / "fits.csv").sort_values("mass_kda")
+    error = np.hypot(fits["sigma_mass_kda"], fits["systematic_mass_kda"])
+    assert (np.abs(fits["mass_kda"] - [900.0, 1500.0]) < 5 * error).all()
+
+
+def test_a_changed_calibrant_analyses_what_depends_on_it(day: Path, tmp_path: Path) -> None:
+    lab = tmp_path / "day"
+    shutil.copytree(day, lab)
+    _simulate(lab / "new.tif", seed=8, masses=12 * STANDARDS)
+    (lab / "new.tif").replace(lab / "standards.tif")
+    assert set(_calibrated(lab).analysed) == {"sample", "standards"}
+    assert _calibrated(lab).analysed == ()
+
+
+def test_a_calibrant_that_fails_leaves_the_scale_as_configured_and_says_so(
+    day: Path, tmp_path: Path
+) -> None:
+    lab = tmp_path / "day"
+    shutil.copytree(day, lab, ignore=shutil.ignore_patterns("out"))
+    (lab / "standards.tif").write_bytes((lab / "standards.tif").read_bytes()[:5000])
+    (lab / "flat.tif").write_bytes(b"II*\0")
+    found = _calibrated(lab)
+    assert [name for name, _ in found.failed] == [
+        "calibration of the camera", "calibration of the mass", "flat", "standards",
+    ]  # fmt: skip
+    rows = found.movies.set_index("movie")
+    assert rows.loc["sample", "state"] == "done"
+    assert "mass scale: none" in rows.loc["sample", "cautions"]
+    configured = _calibrated(lab, settings={"calibration.gradient_per_kda": LINE})
+    cautions = configured.movies.set_index("movie").loc["sample", "cautions"]
+    assert "as configured, because the day's calibration failed" in cautions
+
+
+def test_parts_share_the_calibrations(day: Path, tmp_path: Path) -> None:
+    lab = tmp_path / "day"
+    shutil.copytree(day, lab, ignore=shutil.ignore_patterns("out"))
+    parts = [
+        threading.Thread(target=_calibrated, args=(lab,), kwargs={"only": (k, 2)}) for k in (1, 2)
+    ]
+    for part in parts:
+        part.start()
+    for part in parts:
+        part.join()
+    assert _calibrated(lab, merge=True).failed == ()
+    names = ("movies.csv", "species.csv", "events.parquet", "batch.html")
+    for name in names:
+        assert (lab / "out" / name).read_bytes() == (day / "out" / name).read_bytes(), name

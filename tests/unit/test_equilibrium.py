@@ -1,0 +1,186 @@
+"""Equilibria: mass action, the likelihood's slope, K_D from a few tables, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from event_tables import draw_series
+from scipy.optimize import approx_fprime, brentq
+
+import iscat_analysis as ia
+from iscat_analysis.species import Efficiency
+from iscat_analysis.species.equilibrium import _Series
+from iscat_analysis.species.mass_action import (
+    COMPOSITION,
+    LANDING_POWER,
+    Model,
+    at_equilibrium,
+    landing_logits,
+)
+from iscat_analysis.species.tables import event_table
+
+EFFICIENCY = Efficiency(5.0, 13.0)
+DIMER = pd.DataFrame({"concentration_nm": [3.0, 10.0, 30.0, 100.0]})
+PARTNERS = pd.DataFrame({"a_nm": [20.0, 20.0, 60.0, 20.0], "b_nm": [5.0, 40.0, 60.0, 0.0]})
+
+
+@pytest.mark.parametrize("total", [1e-4, 1.0, 1e4])
+def test_monomers_and_dimers_obey_mass_action(total: float) -> None:
+    (monomer, dimer), *_ = at_equilibrium("dimer", np.array([[total]]), 10.0)
+    assert monomer + 2 * dimer == pytest.approx(total, rel=1e-12)
+    assert monomer**2 / dimer == pytest.approx(10.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("totals", [(1e-4, 1.0), (20.0, 20.0), (1e4, 3.0)])
+def test_partners_obey_mass_action(totals: tuple[float, float]) -> None:
+    (a, b, both), *_ = at_equilibrium("ab", np.array([totals]), 25.0)
+    assert a + both == pytest.approx(totals[0], rel=1e-9)
+    assert b + both == pytest.approx(totals[1], rel=1e-9)
+    bound = brentq(lambda x: (totals[0] - x) * (totals[1] - x) - 25 * x, 0, min(totals), xtol=1e-15)
+    assert both == pytest.approx(bound, rel=1e-6)
+
+
+def test_an_inactive_part_stays_as_it_is() -> None:
+    (monomer, dimer), *_ = at_equilibrium("dimer", np.array([[100.0]]), 10.0, inactive=0.2)
+    assert monomer + 2 * dimer == pytest.approx(100.0)
+    assert (monomer - 20) ** 2 / dimer == pytest.approx(10.0)
+    assert at_equilibrium("ab", np.array([[10.0, 0.0]]), 5.0).min() > 0
+
+
+def test_landings_follow_the_power() -> None:
+    masses = COMPOSITION["dimer"] @ np.array([66.0])
+    same = landing_logits("dimer", np.array([[10.0]]), 10.0, 0.0, masses, 0.0)
+    less = landing_logits("dimer", np.array([[10.0]]), 10.0, 0.0, masses, LANDING_POWER)
+    assert np.exp(less - same)[0] == pytest.approx([1.0, 2 ** (-1 / 6)])
+
+
+@pytest.mark.parametrize("model", ["dimer", "ab"])
+@pytest.mark.parametrize("inactive", [False, True])
+def test_the_likelihood_has_the_slope_that_differences_give(model: Model, inactive: bool) -> None:
+    random = np.random.default_rng(5)
+    samples, masses = (DIMER, [66.0]) if model == "dimer" else (PARTNERS[:3], [80.0, 150.0])
+    totals = samples.to_numpy(float)
+    tables = draw_series(random, model, totals, 10.0, masses, number=150, efficiency=EFFICIENCY)
+    events = [event_table(table).events for table in tables]
+    series = _Series(events, totals, model, np.array(masses), -0.2, inactive)
+    theta = np.concatenate([series.first, [2.0], [0.1]])[: series.linear + series.constants]
+    value, slope = series.value(theta)
+    numerical = approx_fprime(theta, lambda t: series.value(t)[0], 1e-6)
+    assert np.isfinite(value)
+    assert np.allclose(slope, numerical, rtol=2e-3, atol=0.05)
+
+
+@pytest.fixture(scope="module")
+def dimers() -> list[pd.DataFrame]:
+    random = np.random.default_rng(6)
+    totals = DIMER.to_numpy(float)
+    return draw_series(random, "dimer", totals, 10.0, [66.0], number=900, efficiency=EFFICIENCY)
+
+
+def test_kd_is_found_and_its_ends_are_where_the_profile_says(dimers) -> None:
+    found = ia.fit_kd(DIMER, tables=dimers, model="dimer")
+    fit = found.fit
+    assert fit.kd_low < 10 < fit.kd_high
+    assert fit.kd_high / fit.kd_low < 1.6
+    assert fit.masses_kda == pytest.approx([66.0, 132.0], abs=1.0)
+    assert fit.p_value > 0.01
+    assert fit.dof == 3
+    ends = np.isin(fit.profile_ln_kd, np.log([fit.kd_low, fit.kd_high]))
+    assert np.allclose(fit.profile_deviance[ends], 3.84, atol=0.06)
+    assert found.samples["complexes"].is_monotonic_increasing
+    assert np.all(np.abs(found.samples["pull"]) < 4)
+    assert found.curve["complexes"].is_monotonic_increasing
+
+
+def test_landings_that_are_taken_alike_change_kd(dimers) -> None:
+    right = ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66.0]).fit
+    alike = ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66.0], landing_power=0.0).fit
+    assert alike.kd_nm > 1.1 * right.kd_nm
+
+
+def test_two_partners() -> None:
+    random = np.random.default_rng(7)
+    totals = PARTNERS.to_numpy(float)
+    tables = draw_series(random, "ab", totals, 25.0, [80.0, 150.0], number=900)
+    found = ia.fit_kd(PARTNERS, tables=tables, model="ab", masses_kda=[78.0, 152.0])
+    assert found.fit.kd_low < 25 < found.fit.kd_high
+    assert found.fit.masses_kda == pytest.approx([80, 150, 230], abs=1.5)
+    assert found.curve.empty
+
+
+def test_an_inactive_part_is_told_and_fitted() -> None:
+    random = np.random.default_rng(8)
+    totals = np.array([[1.0], [3], [10], [30], [100], [300]])
+    samples = pd.DataFrame({"concentration_nm": totals[:, 0]})
+    tables = draw_series(random, "dimer", totals, 10.0, [66.0], number=2000, inactive=0.15)
+    plain = ia.fit_kd(samples, tables=tables, model="dimer", masses_kda=[66.0])
+    assert plain.fit.inactive_p < 1e-3
+    assert any("inactive part" in note for note in plain.notes)
+    right = ia.fit_kd(samples, tables=tables, model="dimer", masses_kda=[66.0], inactive=True)
+    assert right.fit.inactive == pytest.approx(0.15, abs=0.05)
+    assert right.fit.kd_low < 10 < right.fit.kd_high
+
+
+def test_an_end_that_the_data_do_not_set_is_open() -> None:
+    random = np.random.default_rng(9)
+    table = draw_series(random, "dimer", np.array([[0.001]]), 1e4, [66.0], number=200)[0]
+    found = ia.fit_kd(
+        pd.DataFrame({"concentration_nm": [1.0]}), tables=[table], model="dimer", masses_kda=[66.0]
+    )
+    assert found.fit.kd_high == np.inf
+    assert found.fit.kd_low > 1
+    assert any("higher concentrations" in note for note in found.notes)
+
+
+def test_samples_are_read_and_results_written(dimers, tmp_path: Path) -> None:
+    for number, table in enumerate(dimers):
+        table.to_csv(tmp_path / f"{number}.csv", index=False)
+    rows = DIMER.assign(path=[f"{n}.csv" for n in range(4)], replicate=1, role="sample")
+    rows.loc[4] = [np.nan, "blank.csv", 1, "blank"]
+    rows.to_csv(tmp_path / "samples.csv", index=False)
+    out = tmp_path / "out"
+    found = ia.fit_kd(tmp_path / "samples.csv", model="dimer", masses_kda=[66.0], out=out)
+    same = ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66.0])
+    assert found.fit.kd_nm == pytest.approx(same.fit.kd_nm, rel=1e-6)
+    assert sorted(path.name for path in out.iterdir()) == ["figures", "kd.csv", "kd.json"]
+    assert json.loads((out / "kd.json").read_text())["kd_nm"] == pytest.approx(found.fit.kd_nm)
+    assert list(pd.read_csv(out / "kd.csv")["replicate"]) == [1] * 4
+    assert (out / "figures" / "kd.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"model": "trimer"}, "must be dimer or ab"),
+        ({"model": "ab"}, "needs the masses of A and B"),
+        ({"model": "dimer", "masses_kda": [66.0, 80.0]}, "takes the mass of the monomer"),
+        ({"model": "ab", "masses_kda": [66.0, -1.0]}, "takes those of A and B"),
+        ({"model": "dimer", "landing_power": 5.0}, "between -1 and 1"),
+    ],
+)
+def test_impossible_options_are_refused(options: dict, said: str, dimers) -> None:
+    with pytest.raises(ia.ConfigError, match=said):
+        ia.fit_kd(DIMER, tables=dimers, **options)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "no CSV file"),
+        ("path\n0.csv\n", "no column concentration_nm"),
+        ("concentration_nm\n3\n", "no column path"),
+        ("path,concentration_nm\n0.csv,-3\n", "row 1 has no concentration above 0"),
+        ("path,concentration_nm\n0.csv,x\n", "no number"),
+        ("path,concentration_nm,role\n0.csv,3,blank\n", "no row of a sample"),
+        ("path,concentration_nm\nnone.csv,3\n", "none.csv: cannot be read"),
+    ],
+)
+def test_wrong_samples_are_refused(text: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "samples.csv"
+    path.write_text(text)
+    with pytest.raises(ia.DataError, match=said):
+        ia.fit_kd(path, model="dimer")

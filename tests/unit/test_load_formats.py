@@ -1,0 +1,334 @@
+"""Movies that are not TIFF: NumPy, plain numbers, HDF5, Zarr; and TIFF in several files."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+import zarr
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie import beside, open_stack
+from iscat_analysis.movie.addresses import split_address
+
+SHAPE = (7, 6, 5)
+COUNTS = np.random.default_rng(1).integers(0, 60000, SHAPE).astype(np.uint16)
+
+
+def assert_whole(address: Path | str, expected: np.ndarray = COUNTS) -> None:
+    with open_stack(address) as stack:
+        assert stack.shape == expected.shape
+        assert stack.dtype == expected.dtype.newbyteorder("=")
+        assert np.array_equal(stack.read(0, len(expected)), expected)
+        assert np.array_equal(stack.read(2, 5), expected[2:5])
+        assert stack.read(3, 3).shape == (0, *expected.shape[1:])
+
+
+def refused(address: Path | str, *parts: str) -> None:
+    with pytest.raises(DataError) as raised:
+        open_stack(address)
+    for part in parts:
+        assert part in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+# ---- NumPy and plain numbers -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", ["u1", "<u2", ">u2", "<i4", "<f4", ">f8"])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_reads_arrays_that_numpy_saved(tmp_path: Path, dtype: str, order: str) -> None:
+    array = np.asarray(COUNTS % 200, dtype=dtype, order=order)  # type: ignore[call-overload]
+    np.save(tmp_path / "movie.npy", array)
+    assert_whole(tmp_path / "movie.npy", array)
+
+
+def test_refuses_arrays_that_are_no_movie(tmp_path: Path) -> None:
+    path = tmp_path / "movie.npy"
+    np.save(path, COUNTS[0])
+    refused(path, "movie.npy", "(6, 5)")
+    np.save(path, COUNTS[:1])
+    refused(path, "single frame")
+    np.save(path, np.array([[["text"]] * 3] * 3, dtype=object))
+    refused(path, "object")
+    np.save(path, COUNTS.astype(complex))
+    refused(path, "complex128")
+
+
+def test_an_array_that_is_cut_short_is_refused_at_every_length(tmp_path: Path) -> None:
+    path = tmp_path / "movie.npy"
+    np.save(path, COUNTS)
+    whole = path.read_bytes()
+    for size in range(8, len(whole), 13):
+        path.write_bytes(whole[:size])
+        refused(path, "movie.npy")
+
+
+@pytest.mark.parametrize("part", ["7x6x5,uint16", "6x5,uint16", "7x6x5,<u2", "6x5, uint16"])
+def test_reads_plain_numbers(tmp_path: Path, part: str) -> None:
+    path = tmp_path / "movie.bin"
+    path.write_bytes(COUNTS.tobytes())
+    assert_whole(f"{path}::{part}")
+
+
+def test_reads_plain_numbers_of_the_other_byte_order(tmp_path: Path) -> None:
+    path = tmp_path / "movie.raw"
+    path.write_bytes(COUNTS.astype(">u2").tobytes())
+    assert_whole(f"{path}::6x5,>u2")
+
+
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [
+        ("8x6x5,uint16", "needs 480"),
+        ("6x4,uint16", "a multiple of 48"),
+        ("6x5", "frames x rows x columns"),
+        ("6x5,uint17", "uint17 is no type"),
+        ("0x0x0,uint16", "check the shape"),
+        ("0x5,uint16", "check the shape"),
+        ("6x5,bool", "needs to be frames"),
+    ],
+)
+def test_plain_numbers_of_another_size_are_refused(tmp_path: Path, part: str, said: str) -> None:
+    path = tmp_path / "movie.bin"
+    path.write_bytes(COUNTS.tobytes())
+    refused(f"{path}::{part}", "movie.bin", said)
+
+
+def test_a_file_of_unknown_numbers_says_how_to_name_them(tmp_path: Path) -> None:
+    path = tmp_path / "movie.bin"
+    path.write_bytes(COUNTS.tobytes())
+    refused(path, "plain numbers", 'movie.bin::1500x128x128,uint16"')
+
+
+def test_a_mapped_file_that_shrinks_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "movie.npy"
+    np.save(path, COUNTS)
+    with open_stack(path) as stack:
+        path.write_bytes(path.read_bytes()[:200])
+        with pytest.raises(DataError, match="shrank"):
+            stack.read(0, 7)
+
+
+# ---- HDF5 ------------------------------------------------------------------------------------
+
+
+def test_reads_the_dataset_that_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "day.h5"
+    with h5py.File(path, "w") as file:
+        file["run 3/movie"] = COUNTS
+        file.create_dataset("packed", data=COUNTS[::-1], chunks=(2, 4, 5), compression="gzip")
+        file["five"] = COUNTS[:, None, None]
+        file["note"] = "text"
+        file["flat"] = COUNTS[0]
+    assert_whole(f"{path}::/run 3/movie")
+    assert_whole(f"{path}::packed", COUNTS[::-1])
+    assert_whole(f"{path}::/five")
+    refused(path, "holds 3 datasets", "/run 3/movie", "day.h5::/")
+    refused(f"{path}::/run 4/movie", "is not there", "/packed")
+    refused(f"{path}::/flat", "(6, 5)")
+    refused(f"{path}::/note", "note")
+
+
+def test_takes_the_only_dataset_of_frames_and_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "day.h5"
+    with h5py.File(path, "w") as file:
+        file["run/movie"] = COUNTS
+        file["run/times"] = np.arange(7.0)
+    assert_whole(path)
+    with open_stack(path) as stack:
+        assert "/run/movie" in stack.notes[0]
+        assert stack.name == "day.h5"
+    with h5py.File(path, "w") as file:
+        file["times"] = np.arange(7.0)
+    refused(path, "holds no frames")
+
+
+# ---- Zarr ------------------------------------------------------------------------------------
+
+
+def _ome_zarr(folder: Path, counts: np.ndarray, axes: str, **units: str) -> None:
+    group = zarr.open_group(str(folder), mode="w")
+    array = group.create_array("0", shape=counts.shape, chunks=(2, *counts.shape[1:]), dtype="u2")
+    array[:] = counts
+    scale = [{"t": 0.004, "x": 0.0844, "y": 0.0844}.get(axis, 1.0) for axis in axes]
+    group.attrs["ome"] = {
+        "version": "0.5",
+        "multiscales": [
+            {
+                "axes": [
+                    {"name": axis, **({"unit": units[axis]} if axis in units else {})}
+                    for axis in axes
+                ],
+                "datasets": [
+                    {"path": "0", "coordinateTransformations": [{"type": "scale", "scale": scale}]}
+                ],
+            }
+        ],
+    }
+
+
+def test_reads_ome_zarr_with_its_scale(tmp_path: Path) -> None:
+    path = tmp_path / "movie.zarr"
+    _ome_zarr(path, COUNTS[:, None, None], "tczyx", t="second", x="micrometer", y="micrometer")
+    assert_whole(path)
+    with open_stack(path) as stack:
+        assert stack.metadata.pixel_size_nm == pytest.approx(84.4)
+        assert stack.metadata.frame_rate_hz == pytest.approx(250.0)
+        first = stack.sha256(), stack.identity
+    chunk = next(file for file in path.rglob("*") if file.is_file() and file.name == "0")
+    chunk.write_bytes(chunk.read_bytes() + b"\0")
+    with open_stack(path) as stack:
+        assert stack.sha256() != first[0]
+        assert stack.identity != first[1]
+
+
+def test_without_units_nothing_is_said_of_the_scale(tmp_path: Path) -> None:
+    _ome_zarr(tmp_path / "movie.zarr", COUNTS, "tyx")
+    with open_stack(tmp_path / "movie.zarr") as stack:
+        assert stack.metadata.pixel_size_nm is None
+        assert stack.metadata.frame_rate_hz is None
+
+
+def test_refuses_ome_zarr_with_channels_or_heights(tmp_path: Path) -> None:
+    _ome_zarr(tmp_path / "movie.zarr", np.stack([COUNTS, COUNTS], axis=1), "tcyx")
+    refused(tmp_path / "movie.zarr", "t 7, c 2, y 6, x 5")
+    _ome_zarr(tmp_path / "movie.zarr", COUNTS, "zyx")
+    refused(tmp_path / "movie.zarr", "z 7, y 6, x 5")
+
+
+def test_reads_arrays_of_a_zarr_folder(tmp_path: Path) -> None:
+    path = tmp_path / "day.zarr"
+    group = zarr.open_group(str(path), mode="w")
+    group.create_array("movie", data=COUNTS)
+    assert_whole(path)
+    group.create_array("other", data=COUNTS)
+    refused(path, "/movie", "/other")
+    assert_whole(f"{path}::/movie")
+    refused(f"{path}::/lost", "day.zarr::/lost")
+
+
+def test_says_which_package_reads_zarr(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    zarr.open_group(str(tmp_path / "day.zarr"), mode="w")
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    refused(tmp_path / "day.zarr", 'pip install "iscat-analysis[zarr]"')
+
+
+# ---- films and other files -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"RIFF\x00\x00\x00\x00AVI LIST", "AVI film"),
+        (b"\x00\x00\x00\x18ftypmp42\x00\x00", "film"),
+        (b"\x1aE\xdf\xa3\x01\x00\x00\x00\x00", "Matroska film"),
+    ],
+)
+def test_films_are_refused_because_they_keep_no_counts(
+    tmp_path: Path, content: bytes, said: str
+) -> None:
+    (tmp_path / "movie.tif").write_bytes(content)
+    refused(tmp_path / "movie.tif", said, "keeps no counts")
+
+
+def test_files_of_microscopes_are_named(tmp_path: Path) -> None:
+    (tmp_path / "a.nd2").write_bytes(b"\xda\xce\xbe\x0a" + bytes(20))
+    refused(tmp_path / "a.nd2", "Nikon ND2", "OME-TIFF", "fit_movie")
+    (tmp_path / "a.czi").write_bytes(b"ZISRAWFILE" + bytes(20))
+    refused(tmp_path / "a.czi", "Zeiss CZI", "OME-TIFF")
+
+
+# ---- TIFF in several files -------------------------------------------------------------------
+
+OME = '<?xml version="1.0" encoding="UTF-8"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06">{}</OME>'
+
+
+def _set(folder: Path, *, lost: int = 0, elsewhere: str = "") -> list[Path]:
+    """Write 7 frames to three files, as Micro-Manager does beyond 4 GB."""
+    parts = (range(3), range(3, 6), range(6, 7))
+    paths = [folder / f"m_{k}.ome.tif" for k in range(len(parts))]
+    blocks = "".join(
+        f'<TiffData FirstT="{t}" FirstC="0" FirstZ="0" IFD="{i}" PlaneCount="1">'
+        f'<UUID FileName="{elsewhere}{path.name}">urn:uuid:0</UUID></TiffData>'
+        for part, path in zip(parts, paths, strict=True)
+        for i, t in enumerate(part)
+        if t < len(COUNTS) - lost
+    )
+    pixels = (
+        '<Image ID="Image:0"><Pixels ID="Pixels:0" DimensionOrder="XYCZT" Type="uint16" SizeX="5" '
+        'SizeY="6" SizeC="1" SizeZ="1" SizeT="7" PhysicalSizeX="0.0844" PhysicalSizeY="0.0844" '
+        f'TimeIncrement="4" TimeIncrementUnit="ms">{blocks}</Pixels></Image>'
+    )
+    for part, path in zip(parts, paths, strict=True):
+        with tifffile.TiffWriter(path) as tiff:
+            for t in part:
+                tiff.write(
+                    COUNTS[t], contiguous=False, metadata=None,
+                    description=OME.format(pixels).encode() if t == part[0] else None,
+                )  # fmt: skip
+    return paths
+
+
+def test_reads_a_movie_in_several_files_from_any_of_them(tmp_path: Path) -> None:
+    paths = _set(tmp_path)
+    hashes = set()
+    for path in paths:
+        assert_whole(path)
+        with open_stack(path) as stack:
+            assert stack.metadata.pixel_size_nm == pytest.approx(84.4)
+            assert stack.metadata.frame_rate_hz == pytest.approx(250.0)
+            hashes.add(stack.sha256())
+    assert len(hashes) == 1
+    tifffile.imwrite(paths[2], COUNTS[6] + 1, metadata=None)
+    with open_stack(paths[0]) as stack:
+        assert stack.sha256() not in hashes
+
+
+def test_a_set_with_a_part_missing_is_refused(tmp_path: Path) -> None:
+    paths = _set(tmp_path)
+    paths[1].unlink()
+    refused(paths[0], "one of 3 files", "m_1.ome.tif is not beside it")
+
+
+def test_a_set_that_is_cut_short_is_refused(tmp_path: Path) -> None:
+    paths = _set(tmp_path)
+    tifffile.imwrite(paths[1], COUNTS[3:5], metadata=None)
+    refused(paths[0], "m_1.ome.tif: holds 2 images", "says 3")
+    paths = _set(tmp_path, lost=2)
+    refused(paths[0], "does not say where 2 of 7 frames lie")
+
+
+def test_parts_of_another_kind_or_elsewhere_are_refused(tmp_path: Path) -> None:
+    paths = _set(tmp_path)
+    tifffile.imwrite(paths[1], COUNTS[3:6].astype("u1"), metadata=None)
+    refused(paths[0], "m_1.ome.tif", "other pixels")
+    paths = _set(tmp_path, elsewhere="../")
+    refused(paths[0], "other folders")
+
+
+# ---- names -----------------------------------------------------------------------------------
+
+
+def test_results_lie_beside_the_movie(tmp_path: Path) -> None:
+    assert beside(Path("a/movie.tif"), ".iscat") == Path("a/movie.iscat")
+    assert beside(Path("a/day.h5::/run 3/movie"), ".iscat") == Path("a/day.run 3.movie.iscat")
+    assert beside(Path("a/movie.bin::6x5,uint16"), ".iscat") == Path("a/movie.iscat")
+    odd = tmp_path / "a::b.tif"
+    odd.touch()
+    assert split_address(odd) == (odd, "")
+    assert beside(odd, ".iscat") == tmp_path / "a::b.iscat"
+
+
+def test_parts_of_one_file_are_different_movies(tmp_path: Path) -> None:
+    path = tmp_path / "day.h5"
+    with h5py.File(path, "w") as file:
+        file["a"], file["b"] = COUNTS, COUNTS
+    with open_stack(f"{path}::/a") as a, open_stack(f"{path}::/b") as b:
+        assert a.name == "day.h5::/a"
+        assert a.identity != b.identity
+        assert a.sha256() != b.sha256()
