@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from iscat_cli.console import Messages, failures, print_result, short, table
+from iscat_cli.kd import Reaction
 from iscat_cli.options import ConfigOption, DebugOption, QuietOption, SetOption
+from iscat_cli.tables import numbers
 
 if TYPE_CHECKING:
     from iscat_analysis.day import Batch
@@ -63,6 +65,23 @@ def batch(
             show_default=False,
         ),
     ] = None,
+    kd: Annotated[
+        Reaction | None,
+        typer.Option(
+            "--kd",
+            help="Fit K_D to each condition with several concentrations, as iscat kd does.",
+            show_default=False,
+        ),
+    ] = None,
+    kd_masses: Annotated[
+        str | None,
+        typer.Option(
+            "--kd-masses",
+            metavar="M | A,B",
+            help="About the mass of the monomer, found otherwise, or of A and B [kDa]; fitted.",
+            show_default=False,
+        ),
+    ] = None,
     only: Annotated[
         str | None,
         typer.Option(
@@ -101,6 +120,8 @@ def batch(
                 config=config,
                 settings=changes,
                 standards=standards,
+                kd=None if kd is None else kd.value,
+                kd_masses_kda=None if kd_masses is None else numbers("--kd-masses", kd_masses),
                 only=part,
                 merge=merge,
                 progress=progress,
@@ -150,6 +171,13 @@ def _print(found: Batch, part: tuple[int, int] | None) -> None:
             cautions if isinstance(cautions, str) else "",
         )
     print_result(shown)
+    for row in found.kd.to_dict("records"):
+        if not row["why"]:
+            where = f" of {row['condition']}" if row["condition"] else ""
+            print_result(
+                f"K_D{where} = {short(row['kd_nm'])} nM (95 %: {short(row['kd_low'])} to "
+                f"{short(row['kd_high'])}), {row['movies']} movies, p = {row['p_value']:.2g}"
+            )
     if len(found.movies) > ROWS_SHOWN:
         print_result(f"… and {len(found.movies) - ROWS_SHOWN} more in {found.out / 'movies.csv'}")
     print_result(

@@ -328,7 +328,7 @@ def _termination_interrupts() -> Iterator[None]:
 _OPTIONS = {
     **{
         name: name
-        for name in ("dark", "draws", "free", "hold", "inactive", "inject", "k", "ladder",
+        for name in ("dark", "draws", "free", "hold", "inactive", "inject", "k", "kd", "ladder",
                      "landing", "maps", "model", "offset", "optimize", "out", "overwrite",
                      "scan", "steps", "target")
     },
@@ -336,6 +336,7 @@ _OPTIONS = {
     "frame_rate_hz": "frame-rate",
     "landing_power": "landing",
     "limit_kda": "limit",
+    "kd_masses_kda": "kd-masses",
     "masses_kda": "masses",
     "offset_adu": "offset",
     "sigma_kda": "sigma",

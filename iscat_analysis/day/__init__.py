@@ -19,6 +19,7 @@ import pandas as pd
 
 from iscat_analysis.config import Config, configure
 from iscat_analysis.day.calibrate import Day, calibrate_day
+from iscat_analysis.day.equilibria import Reaction, kd_name
 from iscat_analysis.day.gather import Found, read_movie
 from iscat_analysis.day.plan import Movie, Plan, configured, make_plan, part_of
 from iscat_analysis.day.publish import publish_day
@@ -26,7 +27,9 @@ from iscat_analysis.day.run import Outcome, Runner
 from iscat_analysis.day.state import Records, claim_folder
 from iscat_analysis.day.table import read_standards, read_table
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.pipeline.binding import check_reaction
 from iscat_analysis.records import Progress, silent
+from iscat_analysis.species.mass_action import Model
 
 __all__ = ["Batch", "batch", "read_table"]
 
@@ -43,15 +46,19 @@ class Batch:
         One row per movie: ``movies.csv``; of a part, movie, state and why.
     species : pandas.DataFrame
         One row per species and movie: ``species.csv``; empty of a part.
+    kd : pandas.DataFrame
+        One row per condition: ``kd.csv``; empty of a part, and where it was not asked for.
     analysed : tuple of str
         Movies that were analysed now; the others were finished before.
     failed : tuple of (str, str)
-        Movies and calibrations that could not be analysed, or are not yet, each with its reason.
+        Movies and calibrations that could not be analysed, or are not yet, and conditions without
+        the K_D that was asked for, each with its reason.
     """
 
     out: Path
     movies: pd.DataFrame
     species: pd.DataFrame
+    kd: pd.DataFrame
     analysed: tuple[str, ...]
     failed: tuple[tuple[str, str], ...]
 
@@ -68,6 +75,8 @@ def batch(
     config: str | Path | Mapping[str, Any] | Config | None = None,
     settings: Mapping[str, Any] | Iterable[str] | None = None,
     standards: str | Sequence[float] | None = None,
+    kd: Model | None = None,
+    kd_masses_kda: Sequence[float] | None = None,
     only: tuple[int, int] | None = None,
     merge: bool = False,
     progress: Progress = silent,
@@ -97,6 +106,12 @@ def batch(
     standards : str or sequence of float, optional
         Masses in the calibrants [kDa], beside those of the table; as text with standard errors, as
         in ``"66,146:1.5,480"``, otherwise 1 %.
+    kd : {"dimer", "ab"}, optional
+        Fit an equilibrium constant to each condition with samples of several concentrations, as
+        `fit_kd`: of monomers in all in ``concentration_nm``, or of A and B in columns ``a_nm`` and
+        ``b_nm``.
+    kd_masses_kda : sequence of float, optional
+        About the mass of the monomer, which is found otherwise, or of A and B [kDa].
     only : (int, int), optional
         Analyse the K-th of N parts of the movies, and make no picture; several parts may be
         analysed at the same time, on machines that share the folder.
@@ -129,6 +144,13 @@ def batch(
             + ("parts are analysed first, and merged when all are" if merge else "write it as K/N")
             + ", as in 1/4 for the first of four parts"
         )
+    reaction = None
+    if kd is not None:
+        check_reaction(kd, kd_masses_kda, names=("kd", "kd_masses_kda"))
+        masses = None if kd_masses_kda is None else tuple(map(float, kd_masses_kda))
+        reaction = Reaction(kd, masses)
+    elif kd_masses_kda is not None:
+        raise ConfigError("`kd_masses_kda` is of K_D: give `kd`, dimer or ab, as well")
     table = read_table(Path(samples))
     try:
         named = read_standards(standards) if standards is not None else ()
@@ -167,8 +189,8 @@ def batch(
     if only is not None:
         rows = [(name, each.state, each.why) for name, each in outcomes.items()]
         movies = pd.DataFrame(rows, columns=["movie", "state", "why"])
-        return Batch(folder, movies, pd.DataFrame(), ran, tuple(failed))
-    return _gathered(plan, day, outcomes, runner, ran, tuple(failed))
+        return Batch(folder, movies, pd.DataFrame(), pd.DataFrame(), ran, tuple(failed))
+    return _gathered(plan, day, outcomes, reaction, runner, ran, tuple(failed))
 
 
 def _flats(plan: Plan) -> list[str]:
@@ -202,6 +224,7 @@ def _gathered(
     plan: Plan,
     day: Day,
     outcomes: Mapping[str, Outcome],
+    reaction: Reaction | None,
     runner: Runner,
     ran: tuple[str, ...],
     failed: tuple[tuple[str, str], ...],
@@ -210,7 +233,7 @@ def _gathered(
     out = runner.out
     by_path = {movie.row.path: movie for movie in (*plan.flats, *plan.movies)}
     ordered = [by_path[row.path] for row in plan.table.rows]
-    key = _page_key(plan, day, ordered, outcomes)
+    key = _page_key(plan, day, ordered, outcomes, reaction)
     with runner.records.held("page", runner.notify):
         page = out / "batch.html"
         if ran or not page.is_file() or runner.records.read("page").get("key") != key:
@@ -219,18 +242,29 @@ def _gathered(
             for movie in ordered:
                 found.append(read_movie(movie, outcomes[movie.name], _result(out, movie)))
                 runner.progress("gather", len(found), len(ordered))
-            publish_day(plan, day, found, failed, out)
+            publish_day(plan, day, found, reaction, failed, out)
             runner.records.write("page", {"key": key})
     text = {"movie": str, "sample": str, "condition": str, "replicate": str}
     movies, species = (
         pd.read_csv(out / f"{name}.csv", dtype=text, keep_default_na=True)
         for name in ("movies", "species")
     )
-    return Batch(out, movies, species, ran, failed)
+    found_kd = pd.DataFrame()
+    if reaction is not None:
+        words = dict.fromkeys(("condition", "model", "masses_kda", "remarks", "why"), str)
+        found_kd = pd.read_csv(out / "kd.csv", dtype=words)
+        found_kd = found_kd.fillna(dict.fromkeys(words, ""))
+        absent = found_kd[found_kd["why"] != ""]
+        failed += tuple(zip(map(kd_name, absent["condition"]), absent["why"], strict=True))
+    return Batch(out, movies, species, found_kd, ran, failed)
 
 
 def _page_key(
-    plan: Plan, day: Day, movies: Sequence[Movie], outcomes: Mapping[str, Outcome]
+    plan: Plan,
+    day: Day,
+    movies: Sequence[Movie],
+    outcomes: Mapping[str, Outcome],
+    reaction: Reaction | None,
 ) -> str:
     """Hash what the page is made of."""
     rows = [
@@ -238,5 +272,6 @@ def _page_key(
         for m in movies
         for o in (outcomes[m.name],)
     ]
-    text = json.dumps([version("iscat-analysis"), str(plan.table.source), repr(day.failed), rows])
+    made_of = [str(plan.table.source), repr(day.failed), rows, repr(reaction)]
+    text = json.dumps([version("iscat-analysis"), *made_of])
     return hashlib.sha256(text.encode()).hexdigest()

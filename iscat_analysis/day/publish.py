@@ -12,6 +12,7 @@ import pandas as pd
 
 from iscat_analysis.day.calibrate import Day
 from iscat_analysis.day.compare import match_species, shifts
+from iscat_analysis.day.equilibria import Reaction, Series, find_equilibria, kd_name, kd_table
 from iscat_analysis.day.gather import (
     MOVIE_COLUMNS,
     SPECIES_COLUMNS,
@@ -28,11 +29,16 @@ from iscat_analysis.report.batch_figures import Curve
 from iscat_analysis.report.output import atomic_folder
 from iscat_analysis.report.tables import CSV_DIGITS
 
-_FIGURE = re.compile(r"(overlaid|stacked(_\d+)?|species|shares|rates)\.(png|svg|pdf)")
+_FIGURE = re.compile(r"(overlaid|stacked(_\d+)?|species|shares|rates|kd(_\d+)?)\.(png|svg|pdf)")
 
 
 def publish_day(
-    plan: Plan, day: Day, found: Sequence[Found], failed: Sequence[tuple[str, str]], out: Path
+    plan: Plan,
+    day: Day,
+    found: Sequence[Found],
+    reaction: Reaction | None,
+    failed: Sequence[tuple[str, str]],
+    out: Path,
 ) -> None:
     """Write everything that is said of all movies together; each file is there whole or not at all.
 
@@ -44,6 +50,8 @@ def publish_day(
         The calibrations.
     found : sequence of Found
         In the order of the table.
+    reaction : Reaction or None
+        Whose equilibrium constants are asked for.
     failed : sequence of (str, str)
         What could not be analysed, each with its reason.
     out : Path
@@ -52,11 +60,17 @@ def publish_day(
     movies = movie_table(plan, day, found, out)
     species = match_species(species_table(found))[list(SPECIES_COLUMNS)]
     shifted = shifts(species[species["role"] != "calibrant"], reference_of(found))
-    for name, table in (("movies", movies), ("species", species), ("shifts", shifted)):
+    series = [] if reaction is None else find_equilibria(found, reaction)
+    tables = {"movies": movies, "species": species, "shifts": shifted}
+    if reaction is not None:
+        tables["kd"] = kd_table(series, reaction)
+    else:
+        (out / "kd.csv").unlink(missing_ok=True)
+    for name, table in tables.items():
         text = table.to_csv(index=False, float_format=f"%.{CSV_DIGITS}g", lineterminator="\n")
         write_whole(out / f"{name}.csv", text)
     with atomic_folder(out / "figures", True, known=_figure_files(out / "figures")) as folder:
-        page = _page(plan, day, found, movies, species, shifted, failed, folder)
+        page = _page(plan, day, found, movies, species, shifted, series, failed, folder)
     write_whole(out / "batch.html", page)
     own = movies[list(movies.columns[len(MOVIE_COLUMNS) :])]
     building = out / f".events.{os.getpid()}.tmp"
@@ -80,6 +94,7 @@ def _page(
     movies: pd.DataFrame,
     species: pd.DataFrame,
     shifted: pd.DataFrame,
+    series: Sequence[Series],
     failed: Sequence[tuple[str, str]],
     folder: Path,
 ) -> str:
@@ -107,8 +122,13 @@ def _page(
         movies=shown,
         species=species.assign(group=[groups[name] for name in species["movie"]]),
         shifts=shifted,
+        equilibria=[
+            (each.condition, each.binding.to_dict(), each.remarks)
+            for each in series
+            if each.binding is not None
+        ],
         calibrations=_calibrations(day),
-        failed=failed,
+        failed=[*failed, *((kd_name(each.condition), each.why) for each in series if each.why)],
         mass_label="mass [kDa]" if scales <= {"calibration"} else "mass, model scale [kDa]",
         folder=folder,
     )

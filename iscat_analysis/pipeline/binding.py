@@ -171,7 +171,11 @@ def fit_kd(
     >>> found.fit.kd_low < 10 < found.fit.kd_high
     True
     """
-    _check(model, masses_kda, landing_power)
+    check_reaction(model, masses_kda)
+    if not (math.isfinite(landing_power) and abs(landing_power) <= 1):
+        raise ConfigError(
+            f"`landing_power` = {landing_power:g}: must lie between -1 and 1, as in -0.167"
+        )
     folder = None if out is None else Path(out)
     if folder is not None:
         check_output(folder, overwrite, known=BINDING_FILES)
@@ -179,6 +183,7 @@ def fit_kd(
     rows = samples if isinstance(samples, pd.DataFrame) else _read_samples(Path(samples))
     rows, kept = _used(rows, name)
     totals = _totals(rows, model, name)
+    rows[list(CONCENTRATIONS[model])] = totals
     base = None if isinstance(samples, pd.DataFrame) else Path(samples).parent
     sources: Sequence[EventTable | pd.DataFrame | Path]
     if tables is None:
@@ -228,20 +233,39 @@ def fit_kd(
     return result
 
 
-def _check(model: str, masses_kda: Sequence[float] | None, power: float) -> None:
+def check_reaction(
+    model: str,
+    masses_kda: Sequence[float] | None,
+    *,
+    names: tuple[str, str] = ("model", "masses_kda"),
+) -> None:
+    """See that there is such a reaction, and that the masses are of its partners.
+
+    Parameters
+    ----------
+    model : str
+        Must be ``"dimer"`` or ``"ab"``.
+    masses_kda : sequence of float or None
+        About the mass of the monomer, or of A and B [kDa].
+    names : (str, str)
+        What messages call the two.
+
+    Raises
+    ------
+    ConfigError
+        Otherwise.
+    """
     if model not in get_args(Model):
-        raise ConfigError(f"`model` = {model!r}: must be dimer or ab")
+        raise ConfigError(f"`{names[0]}` = {model!r}: must be dimer or ab")
     parts = len(CONCENTRATIONS[model])  # type: ignore[index]
     if masses_kda is None:
         if parts > 1:
-            raise ConfigError("`masses_kda`: model ab needs the masses of A and B, as in 40,80")
+            raise ConfigError(f"`{names[1]}`: model ab needs the masses of A and B, as in 40,80")
     elif len(masses_kda) != parts or not all(0 < m < math.inf for m in masses_kda):
         wanted = (
             "the mass of the monomer, as in 66" if parts == 1 else "those of A and B, as in 40,80"
         )
-        raise ConfigError(f"`masses_kda`: model {model} takes {wanted} [kDa], above 0")
-    if not (math.isfinite(power) and abs(power) <= 1):
-        raise ConfigError(f"`landing_power` = {power:g}: must lie between -1 and 1, as in -0.167")
+        raise ConfigError(f"`{names[1]}`: model {model} takes {wanted} [kDa], above 0")
 
 
 def _read_samples(path: Path) -> pd.DataFrame:
@@ -296,9 +320,12 @@ def _totals(rows: pd.DataFrame, model: Model, name: str) -> FloatArray:
 def _paths(rows: pd.DataFrame, base: Path | None, name: str) -> list[Path]:
     if "path" not in rows:
         raise DataError(f"{name}: has no column path, which names a table of events in each row")
+    # The movies.csv of a batch says where each result is.
+    column = "report" if "report" in rows else "path"
     found = []
-    for given in rows["path"].astype(str):
+    for given in rows[column].fillna("").astype(str):
         path = Path(given.strip())
+        path = path.parent if column == "report" else path
         if base is not None and not path.is_absolute() and (base / path).exists():
             path = base / path
         folder = path.with_suffix(".iscat")

@@ -6,18 +6,22 @@ Everything arrives as the tables that are written beside it; nothing is computed
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import pandas as pd
 from markupsafe import Markup
+from matplotlib.figure import Figure
 
 from iscat_analysis.report.batch_figures import Curve, batch_figures
+from iscat_analysis.report.binding import binding_figure
 from iscat_analysis.report.numbers import count, decimals_for, fixed, number
 from iscat_analysis.report.page import render_page
 from iscat_analysis.report.style import publish
+from iscat_analysis.schemas import jsonable
 
 LONG = 30
 """Rows above which a table scrolls, and can be narrowed."""
@@ -44,6 +48,11 @@ _CHARTS = {
         "Share against concentration",
         "Of the particles that came, outliers left out, with 95 % intervals.",
     ),
+    "kd": (
+        "Equilibrium",
+        "Complexes among the particles that landed, with 95 % intervals, and the equilibrium that "
+        "fits all movies together; on the right the likelihood, maximised over everything else.",
+    ),
     "rates": ("Landing rate", "With 95 % Poisson intervals; not corrected for what was missed."),
 }
 
@@ -56,6 +65,7 @@ def batch_page(
     movies: pd.DataFrame,
     species: pd.DataFrame,
     shifts: pd.DataFrame,
+    equilibria: Sequence[tuple[str, Mapping[str, Any], Sequence[str]]] = (),
     calibrations: Sequence[tuple[str, str, str]],
     failed: Sequence[tuple[str, str]],
     mass_label: str,
@@ -75,6 +85,8 @@ def batch_page(
         ``species.csv``, with the column group.
     shifts : pandas.DataFrame
         ``shifts.csv``.
+    equilibria : sequence of (str, mapping, sequence of str)
+        A condition, its document ``kd`` and remarks.
     calibrations : sequence of (str, str, str)
         What was calibrated, by what, and the page of it, relative to this one; empty without.
     failed : sequence of (str, str)
@@ -89,13 +101,15 @@ def batch_page(
     str
         HTML.
     """
-    drawn = publish(
-        batch_figures(curves, movies, species, mass_label=mass_label), folder, printed=True
+    figures = chain(
+        batch_figures(curves, movies, species, mass_label=mass_label), _binding(equilibria)
     )
+    drawn = publish(figures, folder, printed=True)
     sections = [
         _overview(movies, failed, calibrations),
         _charts("masses", "Masses", drawn, ("overlaid", "stacked")),
         _species(species, shifts, drawn, mass_label, movies),
+        _equilibria(equilibria, drawn),
         _landing(movies, drawn),
         _quality(movies),
     ]
@@ -284,6 +298,51 @@ def _species_table(
     ]
     caption = "Species by movie"
     return {"caption": caption, "columns": columns, "rows": rows, "tall": len(rows) > LONG}
+
+
+def _binding(
+    equilibria: Sequence[tuple[str, Mapping[str, Any], Sequence[str]]],
+) -> Iterator[tuple[str, Figure]]:
+    """Draw the figure of every series: kd, kd_2, …."""
+    for n, (_, found, _) in enumerate(equilibria, 1):
+        for name, figure in binding_figure(jsonable(found)):
+            yield (name if n == 1 else f"{name}_{n}"), figure
+
+
+def _equilibria(
+    equilibria: Sequence[tuple[str, Mapping[str, Any], Sequence[str]]],
+    drawn: Mapping[str, Markup],
+) -> dict[str, Any] | None:
+    """Say what K_D is, and whether the movies follow the equilibrium."""
+    if not equilibria:
+        return None
+    section = _charts("equilibrium", "Equilibrium", drawn, ("kd",)) or {}
+    charts = section["charts"]
+    rows = []
+    for chart, (condition, found, remarks) in zip(charts, equilibria, strict=True):
+        chart["title"] = f"K_D, {condition}" if condition else "K_D"
+        kd, low, high = (found[name] for name in ("kd_nm", "kd_low", "kd_high"))
+        rows.append(
+            [
+                condition or "—",
+                {"dimer": "2 M ⇌ D", "ab": "A + B ⇌ AB"}[found["model"]],
+                len(found["samples"]),
+                number(kd),
+                f"{number(low)} to {number(high) if math.isfinite(high) else '∞'}",
+                _probability(found["p_value"]),
+                "; ".join(remarks) or "none",
+            ]
+        )
+    columns = [
+        "condition",
+        "reaction",
+        {"label": "movies", "numeric": True},
+        {"label": "K_D [nM]", "numeric": True},
+        {"label": "95 %", "numeric": True, "title": "of the profile likelihood"},
+        {"label": "p", "numeric": True, "title": "whether the movies follow the equilibrium"},
+        "remarks",
+    ]
+    return {**section, "tables": [{"columns": columns, "rows": rows}]}
 
 
 def _landing(movies: pd.DataFrame, drawn: Mapping[str, Markup]) -> dict[str, Any] | None:

@@ -12,10 +12,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+from event_tables import draw_series
 
 import iscat_analysis as ia
 from iscat_analysis.day import Batch, run
 from iscat_analysis.day.state import STATE, Records
+from iscat_analysis.errors import ConfigError
 from iscat_cli import main
 
 pytestmark = pytest.mark.usefixtures("all_sketched")
@@ -242,6 +244,70 @@ def test_a_day_on_which_everything_failed_has_a_page(lab: Path) -> None:
     assert "not analysed" in found.page.read_text(encoding="utf-8")
     assert len(pd.read_parquet(lab / "out" / "events.parquet")) == 0
     assert found.species.empty
+
+
+# ---- K_D ----------------------------------------------------------------------------------------
+
+
+def _fill(lab: Path, tables: list[pd.DataFrame]) -> None:
+    """Give the results of the three movies events of one's own."""
+    for name, table in zip(NAMES, tables, strict=True):
+        path = lab / "out" / "movies" / f"{name}.iscat" / "fits.parquet"
+        columns = pd.read_parquet(path).columns
+        whole = table.assign(status="ok", p_value=0.5).reindex(columns=columns)
+        whole.to_parquet(path)
+
+
+def test_a_series_of_concentrations_has_its_equilibrium(finished: Path, capsys) -> None:
+    totals = np.array([[1.0], [2.0], [3.0]])
+    drawn = draw_series(np.random.default_rng(3), "dimer", totals, 2.0, [66.0], number=1500)
+    _fill(finished, drawn)
+    found = _run(finished, kd="dimer", kd_masses_kda=[66])
+    assert (found.failed, found.analysed) == ((), ())
+    row = found.kd.iloc[0]
+    assert (row["condition"], row["movies"], row["model"]) == ("pH 7", 3, "dimer")
+    assert row["kd_low"] < 2.0 < row["kd_high"] < 1.4 * row["kd_low"]
+    assert row["p_value"] > 1e-3
+    page = found.page.read_text(encoding="utf-8")
+    assert "K_D, pH 7" in page
+    assert (finished / "out" / "figures" / "kd.svg").is_file()
+
+    # The tables alone say the same.
+    alone = ia.fit_kd(finished / "out" / "movies.csv", model="dimer", masses_kda=[66])
+    assert alone.fit.kd_nm == pytest.approx(row["kd_nm"], rel=1e-6)
+
+    config = finished / "out" / "movies" / "a.iscat" / "config.toml"
+    command = ["batch", finished / "samples.csv", "--out", finished / "out", "--config", config]
+    assert main([*map(str, command), "--kd", "dimer", "--kd-masses", "66"]) == 0
+    assert f"K_D of pH 7 = {row['kd_nm']:.4g} nM" in capsys.readouterr().out
+    assert not len(_run(finished).kd)
+    assert not (finished / "out" / "kd.csv").exists()
+
+
+def test_what_is_no_series_says_why_it_has_no_equilibrium(finished: Path) -> None:
+    asked = _run(finished, kd="dimer")
+    ((what, why),) = asked.failed
+    assert what == "K_D of pH 7"
+    assert "no movie has" in why
+    assert "no movie has" in asked.page.read_text(encoding="utf-8")
+    assert _run(finished, kd="dimer").failed == asked.failed  # read back, not fitted again
+    ((what, why),) = _run(finished, kd="ab", kd_masses_kda=(40, 80)).failed
+    assert (what, "a_nm and b_nm" in why) == ("K_D", True)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"kd": "trimer"}, "`kd`"),
+        ({"kd": "ab"}, "`kd_masses_kda`"),
+        ({"kd": "dimer", "kd_masses_kda": [-66]}, "`kd_masses_kda`"),
+        ({"kd_masses_kda": [66]}, "give `kd`"),
+    ],
+)
+def test_impossible_reactions_are_refused(lab: Path, given: dict, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        _run(lab, **given)
+    assert not (lab / "out").exists()
 
 
 def test_heights_have_no_species(lab: Path) -> None:

@@ -1,0 +1,179 @@
+"""Equilibrium constants of a day: one for each condition that is a series of concentrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import pandas as pd
+
+from iscat_analysis.day.gather import Found
+from iscat_analysis.errors import DataError
+from iscat_analysis.pipeline.binding import CONCENTRATIONS, Binding, fit_kd
+from iscat_analysis.species import LEAST_EVENTS
+from iscat_analysis.species.mass_action import Model
+from iscat_analysis.species.tables import event_table
+
+KD_COLUMNS = (
+    "condition", "model", "movies", "kd_nm", "kd_low", "kd_high", "inactive_p", "p_value",
+    "masses_kda", "remarks", "why",
+)  # fmt: skip
+"""Columns of ``kd.csv``: K_D with its 95 % interval [nM], the chance of such a gain by an inactive
+part where there is none, the chance of at least such a distance from the equilibrium where it
+holds, masses of the species, remarks, and why there is no K_D."""
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """What K_D is of.
+
+    Attributes
+    ----------
+    model : {"dimer", "ab"}
+        2 M ⇌ D or A + B ⇌ AB.
+    masses_kda : tuple of float or None
+        About the mass of the monomer, or of A and B [kDa].
+    """
+
+    model: Model
+    masses_kda: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """The movies of one condition.
+
+    Attributes
+    ----------
+    condition : str
+        As in the table.
+    movies : int
+        With enough events.
+    binding : Binding or None
+        What they say of K_D.
+    remarks : tuple of str
+        What the user should know, one sentence each.
+    why : str
+        Why they say nothing.
+    """
+
+    condition: str
+    movies: int
+    binding: Binding | None
+    remarks: tuple[str, ...] = ()
+    why: str = ""
+
+
+def find_equilibria(found: Sequence[Found], reaction: Reaction) -> list[Series]:
+    """Fit an equilibrium constant to each condition with samples of several concentrations.
+
+    Parameters
+    ----------
+    found : sequence of Found
+        What the movies gave, in the order of the table.
+    reaction : Reaction
+        Which reaction.
+
+    Returns
+    -------
+    list of Series
+        In the order of the table; one without a name where no condition is a series.
+    """
+    columns = CONCENTRATIONS[reaction.model]
+    conditions: dict[str, list[Found]] = {}
+    for each in found:
+        if each.movie.row.role == "sample" and each.summary and _totals(each, columns):
+            conditions.setdefault(each.movie.row.condition, []).append(each)
+    series = [
+        _fit(condition, members, columns, reaction)
+        for condition, members in conditions.items()
+        if len({_totals(each, columns) for each in members}) > 1
+    ]
+    if series:
+        return series
+    wanted = " and ".join(columns)
+    return [Series("", 0, None, why=f"no condition has analysed samples of several {wanted}")]
+
+
+def kd_table(series: Sequence[Series], reaction: Reaction) -> pd.DataFrame:
+    """Lay out ``kd.csv``.
+
+    Parameters
+    ----------
+    series : sequence of Series
+        From `find_equilibria`.
+    reaction : Reaction
+        Of which they are.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns `KD_COLUMNS`.
+    """
+    rows = []
+    for each in series:
+        row = {
+            "condition": each.condition,
+            "model": reaction.model,
+            "movies": each.movies,
+            "remarks": "; ".join(each.remarks),
+            "why": each.why,
+        }
+        if each.binding is not None:
+            fit = each.binding.fit
+            names = ("kd_nm", "kd_low", "kd_high", "inactive_p", "p_value")
+            row |= {name: getattr(fit, name) for name in names}
+            row["masses_kda"] = " ".join(f"{mass:.4g}" for mass in fit.masses_kda)
+        rows.append(row)
+    return pd.DataFrame(rows, columns=list(KD_COLUMNS))
+
+
+def kd_name(condition: str) -> str:
+    """Name an equilibrium constant.
+
+    Parameters
+    ----------
+    condition : str
+        Of its series; may be empty.
+
+    Returns
+    -------
+    str
+        As in ``"K_D of pH 7"``.
+    """
+    return f"K_D of {condition}" if condition else "K_D"
+
+
+def _totals(each: Found, columns: Sequence[str]) -> tuple[str, ...]:
+    """Give the concentrations of a movie; nothing where the table leaves one out."""
+    row = each.movie.row
+    given = {"concentration_nm": row.concentration_nm, **row.further}
+    values = tuple(str(given.get(name, "")).strip() for name in columns)
+    return values if all(value not in ("", "None", "nan") for value in values) else ()
+
+
+def _fit(
+    condition: str, members: Sequence[Found], columns: Sequence[str], reaction: Reaction
+) -> Series:
+    """Fit all movies of a condition that have enough events."""
+    tables = [event_table(each.folder, name=each.movie.name) for each in members]
+    kept = [table.mass_kda.size >= LEAST_EVENTS for table in tables]
+    few = [each.movie.name for each, keep in zip(members, kept, strict=True) if not keep]
+    remarks = (f"left out, with less than {LEAST_EVENTS} events: {', '.join(few)}",) if few else ()
+    used = [each for each, keep in zip(members, kept, strict=True) if keep]
+    if not used:
+        return Series(condition, 0, None, why=f"no movie has {LEAST_EVENTS} events")
+    rows = [
+        {"path": each.movie.name, **dict(zip(columns, _totals(each, columns), strict=True))}
+        for each in used
+    ]
+    try:
+        binding = fit_kd(
+            pd.DataFrame(rows),
+            model=reaction.model,
+            masses_kda=reaction.masses_kda,
+            tables=[table for table, keep in zip(tables, kept, strict=True) if keep],
+        )
+    except DataError as error:
+        return Series(condition, len(used), None, remarks, str(error))
+    return Series(condition, len(used), binding, (*remarks, *binding.notes))
