@@ -44,11 +44,14 @@ from iscat_cli.species import EXAMPLE as SPECIES_EXAMPLE
 from iscat_cli.species import species
 from iscat_cli.view import EXAMPLE as VIEW_EXAMPLE
 from iscat_cli.view import view
+from iscat_cli.watch import EXAMPLE as WATCH_EXAMPLE
+from iscat_cli.watch import watch
 
 # To add a command: its own file with a function and an EXAMPLE, and one line here.
 COMMANDS = (
     (fit, FIT_EXAMPLE),
     (batch, BATCH_EXAMPLE),
+    (watch, WATCH_EXAMPLE),
     (simulate, SIMULATE_EXAMPLE),
     (bounds, BOUNDS_EXAMPLE),
     (benchmark, BENCHMARK_EXAMPLE),

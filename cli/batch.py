@@ -10,7 +10,7 @@ import typer
 
 from iscat_cli.console import Messages, failures, print_result, short, table
 from iscat_cli.kd import Reaction
-from iscat_cli.options import ConfigOption, DebugOption, QuietOption, SetOption
+from iscat_cli.options import ConfigOption, DebugOption, QuietOption, SetOption, WorkersOption
 from iscat_cli.tables import numbers
 
 if TYPE_CHECKING:
@@ -18,6 +18,36 @@ if TYPE_CHECKING:
 
 INCOMPLETE = 3
 ROWS_SHOWN = 40
+
+StandardsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--standards",
+        metavar="MASSES",
+        help="Masses in the calibrants [kDa], beside those of the table, as in 66,146,480; "
+        "66:0.5 gives one its standard error, otherwise 1 %.",
+        show_default=False,
+    ),
+]
+
+KdOption = Annotated[
+    Reaction | None,
+    typer.Option(
+        "--kd",
+        help="Fit K_D to each condition with several concentrations, as iscat kd does.",
+        show_default=False,
+    ),
+]
+
+KdMassesOption = Annotated[
+    str | None,
+    typer.Option(
+        "--kd-masses",
+        metavar="M | A,B",
+        help="About the mass of the monomer, found otherwise, or of A and B [kDa]; fitted.",
+        show_default=False,
+    ),
+]
 
 EXAMPLE = """Example: a table with one row per movie, the standards' masses in it.
 
@@ -56,32 +86,9 @@ def batch(
     ],
     config: ConfigOption = None,
     settings: SetOption = None,
-    standards: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MASSES",
-            help="Masses in the calibrants [kDa], beside those of the table, as in 66,146,480; "
-            "66:0.5 gives one its standard error, otherwise 1 %.",
-            show_default=False,
-        ),
-    ] = None,
-    kd: Annotated[
-        Reaction | None,
-        typer.Option(
-            "--kd",
-            help="Fit K_D to each condition with several concentrations, as iscat kd does.",
-            show_default=False,
-        ),
-    ] = None,
-    kd_masses: Annotated[
-        str | None,
-        typer.Option(
-            "--kd-masses",
-            metavar="M | A,B",
-            help="About the mass of the monomer, found otherwise, or of A and B [kDa]; fitted.",
-            show_default=False,
-        ),
-    ] = None,
+    standards: StandardsOption = None,
+    kd: KdOption = None,
+    kd_masses: KdMassesOption = None,
     only: Annotated[
         str | None,
         typer.Option(
@@ -94,9 +101,7 @@ def batch(
     merge: Annotated[
         bool, typer.Option("--merge", help="Analyse nothing; make the page of what is finished.")
     ] = False,
-    workers: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Threads.", show_default=False)
-    ] = None,
+    workers: WorkersOption = None,
     quiet: QuietOption = False,
     debug: DebugOption = False,
 ) -> None:
@@ -128,7 +133,14 @@ def batch(
                 notify=messages.notify,
                 command=context.obj,
             )
-        _print(found, part)
+        if part is None:
+            print_batch(found)
+        else:
+            done = int((found.movies["state"] == "done").sum())
+            print_result(
+                f"part {part[0]} of {part[1]}: {done} of {len(found.movies)} movies done, "
+                f"{len(found.analysed)} of them now; results in {found.out}"
+            )
         for name, why in found.failed:
             messages.error(f"{name}: {why}")
         if found.failed:
@@ -147,15 +159,15 @@ def _part(text: str | None) -> tuple[int, int] | None:
     return int(match[1]), int(match[2])
 
 
-def _print(found: Batch, part: tuple[int, int] | None) -> None:
-    """Print a line per movie, and what there is now."""
+def print_batch(found: Batch) -> None:
+    """Print a line per movie, and what there is now.
+
+    Parameters
+    ----------
+    found : Batch
+        Of all movies.
+    """
     done = int((found.movies["state"] == "done").sum())
-    if part is not None:
-        print_result(
-            f"part {part[0]} of {part[1]}: {done} of {len(found.movies)} movies done, "
-            f"{len(found.analysed)} of them now; results in {found.out}"
-        )
-        return
     shown = table("movie")
     shown.add_column("sample", no_wrap=True)
     for heading in ("events", "landings", "species", "main mass [kDa]"):

@@ -15,6 +15,7 @@ from iscat_cli.options import (
     OverwriteOption,
     QuietOption,
     SetOption,
+    WorkersOption,
 )
 
 if TYPE_CHECKING:
@@ -47,9 +48,7 @@ def benchmark(
             "--posterior/--no-posterior", help="Sample a posterior for one in 20 repetitions."
         ),
     ] = True,
-    workers: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Threads.", show_default=False)
-    ] = None,
+    workers: WorkersOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,

@@ -330,10 +330,11 @@ _OPTIONS = {
         name: name
         for name in ("dark", "draws", "free", "hold", "inactive", "inject", "k", "kd", "ladder",
                      "landing", "maps", "model", "offset", "optimize", "out", "overwrite",
-                     "scan", "steps", "target")
+                     "scan", "standards", "steps", "target")
     },
     "above_kda": "above",
     "frame_rate_hz": "frame-rate",
+    "interval_s": "interval",
     "landing_power": "landing",
     "limit_kda": "limit",
     "kd_masses_kda": "kd-masses",

@@ -20,6 +20,7 @@ from iscat_cli.options import (
     OverwriteOption,
     QuietOption,
     SetOption,
+    WorkersOption,
     frame_range,
 )
 
@@ -90,9 +91,7 @@ def fit(
             show_default=False,
         ),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Threads.", show_default=False)
-    ] = None,
+    workers: WorkersOption = None,
     inject: Annotated[
         int | None,
         typer.Option(

@@ -75,6 +75,11 @@ SetOption = Annotated[
     ),
 ]
 
+WorkersOption = Annotated[
+    int | None,
+    typer.Option("--workers", min=1, metavar="N", help="Threads.", show_default=False),
+]
+
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace earlier output.")]
 
 JsonOption = Annotated[

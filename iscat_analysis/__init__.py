@@ -34,6 +34,7 @@ Whole jobs, from a movie to a report::
     result.save("movie.iscat")  # report.html, fits.csv, fits.parquet, …
     ia.calibrate_optics("movie.tif", config=setup)  # focus, aberrations… from the movie itself
     ia.batch("samples.csv", out="day", config=setup)  # a day's movies: calibrations, one picture
+    ia.watch("movies", config=setup)                # the same as they are saved, until Ctrl-C
     ia.compute_bounds(setup)    # what no estimate from such frames can beat
     ia.forecast_optics(setup)   # how well they would tell focus, NA, aberrations…
 
@@ -64,6 +65,7 @@ if TYPE_CHECKING:
     from iscat_analysis.config import load_config as load_config
     from iscat_analysis.day import Batch as Batch
     from iscat_analysis.day import batch as batch
+    from iscat_analysis.day.watch import watch as watch
     from iscat_analysis.errors import ConfigError as ConfigError
     from iscat_analysis.errors import DataError as DataError
     from iscat_analysis.errors import IscatError as IscatError
@@ -135,6 +137,7 @@ _HOME = {
     "configure": "config",
     "batch": "day",
     "Batch": "day",
+    "watch": "day.watch",
     "fit_movie": "notebook",
     "Result": "notebook",
     "simulate_movie": "notebook",
@@ -225,6 +228,7 @@ __all__ = [
     "simulate_movie",
     "to_napari",
     "to_trackpy",
+    "watch",
 ]
 
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
 
 SHORT, LONG, ASCII, RATIONAL, LONG8 = 3, 4, 2, 5, 16
@@ -114,3 +115,34 @@ def write_micro_manager(
     if description is not None:
         page_tags.setdefault(0, {})[270] = (ASCII, description)
     return write_tiff(path, pages_of(data), data.shape[1:], page_tags=page_tags)
+
+
+OME = '<?xml version="1.0" encoding="UTF-8"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06">{}</OME>'
+
+
+def write_ome_set(
+    folder: Path, counts: NDArray, *, lost: int = 0, elsewhere: str = ""
+) -> list[Path]:
+    """Write 7 frames of 6 x 5 pixels to three files, as Micro-Manager does beyond 4 GB."""
+    parts = (range(3), range(3, 6), range(6, 7))
+    paths = [folder / f"m_{k}.ome.tif" for k in range(len(parts))]
+    blocks = "".join(
+        f'<TiffData FirstT="{t}" FirstC="0" FirstZ="0" IFD="{i}" PlaneCount="1">'
+        f'<UUID FileName="{elsewhere}{path.name}">urn:uuid:0</UUID></TiffData>'
+        for part, path in zip(parts, paths, strict=True)
+        for i, t in enumerate(part)
+        if t < len(counts) - lost
+    )
+    pixels = (
+        '<Image ID="Image:0"><Pixels ID="Pixels:0" DimensionOrder="XYCZT" Type="uint16" SizeX="5" '
+        'SizeY="6" SizeC="1" SizeZ="1" SizeT="7" PhysicalSizeX="0.0844" PhysicalSizeY="0.0844" '
+        f'TimeIncrement="4" TimeIncrementUnit="ms">{blocks}</Pixels></Image>'
+    )
+    for part, path in zip(parts, paths, strict=True):
+        with tifffile.TiffWriter(path) as tiff:
+            for t in part:
+                tiff.write(
+                    counts[t], contiguous=False, metadata=None,
+                    description=OME.format(pixels).encode() if t == part[0] else None,
+                )  # fmt: skip
+    return paths

@@ -19,19 +19,18 @@ import pandas as pd
 
 from iscat_analysis.config import Config, configure
 from iscat_analysis.day.calibrate import Day, calibrate_day
-from iscat_analysis.day.equilibria import Reaction, kd_name
+from iscat_analysis.day.equilibria import Reaction, kd_name, reaction_of
 from iscat_analysis.day.gather import Found, read_movie
 from iscat_analysis.day.plan import Movie, Plan, configured, make_plan, part_of
 from iscat_analysis.day.publish import publish_day
 from iscat_analysis.day.run import Outcome, Runner
 from iscat_analysis.day.state import Records, claim_folder
-from iscat_analysis.day.table import read_standards, read_table
+from iscat_analysis.day.table import Table, read_standards, read_table
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.pipeline.binding import check_reaction
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.mass_action import Model
 
-__all__ = ["Batch", "batch", "read_table"]
+__all__ = ["Batch", "Table", "batch", "read_table"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ class Batch:
 
 
 def batch(
-    samples: str | Path,
+    samples: str | Path | Table,
     *,
     out: str | Path,
     config: str | Path | Mapping[str, Any] | Config | None = None,
@@ -79,6 +78,7 @@ def batch(
     kd_masses_kda: Sequence[float] | None = None,
     only: tuple[int, int] | None = None,
     merge: bool = False,
+    retry: bool = True,
     progress: Progress = silent,
     notify: Callable[[str], None] | None = None,
     command: str = "",
@@ -90,12 +90,12 @@ def batch(
 
     Parameters
     ----------
-    samples : str or Path
+    samples : str, Path or Table
         A table, CSV or TOML, one row per movie; or a folder, whose movies are samples.  Columns:
-        path (relative to the table), sample, condition, concentration_nm, replicate, role
-        (``sample``, ``calibrant``, ``blank`` or ``flat``) and standards, the masses in a calibrant;
-        one named as a key of the configuration, as ``background.frames``, sets it for that movie,
-        and any other is kept.
+        path (an address as for `open_stack`, relative to the table), sample, condition,
+        concentration_nm, replicate, role (``sample``, ``calibrant``, ``blank`` or ``flat``) and
+        standards, the masses in a calibrant; one named as a key of the configuration, as
+        ``background.frames``, sets it for that movie, and any other is kept.
     out : str or Path
         Folder of the batch; it may hold an earlier one, which is brought up to date.
     config : str, Path, mapping or Config, optional
@@ -117,6 +117,8 @@ def batch(
         analysed at the same time, on machines that share the folder.
     merge : bool
         Make the picture of what is finished, and analyse nothing.
+    retry : bool
+        Try again what failed, though nothing has changed.
     progress : Progress
         Called with the stage and the steps done and in all.
     notify : callable, optional
@@ -144,14 +146,8 @@ def batch(
             + ("parts are analysed first, and merged when all are" if merge else "write it as K/N")
             + ", as in 1/4 for the first of four parts"
         )
-    reaction = None
-    if kd is not None:
-        check_reaction(kd, kd_masses_kda, names=("kd", "kd_masses_kda"))
-        masses = None if kd_masses_kda is None else tuple(map(float, kd_masses_kda))
-        reaction = Reaction(kd, masses)
-    elif kd_masses_kda is not None:
-        raise ConfigError("`kd_masses_kda` is of K_D: give `kd`, dimer or ab, as well")
-    table = read_table(Path(samples))
+    reaction = reaction_of(kd, kd_masses_kda)
+    table = samples if isinstance(samples, Table) else read_table(Path(samples))
     try:
         named = read_standards(standards) if standards is not None else ()
     except ValueError as error:
@@ -160,8 +156,8 @@ def batch(
     folder = Path(out)
     claim_folder(folder)
     tell = notify or (lambda _: None)
-    said = command or f"iscat_analysis.batch({str(samples)!r}, out={str(out)!r})"
-    runner = Runner(folder, Records(folder), merge, progress, tell, said)
+    said = command or f"iscat_analysis.batch({str(table.source)!r}, out={str(out)!r})"
+    runner = Runner(folder, Records(folder), merge, progress, tell, said, retry)
     outcomes: dict[str, Outcome] = {}
     try:
         day = calibrate_day(plan, runner)
@@ -170,7 +166,8 @@ def batch(
             progress("movies", number - 1, len(wanted))
             outcomes[movie.name] = _analyse(plan, day, movie, runner)
             if outcomes[movie.name].ran:
-                tell(f"{number} of {len(wanted)}: {movie.name}: {_short(outcomes[movie.name])}")
+                which = f"{number} of {len(wanted)}: " if len(wanted) > 1 else ""
+                tell(f"{which}{movie.name}: {_short(outcomes[movie.name])}")
         progress("movies", len(wanted), len(wanted))
     except KeyboardInterrupt:
         done = sum(outcome.state == "done" for outcome in outcomes.values())

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import pandas as pd
 
 from iscat_analysis.day.gather import Found
-from iscat_analysis.errors import DataError
-from iscat_analysis.pipeline.binding import CONCENTRATIONS, Binding, fit_kd
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.pipeline.binding import CONCENTRATIONS, Binding, check_reaction, fit_kd
 from iscat_analysis.species import LEAST_EVENTS
 from iscat_analysis.species.mass_action import Model
 from iscat_analysis.species.tables import event_table
@@ -62,6 +62,34 @@ class Series:
     binding: Binding | None
     remarks: tuple[str, ...] = ()
     why: str = ""
+
+
+def reaction_of(kd: Model | None, kd_masses_kda: Sequence[float] | None) -> Reaction | None:
+    """Check what K_D is asked for.
+
+    Parameters
+    ----------
+    kd : {"dimer", "ab"} or None
+        The reaction.
+    kd_masses_kda : sequence of float or None
+        About the mass of the monomer, or of A and B [kDa].
+
+    Returns
+    -------
+    Reaction or None
+        None where none is asked for.
+
+    Raises
+    ------
+    ConfigError
+        There is no such reaction, or the masses are not its.
+    """
+    if kd is None:
+        if kd_masses_kda is not None:
+            raise ConfigError("`kd_masses_kda` is of K_D: give `kd`, dimer or ab, as well")
+        return None
+    check_reaction(kd, kd_masses_kda, names=("kd", "kd_masses_kda"))
+    return Reaction(kd, None if kd_masses_kda is None else tuple(map(float, kd_masses_kda)))
 
 
 def find_equilibria(found: Sequence[Found], reaction: Reaction) -> list[Series]:

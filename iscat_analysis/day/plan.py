@@ -10,6 +10,7 @@ from typing import Any
 from iscat_analysis.config import Config, configure
 from iscat_analysis.day.table import Row, Table
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.movie.addresses import beside, split_address
 
 
 @dataclass(frozen=True)
@@ -144,20 +145,21 @@ def part_of(movies: tuple[Movie, ...], only: tuple[int, int] | None) -> tuple[Mo
 
 def _names(table: Table) -> list[str]:
     """Name each result after its movie, with as many folders as it takes to tell it from others."""
-    paths = [row.path for row in table.rows]
-    same = Counter(path.with_suffix("") for path in paths)
+    files = [split_address(row.path)[0] for row in table.rows]
+    stems = [beside(row.path, "") for row in table.rows]
+    same = Counter(stems)
     ends = [
-        f"{path.stem}-{path.suffix[1:]}" if same[path.with_suffix("")] > 1 else path.stem
-        for path in paths
+        f"{stem.name}-{file.suffix[1:]}" if same[stem] > 1 else stem.name
+        for stem, file in zip(stems, files, strict=True)
     ]
     folders = [
-        len(path.relative_to(table.root).parts) - 1 if path.is_relative_to(table.root) else 0
-        for path in paths
+        len(file.relative_to(table.root).parts) - 1 if file.is_relative_to(table.root) else 0
+        for file in files
     ]
     while True:
         names = [
-            "/".join([*path.parent.parts[len(path.parent.parts) - n :], end])
-            for path, end, n in zip(paths, ends, folders, strict=True)
+            "/".join([*file.parent.parts[len(file.parent.parts) - n :], end])
+            for file, end, n in zip(files, ends, folders, strict=True)
         ]
         many = Counter(names)
         if len(many) == len(names):

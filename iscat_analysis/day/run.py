@@ -59,6 +59,8 @@ class Runner:
         Told in one line what was done.
     command : str
         The command line, for the reports.
+    retry : bool
+        Try again what failed, though nothing has changed.
     """
 
     out: Path
@@ -67,6 +69,7 @@ class Runner:
     progress: Progress
     notify: Notify
     command: str
+    retry: bool = True
 
     def job(
         self,
@@ -104,8 +107,8 @@ class Runner:
             current = current and all(saw(files[each], path) for each, path in inputs.items())
             if current and record["state"] == "done" and result.is_file():
                 return Outcome("done", record=record)
-            if self.dry:
-                failed = current and record["state"] == "failed"
+            failed = current and record["state"] == "failed"
+            if self.dry or (failed and not self.retry):
                 return Outcome("failed" if failed else "missing", record.get("why", ""))
             self.records.drop(name)
             before = {each: {"fingerprint": seen(path)} for each, path in inputs.items()}

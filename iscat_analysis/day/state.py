@@ -20,7 +20,8 @@ from typing import Any
 
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.addresses import fingerprint
+from iscat_analysis.movie.addresses import fingerprint, split_address
+from iscat_analysis.movie.folders import files_of
 
 STATE = ".batch"
 """Folder of records and locks; it marks a folder as that of a batch."""
@@ -84,6 +85,13 @@ class Records:
             Of the job.
         """
         self._path(name).unlink(missing_ok=True)
+
+    def forget_failed(self) -> None:
+        """Forget every job that failed, so that it is tried again."""
+        for path in self._folder.rglob("*.json"):
+            name = path.relative_to(self._folder).with_suffix("").as_posix()
+            if self.read(name).get("state") == "failed":
+                self.drop(name)
 
     @contextmanager
     def held(self, name: str, notify: Callable[[str], None]) -> Iterator[None]:
@@ -208,23 +216,27 @@ def key_of(config: Config, *further: Any) -> str:
 
 
 def sha256_of(path: Path) -> str:
-    """Hash a file.
+    """Hash a file, or a movie as `Stack.sha256` does.
 
     Parameters
     ----------
     path : Path
-        The file.
+        The file, or the address of a movie.
 
     Returns
     -------
     str
         In hexadecimal; empty where it cannot be read, which whoever opens it will say.
     """
+    digest = hashlib.sha256()
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        for each in files_of(path):
+            with each.open("rb") as file:
+                hashlib.file_digest(file, lambda: digest)
     except OSError:
         return ""
+    digest.update(split_address(path)[1].encode("utf-8", "backslashreplace"))
+    return digest.hexdigest()
 
 
 def saw(record: Mapping[str, Any], path: Path) -> bool:
@@ -243,7 +255,7 @@ def saw(record: Mapping[str, Any], path: Path) -> bool:
         By its size, time and ends; where these differ, by its SHA-256.
     """
     try:
-        if record.get("fingerprint") == fingerprint([path]):
+        if record.get("fingerprint") == _fingerprint(path):
             return True
     except OSError:
         return False
@@ -264,6 +276,10 @@ def seen(path: Path) -> str:
         In hexadecimal.
     """
     try:
-        return fingerprint([path])
+        return _fingerprint(path)
     except OSError:
         return ""
+
+
+def _fingerprint(address: Path) -> str:
+    return fingerprint(files_of(address), split_address(address)[1])

@@ -18,6 +18,9 @@ from typing import Any
 from iscat_analysis.calibration.mass import STANDARD_ERROR
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.movie.addresses import MARK, beside, split_address
+from iscat_analysis.movie.folders import SUFFIXES, files_of, find_movies
+from iscat_analysis.movie.ome_zarr import is_zarr
 
 ROLES = ("sample", "calibrant", "blank", "flat")
 """What a movie is for."""
@@ -27,12 +30,15 @@ COLUMNS = (
 )  # fmt: skip
 """The columns that have a meaning; others are kept, or set keys of the configuration."""
 
-SUFFIXES = (".tif", ".tiff", ".btf", ".tf8", ".mp", ".npy")
-"""Files of a folder that are taken for movies."""
+TABLES = ("samples.csv", "samples.toml")
+"""The table of a folder that is watched."""
 
 _DELIMITERS = ",;\t"
 _CLOSE = 0.85  # likeness of a column's name to one that has a meaning
 _SAID = 5  # complaints in one line
+
+
+Records = list[tuple[str, dict[str, Any]]]
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,7 @@ class Row:
     where : str
         What messages call it, as in ``"line 5"``.
     path : Path
-        The movie, absolute.
+        Address of the movie, absolute.
     given : str
         The path as it was written.
     sample, condition, replicate : str
@@ -86,11 +92,14 @@ class Table:
         Folder that the paths are relative to, absolute.
     rows : tuple of Row
         In the order of the table.
+    absent : tuple of str
+        Paths of rows that are left out, because there is no such movie yet.
     """
 
     source: Path
     root: Path
     rows: tuple[Row, ...]
+    absent: tuple[str, ...] = ()
 
 
 def read_table(source: Path) -> Table:
@@ -113,39 +122,98 @@ def read_table(source: Path) -> Table:
         One line that names file, row and column of whatever is wrong.
     """
     if source.is_dir():
-        found = [p for p in sorted(source.iterdir()) if _is_movie(p)]
+        found = find_movies(source)
         if not found:
             raise ConfigError(
                 f"{source}: holds no movie ({', '.join(SUFFIXES)}); give the folder that does, or "
                 "a table of movies"
             )
-        records = [(path.name, {"path": path.name}) for path in found]
-        root, toml = source.resolve(), False
-    else:
-        text = _text(source)
-        toml = source.suffix.lower() == ".toml"
-        records = _from_toml(source, text) if toml else _from_csv(source, text)
-        root = source.resolve().parent
-    rows, problems = [], []
+        return _checked(source, source, _named(found), written=True)
+    return _read_file(source)
+
+
+def read_growing(folder: Path, movies: Sequence[Path]) -> Table:
+    """Read the table of a folder that is still being filled.
+
+    Parameters
+    ----------
+    folder : Path
+        It may hold one of `TABLES`, which says what its movies are.
+    movies : sequence of Path
+        That are in the folder; those that the table does not name are samples.
+
+    Returns
+    -------
+    Table
+        Movies that are there, and the paths of those in the table that are not.
+
+    Raises
+    ------
+    ConfigError
+        The table is wrong, as in `read_table`, or there are two.
+    """
+    tables = [folder / name for name in TABLES if (folder / name).is_file()]
+    if len(tables) > 1:
+        raise ConfigError(f"{folder}: holds {' and '.join(TABLES)}; leave one table of the movies")
+    root = folder.resolve()
+    told = _read_file(tables[0], partial=True) if tables else Table(folder, root, ())
+    known = {file for row in told.rows for file in files_of(row.path)}
+    others = [path for path in movies if known.isdisjoint(files_of(path.resolve()))]
+    more = _checked(folder, folder, _named(others), written=True, partial=True)
+    return Table(folder, root, (*told.rows, *more.rows), told.absent)
+
+
+def _named(movies: Sequence[Path]) -> Records:
+    return [(path.name, {"path": path.name}) for path in movies]
+
+
+def _read_file(source: Path, *, partial: bool = False) -> Table:
+    text = _text(source)
+    toml = source.suffix.lower() == ".toml"
+    records = _from_toml(source, text) if toml else _from_csv(source, text)
+    if not records and not partial:
+        raise ConfigError(f"{source}: it lists no movie")
+    return _checked(source, source.parent, records, written=not toml, partial=partial)
+
+
+def _checked(
+    source: Path, folder: Path, records: Records, *, written: bool, partial: bool = False
+) -> Table:
+    """Make a table of what was read; a partial one leaves out the movies that are not there."""
+    root = folder.resolve()
+    rows, problems, absent = [], [], []
     for where, values in records:
-        row, wrong = _row(where, values, root, written=not toml)
+        given = str(values.get("path", ""))
+        if partial and given and not _is_there(_address(given, root)):
+            absent.append(given)
+            continue
+        row, wrong = _row(where, values, root, written=written)
         problems += [f"{where}, {complaint}" for complaint in wrong]
         if row is not None:
             rows.append(row)
-    first: dict[Path, str] = {}
+    first: dict[tuple[tuple[Path, ...], str], str] = {}
     for row in rows:
-        if row.path in first:
+        movie = (files_of(row.path), split_address(row.path)[1].strip("/"))
+        if movie in first:
             problems.append(
-                f"{row.where}, path: {row.given} is the movie of {first[row.path]} already; leave "
+                f"{row.where}, path: {row.given} is the movie of {first[movie]} already; leave "
                 "one of the rows out"
             )
-        first.setdefault(row.path, row.where)
-    if not records:
-        problems.append("it lists no movie")
+        first.setdefault(movie, row.where)
     if problems:
         more = f"; and {len(problems) - _SAID} more" if len(problems) > _SAID else ""
         raise ConfigError(f"{source}: {'; '.join(problems[:_SAID])}{more}")
-    return Table(source, root, tuple(rows))
+    return Table(source, root, tuple(rows), tuple(absent))
+
+
+def _address(given: str, root: Path) -> Path:
+    file, part = split_address(root / Path(given).expanduser())
+    return Path(f"{file.resolve()}{MARK}{part}") if part else file.resolve()
+
+
+def _is_there(address: Path) -> bool:
+    path, _ = split_address(address)
+    return path.is_file() or (path.is_dir() and (path.suffix.lower() == ".zarr" or is_zarr(path)))
 
 
 def read_standards(text: str | Sequence[float]) -> tuple[tuple[float, float], ...]:
@@ -182,10 +250,6 @@ def read_standards(text: str | Sequence[float]) -> tuple[tuple[float, float], ..
     return tuple(found)
 
 
-def _is_movie(path: Path) -> bool:
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
-
-
 def _text(source: Path) -> str:
     try:
         return source.read_text(encoding="utf-8-sig")
@@ -200,9 +264,6 @@ def _text(source: Path) -> str:
         raise ConfigError(
             f"{source}: is not a text file in UTF-8: give a table of movies, saved as CSV in UTF-8"
         ) from None
-
-
-Records = list[tuple[str, dict[str, Any]]]
 
 
 def _from_csv(source: Path, text: str) -> Records:
@@ -285,10 +346,10 @@ def _row(
     wrong: list[str] = []
     known = {name: values.get(name, "") for name in COLUMNS}
     given = str(known["path"])
-    path = root / Path(given).expanduser()
     if not given:
         return None, ["path: is empty"]
-    if not path.is_file():
+    path = _address(given, root)
+    if not _is_there(path):
         what = "is a folder, and one movie is wanted" if path.is_dir() else "there is no such file"
         wrong.append(f"path: {given}: {what}; paths are relative to {root}")
     role = str(known["role"]).lower() or "sample"
@@ -318,9 +379,9 @@ def _row(
     settings, further = _divided(values, written)
     row = Row(
         where=where,
-        path=path.resolve(),
+        path=path,
         given=given,
-        sample=str(known["sample"]) or path.stem,
+        sample=str(known["sample"]) or beside(path, "").name,
         condition=str(known["condition"]),
         replicate=str(known["replicate"]),
         concentration_nm=concentration,

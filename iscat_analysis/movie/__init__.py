@@ -14,6 +14,7 @@ from pathlib import Path
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.addresses import MARK, beside, split_address
 from iscat_analysis.movie.datasets import open_hdf5
+from iscat_analysis.movie.folders import files_of
 from iscat_analysis.movie.hdf5 import SIGNATURE
 from iscat_analysis.movie.mapped_frames import NPY_SIGNATURE, open_npy, open_raw
 from iscat_analysis.movie.ome_zarr import is_zarr, open_zarr
@@ -126,8 +127,7 @@ def _open_file(address: Path) -> Stack:
     if path.is_dir():
         if not is_zarr(path):
             raise DataError(f"{path}: is a folder; give the path of one movie file")
-        files = [file for file in sorted(path.rglob("*")) if file.is_file()]
-        return Stack(path, open_zarr(path, part), part=part, files=files)
+        return Stack(path, open_zarr(path, part), part=part, files=files_of(path))
     try:
         with path.open("rb") as file:
             signature = file.read(_SIGNATURE_BYTES)

@@ -13,7 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 MARK = "::"
-_END_BYTES = 2**20
+_END_BYTES = 2**20  # that are read of a file; many files share them
+_LEAST_END_BYTES = 2**8
 _SHAPE = re.compile(r"(?:(\d+)x)?(\d+)x(\d+),\s*(\S+)", flags=re.ASCII)
 
 
@@ -92,12 +93,13 @@ def fingerprint(files: Sequence[Path], part: str = "") -> str:
     str
         Hash of the sizes, times of change and ends of the files, and of the part.
     """
+    end = max(_END_BYTES // max(len(files), 1), _LEAST_END_BYTES)
     digest = hashlib.sha256(part.encode("utf-8", "backslashreplace"))
     for path in files:
         with path.open("rb") as file:
             state = os.fstat(file.fileno())
             digest.update(f"{state.st_size} {state.st_mtime_ns}".encode())
-            digest.update(file.read(_END_BYTES))
-            file.seek(max(state.st_size - _END_BYTES, 0))
-            digest.update(file.read(_END_BYTES))
+            digest.update(file.read(end))
+            file.seek(max(state.st_size - end, 0))
+            digest.update(file.read(end))
     return digest.hexdigest()

@@ -93,6 +93,27 @@ def open_hdf5(path: Path, part: str) -> Frames:
             raise
 
 
+def is_one_movie(path: Path) -> bool:
+    """Tell whether an HDF5 file is a movie without anything being named in it.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    bool
+        Whether it is Refeyn's or holds a single dataset of frames; true of a damaged file, which
+        is refused where it is opened.
+    """
+    try:
+        with closing(Hdf5Reader(path)) as reader, closing(reader.data):
+            return is_refeyn(reader) or len(list(_movies(reader))) == 1
+    except DataError:
+        return True
+
+
 def _which(path: Path, names: list[str]) -> str:
     if not names:
         return (

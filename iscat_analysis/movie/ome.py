@@ -169,6 +169,32 @@ def read_ome_set(text: str, path: Path) -> OmeSet | None:
     return OmeSet(tuple(files), where, _hints(pixels, axis))
 
 
+def files_of_set(text: str, path: Path) -> tuple[str, ...]:
+    """Name the files that OME-XML describes.
+
+    Parameters
+    ----------
+    text : str
+        The XML.
+    path : Path
+        Of the file that holds it.
+
+    Returns
+    -------
+    tuple of str
+        Empty for the file that says so.
+
+    Raises
+    ------
+    DataError
+        The XML is damaged, or names files elsewhere.
+    """
+    files = _files(_images(text, path))
+    if any(Path(name).name != name for name in files):
+        raise _damaged(path, "it names files in other folders")
+    return tuple(files)
+
+
 def _images(text: str, path: Path) -> list[ElementTree.Element]:
     """Give the pixels of every image that is described."""
     root = _parse(text, path)

@@ -231,6 +231,23 @@ def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | TiffSet:
         ) from None
 
 
+def first_texts(path: Path) -> tuple[str, ...]:
+    """Read the descriptions of the first image alone.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    tuple of str
+        As they stand there; what a damaged file raises is any of `WHAT_LIBRARIES_RAISE`.
+    """
+    with _unheard(), tifffile.TiffFile(path, **_PLAIN) as file:
+        return tuple(_text(tag.value) for tag in file.pages[0].tags.getall(_DESCRIPTION, ()))
+
+
 def _open(
     file: tifffile.TiffFile, data: mmap.mmap, path: Path, member: bool
 ) -> TiffFrames | TiffSet:

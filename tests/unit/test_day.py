@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 import tifffile
 from event_tables import draw_series
+from small_movies import SETUP, simulate
 
 import iscat_analysis as ia
 from iscat_analysis.day import Batch, run
@@ -22,33 +23,8 @@ from iscat_cli import main
 
 pytestmark = pytest.mark.usefixtures("all_sketched")
 
-SETUP = {
-    "optics.focus_nm": -300.0,
-    "optics.calibrate": "never",
-    "camera.pixel_size_nm": 84.4,
-    "particle.mass_kda": 900.0,
-    "background.frames": (0, 30),
-    "fit.frames": (30, 60),
-    "posterior.enabled": False,
-    "calibration.gradient_per_kda": -3.1e-5,
-    "simulation.shape": [64, 64],
-    "simulation.frames": 60,
-}
 LINE = SETUP["calibration.gradient_per_kda"]
 NAMES = ("a", "b", "c")
-
-
-def _simulate(path: Path, *, seed: int, masses: tuple[float, ...] = (900.0, 1500.0)) -> None:
-    """Write a movie of particles 32 pixels apart."""
-    side = int(np.ceil(np.sqrt(len(masses))))
-    events = [
-        {"frame": 30, "x_px": 20.3 + 32 * (k % side), "y_px": 20.8 + 32 * (k // side),
-         "mass_kda": mass}
-        for k, mass in enumerate(masses)
-    ]  # fmt: skip
-    shape = [8 + 32 * side] * 2
-    changes = {"simulation.shape": shape, "simulation.events": events}
-    ia.simulate_movie({**SETUP, **changes}, str(path), seed=seed)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +32,7 @@ def made(tmp_path_factory) -> Path:
     """Simulate the movies once: three samples, and one that is cut short."""
     folder = tmp_path_factory.mktemp("made")
     for number, name in enumerate(NAMES):
-        _simulate(folder / f"{name}.tif", seed=number + 1)
+        simulate(folder / f"{name}.tif", seed=number + 1)
     whole = (folder / "a.tif").read_bytes()
     (folder / "cut.tif").write_bytes(whole[: len(whole) // 2])
     return folder
@@ -144,7 +120,7 @@ def test_what_is_said_of_a_movie_is_told_without_analysing_it(finished: Path) ->
 
 
 def test_a_movie_more_is_the_only_one_analysed(finished: Path) -> None:
-    _simulate(finished / "d.tif", seed=9)
+    simulate(finished / "d.tif", seed=9)
     _table(finished, (*NAMES, "d"))
     again = _run(finished)
     assert again.analysed == ("d",)
@@ -152,7 +128,7 @@ def test_a_movie_more_is_the_only_one_analysed(finished: Path) -> None:
 
 
 def test_a_movie_that_changed_is_analysed_again(finished: Path) -> None:
-    _simulate(finished / "b.tif.new", seed=7)
+    simulate(finished / "b.tif.new", seed=7)
     (finished / "b.tif.new").replace(finished / "b.tif")
     assert _run(finished).analysed == ("b",)
 
@@ -399,8 +375,8 @@ STANDARDS = (600.0, 1200.0, 2400.0)
 def day(tmp_path_factory) -> Path:
     """Make a day: a flat, a calibrant of three standards, a sample."""
     folder = tmp_path_factory.mktemp("day")
-    _simulate(folder / "standards.tif", seed=4, masses=12 * STANDARDS)
-    _simulate(folder / "sample.tif", seed=5)
+    simulate(folder / "standards.tif", seed=4, masses=12 * STANDARDS)
+    simulate(folder / "sample.tif", seed=5)
     random = np.random.default_rng(6)
     level = np.linspace(2e3, 2e4, 64)
     flat = random.poisson(level, (60, 64, 64))  # its gain is one photoelectron per count
@@ -445,7 +421,7 @@ def test_the_day_is_calibrated_before_its_samples(day: Path) -> None:
 def test_a_changed_calibrant_analyses_what_depends_on_it(day: Path, tmp_path: Path) -> None:
     lab = tmp_path / "day"
     shutil.copytree(day, lab)
-    _simulate(lab / "new.tif", seed=8, masses=12 * STANDARDS)
+    simulate(lab / "new.tif", seed=8, masses=12 * STANDARDS)
     (lab / "new.tif").replace(lab / "standards.tif")
     assert set(_calibrated(lab).analysed) == {"sample", "standards"}
     assert _calibrated(lab).analysed == ()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 import zarr
+from tiff_files import write_ome_set
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import beside, open_stack
@@ -245,37 +246,9 @@ def test_files_of_microscopes_are_named(tmp_path: Path) -> None:
 
 # ---- TIFF in several files -------------------------------------------------------------------
 
-OME = '<?xml version="1.0" encoding="UTF-8"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06">{}</OME>'
-
-
-def _set(folder: Path, *, lost: int = 0, elsewhere: str = "") -> list[Path]:
-    """Write 7 frames to three files, as Micro-Manager does beyond 4 GB."""
-    parts = (range(3), range(3, 6), range(6, 7))
-    paths = [folder / f"m_{k}.ome.tif" for k in range(len(parts))]
-    blocks = "".join(
-        f'<TiffData FirstT="{t}" FirstC="0" FirstZ="0" IFD="{i}" PlaneCount="1">'
-        f'<UUID FileName="{elsewhere}{path.name}">urn:uuid:0</UUID></TiffData>'
-        for part, path in zip(parts, paths, strict=True)
-        for i, t in enumerate(part)
-        if t < len(COUNTS) - lost
-    )
-    pixels = (
-        '<Image ID="Image:0"><Pixels ID="Pixels:0" DimensionOrder="XYCZT" Type="uint16" SizeX="5" '
-        'SizeY="6" SizeC="1" SizeZ="1" SizeT="7" PhysicalSizeX="0.0844" PhysicalSizeY="0.0844" '
-        f'TimeIncrement="4" TimeIncrementUnit="ms">{blocks}</Pixels></Image>'
-    )
-    for part, path in zip(parts, paths, strict=True):
-        with tifffile.TiffWriter(path) as tiff:
-            for t in part:
-                tiff.write(
-                    COUNTS[t], contiguous=False, metadata=None,
-                    description=OME.format(pixels).encode() if t == part[0] else None,
-                )  # fmt: skip
-    return paths
-
 
 def test_reads_a_movie_in_several_files_from_any_of_them(tmp_path: Path) -> None:
-    paths = _set(tmp_path)
+    paths = write_ome_set(tmp_path, COUNTS)
     hashes = set()
     for path in paths:
         assert_whole(path)
@@ -290,24 +263,24 @@ def test_reads_a_movie_in_several_files_from_any_of_them(tmp_path: Path) -> None
 
 
 def test_a_set_with_a_part_missing_is_refused(tmp_path: Path) -> None:
-    paths = _set(tmp_path)
+    paths = write_ome_set(tmp_path, COUNTS)
     paths[1].unlink()
     refused(paths[0], "one of 3 files", "m_1.ome.tif is not beside it")
 
 
 def test_a_set_that_is_cut_short_is_refused(tmp_path: Path) -> None:
-    paths = _set(tmp_path)
+    paths = write_ome_set(tmp_path, COUNTS)
     tifffile.imwrite(paths[1], COUNTS[3:5], metadata=None)
     refused(paths[0], "m_1.ome.tif: holds 2 images", "says 3")
-    paths = _set(tmp_path, lost=2)
+    paths = write_ome_set(tmp_path, COUNTS, lost=2)
     refused(paths[0], "does not say where 2 of 7 frames lie")
 
 
 def test_parts_of_another_kind_or_elsewhere_are_refused(tmp_path: Path) -> None:
-    paths = _set(tmp_path)
+    paths = write_ome_set(tmp_path, COUNTS)
     tifffile.imwrite(paths[1], COUNTS[3:6].astype("u1"), metadata=None)
     refused(paths[0], "m_1.ome.tif", "other pixels")
-    paths = _set(tmp_path, elsewhere="../")
+    paths = write_ome_set(tmp_path, COUNTS, elsewhere="../")
     refused(paths[0], "other folders")
 
 

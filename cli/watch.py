@@ -1,0 +1,100 @@
+"""`iscat watch`: movies are analysed as they are saved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from iscat_cli import INTERRUPTED
+from iscat_cli.batch import (
+    INCOMPLETE,
+    KdMassesOption,
+    KdOption,
+    StandardsOption,
+    print_batch,
+)
+from iscat_cli.console import Messages, failures, print_result
+from iscat_cli.options import ConfigOption, DebugOption, QuietOption, SetOption, WorkersOption
+from iscat_cli.tables import numbers
+
+EXAMPLE = """Example: a folder that the microscope writes to.
+
+    iscat watch movies --config setup.toml
+
+Movies that samples.csv or samples.toml in the folder names are what it says,
+as for iscat batch; it may grow as well. The others are samples.
+
+Exit status, after Ctrl-C: 0 everything is analysed; 3 some movies or
+calibrations failed, which are listed; 130 a movie was interrupted, and the
+same command goes on; 2 usage, table or configuration.
+"""
+
+
+def watch(
+    context: typer.Context,
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER", help="Folder that movies are saved in.", show_default=False
+        ),
+    ],
+    *,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of the batch; default FOLDER/batch; an earlier one is brought up to date.",
+            show_default=False,
+        ),
+    ] = None,
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    standards: StandardsOption = None,
+    kd: KdOption = None,
+    kd_masses: KdMassesOption = None,
+    interval: Annotated[
+        float, typer.Option(metavar="S", help="Seconds between two looks at the folder.")
+    ] = 10.0,
+    workers: WorkersOption = None,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Analyse movies as they are saved, and keep batch.html current, until Ctrl-C.
+
+    What is still being written is waited for. A movie that fails is told once, and tried again when
+    it changes. Results are those of iscat batch, which may go on with them.
+    """
+    messages = Messages(context.command_path, quiet=quiet)
+    with failures(messages, debug=debug):
+        changes = [*(settings or ()), *([f"compute.workers={workers}"] if workers else [])]
+
+        from iscat_analysis.day.watch import watch as run
+
+        with messages.progress() as progress:
+            found = run(
+                folder,
+                out=out,
+                config=config,
+                settings=changes,
+                standards=standards,
+                kd=None if kd is None else kd.value,
+                kd_masses_kda=None if kd_masses is None else numbers("--kd-masses", kd_masses),
+                interval_s=interval,
+                progress=progress,
+                notify=messages.notify,
+                command=context.obj,
+            )
+        if found is None:
+            print_result(f"no movie came into {folder}")
+            return
+        print_batch(found)
+        missing = set(found.movies["movie"][found.movies["state"] == "missing"])
+        failed = [(name, why) for name, why in found.failed if name not in missing]
+        for name, why in failed:
+            messages.error(f"{name}: {why}")
+        if missing:
+            raise typer.Exit(INTERRUPTED)
+        if failed:
+            raise typer.Exit(INCOMPLETE)

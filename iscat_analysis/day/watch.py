@@ -1,0 +1,304 @@
+"""A folder that is being filled: movies are analysed as they appear, and the page is kept current.
+
+The folder is looked at again and again, because disks of a network tell of no changes.  A movie is
+taken once two looks find it the same and it can be read to its end.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from iscat_analysis.config import Config, configure
+from iscat_analysis.day import Batch, batch
+from iscat_analysis.day.equilibria import reaction_of
+from iscat_analysis.day.state import Records, claim_folder
+from iscat_analysis.day.table import TABLES, Table, read_growing, read_standards
+from iscat_analysis.errors import ConfigError, IscatError
+from iscat_analysis.movie import open_stack
+from iscat_analysis.movie.folders import files_of, find_movies
+from iscat_analysis.records import Progress, silent
+from iscat_analysis.species.mass_action import Model
+
+__all__ = ["watch"]
+
+PATIENCE = 6
+"""Looks without a change after which a movie that cannot be read, or is gone, is taken as it is."""
+
+FOLDER = "batch"
+"""Of the results, in the folder that is watched."""
+
+_PAGES = 0.1  # share of the time that pages between two movies may take
+
+State = tuple[tuple[str, int, int], ...]
+Look = tuple[Table, tuple[State | None, ...]]
+Notify = Callable[[str], None]
+
+
+def watch(
+    folder: str | Path,
+    *,
+    out: str | Path | None = None,
+    config: str | Path | Mapping[str, Any] | Config | None = None,
+    settings: Mapping[str, Any] | Iterable[str] | None = None,
+    standards: str | Sequence[float] | None = None,
+    kd: Model | None = None,
+    kd_masses_kda: Sequence[float] | None = None,
+    interval_s: float = 10.0,
+    stop: threading.Event | None = None,
+    progress: Progress = silent,
+    notify: Notify | None = None,
+    command: str = "",
+) -> Batch | None:
+    """Analyse the movies of a folder as they are saved, until it is interrupted.
+
+    Every movie is analysed as `batch` does it, and the page shows what there is.  A movie that is
+    still being written is waited for; one that fails is told once, and tried again when it changes.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Where movies are saved.  A table in it, ``samples.csv`` or ``samples.toml``, says what they
+        are, as for `batch`, and may grow as well; movies that it does not name are samples.
+    out : str or Path, optional
+        Folder of the batch; default ``batch`` in `folder`.
+    config, settings, standards, kd, kd_masses_kda : optional
+        As for `batch`; `standards` are used once there is a calibrant.
+    interval_s : float
+        Time between two looks at the folder [s].
+    stop : threading.Event, optional
+        Ends the watching when it is set, once the movie in work is finished.
+    progress : Progress
+        Called with the stage and the steps done and in all.
+    notify : callable, optional
+        Told in one line what was done.
+    command : str
+        The command line, for the reports.
+
+    Returns
+    -------
+    Batch or None
+        As `batch` gives it, of everything that is finished, after Ctrl-C or `stop`; None where no
+        movie came.
+
+    Raises
+    ------
+    ConfigError
+        The folder is none, or the configuration or the table of the beginning is wrong.
+    DataError
+        The folder of the batch holds something else.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise ConfigError(f"{place}: there is no such folder; give the one movies are saved in")
+    if not (math.isfinite(interval_s) and interval_s > 0):
+        raise ConfigError(f"`interval_s` = {interval_s:g} must be positive")
+    results = place / FOLDER if out is None else Path(out)
+    if results.resolve() == place.resolve():
+        raise ConfigError(f"{results}: is where the movies are; choose another `out`")
+    try:
+        read_standards(standards or ())
+    except ValueError as error:
+        raise ConfigError(f"`standards`: {error}") from None
+    reaction_of(kd, kd_masses_kda)
+    tell = notify or (lambda _: None)
+    analyse = partial(
+        batch,
+        out=results,
+        config=configure(config, settings=settings),
+        kd=kd,
+        kd_masses_kda=kd_masses_kda,
+        retry=False,
+        progress=_of_one_movie(progress),
+        notify=tell,
+        command=command or f"iscat_analysis.watch({str(folder)!r})",
+    )
+    run, seen = _Run(analyse, standards, tell), _Folder(place, results, tell)
+    ended = stop or threading.Event()
+    done: Look | None = None
+    try:
+        seen.look()
+        claim_folder(results)
+        Records(results).forget_failed()
+        tell(f"looks at {place} every {interval_s:g} s; Ctrl-C ends it")
+        while not ended.wait(interval_s):
+            found = seen.look()
+            if found is not None and found != done:
+                try:
+                    run.bring_up_to_date(found[0], ended)
+                    done = found
+                except (OSError, ConfigError) as error:
+                    seen.tell(f"{error}; waiting until it is mended")
+    except KeyboardInterrupt:
+        tell("ending; the page is being completed")
+    return run.last_page(progress)
+
+
+def _of_one_movie(progress: Progress) -> Progress:
+    """Leave out the stages that count movies, of which there is one at a time."""
+
+    def tell(stage: str, done: int, total: int) -> None:
+        if stage not in ("movies", "gather"):
+            progress(stage, done, total)
+
+    return tell
+
+
+@dataclass
+class _Sight:
+    """What was seen of a movie: its files, in how many looks since, and whether it can be read."""
+
+    state: State | None
+    looks: int = 0
+    readable: bool = False
+
+    @property
+    def settled(self) -> bool:
+        """Whether it is to be waited for no longer."""
+        return self.looks >= PATIENCE or (self.looks > 0 and self.readable)
+
+
+class _Folder:
+    """Looks at a folder."""
+
+    def __init__(self, folder: Path, out: Path, notify: Notify) -> None:
+        self._folder, self._out = folder, out
+        self._notify = notify
+        self._sights: dict[Path, _Sight] = {}
+        self._taken: set[Path] = set()
+        self._told: set[str] = set()
+        self._begun = False
+
+    def look(self) -> Look | None:
+        """Give the movies that are whole, and what tells them from later ones.
+
+        None where there is none, or where one that was given before is being changed.
+        """
+        tables = [self._sight(self._folder / name, table=True) for name in TABLES]
+        if self._begun and not all(sight.state is None or sight.looks for sight in tables):
+            return None
+        inside = self._folder / self._out.name
+        own = [inside] if inside.resolve() == self._out.resolve() else []
+        try:
+            table = read_growing(self._folder, find_movies(self._folder, but=own))
+        except OSError as error:
+            self.tell(f"{self._folder}: cannot be read ({error.strerror}); waiting for it")
+            return None
+        except ConfigError as error:
+            if not self._begun:
+                raise
+            self.tell(f"{error}; waiting until it is mended")
+            return None
+        self._begun = True
+        for given in table.absent:
+            self.tell(f"{given}: is in the table, and waited for")
+        known = dict.fromkeys([*self._taken, *(row.path for row in table.rows)])
+        sights = {path: self._sight(path) for path in known}
+        ready = tuple(row for row in table.rows if sights[row.path].settled)
+        if not ready or not all(sights[path].settled for path in self._taken):
+            return None
+        self._taken = {row.path for row in ready}
+        states = tuple(sights[row.path].state for row in ready)
+        return replace(table, rows=ready, absent=()), states
+
+    def _sight(self, path: Path, *, table: bool = False) -> _Sight:
+        state = _state(path)
+        before = self._sights.get(path)
+        if before is not None and before.state == state:
+            before.looks += 1
+        else:
+            if before is not None and before.state is not None and state is not None and not table:
+                self.tell(f"{path.name}: is being written, and waited for")
+            self._sights[path] = before = _Sight(state)
+        if before.looks == 1 and state is not None and not table:
+            before.readable = _opens(path)
+        return before
+
+    def tell(self, text: str) -> None:
+        """Say something once."""
+        if text not in self._told:
+            self._told.add(text)
+            self._notify(text)
+
+
+def _state(address: Path) -> State | None:
+    """Give size and time of the files of a movie; None where it is not there."""
+    try:
+        found = [(file, file.stat()) for file in files_of(address)]
+    except OSError:
+        return None
+    return tuple((str(file), stat.st_size, stat.st_mtime_ns) for file, stat in found)
+
+
+def _opens(address: Path) -> bool:
+    try:
+        with open_stack(address):
+            return True
+    except (IscatError, OSError):
+        return False
+
+
+class _Run:
+    """Brings a batch up to date, one movie after another, with a page in between now and then."""
+
+    def __init__(
+        self, analyse: Callable[..., Batch], standards: str | Sequence[float] | None, notify: Notify
+    ) -> None:
+        self._analyse, self._standards, self._notify = analyse, standards, notify
+        self._table: Table | None = None
+        self._told: set[tuple[str, str]] = set()
+        self._analysed: list[str] = []
+
+    def bring_up_to_date(self, table: Table, stop: threading.Event) -> None:
+        """Analyse what is new or has changed."""
+        self._table = table
+        number = sum(row.role != "flat" for row in table.rows)
+        self._batch(table, only=(number + 1, number + 1))  # without a movie: the calibrations
+        page, due = self._page(table)
+        movies = page.movies[page.movies["role"] != "flat"].sort_values("movie")
+        waiting = [k for k, state in enumerate(movies["state"], 1) if state == "missing"]
+        for k in waiting:
+            if stop.is_set():
+                return
+            part = self._batch(table, only=(k, number))
+            self._told.update(pair for pair in part.failed if pair[0] in part.analysed)
+            self._analysed += part.analysed
+            if k == waiting[-1] or time.monotonic() > due:
+                page, due = self._page(table)
+        if waiting:
+            counts = Counter(page.movies["state"])
+            said = ", ".join(f"{counts[name]} {name}" for name in sorted(counts))
+            self._notify(f"{said}; the page is {page.page}")
+
+    def last_page(self, progress: Progress) -> Batch | None:
+        """Put everything that is finished on the page."""
+        if self._table is None:
+            return None
+        progress("report", 0, 1)
+        found = self._batch(self._table, merge=True, progress=silent)
+        progress("report", 1, 1)
+        return replace(found, analysed=tuple(dict.fromkeys(self._analysed)))
+
+    def _page(self, table: Table) -> tuple[Batch, float]:
+        """Make the page, and say when the next one is due."""
+        begun = time.monotonic()
+        found = self._batch(table, merge=True)
+        missing = set(found.movies["movie"][found.movies["state"] == "missing"])
+        for name, why in found.failed:
+            if name not in missing and (name, why) not in self._told:
+                self._told.add((name, why))
+                self._notify(f"{name}: failed: {why}")
+        ended = time.monotonic()
+        return found, ended + (ended - begun) / _PAGES
+
+    def _batch(self, table: Table, **options: Any) -> Batch:
+        roles = {row.role for row in table.rows}
+        standards = self._standards if "calibrant" in roles else None
+        return self._analyse(table, standards=standards, **options)

@@ -1,0 +1,107 @@
+"""Which files hold a movie, and which movies a folder holds."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from functools import lru_cache
+from pathlib import Path
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie.addresses import split_address
+from iscat_analysis.movie.datasets import is_one_movie
+from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
+from iscat_analysis.movie.ome import files_of_set, is_ome
+from iscat_analysis.movie.tiff import first_texts
+
+_TIFF = (".tif", ".tiff", ".btf", ".tf8")
+_HDF5 = (".h5", ".hdf5")
+_ZARR = ".zarr"
+SUFFIXES = (*_TIFF, ".mp", ".npy", *_HDF5, _ZARR)
+"""Files and folders that are taken for movies where a folder is searched for them."""
+
+_REMEMBERED = 4096  # sets of files
+
+
+def files_of(address: Path) -> tuple[Path, ...]:
+    """Give the files that hold a movie, without opening it.
+
+    Parameters
+    ----------
+    address : Path
+        Of the movie.
+
+    Returns
+    -------
+    tuple of Path
+        Those that are there: one file, all files of a folder, or all of a set.
+    """
+    path, _ = split_address(address)
+    if path.is_dir():
+        return tuple(sorted(file for file in path.rglob("*") if file.is_file()))
+    if path.suffix.lower() in _TIFF:
+        try:
+            state = path.stat()
+        except OSError:
+            return (path,)
+        names = _described(path, state.st_size, state.st_mtime_ns)
+        if len(names) > 1:
+            members = dict.fromkeys(path.with_name(name) if name else path for name in names)
+            return tuple(file for file in {**members, path: None} if file.is_file())
+    return (path,)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _described(path: Path, size: int, changed_ns: int) -> tuple[str, ...]:
+    """Name the files of the set that a file describes; size and time tell it from later ones."""
+    del size, changed_ns
+    try:
+        text = next((text for text in first_texts(path) if is_ome(text)), "")
+        return files_of_set(text, path) if "FileName" in text else ()
+    except (DataError, *WHAT_LIBRARIES_RAISE):  # whoever opens it says what is wrong with it
+        return ()
+
+
+def find_movies(folder: Path, *, but: Collection[Path] = ()) -> list[Path]:
+    """List the movies of a folder by their names.
+
+    A set of files is one movie, under the name of the first file that describes it, and an HDF5
+    file is one if it holds a single dataset of frames.
+
+    Parameters
+    ----------
+    folder : Path
+        Its own folders are not searched.
+    but : collection of Path
+        What to leave out.
+
+    Returns
+    -------
+    list of Path
+        Sorted.
+    """
+    found = [path for path in sorted(folder.iterdir()) if path not in but and _is_movie(path)]
+    return list(_once(found))
+
+
+def _is_movie(path: Path) -> bool:
+    suffix = path.suffix.lower()
+    if path.name.startswith(".") or suffix not in SUFFIXES:
+        return False
+    if suffix == _ZARR:
+        return path.is_dir()
+    return path.is_file() and (suffix not in _HDF5 or is_one_movie(path))
+
+
+def _once(paths: Sequence[Path]) -> list[Path]:
+    """Leave one file of every set."""
+    sets = {path: frozenset(files) for path in paths if len(files := files_of(path)) > 1}
+    sets = {path: files for path, files in sets.items() if path.is_file()}
+    named: set[frozenset[Path]] = set()
+    kept = []
+    for path in paths:
+        mine = [files for files in sets.values() if path in files]
+        if mine and (sets.get(path) is None or sets[path] in named):
+            continue
+        named.update(mine)
+        kept.append(path)
+    return kept

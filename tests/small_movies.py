@@ -1,0 +1,35 @@
+"""Small movies of two particles, for days of many."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+import iscat_analysis as ia
+
+SETUP = {
+    "optics.focus_nm": -300.0,
+    "optics.calibrate": "never",
+    "camera.pixel_size_nm": 84.4,
+    "particle.mass_kda": 900.0,
+    "background.frames": (0, 30),
+    "fit.frames": (30, 60),
+    "posterior.enabled": False,
+    "calibration.gradient_per_kda": -3.1e-5,
+    "simulation.shape": [64, 64],
+    "simulation.frames": 60,
+}
+
+
+def simulate(path: Path, *, seed: int, masses: tuple[float, ...] = (900.0, 1500.0)) -> None:
+    """Write a movie of particles 32 pixels apart."""
+    side = int(np.ceil(np.sqrt(len(masses))))
+    events = [
+        {"frame": 30, "x_px": 20.3 + 32 * (k % side), "y_px": 20.8 + 32 * (k // side),
+         "mass_kda": mass}
+        for k, mass in enumerate(masses)
+    ]  # fmt: skip
+    shape = [8 + 32 * side] * 2
+    changes = {"simulation.shape": shape, "simulation.events": events}
+    ia.simulate_movie({**SETUP, **changes}, str(path), seed=seed)

@@ -1,0 +1,320 @@
+"""A folder that is being filled: what is taken, what is waited for, and what is told."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from small_movies import SETUP, simulate
+from tiff_files import write_ome_set
+
+import iscat_analysis as ia
+from iscat_analysis.day import run
+from iscat_analysis.day.watch import PATIENCE, Look, _Folder
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_cli import main
+
+pytestmark = pytest.mark.usefixtures("all_sketched")
+
+COUNTS = np.arange(4 * 6 * 6, dtype="u2").reshape(4, 6, 6)
+SET = np.arange(7 * 6 * 5, dtype="u2").reshape(7, 6, 5)
+INTERVAL_S = 0.01
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return an empty folder."""
+    place = tmp_path / "movies"
+    place.mkdir()
+    return place
+
+
+def _names(look: Look | None) -> list[str] | None:
+    return None if look is None else [row.path.name for row in look[0].rows]
+
+
+def _looks(folder: Path, told: list[str] | None = None) -> _Folder:
+    return _Folder(folder, folder / "batch", (told if told is not None else []).append)
+
+
+# ---- looks -----------------------------------------------------------------------------------
+
+
+def test_a_movie_is_taken_once_it_rests(folder: Path) -> None:
+    told: list[str] = []
+    seen = _looks(folder, told)
+    assert seen.look() is None
+    np.save(folder / "a.npy", COUNTS)
+    whole = (folder / "a.npy").read_bytes()
+    for size in (200, 300):
+        (folder / "a.npy").write_bytes(whole[:size])
+        assert seen.look() is None
+    (folder / "a.npy").write_bytes(whole)
+    assert seen.look() is None
+    assert _names(seen.look()) == ["a.npy"]
+    assert seen.look() == seen.look()
+    assert told == ["a.npy: is being written, and waited for"]
+
+
+def test_a_movie_that_rests_but_cannot_be_read_is_waited_for_a_while(folder: Path) -> None:
+    seen = _looks(folder)
+    np.save(folder / "a.npy", COUNTS)
+    (folder / "a.npy").write_bytes((folder / "a.npy").read_bytes()[:-10])
+    assert [_names(seen.look()) for _ in range(PATIENCE)] == [None] * PATIENCE
+    assert _names(seen.look()) == ["a.npy"]
+
+
+def test_nothing_is_done_while_a_movie_that_was_taken_changes_or_is_gone(folder: Path) -> None:
+    seen = _looks(folder)
+    for name in "ab":
+        np.save(folder / f"{name}.npy", COUNTS)
+    seen.look()
+    first = seen.look()
+    assert _names(first) == ["a.npy", "b.npy"]
+    np.save(folder / "b.npy", COUNTS[:3])
+    assert seen.look() is None
+    again = seen.look()
+    assert _names(again) == ["a.npy", "b.npy"]
+    assert again != first
+    (folder / "b.npy").unlink()
+    assert [_names(seen.look()) for _ in range(PATIENCE)] == [None] * PATIENCE
+    assert _names(seen.look()) == ["a.npy"]
+
+
+def test_the_table_says_what_movies_are_and_may_grow(folder: Path) -> None:
+    told: list[str] = []
+    seen = _looks(folder, told)
+    (folder / "samples.csv").write_text("path,sample,role\na.npy,buffer,blank\nz.npy,later,\n")
+    for name in "ab":
+        np.save(folder / f"{name}.npy", COUNTS)
+    seen.look()
+    look = seen.look()
+    assert look is not None
+    assert [(r.path.name, r.sample, r.role) for r in look[0].rows] == [
+        ("a.npy", "buffer", "blank"), ("b.npy", "b", "sample"),
+    ]  # fmt: skip
+    assert told == ["z.npy: is in the table, and waited for"]
+    (folder / "samples.csv").write_text("path,sample,role\na.npy,buffer,smaple\n")
+    assert (seen.look(), seen.look(), seen.look()) == (None, None, None)
+    (wrong,) = told[1:]
+    assert "did you mean sample?" in wrong
+    (folder / "samples.csv").write_text("path,sample\na.npy,BSA\n")
+    assert seen.look() is None  # it may not be written to its end
+    look = seen.look()
+    assert look is not None
+    assert [row.sample for row in look[0].rows] == ["BSA", "b"]
+
+
+def test_a_set_is_waited_for_until_all_its_files_are_there(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "set").mkdir()
+    first, *others = write_ome_set(tmp_path / "set", SET)
+    seen = _looks(folder)
+    shutil.copy(first, folder)
+    assert (seen.look(), seen.look()) == (None, None)
+    for path in others:
+        shutil.copy(path, folder)
+    assert seen.look() is None
+    assert _names(seen.look()) == [first.name]
+
+
+def test_results_in_the_folder_are_no_movies(folder: Path) -> None:
+    out = folder / "day.zarr"
+    (out / "movies").mkdir(parents=True)
+    (folder / "a.iscat").mkdir()
+    np.save(folder / "a.npy", COUNTS)
+    seen = _Folder(folder, out, [].append)
+    seen.look()
+    assert _names(seen.look()) == ["a.npy"]
+
+
+def test_a_folder_that_cannot_be_read_is_waited_for(folder: Path) -> None:
+    told: list[str] = []
+    seen = _looks(folder, told)
+    np.save(folder / "a.npy", COUNTS)
+    seen.look()
+    folder.rename(folder.with_name("away"))
+    assert (seen.look(), seen.look()) == (None, None)
+    assert len(told) == 1
+    assert "cannot be read" in told[0]
+    folder.with_name("away").rename(folder)
+    seen.look()
+    assert _names(seen.look()) == ["a.npy"]
+
+
+# ---- analyses --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """Make a movie and its result."""
+    place = tmp_path_factory.mktemp("made")
+    simulate(place / "movie.tif", seed=1)
+    ia.fit_stack(place / "movie.tif", ia.configure(SETUP), out=place / "movie.iscat")
+    return place
+
+
+@pytest.fixture
+def fits(made: Path, monkeypatch) -> list[str]:
+    """Put the finished result in the place of every fit, and note the movies that it is of."""
+    done: list[str] = []
+
+    def fit_stack(movie: Path, _: object, *, out: Path, **__: object) -> SimpleNamespace:
+        done.append(movie.name)
+        with ia.open_stack(movie) as stack:
+            sha256 = stack.sha256()
+        shutil.copytree(made / "movie.iscat", out, dirs_exist_ok=True)
+        summary = json.loads((out / "summary.json").read_text())
+        return SimpleNamespace(summary={**summary, "input": {"sha256": sha256}})
+
+    monkeypatch.setattr(run, "fit_stack", fit_stack)
+    return done
+
+
+class Day:
+    """What happens in a folder, each step once a line is told."""
+
+    def __init__(self, *steps: tuple[str, Callable[[], object]]) -> None:
+        self.steps, self.told = list(steps), []
+        self.stop = threading.Event()
+
+    def __call__(self, line: str) -> None:
+        self.told.append(line)
+        if self.steps and self.steps[0][0] in line:
+            self.steps.pop(0)[1]()
+        if not self.steps:
+            self.stop.set()
+
+    def watch(self, folder: Path, **options: object) -> ia.Batch | None:
+        given: dict = {"config": SETUP, "interval_s": INTERVAL_S, **options}
+        return ia.watch(folder, stop=self.stop, notify=self, **given)
+
+
+def test_movies_are_analysed_as_they_come_and_failures_told_once(
+    folder: Path, made: Path, fits: list[str]
+) -> None:
+    movie = made / "movie.tif"
+    page = folder / "batch" / "batch.html"
+
+    def damage() -> None:
+        assert ">a<" in page.read_text()
+        (folder / "cut.tif").write_bytes(movie.read_bytes()[:5000])
+
+    def add() -> None:
+        assert "not analysed" in page.read_text()
+        shutil.copy(movie, folder / "b.tif")
+
+    day = Day(
+        ("looks at", lambda: shutil.copy(movie, folder / "a.tif")),
+        ("1 done", damage),
+        ("1 done, 1 failed", add),
+        ("2 done, 1 failed", lambda: shutil.copy(movie, folder / "cut.tif")),
+        ("3 done", lambda: None),
+    )
+    found = day.watch(folder)
+    assert found is not None
+    assert fits == ["a.tif", "b.tif", "cut.tif"]
+    assert len([line for line in day.told if line.startswith("cut: failed")]) == 1
+    assert found.movies["movie"].tolist() == ["a", "b", "cut"]
+    assert set(found.analysed) == {"a", "b", "cut"}
+    assert found.failed == ()
+    assert "batch.html" in day.told[-1]
+
+    again = Day(("looks at", lambda: None), ("never", lambda: None))
+    threading.Timer(1.0, again.stop.set).start()
+    kept = again.watch(folder)
+    assert kept is None or kept.analysed == ()
+    assert fits == ["a.tif", "b.tif", "cut.tif"]
+
+
+def test_what_failed_is_tried_again_when_the_watching_begins(
+    folder: Path, made: Path, fits: list[str], monkeypatch
+) -> None:
+    shutil.copy(made / "movie.tif", folder / "a.tif")
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "fit_stack", lambda *_, **__: 1 / 0)
+        day = Day(("a: failed", lambda: None), ("1 failed", lambda: None))
+        first = day.watch(folder)
+    assert first is not None
+    assert first.failed == (("a", "unexpected ZeroDivisionError: division by zero"),)
+    second = Day(("1 done", lambda: None)).watch(folder)
+    assert second is not None
+    assert (fits, second.failed) == (["a.tif"], ())
+
+
+def test_an_interrupt_ends_with_a_page_of_what_is_finished(
+    folder: Path, made: Path, fits: list[str], monkeypatch, capsys, tmp_path: Path
+) -> None:
+    finish = run.fit_stack
+
+    def stopped(movie: Path, *arguments: object, **options: object) -> object:
+        if movie.name == "b.tif":
+            raise KeyboardInterrupt
+        return finish(movie, *arguments, **options)  # type: ignore[arg-type]
+
+    for name in "abc":
+        shutil.copy(made / "movie.tif", folder / f"{name}.tif")
+    setup = tmp_path / "setup.toml"
+    setup.write_text(ia.config_to_toml(ia.configure(SETUP)), encoding="utf-8")
+    command = ["watch", str(folder), "--config", str(setup), "--interval", str(INTERVAL_S)]
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "fit_stack", stopped)
+        assert main([*command, "--out", str(tmp_path / "day")]) == 130
+    said = capsys.readouterr()
+    assert "1 of 3 movies done, 1 of them now" in said.out
+    assert "iscat watch: ending" in said.err
+    assert "not analysed yet" in (tmp_path / "day" / "batch.html").read_text()
+    assert fits == ["a.tif"]
+
+
+# ---- what is wrong ---------------------------------------------------------------------------
+
+
+def test_what_cannot_be_watched_is_refused_at_once(folder: Path, capsys) -> None:
+    for options, said in (
+        ([str(folder / "absent")], "there is no such folder"),
+        ([str(folder), "--interval", "0"], "--interval 0 must be positive"),
+        ([str(folder), "--interval", "nan"], "--interval nan must be positive"),
+        ([str(folder), "--out", str(folder)], "choose another --out"),
+        ([str(folder), "--standards", "x"], "--standards: 'x' is not a mass"),
+        ([str(folder), "--set", "optics.nna=1"], "did you mean"),
+    ):
+        assert main(["watch", *options]) == 2, said
+        assert said in capsys.readouterr().err
+    (folder / "samples.csv").write_text("path,role\n")
+    (folder / "samples.toml").write_text("")
+    with pytest.raises(ConfigError, match=r"samples.csv and samples.toml"):
+        ia.watch(folder)
+    (folder / "samples.toml").unlink()
+    (folder / "samples.csv").write_text("sample\na\n")
+    with pytest.raises(ConfigError, match="lacks the column path"):
+        ia.watch(folder)
+    (folder / "samples.csv").unlink()
+    (folder / "batch").mkdir()
+    (folder / "batch" / "mine").write_text("x")
+    with pytest.raises(DataError, match="is no earlier batch"):
+        ia.watch(folder)
+
+
+def test_a_row_that_is_wrong_is_waited_for(folder: Path, made: Path, fits: list[str]) -> None:
+    shutil.copy(made / "movie.tif", folder / "a.tif")
+    table = folder / "samples.csv"
+    table.write_text("path,optics.nna\na.tif,1.3\n")
+    day = Day(
+        ("did you mean", lambda: table.write_text("path,optics.na\na.tif,1.3\n")),
+        ("1 done", lambda: None),
+    )
+    found = day.watch(folder)
+    assert found is not None
+    assert found.movies["state"].tolist() == ["done"]
+    assert fits == ["a.tif"]
+
+
+def test_a_folder_without_movies_ends_without_a_page(folder: Path, tmp_path: Path) -> None:
+    assert Day(("looks at", lambda: None)).watch(folder, out=tmp_path / "day") is None
+    assert not (tmp_path / "day" / "batch.html").exists()
