@@ -176,6 +176,7 @@ def print_batch(found: Batch) -> None:
     for row in found.movies.head(ROWS_SHOWN).to_dict("records"):
         numbers = ("events", "landings", "species", "main_mass_kda")
         cautions = row["why"] if row["state"] == "failed" else row["cautions"]
+        cautions = "not analysed yet" if row["state"] == "missing" else cautions
         shown.add_row(
             str(row["movie"]),
             str(row["sample"]),

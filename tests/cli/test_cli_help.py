@@ -113,6 +113,13 @@ def test_every_example_runs(
     if "view" in arguments:
         Path("movie.iscat").mkdir()
         Path("movie.iscat/report.html").write_text("<title>a page</title>", encoding="utf-8")
+    if "watch" in arguments:
+
+        def interrupt(_: object) -> None:
+            raise KeyboardInterrupt
+
+        Path("movies").mkdir()
+        monkeypatch.setattr("iscat_analysis.day.watch._Folder.look", interrupt)
     if "samples.csv" in arguments:
         sketch_figures(monkeypatch)
         Path("samples.csv").write_text("path,sample\nmovie.tif,protein\n", encoding="utf-8")

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -270,6 +273,24 @@ def test_an_interrupt_ends_with_a_page_of_what_is_finished(
     assert "iscat watch: ending" in said.err
     assert "not analysed yet" in (tmp_path / "day" / "batch.html").read_text()
     assert fits == ["a.tif"]
+
+
+def test_ctrl_c_ends_the_waiting_without_an_error(folder: Path) -> None:
+    code = "import sys; from iscat_cli import main; sys.exit(main())"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "watch", str(folder), "--interval", "3600"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert process.stderr is not None
+        assert "Ctrl-C ends it" in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0
+    assert out == f"no movie came into {folder}\n"
+    assert "error" not in err
 
 
 # ---- what is wrong ---------------------------------------------------------------------------
