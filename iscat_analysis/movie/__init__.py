@@ -14,13 +14,14 @@ from pathlib import Path
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.addresses import MARK, beside, split_address
 from iscat_analysis.movie.datasets import open_hdf5
+from iscat_analysis.movie.file_set import FileSet
 from iscat_analysis.movie.folders import files_of
 from iscat_analysis.movie.hdf5 import SIGNATURE
 from iscat_analysis.movie.mapped_frames import NPY_SIGNATURE, open_npy, open_raw
 from iscat_analysis.movie.ome_zarr import is_zarr, open_zarr
+from iscat_analysis.movie.recorded import description_of, open_recorded
 from iscat_analysis.movie.stack import ArrayFrames, ArrayLike, Frames, Stack
 from iscat_analysis.movie.tiff import open_tiff
-from iscat_analysis.movie.tiff_set import TiffSet
 from iscat_analysis.records import StackMetadata
 
 __all__ = ["ArrayLike", "Frames", "Stack", "beside", "open_stack"]
@@ -64,7 +65,8 @@ def open_stack(
     TIFF, BigTIFF, OME-TIFF, ImageJ and Micro-Manager stacks are read; strips or tiles;
     uncompressed, LZW, Deflate, Zstandard, PackBits or LZMA.  So are Refeyn's ``.mp`` movies, of
     OneMP and TwoMP, compressed or not; datasets of HDF5 files, as ``"day.h5::/run 3/movie"``;
-    images and arrays of Zarr folders, OME-Zarr among them; ``.npy`` files; files of plain numbers,
+    images and arrays of Zarr folders, OME-Zarr among them; ``.npy`` files; files of plain numbers
+    with the settings of PyLabLib beside them, with their shape in the name as PiSCAT's have it, or
     as ``"movie.bin::1500x128x128,uint16"``; and arrays: of NumPy, memory-mapped or not, of Dask,
     Zarr or h5py, or whatever has a shape and a dtype and can be sliced.
 
@@ -141,11 +143,14 @@ def _open_file(address: Path) -> Stack:
         return Stack(path, open_hdf5(path, part), part=part)
     if part:
         return Stack(path, open_raw(path, part), part=part)
+    if description_of(path) is not None:
+        recorded = open_recorded(path)
+        return Stack(path, recorded, files=recorded.files)
     reader = _READERS.get(signature[:4])
     if reader is None:
         raise DataError(f"{path}: {_refusal(path, signature)}")
     frames = reader(path)
-    return Stack(path, frames, files=frames.files if isinstance(frames, TiffSet) else None)
+    return Stack(path, frames, files=frames.files if isinstance(frames, FileSet) else None)
 
 
 def _refusal(path: Path, signature: bytes) -> str:

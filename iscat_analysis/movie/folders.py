@@ -11,14 +11,18 @@ from iscat_analysis.movie.addresses import split_address
 from iscat_analysis.movie.datasets import is_one_movie
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
 from iscat_analysis.movie.ome import files_of_set, is_ome
+from iscat_analysis.movie.recorded import SUFFIXES as RECORDED
+from iscat_analysis.movie.recorded import description_of, recorded_files
 from iscat_analysis.movie.tiff import first_texts
 
 _TIFF = (".tif", ".tiff", ".btf", ".tf8")
 _HDF5 = (".h5", ".hdf5")
 _ZARR = ".zarr"
-SUFFIXES = (*_TIFF, ".mp", ".npy", *_HDF5, _ZARR)
-"""Files and folders that are taken for movies where a folder is searched for them."""
+SUFFIXES = (*_TIFF, ".mp", ".npy", *_HDF5, _ZARR, *RECORDED)
+"""Files and folders that are taken for movies where a folder is searched for them; files of plain
+numbers only where something describes them."""
 
+_SNAPSHOT = "_snapshot"  # single frames, which have settings as well
 _REMEMBERED = 4096  # sets of files
 
 
@@ -35,7 +39,7 @@ def files_of(address: Path) -> tuple[Path, ...]:
     tuple of Path
         Those that are there: one file, all files of a folder, or all of a set.
     """
-    path, _ = split_address(address)
+    path, part = split_address(address)
     if path.is_dir():
         return tuple(sorted(file for file in path.rglob("*") if file.is_file()))
     if path.suffix.lower() in _TIFF:
@@ -47,7 +51,7 @@ def files_of(address: Path) -> tuple[Path, ...]:
         if len(names) > 1:
             members = dict.fromkeys(path.with_name(name) if name else path for name in names)
             return tuple(file for file in {**members, path: None} if file.is_file())
-    return (path,)
+    return (path,) if part else recorded_files(path)
 
 
 @lru_cache(maxsize=_REMEMBERED)
@@ -89,6 +93,8 @@ def _is_movie(path: Path) -> bool:
         return False
     if suffix == _ZARR:
         return path.is_dir()
+    if suffix in RECORDED:
+        return description_of(path) is not None and not path.stem.endswith(_SNAPSHOT)
     return path.is_file() and (suffix not in _HDF5 or is_one_movie(path))
 
 

@@ -35,6 +35,8 @@ class MappedFrames:
         Where the numbers begin [bytes].
     last_first : bool
         Whether the first axis runs fastest, as in Fortran.
+    member : bool
+        One of several files of a movie, which may hold a single frame.
 
     Raises
     ------
@@ -53,13 +55,14 @@ class MappedFrames:
         *,
         offset: int,
         last_first: bool = False,
+        member: bool = False,
     ) -> None:
         if len(shape) != 3 or 0 in shape or stored.kind not in "uif":
             raise DataError(
                 f"{path}: needs to be frames (t, y, x) of integers or floats but is {stored} of "
                 f"shape {shape}; save the camera's counts, one frame after the other"
             )
-        if shape[0] < 2:
+        if shape[0] < 2 and not member:
             raise DataError(
                 f"{path}: holds a single frame; a movie needs frames before and after a particle "
                 "binds"

@@ -35,9 +35,9 @@ from iscat_analysis.movie.descriptions import (
     plain_hints,
     time_axis,
 )
+from iscat_analysis.movie.file_set import FileSet, open_set
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, map_file, refuse_changed, release
 from iscat_analysis.movie.ome import is_ome, read_ome, read_ome_set
-from iscat_analysis.movie.tiff_set import TiffSet, open_set
 from iscat_analysis.records import StackMetadata
 
 _DESCRIPTION, _MICRO_MANAGER = 270, 51123
@@ -195,7 +195,7 @@ class TiffFrames:
                 ) from None
 
 
-def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | TiffSet:
+def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | FileSet:
     """Open a TIFF movie.
 
     Parameters
@@ -207,7 +207,7 @@ def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | TiffSet:
 
     Returns
     -------
-    TiffFrames or TiffSet
+    TiffFrames or FileSet
         Every frame of it.
 
     Raises
@@ -250,7 +250,7 @@ def first_texts(path: Path) -> tuple[str, ...]:
 
 def _open(
     file: tifffile.TiffFile, data: mmap.mmap, path: Path, member: bool
-) -> TiffFrames | TiffSet:
+) -> TiffFrames | FileSet:
     images = list(_images(file, data, path))
     texts = images[0].texts
     ome_text = next((text for text in texts if is_ome(text)), None)

@@ -1,4 +1,4 @@
-"""A movie in several TIFF files, as Micro-Manager writes it beyond 4 GB and OME describes it."""
+"""A movie in several files: TIFF, as Micro-Manager writes it beyond 4 GB and OME describes it."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from iscat_analysis.movie.stack import Frames
 from iscat_analysis.records import StackMetadata
 
 
-class TiffSet:
-    """The frames of a set of files; `open_set` makes it.
+class FileSet:
+    """The frames of a set of files.
 
     Parameters
     ----------
     members : sequence of Frames
-        Every file, all of its images as frames.
+        Every file that holds frames, all of its images as frames.
     files : sequence of Path
-        Their paths.
+        What the movie is made of.
     where : ndarray of int, shape (t, 2)
         File and image of each frame.
     metadata : StackMetadata
@@ -65,7 +65,7 @@ class TiffSet:
             member.close()
 
 
-def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames]) -> TiffSet:
+def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames]) -> FileSet:
     """Open the files of a set, which lie beside each other.
 
     Parameters
@@ -79,7 +79,7 @@ def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames
 
     Returns
     -------
-    TiffSet
+    FileSet
         Every frame.
 
     Raises
@@ -109,4 +109,4 @@ def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames
                     f"{needed}; the recording or the copy was interrupted: export it again"
                 )
         opened.pop_all()
-    return TiffSet(members, files, described.where, merge([described.hints], path))
+    return FileSet(members, files, described.where, merge([described.hints], path))
