@@ -8,9 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from iscat_cli.console import Messages, failures, print_result, short, table
+from iscat_cli.console import Messages, failures, print_json, print_result, short, table
 from iscat_cli.kd import Reaction
-from iscat_cli.options import ConfigOption, DebugOption, QuietOption, SetOption, WorkersOption
+from iscat_cli.options import (
+    ConfigOption,
+    DebugOption,
+    JsonOption,
+    QuietOption,
+    SetOption,
+    WorkersOption,
+)
 from iscat_cli.tables import numbers
 
 if TYPE_CHECKING:
@@ -102,6 +109,7 @@ def batch(
         bool, typer.Option("--merge", help="Analyse nothing; make the page of what is finished.")
     ] = False,
     workers: WorkersOption = None,
+    as_json: JsonOption = False,
     quiet: QuietOption = False,
     debug: DebugOption = False,
 ) -> None:
@@ -133,7 +141,9 @@ def batch(
                 notify=messages.notify,
                 command=context.obj,
             )
-        if part is None:
+        if as_json:
+            print_json("batch", found.to_dict())
+        elif part is None:
             print_batch(found)
         else:
             done = int((found.movies["state"] == "done").sum())

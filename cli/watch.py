@@ -15,8 +15,15 @@ from iscat_cli.batch import (
     StandardsOption,
     print_batch,
 )
-from iscat_cli.console import Messages, failures, print_result
-from iscat_cli.options import ConfigOption, DebugOption, QuietOption, SetOption, WorkersOption
+from iscat_cli.console import Messages, failures, print_json, print_result
+from iscat_cli.options import (
+    ConfigOption,
+    DebugOption,
+    JsonOption,
+    QuietOption,
+    SetOption,
+    WorkersOption,
+)
 from iscat_cli.tables import numbers
 
 EXAMPLE = """Example: a folder that the microscope writes to.
@@ -58,6 +65,7 @@ def watch(
         float, typer.Option(metavar="S", help="Seconds between two looks at the folder.")
     ] = 10.0,
     workers: WorkersOption = None,
+    as_json: JsonOption = False,
     quiet: QuietOption = False,
     debug: DebugOption = False,
 ) -> None:
@@ -70,6 +78,7 @@ def watch(
     with failures(messages, debug=debug):
         changes = [*(settings or ()), *([f"compute.workers={workers}"] if workers else [])]
 
+        from iscat_analysis.day.watch import FOLDER
         from iscat_analysis.day.watch import watch as run
 
         with messages.progress() as progress:
@@ -87,9 +96,16 @@ def watch(
                 command=context.obj,
             )
         if found is None:
-            print_result(f"no movie came into {folder}")
+            if as_json:
+                nothing = dict.fromkeys(("movies", "species", "kd", "analysed", "failed"), ())
+                print_json("batch", {"out": str(out or folder / FOLDER), **nothing})
+            else:
+                print_result(f"no movie came into {folder}")
             return
-        print_batch(found)
+        if as_json:
+            print_json("batch", found.to_dict())
+        else:
+            print_batch(found)
         missing = set(found.movies["movie"][found.movies["state"] == "missing"])
         failed = [(name, why) for name, why in found.failed if name not in missing]
         for name, why in failed:

@@ -66,6 +66,24 @@ class Batch:
         """The page that shows everything."""
         return self.out / "batch.html"
 
+    def to_dict(self) -> dict[str, Any]:
+        """Give everything as plain values.
+
+        Returns
+        -------
+        dict
+            What ``iscat batch --json`` prints; ``iscat_analysis.schema("batch")`` describes it.
+        """
+        return {
+            "out": str(self.out),
+            **({"page": str(self.page)} if self.page.is_file() else {}),
+            "movies": self.movies.to_dict("records"),
+            "species": self.species.to_dict("records"),
+            "kd": self.kd.to_dict("records"),
+            "analysed": list(self.analysed),
+            "failed": [{"name": name, "why": why} for name, why in self.failed],
+        }
+
 
 def batch(
     samples: str | Path | Table,

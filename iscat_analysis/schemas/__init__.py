@@ -21,10 +21,12 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.schemas.answers import Kd, Species, SpeciesComparison
 from iscat_analysis.schemas.bounds import Bounds, Comparison, OpticsBounds
 from iscat_analysis.schemas.calibration import Camera, MassCalibration, Optics, Template
+from iscat_analysis.schemas.day import Batch
 from iscat_analysis.schemas.fit import Fit, Simulate, Summary
 from iscat_analysis.schemas.study import Benchmark
 
 _DOCUMENTS: Mapping[str, type[BaseModel]] = {
+    "batch": Batch,
     "benchmark": Benchmark,
     "bounds": Bounds,
     "calibration": MassCalibration,
@@ -59,9 +61,9 @@ def schema(name: str) -> dict[str, Any]:
     Parameters
     ----------
     name : str
-        ``"fit"``, ``"simulate"`` or ``"bounds"`` for what the command prints with ``--json``, and
-        ``"comparison"`` and ``"optics_bounds"`` for ``iscat bounds --preset`` and ``--for optics``,
-        ``"species_comparison"`` for ``iscat species`` of several tables;
+        ``"fit"``, ``"batch"``, ``"simulate"`` or ``"bounds"`` for what the command prints with
+        ``--json``, ``"comparison"`` and ``"optics_bounds"`` for ``iscat bounds --preset`` and
+        ``--for optics``, ``"species_comparison"`` for ``iscat species`` of several tables;
         ``"summary"``, ``"benchmark"``, ``"camera"``, ``"optics"``, ``"template"``,
         ``"calibration"``, ``"species"`` or ``"kd"`` for the file of that name and what is printed
         beside it.

@@ -57,12 +57,13 @@ def _printed(capsys, *arguments: str) -> Any:
 
 def test_schemas_are_schemas() -> None:
     assert set(schema_names()) == {
-        "benchmark", "bounds", "calibration", "camera", "comparison", "fit", "kd", "optics",
-        "optics_bounds", "simulate", "species", "species_comparison", "summary", "template",
+        "batch", "benchmark", "bounds", "calibration", "camera", "comparison", "fit", "kd",
+        "optics", "optics_bounds", "simulate", "species", "species_comparison", "summary",
+        "template",
     }  # fmt: skip
     for name in schema_names():
         jsonschema.Draft202012Validator.check_schema(schema(name))
-    with pytest.raises(ConfigError, match="there are benchmark, bounds"):
+    with pytest.raises(ConfigError, match="there are batch, benchmark"):
         schema("fits")
 
 

@@ -7,7 +7,9 @@ import os
 import shutil
 import threading
 from pathlib import Path
+from typing import Any
 
+import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,8 +19,11 @@ from small_movies import SETUP, simulate
 
 import iscat_analysis as ia
 from iscat_analysis.day import Batch, run
+from iscat_analysis.day.equilibria import KD_COLUMNS
+from iscat_analysis.day.gather import MOVIE_COLUMNS, SPECIES_COLUMNS
 from iscat_analysis.day.state import STATE, Records
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.schemas import schema, to_json
 from iscat_cli import main
 
 pytestmark = pytest.mark.usefixtures("all_sketched")
@@ -77,6 +82,13 @@ def _run(lab: Path, **options: object) -> Batch:
     return ia.batch(lab / "samples.csv", **given)
 
 
+def _described(found: Batch) -> dict[str, Any]:
+    """Check that a batch is as its schema says, and give it as JSON."""
+    document = json.loads(to_json("batch", found.to_dict()))
+    jsonschema.Draft202012Validator(schema("batch")).validate(document)
+    return document
+
+
 def test_every_movie_has_an_ordinary_result_and_the_day_its_tables(done: Path) -> None:
     found = _run(done)
     assert found.failed == ()
@@ -98,6 +110,31 @@ def test_every_movie_has_an_ordinary_result_and_the_day_its_tables(done: Path) -
     page = found.page.read_text(encoding="utf-8")
     assert 'href="movies/b.iscat/report.html"' in page
     assert "://" not in page.replace("http://www.w3.org/2000/svg", "")
+
+
+def test_the_schema_names_the_columns_of_the_tables() -> None:
+    parts = schema("batch")["$defs"]
+    assert tuple(parts["DaySpecies"]["properties"]) == SPECIES_COLUMNS
+    assert set(parts["DayMovie"]["properties"]) == set(MOVIE_COLUMNS)
+    assert tuple(parts["DayKd"]["properties"]) == KD_COLUMNS
+
+
+def test_a_batch_is_printed_as_one_object(done: Path, capsys, tmp_path: Path) -> None:
+    setup = tmp_path / "setup.toml"
+    setup.write_text(ia.config_to_toml(ia.configure(SETUP)), encoding="utf-8")
+    command = ["batch", str(done / "samples.csv"), "--out", str(done / "out")]
+    assert main([*command, "--config", str(setup), "--json", "--quiet"]) == 0
+    printed = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert printed == _described(_run(done))
+    assert [movie["events"] for movie in printed["movies"]] == [2, 2, 2]
+    assert printed["movies"][1]["operator"] == "x"
+    assert printed["page"] == str(done / "out" / "batch.html")
+    part = _described(_run(done, only=(1, 2)))
+    assert [movie["movie"] for movie in part["movies"]] == ["a", "c"]
+    early = _described(_run(done, out=tmp_path / "new", merge=True))
+    assert early["failed"][0] == {"name": "a", "why": "not analysed yet"}
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.Draft202012Validator(schema("batch")).validate({**printed, "failed": ["a"]})
 
 
 def test_what_has_not_changed_is_left_alone(finished: Path) -> None:
@@ -241,6 +278,7 @@ def test_a_series_of_concentrations_has_its_equilibrium(finished: Path, capsys) 
     found = _run(finished, kd="dimer", kd_masses_kda=[66])
     assert (found.failed, found.analysed) == ((), ())
     row = found.kd.iloc[0]
+    assert _described(found)["kd"][0]["kd_nm"] == row["kd_nm"]
     assert (row["condition"], row["movies"], row["model"]) == ("pH 7", 3, "dimer")
     assert row["kd_low"] < 2.0 < row["kd_high"] < 1.4 * row["kd_low"]
     assert row["p_value"] > 1e-3
@@ -411,6 +449,7 @@ def test_the_day_is_calibrated_before_its_samples(day: Path) -> None:
     assert abs(line["gradient_per_kda"] - LINE) < 5 * line["gradient_se"]
     rows = found.movies.set_index("movie")
     assert rows.loc["standards", "standards_seen"] == "3 of 3"
+    assert len(_described(found)["species"]) == len(found.species) > 0
     assert rows.loc["sample", "mass_scale"] == "of the day"
     assert rows.loc["flat", "state"] == "done"
     fits = pd.read_csv(day / "out" / "movies" / "sample.iscat" / "fits.csv").sort_values("mass_kda")

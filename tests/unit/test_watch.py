@@ -275,6 +275,17 @@ def test_an_interrupt_ends_with_a_page_of_what_is_finished(
     assert fits == ["a.tif"]
 
 
+def test_without_movies_too_one_object_is_printed(folder: Path, monkeypatch, capsys) -> None:
+    def interrupt(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_Folder, "look", interrupt)
+    assert main(["watch", str(folder), "--json", "--quiet"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["out"] == str(folder / "batch")
+    assert printed["movies"] == []
+
+
 def test_ctrl_c_ends_the_waiting_without_an_error(folder: Path) -> None:
     code = "import sys; from iscat_cli import main; sys.exit(main())"
     process = subprocess.Popen(
