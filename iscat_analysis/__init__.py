@@ -32,6 +32,8 @@ Whole jobs, from a movie to a report::
     result.posterior(0)         # arviz.InferenceData
     result.tracks               # of particles that move: mass, D, one row per track
     result.save("movie.iscat")  # report.html, fits.csv, fits.parquet, …
+    ia.open_result("movie.iscat").view(0)           # a folder that was written before
+    ia.Preview(ia.open_stack("movie.tif"), setup).look(200).found()  # what the search sees there
     ia.calibrate_optics("movie.tif", config=setup)  # focus, aberrations… from the movie itself
     ia.batch("samples.csv", out="day", config=setup)  # a day's movies: calibrations, one picture
     ia.watch("movies", config=setup)                # the same as they are saved, until Ctrl-C
@@ -91,6 +93,10 @@ if TYPE_CHECKING:
     from iscat_analysis.pipeline.comparing import compare_tables as compare_tables
     from iscat_analysis.pipeline.kinetics import Kinetics as Kinetics
     from iscat_analysis.pipeline.kinetics import fit_kinetics as fit_kinetics
+    from iscat_analysis.pipeline.looks import Look as Look
+    from iscat_analysis.pipeline.preview import Preview as Preview
+    from iscat_analysis.pipeline.stored import StoredResult as StoredResult
+    from iscat_analysis.pipeline.stored import open_result as open_result
     from iscat_analysis.records import EVENT_COLUMNS as EVENT_COLUMNS
     from iscat_analysis.records import FREE_PARAMETERS as FREE_PARAMETERS
     from iscat_analysis.records import TRACK_COLUMNS as TRACK_COLUMNS
@@ -99,6 +105,7 @@ if TYPE_CHECKING:
     from iscat_analysis.records import TrackStatus as TrackStatus
     from iscat_analysis.report.exchange import to_napari as to_napari
     from iscat_analysis.report.exchange import to_trackpy as to_trackpy
+    from iscat_analysis.report.exchange import tracked_rows as tracked_rows
     from iscat_analysis.result import Bounds as Bounds
     from iscat_analysis.result import Result as Result
     from iscat_analysis.schemas import schema as schema
@@ -134,6 +141,11 @@ _HOME = {
     "refractive_index": "species",
     "to_trackpy": "report.exchange",
     "to_napari": "report.exchange",
+    "tracked_rows": "report.exchange",
+    "open_result": "pipeline.stored",
+    "StoredResult": "pipeline.stored",
+    "Preview": "pipeline.preview",
+    "Look": "pipeline.looks",
     "configure": "config",
     "batch": "day",
     "Batch": "day",
@@ -193,11 +205,14 @@ __all__ = [
     "IscatError",
     "Kinetics",
     "LogLikelihood",
+    "Look",
     "Optics",
     "Particle",
+    "Preview",
     "Result",
     "Stack",
     "Status",
+    "StoredResult",
     "TrackStatus",
     "anomalous_test",
     "batch",
@@ -220,6 +235,7 @@ __all__ = [
     "hydrodynamic_diameter",
     "load_config",
     "log_likelihood",
+    "open_result",
     "open_stack",
     "psf",
     "qcrb",
@@ -228,6 +244,7 @@ __all__ = [
     "simulate_movie",
     "to_napari",
     "to_trackpy",
+    "tracked_rows",
     "watch",
 ]
 

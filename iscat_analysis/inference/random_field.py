@@ -14,6 +14,7 @@ filter is cut, and maxima are not more frequent than elsewhere.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
@@ -113,14 +114,57 @@ def companions(u: float, ring: FloatArray, cell: float) -> float:
     return float(cell / (2 * math.pi) ** 1.5 * np.sum(more))
 
 
+@dataclass(frozen=True)
+class Excursions:
+    """How often noise exceeds a level in one search.
+
+    Attributes
+    ----------
+    area, volume : float
+        From `extent`.
+    correlation : float
+        As in `expected_maxima`.
+    ring : ndarray or None
+        As in `companions`, where maxima of both signs count and the higher of two is taken off
+        before the other is looked at.
+    cell : float
+        As in `companions`.
+    """
+
+    area: float
+    volume: float = 0.0
+    correlation: float = 0.0
+    ring: FloatArray | None = None
+    cell: float = 0.0
+
+    def above(self, u: float) -> float:
+        """Count the maxima above a level."""
+        found = expected_maxima(u, self.area, self.volume, correlation=self.correlation)
+        if self.ring is not None:  # of each pair one is left
+            found *= 1 - min(companions(u, self.ring, self.cell), 1.0) / 2
+        return found
+
+    def level(self, alarms: float, *, lowest: float = _LOWEST) -> float:
+        """Find the level that a number of maxima exceeds; `lowest` where fewer do."""
+
+        def excess(u: float) -> float:
+            return math.log(self.above(u) / alarms)
+
+        low = max(lowest, _LOWEST if self.volume else 1.0)
+        if not self.area > 0 or excess(low) <= 0:
+            return lowest
+        high = low
+        while excess(high) > 0 and high < _HIGHEST:
+            high = min(high + 1.0, _HIGHEST)
+        return float(brentq(excess, low, high, xtol=1e-10))
+
+
 def height_reached(
     alarms: float,
     area: float,
     volume: float = 0.0,
     *,
     correlation: float = 0.0,
-    ring: FloatArray | None = None,
-    cell: float = 0.0,
     lowest: float = _LOWEST,
 ) -> float:
     """Find the level above which noise has a given expected number of maxima.
@@ -133,11 +177,6 @@ def height_reached(
         From `extent`.
     correlation : float
         As in `expected_maxima`.
-    ring : ndarray, optional
-        As in `companions`, where maxima of both signs count and the higher of two is taken off
-        before the other is looked at.
-    cell : float
-        As in `companions`.
     lowest : float
         The answer where noise has fewer maxima even there.
 
@@ -146,17 +185,4 @@ def height_reached(
     float
         The level, not below `lowest`.
     """
-
-    def excess(u: float) -> float:
-        found = expected_maxima(u, area, volume, correlation=correlation)
-        if ring is not None:  # of each pair one is left
-            found *= 1 - min(companions(u, ring, cell), 1.0) / 2
-        return math.log(found / alarms)
-
-    low = max(lowest, _LOWEST if volume else 1.0)
-    if not area > 0 or excess(low) <= 0:
-        return lowest
-    high = low
-    while excess(high) > 0 and high < _HIGHEST:
-        high = min(high + 1.0, _HIGHEST)
-    return float(brentq(excess, low, high, xtol=1e-10))
+    return Excursions(area, volume, correlation).level(alarms, lowest=lowest)

@@ -12,10 +12,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.moving import box_of
+from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.linking import typical_error
-from iscat_analysis.pipeline.moving import Moving, follow
+from iscat_analysis.pipeline.moving import follow
 from iscat_analysis.pipeline.moving_table import common_masses, moving_table
 from iscat_analysis.pipeline.resume import Shelf, packed_views, unpacked_views
 from iscat_analysis.pipeline.scene import Scene
@@ -153,7 +154,9 @@ def analyse_block(
         table=table,
         inside=inside,
         masses=common_masses(scene, moving),
-        views=tuple(_view(moving, int(row)) for row in best.index),
+        views=tuple(
+            row_view(moving.field, moving.ground, moving.rows, int(row)) for row in best.index
+        ),
         level=moving.ground.level,
         power=moving.ground.power,
         total_e=field.counts_e.sum(axis=0, dtype=np.float64),
@@ -161,9 +164,25 @@ def analyse_block(
     )
 
 
-def _view(moving: Moving, mine: int) -> EventView:
-    """Images of one row: what was measured, the model and what it leaves over."""
-    field, rows = moving.field, moving.rows
+def row_view(field: MovingField, ground: Ground, rows: Rows, mine: int) -> EventView:
+    """Draw a particle in one frame.
+
+    Parameters
+    ----------
+    field : MovingField
+        The frames.
+    ground : Ground
+        The light without particles.
+    rows : Rows
+        All particles.
+    mine : int
+        Which of the rows.
+
+    Returns
+    -------
+    EventView
+        What was measured without the others, the model and what both leave over.
+    """
     frame, theta = int(rows.frame[mine]), rows.theta[mine]
     spans = [
         box_of(float(centre), field.pixel_nm, field.roi_px, size)
@@ -171,7 +190,6 @@ def _view(moving: Moving, mine: int) -> EventView:
     ]
     cut = slice(*spans[0]), slice(*spans[1])
     others = rows.only(np.arange(len(rows.frame)) != mine)
-    ground: Ground = moving.ground
     left, alone = (field.residual(ground, r, frame, frame + 1)[0][cut] for r in (rows, others))
     light = ground.power[frame] * ground.level[cut]
     used = field.used[cut]

@@ -52,6 +52,10 @@ _AS_FOUND = 0.95  # of the threshold; what was found is dropped only where other
 _DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
 
 
+Place = tuple[float, float, float, float]
+"""x, y, z [nm] and mass [kDa]."""
+
+
 @dataclass(frozen=True)
 class Event:
     """One fitted particle: where it was searched, what was fitted, and the likelihood used."""
@@ -67,6 +71,11 @@ class Event:
         return Candidate(
             self.fit.x_nm / pixel, self.fit.y_nm / pixel, self.fit.z_nm, self.fit.mass_kda, self.snr
         )
+
+    @property
+    def place(self) -> Place:
+        """Where it is, and its mass."""
+        return self.fit.x_nm, self.fit.y_nm, self.fit.z_nm, self.fit.mass_kda
 
     @property
     def snr(self) -> float:
@@ -118,7 +127,7 @@ def fit_field(
     for number in range(MAX_ROUNDS):
         progress("detect", number, MAX_ROUNDS)
         if number or not fresh:
-            fresh, doubtful = _search(scene, windows, events, excess_noise)
+            fresh, doubtful = search_field(scene, windows, events, excess_noise)
         if not fresh and (number or not starts):
             break
         events = _fit_all(scene, windows, [*(e.candidate for e in events), *fresh], events, pool)
@@ -162,15 +171,27 @@ def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Event]) 
     """
     total = np.zeros(shape)
     for event in events:
-        _add_signal(scene, event, Region((0, shape[0]), (0, shape[1])), total)
+        add_signal(scene, event.place, Region((0, shape[0]), (0, shape[1])), total)
     return total
 
 
-def _add_signal(scene: Scene, event: Event, region: Region, total: FloatArray) -> None:
-    """Add a particle's signal to the pixels of a region that it reaches."""
-    fit = event.fit
+def add_signal(scene: Scene, place: Place, region: Region, total: FloatArray) -> None:
+    """Add a particle's signal to the pixels of a region that it reaches.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    place : (float, float, float, float)
+        x, y, z [nm] and mass [kDa].
+    region : Region
+        The pixels of `total`.
+    total : ndarray, shape (y, x)
+        Added to.
+    """
+    x_nm, y_nm, _, _ = place
     spans = []
-    for centre, (low, high) in ((fit.y_nm, region.rows), (fit.x_nm, region.columns)):
+    for centre, (low, high) in ((y_nm, region.rows), (x_nm, region.columns)):
         first = max(low, math.ceil((centre - SPREAD_NM) / scene.pixel_nm))
         spans.append((first, min(high, math.floor((centre + SPREAD_NM) / scene.pixel_nm) + 1)))
     rows, columns = spans
@@ -181,13 +202,30 @@ def _add_signal(scene: Scene, event: Event, region: Region, total: FloatArray) -
         slice(rows[0] - region.rows[0], rows[1] - region.rows[0]),
         slice(columns[0] - region.columns[0], columns[1] - region.columns[0]),
     )
-    total[inside] += scene.wide.image(grid, fit.x_nm, fit.y_nm, fit.z_nm, fit.mass_kda)
+    total[inside] += scene.wide.image(grid, *place)
 
 
-def _search(
-    scene: Scene, windows: Windows, events: Sequence[Event], excess_noise: str
+def search_field(
+    scene: Scene, windows: Windows, events: Sequence[Event] = (), excess_noise: str = ""
 ) -> tuple[list[Candidate], list[Candidate]]:
-    """Find new particles, and what may be but the side lobe of a known one."""
+    """Find new particles, and what may be but the side lobe of a known one.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models and matched filter.
+    windows : Windows
+        Sums before and after.
+    events : sequence of Event
+        Particles that are known.
+    excess_noise : str
+        As for `fit_field`.
+
+    Returns
+    -------
+    fresh, doubtful : list of Candidate
+        Strongest first.
+    """
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
     explained = scene.left(total_signal(scene, shape, events))
     likelihood = search_likelihood(scene, windows, explained)
@@ -261,7 +299,7 @@ def _fit_all(
         others = np.zeros(region.shape)
         for number, event in enumerate(events):
             if number != first + index:
-                _add_signal(scene, event, region, others)
+                add_signal(scene, event.place, region, others)
         if taken is not None:
             others = (1 + others) / taken[region.slices] - 1
         likelihood = region_likelihood(scene, windows, region, others)

@@ -63,7 +63,7 @@ from iscat_analysis.records import (
     Windows,
 )
 from iscat_analysis.search.empty import EmptySpread
-from iscat_analysis.search.sliding import CORRELATION, STRIDES, Chunk
+from iscat_analysis.search.sliding import CORRELATION, STRIDES, Chunk, boundaries, stride_of
 from iscat_analysis.search.templates import LARGEST_IMAGE, make_templates
 from iscat_analysis.threads import threads
 
@@ -202,8 +202,8 @@ def analyse_landings(
         tell(f"{movie.name}: {noise.spectrum.message}")
     if noise.gain_message:
         tell(noise.gain_message)
-    stride = max(1, window // STRIDES)
-    count = max(math.ceil((last - first) / stride) - 1, 1)
+    stride = stride_of(window)
+    count = boundaries(last - first, window)
     posterior = config.samples_posterior
     sampling = config.posterior.model_copy(update={"enabled": posterior})
     config = config.model_copy(update={"posterior": sampling})

@@ -198,7 +198,7 @@ def follow(
         The span is too short.
     """
     config = scene.config
-    field = _load(scene, movie, camera, span, check, pool, progress)
+    field = load_field(scene, movie, camera, span, check, pool, progress)
     follow_power = config.background.power_normalization
     follow_level = config.background.method != "median"
     ground = field.first_ground(follow_power=follow_power)
@@ -207,7 +207,7 @@ def follow(
     total = ROUNDS + 3
     for number in range(ROUNDS):
         progress("track", number, total)
-        found = _search(scene, field, ground, rows, pool)
+        found = search_frames(scene, field, ground, rows, pool)
         before = len(rows.frame)
         if number and len(found.frame) <= _FEW * before:
             break
@@ -284,7 +284,7 @@ def follow(
     )
 
 
-def _load(
+def load_field(
     scene: Scene,
     movie: FrameSource,
     camera: Camera,
@@ -293,7 +293,23 @@ def _load(
     pool: ThreadPoolExecutor,
     progress: Progress,
 ) -> MovingField:
-    """Read the frames as photoelectrons."""
+    """Read the frames as photoelectrons.
+
+    Parameters
+    ----------
+    scene, movie, camera, span, check, pool, progress
+        As for `follow`.
+
+    Returns
+    -------
+    MovingField
+        All frames of the span.
+
+    Raises
+    ------
+    DataError
+        The span is too short.
+    """
     first, last = span
     frames, shape = last - first, (movie.shape[1], movie.shape[2])
     if frames < LEAST_FRAMES:
@@ -322,10 +338,36 @@ def _load(
     )  # fmt: skip
 
 
-def _search(
-    scene: Scene, field: MovingField, ground: Ground, rows: Rows, pool: ThreadPoolExecutor
+def search_frames(
+    scene: Scene,
+    field: MovingField,
+    ground: Ground,
+    rows: Rows,
+    pool: ThreadPoolExecutor,
+    frames: tuple[int, int] | None = None,
 ) -> Sightings:
-    """Find candidates in what the rows leave over."""
+    """Find candidates in what the rows leave over.
+
+    Parameters
+    ----------
+    scene : Scene
+        From `track_scene`.
+    field : MovingField
+        The frames.
+    ground : Ground
+        The light without particles.
+    rows : Rows
+        Particles that are known.
+    pool : ThreadPoolExecutor
+        Runs blocks of frames; the result does not depend on its size.
+    frames : (int, int), optional
+        Which of the field's frames, half-open; default all.
+
+    Returns
+    -------
+    Sightings
+        Above the threshold.
+    """
     polarity = {"both": 0, "bright": 1, "dark": -1}[scene.config.detection.polarity]
     side = scene.roi_px
     if scene.mode == "joint":
@@ -340,12 +382,13 @@ def _search(
     places = np.column_stack([rows.theta[:, :2] / pixel, snr])
 
     def block(first: int) -> Sightings:
-        last = min(first + _BLOCK, field.frames)
+        last = min(first + _BLOCK, end)
         residual = field.residual(ground, rows, first, last)
         known = [places[starts[t] : starts[t + 1]] for t in range(first, last)]
         return search.find(residual, ground.power[first:last], first, known)
 
-    parts = list(pool.map(block, range(0, field.frames, _BLOCK)))
+    begin, end = frames or (0, field.frames)
+    parts = list(pool.map(block, range(begin, end, _BLOCK)))
     return Sightings(
         *(np.concatenate([getattr(part, name) for part in parts])
           for name in ("frame", "x_px", "y_px", "z_nm", "strength", "snr"))
@@ -409,7 +452,7 @@ def _moved(
     judged = field.judge(ground, rows, brief=True)
     diffusion = _diffusion(config, field, rows, judged)
     _, exposure = exposure_of(config)
-    return *_blurred(rows, diffusion, exposure), diffusion
+    return *blurred_rows(rows, diffusion, exposure), diffusion
 
 
 def _diffusion(config: Config, field: MovingField, rows: Rows, judged: Judged) -> FloatArray:
@@ -435,8 +478,25 @@ def _diffusion(config: Config, field: MovingField, rows: Rows, judged: Judged) -
     return out
 
 
-def _blurred(rows: Rows, diffusion: FloatArray, exposure_s: float) -> tuple[Rows, FloatArray]:
-    """Give the blurs of tracks numbers, those that hardly differ the same."""
+def blurred_rows(rows: Rows, diffusion: FloatArray, exposure_s: float) -> tuple[Rows, FloatArray]:
+    """Give the blurs of tracks numbers, those that hardly differ the same.
+
+    Parameters
+    ----------
+    rows : Rows
+        With their tracks.
+    diffusion : ndarray, shape (tracks, 1 or more)
+        D of each track first [µm²/s].
+    exposure_s : float
+        Of a frame [s].
+
+    Returns
+    -------
+    rows : Rows
+        With the numbers of their blurs.
+    variances_nm2 : ndarray, shape (groups,)
+        As for `MovingField.set_blurs`.
+    """
     d = np.nan_to_num(diffusion[:, 0])
     q = np.array([path_variance_nm2(float(v), exposure_s) for v in d]).reshape(-1)
     scale = _FINEST_NM2 / _BLUR_STEP  # steps are even below, relative above

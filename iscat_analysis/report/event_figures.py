@@ -68,7 +68,7 @@ def event_figures(analysis: Analysis, most: int) -> Iterator[tuple[str, Figure]]
     for view in analysis.views[:most]:
         seen[view.event] = nth = seen.get(view.event, 0) + 1
         name = f"event_{view.event:04d}" + (f"_{nth}" if nth > 1 else "")
-        yield name, triptych(view, analysis)
+        yield name, triptych(view, analysis.scheme, analysis.pixel_size_nm)
 
 
 def corner_figures(analysis: Analysis) -> Iterator[tuple[str, Figure]]:
@@ -255,15 +255,17 @@ def scale_bar(axes: Axes, columns: int, rows: int, pixel_size_nm: float) -> None
     axes.text(x, y - 0.015 * rows, text, color="white", fontsize=8, path_effects=HALO, zorder=3)
 
 
-def triptych(view: EventView, analysis: Analysis) -> Figure:
+def triptych(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
     """Draw data, model and residual of one event.
 
     Parameters
     ----------
     view : EventView
         Its images.
-    analysis : Analysis
-        What was found.
+    scheme : str
+        ``"iscat"``, ``"cobri"`` or ``"darkfield"``.
+    pixel_size_nm : float
+        Side of a pixel [nm].
 
     Returns
     -------
@@ -273,9 +275,9 @@ def triptych(view: EventView, analysis: Analysis) -> Figure:
     rows, columns = view.contrast.shape
     aspect = float(np.clip(rows / columns, 0.3, 3.0))
     figure = new_figure(8.4, 2.55 * aspect + 1.0, constrained=False)
-    low, high = display_range([view.contrast, view.model], analysis.scheme)
+    low, high = display_range([view.contrast, view.model], scheme)
     limit = residual_limit(view.residual)
-    unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
+    unit = "photoelectrons" if scheme == "darkfield" else "contrast"
     panels: list[tuple[str, Any, Any, float, float, str]] = [
         ("data", view.contrast, "gray", low, high, unit),
         ("model", view.model, "gray", low, high, unit),
@@ -294,7 +296,7 @@ def triptych(view: EventView, analysis: Analysis) -> Figure:
             nbins=4
         )
         if not place:
-            scale_bar(axes, columns, rows, analysis.pixel_size_nm)
+            scale_bar(axes, columns, rows, pixel_size_nm)
     return figure
 
 

@@ -61,8 +61,25 @@ def to_napari(fits: pd.DataFrame) -> FloatArray:
         Track, frame, y and x [px], sorted by track and frame, each frame of a track once:
         ``viewer.add_tracks(…)`` over the movie takes it as it is.
     """
-    rows = _tracked(fits).drop_duplicates(["particle", "frame"])
+    rows = tracked_rows(fits)
     return np.ascontiguousarray(rows[["particle", "frame", "y_px", "x_px"]].to_numpy(float))
+
+
+def tracked_rows(fits: pd.DataFrame) -> pd.DataFrame:
+    """Give the rows that are the places of `to_napari`, with all of their columns.
+
+    Parameters
+    ----------
+    fits : pandas.DataFrame
+        One row per particle and frame: `Result.table`, or ``fits.csv``.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Those that belong to a track and have a place, sorted by track and frame, each frame of a
+        track once; a column ``particle`` is the track.
+    """
+    return _tracked(fits).drop_duplicates(["particle", "frame"])
 
 
 def _tracked(fits: pd.DataFrame) -> pd.DataFrame:

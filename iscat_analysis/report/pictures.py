@@ -78,8 +78,27 @@ def draw_event(analysis: Analysis, event: int) -> Figure:
     DataError
         There is no such event.
     """
-    view = view_of(analysis, event)
-    return _shown(lambda: event_figures.triptych(view, analysis))
+    return draw_view(view_of(analysis, event), analysis.scheme, analysis.pixel_size_nm)
+
+
+def draw_view(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
+    """Draw the images of one event.
+
+    Parameters
+    ----------
+    view : EventView
+        Its images.
+    scheme : str
+        ``"iscat"``, ``"cobri"`` or ``"darkfield"``.
+    pixel_size_nm : float
+        Side of a pixel [nm].
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Data, model and residual.
+    """
+    return _shown(lambda: event_figures.triptych(view, scheme, pixel_size_nm))
 
 
 def draw_corner(analysis: Analysis, event: int) -> Figure:

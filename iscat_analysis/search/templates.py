@@ -21,7 +21,7 @@ from scipy.ndimage import maximum_filter
 from iscat_analysis.config import Detection
 from iscat_analysis.errors import FloodError
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.random_field import extent, height_reached
+from iscat_analysis.inference.random_field import Excursions, extent
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
@@ -68,6 +68,8 @@ class Templates:
         Signal-to-noise ratio that noise reaches as often as configured.
     two_sided : bool
         Whether negative amplitudes count.
+    excursions : Excursions
+        How often noise exceeds a level, with the sign that it has.
     noise : NoiseSpectrum or None
         What the noise is where it is not white and of the expected size.
     """
@@ -78,6 +80,7 @@ class Templates:
     quadratic: bool
     threshold: float
     two_sided: bool
+    excursions: Excursions
     noise: NoiseSpectrum | None = None
 
 
@@ -150,20 +153,21 @@ def make_templates(
     if z_range_nm is not None:
         volume = extent(rough, size * float(heights[-1] - heights[0]))
     alarms = detection.false_alarms_per_movie / (2 if two_sided else 1)
+    excursions = Excursions(
+        area,
+        volume,
+        correlation,
+        _autocorrelation(stacked[0], noise) if in_turn and two_sided else None,
+        extent(rough[:2, :2], pixel_nm**2),
+    )
     return Templates(
         z_nm=heights,
         images=stacked,
         signs=np.sign(extremes),
         quadratic=model.rho == 0,
-        threshold=height_reached(
-            alarms,
-            area,
-            volume,
-            correlation=correlation,
-            cell=extent(rough[:2, :2], pixel_nm**2),
-            ring=_autocorrelation(stacked[0], noise) if in_turn and two_sided else None,
-        ),
+        threshold=excursions.level(alarms),
         two_sided=two_sided,
+        excursions=excursions,
         noise=noise,
     )
 

@@ -26,9 +26,11 @@ from iscat_analysis.search.sliding.search import (
     Filter,
     MapArray,
     Peak,
+    boundaries,
     find_steps,
     make_filter,
     sliding_maps,
+    stride_of,
 )
 
 __all__ = [
@@ -47,6 +49,7 @@ __all__ = [
     "Patch",
     "Peak",
     "StepFrame",
+    "boundaries",
     "choose_window",
     "crosstalk",
     "find_steps",
@@ -57,4 +60,5 @@ __all__ = [
     "measure_frames",
     "measure_noise",
     "sliding_maps",
+    "stride_of",
 ]

@@ -32,6 +32,40 @@ CORRELATION = 1 - 3 / (2 * STRIDES)
 """Of the noise at a boundary with that at the next, of w frames after less w frames before."""
 
 
+def stride_of(window: int) -> int:
+    """Give the frames between two boundaries that are searched.
+
+    Parameters
+    ----------
+    window : int
+        Frames before and after a step.
+
+    Returns
+    -------
+    int
+        At least 1.
+    """
+    return max(1, window // STRIDES)
+
+
+def boundaries(frames: int, window: int) -> int:
+    """Count the boundaries that are searched in a movie.
+
+    Parameters
+    ----------
+    frames : int
+        Of the movie.
+    window : int
+        Frames before and after a step.
+
+    Returns
+    -------
+    int
+        At least 1.
+    """
+    return max(math.ceil(frames / stride_of(window)) - 1, 1)
+
+
 @dataclass(frozen=True)
 class Filter:
     """Matched filter of one chunk; the weights are those of its mean image.

@@ -1,0 +1,365 @@
+"""Three ways to look at some frames: as a landing movie, over a background, and one by one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from typing import Any, Protocol
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.sliding import contrast_map
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.movie import Stack
+from iscat_analysis.movie.background import measure_windows, start_power
+from iscat_analysis.movie.camera import Camera, check_counts
+from iscat_analysis.movie.lines import Lines, SteadyFrames
+from iscat_analysis.pipeline.chunks import Reader, counts_budget, judge_noise
+from iscat_analysis.pipeline.diagnosis import judge_background
+from iscat_analysis.pipeline.field import search_field
+from iscat_analysis.pipeline.landing import make_landing_scene
+from iscat_analysis.pipeline.moving import LEAST_FRAMES, load_field, search_frames, track_scene
+from iscat_analysis.pipeline.pattern import SPAN, MovingPattern, follow
+from iscat_analysis.pipeline.ranges import frame_ranges
+from iscat_analysis.pipeline.scene import (
+    Scene,
+    field_likelihood,
+    make_scene,
+    reported_steps,
+)
+from iscat_analysis.pipeline.sidelobes import Sieve
+from iscat_analysis.records import FloatArray, silent
+from iscat_analysis.search.sliding import (
+    STRIDES,
+    Filter,
+    MapArray,
+    boundaries,
+    find_steps,
+    make_filter,
+    sliding_maps,
+    stride_of,
+)
+from iscat_analysis.threads import threads
+
+FOUND_COLUMNS = ("x_px", "y_px", "snr", "contrast", "mass_kda")
+"""Columns of what a `Look` finds."""
+
+AROUND = 100
+"""Frames that make the background of one frame in which particles move."""
+
+_WINDOWS_KEPT = 16  # lengths of window whose models are remembered
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the search sees in some frames.
+
+    Attributes
+    ----------
+    frame : int
+        First of the frames `after`; the one that was asked for, or the nearest that has as many
+        frames before and after it as are needed.
+    before : (int, int) or None
+        Frames of the background, half-open; None where it is known.
+    after : (int, int)
+        Frames that are compared with it, half-open.
+    image : ndarray, shape (y, x)
+        Contrast, after over before minus 1 (dark field: photoelectrons above background); NaN where
+        a pixel is not used.
+    threshold : float
+        Signal-to-noise ratio above which `analyse` takes something for a particle.
+    search : callable
+        Threshold → what exceeds it.
+    """
+
+    frame: int
+    before: tuple[int, int] | None
+    after: tuple[int, int]
+    image: FloatArray
+    threshold: float
+    search: Callable[[float], pd.DataFrame]
+
+    def found(self, threshold: float | None = None) -> pd.DataFrame:
+        """Give what exceeds a threshold.
+
+        Parameters
+        ----------
+        threshold : float, optional
+            Signal-to-noise ratio; default as configured.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns `FOUND_COLUMNS`, strongest first: place [px], signal-to-noise ratio, contrast at
+            the peak and mass [kDa] by the linear estimate, negative for a particle that leaves.
+            What may be a side lobe of another is not listed.
+
+        Raises
+        ------
+        ConfigError
+            The threshold is not positive.
+        """
+        return self.search(positive(self.threshold if threshold is None else threshold))
+
+
+class Search(Protocol):
+    """One way to search; each belongs to a kind of movie."""
+
+    window: int
+    longest: int
+    frames: tuple[int, int]
+
+    def scene(self, window: int) -> Scene:
+        """Give models and threshold for windows of a length."""
+
+    def look(self, frame: int, window: int) -> Look:
+        """Look at the frames around one."""
+
+
+class LandingSearch:
+    """What lands or leaves between two windows of a landing movie."""
+
+    def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
+        self.frames = first, last = config.fit.frames or (0, movie.shape[0])
+        self.longest = (last - first) // 2
+        frames = movie if lines is None else SteadyFrames(movie, lines, camera)
+        self._config = config
+        self._reader = Reader(frames, camera, first, last, counts_budget(config))
+        with threads(config.compute.workers) as pool:
+            noise = judge_noise(self._reader, config, pool.map)
+        self.window = noise.window
+
+        @lru_cache(_WINDOWS_KEPT)
+        def scene(window: int) -> Scene:
+            return make_landing_scene(
+                config, self._reader.shape, searches=boundaries(last - first, window),
+                noise=noise.spectrum, lines=lines,
+            )  # fmt: skip
+
+        self.scene = scene
+
+    def look(self, frame: int, window: int) -> Look:
+        """Look at the windows before and after the boundary at which a frame begins."""
+        first, last = self.frames
+        stride = stride_of(window)
+        frame = min(max(frame, first + stride), last - stride)
+        half = STRIDES * stride
+        reach = (SPAN if self._config.background.drift_correction else 1) * STRIDES
+        blocks_before = min(reach, (frame - first) // stride)
+        span = frame - blocks_before * stride, min(frame + reach * stride, last)
+        scene = self.scene(window)
+        with threads(self._config.compute.workers) as pool:
+            chunk = self._reader.chunk(span, stride, pool)
+            way = follow(chunk, pool.map) if reach > STRIDES else None
+            pattern = MovingPattern(chunk, way, pool.map) if way else None
+        chunk = pattern.chunk if pattern else chunk
+        at = blocks_before - 1  # the boundary between blocks at which `frame` begins
+        known = pattern.contrast[at] if pattern else None
+        earlier, later = slice(max(at + 1 - STRIDES, 0), at + 1), slice(at + 1, at + 1 + STRIDES)
+        before, after = (chunk.blocks_e[part].sum(axis=0) for part in (earlier, later))
+        image = np.zeros(chunk.shape, dtype=np.float32)
+        contrast_map(before, after, chunk.usable.astype(np.float32), image)
+        contrast = np.where(chunk.usable, image.astype(np.float64), np.nan)
+        if known is not None:
+            contrast = (1 + contrast) / (1 + known) - 1
+
+        @cache
+        def map_of() -> tuple[Filter, MapArray, FloatArray]:
+            matched = make_filter(chunk, scene.templates.images[0], scene.templates.noise)
+            count = chunk.edges.size - 2
+            empty = np.zeros((count, *chunk.shape), np.float32), np.zeros(count)
+            snr, effective = sliding_maps(
+                chunk, matched, STRIDES, explained=None if known is None else lambda *_: known,
+                earlier=empty, changed=[at],
+            )  # fmt: skip
+            return matched, snr[at : at + 1], effective[at : at + 1]
+
+        def search(threshold: float) -> pd.DataFrame:
+            matched, snr, effective = map_of()
+            peaks = find_steps(chunk, matched, snr, effective, threshold)
+            sieve = Sieve(chunk.first, stride, window, scene.roi_px)
+            sign, model = reported_steps(scene), scene.model
+            nominal = model.material.mass_kda
+            per_amplitude = model.peak_contrast(model.height_nm, nominal) / model.scale.amplitude(
+                nominal
+            )
+            return _listed(
+                (p.x_px, p.y_px, p.snr, p.amplitude * per_amplitude,
+                 math.copysign(float(model.scale.mass(np.asarray(abs(p.amplitude)))), p.amplitude))
+                for p in sieve.sift(peaks, (), snr)[0]
+                if sign * p.amplitude >= 0
+            )  # fmt: skip
+
+        return Look(
+            frame, (max(frame - half, first), frame), (frame, min(frame + half, last)), contrast,
+            scene.templates.threshold, search,
+        )  # fmt: skip
+
+
+class BoundSearch:
+    """What is there in some frames and was not in the background."""
+
+    def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
+        self._movie = movie if lines is None else movie.seen_as(SteadyFrames(movie, lines, camera))
+        self._camera, self._config = camera, config
+        before, after = frame_ranges(movie, config)
+        self.frames, self.longest = after, after[1] - after[0]
+        tracked = config.fit.mode == "track"
+        self.window = 1 if tracked else self.longest
+        shape = (movie.shape[1], movie.shape[2])
+        background = config.background
+        self._windows = measure_windows(
+            self._movie, camera, before, (after[0], after[0] + 1),
+            median=background.method == "median", level_e=background.level_e,
+            power_normalization=background.power_normalization, check=self._check,
+        )  # fmt: skip
+        _, spectrum = judge_background(self._movie, camera, self._windows)
+        searches = self.longest if tracked else 1
+        self._scene = make_scene(config, shape, searches=searches, noise=spectrum, lines=lines)
+
+    def _check(self, counts: NDArray[Any], first: int) -> None:
+        check_counts(counts, first, self._movie.name, camera=self._camera)
+
+    def scene(self, window: int) -> Scene:  # noqa: ARG002
+        """Give models and threshold, which are those of every window."""
+        return self._scene
+
+    def look(self, frame: int, window: int) -> Look:
+        """Look at the frames from one on, over the background."""
+        scene, known = self._scene, self._windows
+        frame = min(max(frame, self.frames[0]), self.frames[1] - window)
+        part = measure_windows(
+            self._movie, self._camera, None, (frame, frame + window),
+            level_e=1.0, power_normalization=False, check=self._check,
+        )  # fmt: skip
+        windows = replace(
+            known,
+            after_e=part.after_e,
+            n_after=window,
+            power_ratio=window / max(known.n_before, 1),
+            read_variance_after_e2=part.read_variance_after_e2,
+            masked=known.masked | part.saturated,
+            saturated=known.saturated | part.saturated,
+            frames_after=part.frames_after,
+        )
+        if self._config.background.power_normalization:
+            windows = start_power(windows)
+        image = field_likelihood(scene, windows).measured_signal()
+        if scene.additive:
+            image = windows.after_e - windows.power_ratio * windows.before_e
+        wanted = {"both": 0, "bright": 1, "dark": -1}[self._config.detection.polarity]
+
+        def search(threshold: float) -> pd.DataFrame:
+            found, _ = search_field(_with_threshold(scene, threshold), windows)
+            rows = [
+                (c.x_px, c.y_px, c.snr, scene.model.peak_contrast(c.z_nm, c.mass_kda), c.mass_kda)
+                for c in found
+            ]
+            return _listed(r for r in rows if scene.additive or wanted * r[3] >= 0)
+
+        return Look(
+            frame, known.frames_before if known.n_before else None, windows.frames_after,
+            np.where(windows.masked, np.nan, image), scene.templates.threshold, search,
+        )  # fmt: skip
+
+
+class MovingSearch:
+    """What is in one frame and not in the median of the frames around it."""
+
+    def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
+        self._movie = movie if lines is None else movie.seen_as(SteadyFrames(movie, lines, camera))
+        self._camera, self._config = camera, config
+        self.frames = first, last = config.fit.frames or (0, movie.shape[0])
+        self.longest = last - first
+        self.window = min(AROUND, self.longest)
+        shape = (movie.shape[1], movie.shape[2])
+        self._scene = track_scene(config, shape, max(last - first, 1))
+
+        @lru_cache(1)
+        def background(span: tuple[int, int]) -> tuple[MovingField, Ground]:
+            with threads(config.compute.workers) as pool:
+                field = load_field(
+                    self._scene, self._movie, camera, span, self._check, pool, silent
+                )
+            return field, field.first_ground(follow_power=config.background.power_normalization)
+
+        self._background = background
+
+    def _check(self, counts: NDArray[Any], first: int) -> None:
+        check_counts(counts, first, self._movie.name, camera=self._camera)
+
+    def scene(self, window: int) -> Scene:  # noqa: ARG002
+        """Give models and threshold, which are those of every window."""
+        return self._scene
+
+    def look(self, frame: int, window: int) -> Look:
+        """Look at one frame over the median of those around it."""
+        first, last = self.frames
+        window = max(window, min(LEAST_FRAMES, last - first))
+        frame = min(max(frame, first), last - 1)
+        start = min(frame - (frame - first) % window, last - window)
+        span = start, start + window
+        field, ground = self._background(span)
+        nothing = np.zeros(0, dtype=np.int64)
+        rows = Rows.of(nothing, nothing, np.zeros((0, 5)))
+        here, scene = frame - start, self._scene
+        light = ground.level * ground.power[here]
+        image = field.residual(ground, rows, here, here + 1)[0] / light
+
+        def search(threshold: float) -> pd.DataFrame:
+            with threads(self._config.compute.workers) as pool:
+                found = search_frames(
+                    _with_threshold(scene, threshold), field, ground, rows, pool, (here, here + 1)
+                )
+            mass = np.asarray(scene.model.scale.mass(found.strength))
+            each = zip(found.x_px, found.y_px, found.snr, found.z_nm, mass, strict=True)
+            return _listed(
+                (x, y, snr, scene.model.peak_contrast(float(z), float(m)), m)
+                for x, y, snr, z, m in each
+            )
+
+        return Look(
+            frame, span, (frame, frame + 1), np.where(field.used, image, np.nan),
+            scene.templates.threshold, search,
+        )  # fmt: skip
+
+
+def _with_threshold(scene: Scene, threshold: float) -> Scene:
+    return replace(scene, templates=replace(scene.templates, threshold=threshold))
+
+
+def _listed(rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
+    """Make a table, strongest first."""
+    values = np.array([tuple(map(float, row)) for row in rows]).reshape(-1, len(FOUND_COLUMNS))
+    order = np.argsort(-np.abs(values[:, FOUND_COLUMNS.index("snr")]), kind="stable")
+    return pd.DataFrame(values[order], columns=list(FOUND_COLUMNS))
+
+
+def positive(threshold: float) -> float:
+    """Refuse a threshold that is none.
+
+    Parameters
+    ----------
+    threshold : float
+        Signal-to-noise ratio.
+
+    Returns
+    -------
+    float
+        The same.
+
+    Raises
+    ------
+    ConfigError
+        It is not a positive number.
+    """
+    if not (math.isfinite(threshold) and threshold > 0):
+        raise ConfigError(f"threshold = {threshold:g} must be a positive signal-to-noise ratio")
+    return threshold

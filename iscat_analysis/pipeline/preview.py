@@ -1,0 +1,171 @@
+"""The search of `analyse` in the frames that one is looking at, before a movie is analysed.
+
+The frames, windows, matched filter and threshold are those with which `analyse` begins; nothing is
+fitted.  The optics are the configured ones: learning them takes the whole movie.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.movie import Stack
+from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_ratio
+from iscat_analysis.movie.lines import Lines
+from iscat_analysis.movie.metadata import resolve_metadata
+from iscat_analysis.pipeline.diagnosis import judge_lines
+from iscat_analysis.pipeline.landing import has_landings
+from iscat_analysis.pipeline.looks import (
+    BoundSearch,
+    LandingSearch,
+    Look,
+    MovingSearch,
+    Search,
+    positive,
+)
+from iscat_analysis.pipeline.tracking import learns_background
+
+
+class Preview:
+    """The search for particles in the frames that one is looking at.
+
+    A landing movie is searched for what lands or leaves between two windows, those just before a
+    frame and those from it on; a movie with background frames for what is there in the frames from
+    it on; a movie of moving particles in the frame itself.
+
+    Parameters
+    ----------
+    movie : Stack
+        From `open_stack`; it must stay open.
+    config : Config
+        As for `fit_movie`.
+
+    Attributes
+    ----------
+    config : Config
+        With what the movie's metadata say.
+    notes : tuple of str
+        What the metadata left to say, one line each.
+
+    Raises
+    ------
+    DataError
+        The movie is too short, or its frames are impossible.
+    ConfigError
+        The configuration does not suit the movie.
+
+    Examples
+    --------
+    >>> import iscat_analysis as ia
+    >>> with ia.open_stack("movie.tif") as movie:  # doctest: +SKIP
+    ...     look = ia.Preview(movie, ia.configure("C.toml")).look(200)
+    ...     look.found(threshold=5.0)
+    """
+
+    def __init__(self, movie: Stack, config: Config) -> None:
+        config, notes = resolve_metadata(config, movie.metadata)
+        self.config = config
+        self.notes = (*movie.notes, *notes)
+        shape = (movie.shape[1], movie.shape[2])
+        camera = camera_from_config(config.camera, shape, movie.dtype)
+        refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
+        lines = judge_lines(movie, config, camera)
+        kind: Callable[[Stack, Config, Camera, Lines | None], Search] = BoundSearch
+        if has_landings(config):
+            kind = LandingSearch
+        elif learns_background(config):
+            kind = MovingSearch
+        if config.fit.frames and config.fit.frames[1] > movie.shape[0]:
+            raise DataError(
+                f"{movie.name}: has {movie.shape[0]} frames, but fit.frames asks for "
+                f"{config.fit.frames[0]}:{config.fit.frames[1]}; change fit.frames"
+            )
+        self._search = kind(movie, config, camera, lines)
+        self._lock = threading.Lock()  # a viewer may ask from several threads
+
+    @property
+    def window(self) -> int:
+        """Frames that `analyse` sums: as configured, or chosen from the noise."""
+        return self._search.window
+
+    @property
+    def longest(self) -> int:
+        """Frames that a window may have at most."""
+        return self._search.longest
+
+    @property
+    def frames(self) -> tuple[int, int]:
+        """Frames that `analyse` looks at, half-open."""
+        return self._search.frames
+
+    def threshold(self, window: int | None = None) -> float:
+        """Give the threshold that is configured.
+
+        Parameters
+        ----------
+        window : int, optional
+            Frames that are summed; default `window`.
+
+        Returns
+        -------
+        float
+            Signal-to-noise ratio.
+        """
+        return self._search.scene(self._checked(window)).templates.threshold
+
+    def false_alarms(self, threshold: float, window: int | None = None) -> float:
+        """Say how many false alarms a threshold would bring.
+
+        Parameters
+        ----------
+        threshold : float
+            Signal-to-noise ratio.
+        window : int, optional
+            Frames that are summed; default `window`.
+
+        Returns
+        -------
+        float
+            Expected in the whole movie: the ``detection.false_alarms_per_movie`` that has this
+            threshold.
+        """
+        templates = self._search.scene(self._checked(window)).templates
+        above = templates.excursions.above
+        share = above(positive(threshold)) / above(templates.threshold)
+        return self.config.detection.false_alarms_per_movie * share
+
+    def look(self, frame: int, window: int | None = None) -> Look:
+        """Search the frames around one.
+
+        Parameters
+        ----------
+        frame : int
+            Number of the frame.
+        window : int, optional
+            Frames that are summed; default `window`.
+
+        Returns
+        -------
+        Look
+            Contrast, threshold, and what exceeds it.
+
+        Raises
+        ------
+        DataError
+            The frames cannot be read or are impossible.
+        ConfigError
+            The window is not one of 1 to `longest`.
+        """
+        with self._lock:
+            return self._search.look(frame, self._checked(window))
+
+    def _checked(self, window: int | None) -> int:
+        if window is None:
+            return self.window
+        if not 1 <= window <= self.longest:
+            raise ConfigError(
+                f"window = {window}: choose 1 to {self.longest} frames, which this movie allows"
+            )
+        return window

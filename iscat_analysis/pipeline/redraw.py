@@ -1,0 +1,261 @@
+"""Images of events that were fitted before: the frames of the fit, summed and fitted again.
+
+A result keeps numbers.  With its movie, the counts that a fit saw are summed again, the other
+events of the table are in their places, and the fit, begun where it ended, gives the images that
+the report has.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis.config import Config
+from iscat_analysis.errors import DataError
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.movie import Stack
+from iscat_analysis.movie.background import measure_windows, refine_power
+from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts
+from iscat_analysis.movie.lines import Lines, SteadyFrames
+from iscat_analysis.pipeline.block_store import row_view
+from iscat_analysis.pipeline.chunks import HALO, Reader, counts_budget
+from iscat_analysis.pipeline.diagnosis import judge_lines
+from iscat_analysis.pipeline.field import Event, Place, add_signal
+from iscat_analysis.pipeline.landing import make_landing_scene
+from iscat_analysis.pipeline.moving import blurred_rows, exposure_of, load_field, track_scene
+from iscat_analysis.pipeline.neighbours import Neighbours, Step, region_around
+from iscat_analysis.pipeline.pattern import MovingPattern, follow
+from iscat_analysis.pipeline.ranges import frame_ranges
+from iscat_analysis.pipeline.results import Row, view_of
+from iscat_analysis.pipeline.scene import Region, make_scene, photons_scale, region_likelihood
+from iscat_analysis.pipeline.tasks import TaskBuilder
+from iscat_analysis.pipeline.tracking import learns_background
+from iscat_analysis.records import Candidate, EventView, FloatArray, Windows, silent
+from iscat_analysis.search.sliding import StepFrame, stride_of
+from iscat_analysis.threads import threads
+
+Redraw = Callable[[int], EventView]
+"""Row of the table → its images."""
+
+_TURNS = 3  # of level and power of a background under particles that are known
+
+
+def redraw(
+    movie: Stack,
+    config: Config,
+    table: pd.DataFrame,
+    tracks: pd.DataFrame | None,
+    summary: Mapping[str, Any],
+) -> Redraw:
+    """Prepare to draw the rows of a result.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie that was analysed; it must stay open.
+    config : Config
+        Resolved, as it was analysed.
+    table : pandas.DataFrame
+        The rows of ``fits.csv``.
+    tracks : pandas.DataFrame or None
+        Mode ``track``: the rows of ``tracks.csv``.
+    summary : mapping
+        What ``summary.json`` holds.
+
+    Returns
+    -------
+    callable
+        Position of a row → `EventView`.
+    """
+    camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
+    lines = judge_lines(movie, config, camera)
+    if "landing" in summary:
+        window = int(summary["landing"]["window_frames"])
+        return _landings(movie, config, camera, lines, table, window)
+    steady = movie if lines is None else movie.seen_as(SteadyFrames(movie, lines, camera))
+    if learns_background(config):
+        blocks = int(summary["blocks"]["number"])
+        return _moving(steady, config, camera, table, tracks, blocks)
+    return _bound(steady, config, camera, lines, table)
+
+
+def _landings(
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    lines: Lines | None,
+    table: pd.DataFrame,
+    window: int,
+) -> Redraw:
+    """Draw what landed or left: windows before and after, in a chunk of their own."""
+    first, last = config.fit.frames or (0, movie.shape[0])
+    frames = movie if lines is None else SteadyFrames(movie, lines, camera)
+    reader = Reader(frames, camera, first, last, counts_budget(config))
+    scene = make_landing_scene(config, reader.shape, searches=1, lines=lines)
+    stride = stride_of(window)
+
+    def draw(row: int) -> EventView:
+        frame = int(table["frame"].iloc[row])
+        span = max(frame - HALO * window, first), min(frame + HALO * window, last)
+        with threads(config.compute.workers) as pool:
+            chunk = reader.chunk(span, stride, pool)
+            way = follow(chunk, pool.map) if config.background.drift_correction else None
+            pattern = MovingPattern(chunk, way, pool.map) if way else None
+        chunk = pattern.chunk if pattern else chunk
+        neighbours = Neighbours(scene, chunk, window, pattern)
+        near = (table["frame"] - frame).abs() < 3 * window
+        known = near & table["mass_kda"].notna() & (table["status"] != "sidelobe")
+        numbers = [row, *(int(i) for i in np.flatnonzero(known) if i != row)]
+        steps = [neighbours.drawn(_step(table.iloc[i])) for i in numbers]
+        task = TaskBuilder(scene, chunk, window, neighbours, pattern).build(
+            0, steps, neighbours.of(steps)[0]
+        )
+        if task is None:
+            raise DataError(f"{movie.name}: there are no frames around frame {frame} to draw")
+        start, (y_px, x_px) = steps[0].start, task.offset_px
+        start = Candidate(
+            start.x_px + x_px, start.y_px + y_px, start.z_nm, start.mass_kda, start.snr
+        )
+        fit = fit_particle(task.likelihood, start, scene.mode, config.fit.z_range_nm, level=True)
+        number = int(table["event"].iloc[row])
+        return view_of(Row(number, Event(task.region, fit, task.likelihood), task.windows))
+
+    return draw
+
+
+def _step(row: pd.Series[Any]) -> Step:
+    """Make a step of a row of the table."""
+    frames = row["n_before"] * row["n_after"] / (row["n_before"] + row["n_after"])
+    at = StepFrame(
+        frame=int(row["frame"]), half_width=int(row["frame_ci95"]), height=1.0,
+        per_frame_snr=float(row["snr"]) / math.sqrt(max(frames, 1.0)), p_constant=1.0,
+    )  # fmt: skip
+    mass = float(row["mass_kda"])
+    start = Candidate(
+        float(row["x_px"]), float(row["y_px"]), float(row["z_nm"]), abs(mass), float(row["snr"])
+    )
+    return Step(-1 if mass < 0 else 1, at, start, (0, 0), np.empty((0, 0)))
+
+
+def _bound(
+    movie: Stack, config: Config, camera: Camera, lines: Lines | None, table: pd.DataFrame
+) -> Redraw:
+    """Draw what is there after the background, or in mode ``track`` in a frame after it."""
+    before, after = frame_ranges(movie, config)
+    tracked = config.fit.mode == "track"
+    shape = (movie.shape[1], movie.shape[2])
+    scene = make_scene(config, shape, lines=lines)
+    background, whole = config.background, Region((0, shape[0]), (0, shape[1]))
+
+    def check(counts: NDArray[Any], start: int) -> None:
+        check_counts(counts, start, movie.name, camera=camera)
+
+    def drawn(region: Region, rows: Sequence[int]) -> FloatArray:
+        """Draw the signal of some rows in a region."""
+        total = np.zeros(region.shape)
+        for i in rows:
+            add_signal(scene, _place(table.iloc[i]), region, total)
+        return total
+
+    @lru_cache(1)
+    def seen(span: tuple[int, int]) -> tuple[Windows, list[int]]:
+        """Give the sums, with the light that the particles leave, and the rows in them."""
+        windows = measure_windows(
+            movie, camera, before, span,
+            median=background.method == "median", level_e=background.level_e,
+            power_normalization=background.power_normalization, check=check,
+        )  # fmt: skip
+        rows = table.index[table["mass_kda"].notna() & (table["status"] != "sidelobe")]
+        here = [int(i) for i in rows if not tracked or int(table["frame"].iloc[i]) == span[0]]
+        if background.power_normalization:
+            signal = scene.left(drawn(whole, here))
+            if scene.additive:
+                signal = signal * photons_scale(scene, windows)
+            windows = refine_power(windows, signal, additive=scene.additive)
+        return windows, here
+
+    def draw(row: int) -> EventView:
+        frame = int(table["frame"].iloc[row])
+        windows, here = seen((frame, frame + 1) if tracked else after)
+        x_nm, y_nm, z_nm, mass = _place(table.iloc[row])
+        pixel = scene.pixel_nm
+        start = Candidate(x_nm / pixel, y_nm / pixel, z_nm, mass, float(table["snr"].iloc[row]))
+        region = region_around(scene.roi_px, shape, start)
+        others = drawn(region, [i for i in here if i != row])
+        if lines is not None:
+            others = (1 + others) / lines.taken(drawn(whole, here))[region.slices] - 1
+        likelihood = region_likelihood(scene, windows, region, others)
+        fit = fit_particle(likelihood, start, scene.mode, config.fit.z_range_nm, level=False)
+        number = int(table["event"].iloc[row])
+        return view_of(Row(number, Event(region, fit, likelihood), windows))
+
+    return draw
+
+
+def _place(row: pd.Series[Any]) -> Place:
+    x, y, z, mass = (float(row[name]) for name in ("x_nm", "y_nm", "z_nm", "mass_kda"))
+    return x, y, z, mass
+
+
+def _moving(
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    table: pd.DataFrame,
+    tracks: pd.DataFrame | None,
+    blocks: int,
+) -> Redraw:
+    """Draw particles in single frames, over the background of their block under all of them."""
+    first, last = config.fit.frames or (0, movie.shape[0])
+    scene = track_scene(config, (movie.shape[1], movie.shape[2]), max(last - first, 1))
+    edges = [first + (last - first) * k // blocks for k in range(blocks + 1)]
+    known = table["mass_kda"].notna() & table["track"].notna()
+    _, exposure_s = exposure_of(config)
+    diffusion: dict[int, float] = {}
+    if tracks is not None:
+        pairs = zip(tracks["track"], np.nan_to_num(tracks["d_um2_s"].to_numpy(float)), strict=True)
+        diffusion = {int(track): float(d) for track, d in pairs}
+
+    def check(counts: NDArray[Any], start: int) -> None:
+        check_counts(counts, start, movie.name, camera=camera)
+
+    @lru_cache(1)
+    def block(start: int, stop: int) -> tuple[MovingField, Ground, Rows, NDArray[np.int64]]:
+        inside = np.flatnonzero(known & table["frame"].between(start, stop - 1))
+        part = table.iloc[inside]
+        theta = np.zeros((len(part), 5))
+        theta[:, :3] = part[["x_nm", "y_nm", "z_nm"]].to_numpy(float)
+        masses = part["mass_kda"].to_numpy(float)
+        theta[:, 3] = [scene.model.scale.amplitude(float(m)) for m in masses]
+        numbers, track = np.unique(part["track"].to_numpy(int), return_inverse=True)
+        frame = part["frame"].to_numpy(np.int64) - start
+        order = np.lexsort((track, frame))
+        rows = Rows.of(frame, track.astype(np.int64), theta)
+        speeds: FloatArray = np.array([[diffusion.get(int(n), 0.0)] for n in numbers])
+        rows, variances = blurred_rows(rows, speeds.reshape(-1, 1), exposure_s)
+        with threads(config.compute.workers) as pool:
+            field = load_field(scene, movie, camera, (start, stop), check, pool, silent)
+            field.set_blurs(variances)
+            follows = config.background.power_normalization
+            ground = field.first_ground(follow_power=follows)
+            for _ in range(_TURNS):
+                found = field.fit(ground, rows, sweeps=0)[1]
+                level = ground.level if config.background.method == "median" else found.level
+                ground = Ground(level, found.power if follows else ground.power)
+        return field, ground, rows, inside[order]
+
+    def draw(row: int) -> EventView:
+        frame = int(table["frame"].iloc[row])
+        k = int(np.searchsorted(edges, frame, side="right")) - 1
+        field, ground, rows, where = block(edges[k], edges[k + 1])
+        return row_view(field, ground, rows, int(np.flatnonzero(where == row)[0]))
+
+    return draw

@@ -1,0 +1,391 @@
+"""The widget: what the search sees in the frames that are shown, and what events look like."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from qtpy.QtCore import Qt, QTimer
+from qtpy.QtWidgets import (
+    QApplication,
+    QCheckBox,
+    QComboBox,
+    QFileDialog,
+    QFormLayout,
+    QGroupBox,
+    QHBoxLayout,
+    QLabel,
+    QLineEdit,
+    QPushButton,
+    QVBoxLayout,
+    QWidget,
+)
+from superqt import QLabeledDoubleSlider, QLabeledSlider
+
+import iscat_analysis as ia
+from iscat_napari.events import EventPanel
+from iscat_napari.frames import LazyFrames, LazyMovie
+from iscat_napari.readers import RESULT, ROW, limits_of
+
+if TYPE_CHECKING:
+    import napari
+
+FOUND, RATIO = "found here", "contrast"
+"""Names of the layers that the widget adds."""
+
+LEAST_THRESHOLD, MOST_THRESHOLD = 2.0, 20.0
+"""Signal-to-noise ratios that can be chosen."""
+
+_SPOT_PX = 12.0
+_SOON_MS = 30  # after which the search follows the slider of frames
+_LANDS, _LEAVES = "yellow", "deepskyblue"
+
+
+class Explorer(QWidget):
+    """Searches the frames that are shown, and shows the images of events.
+
+    Parameters
+    ----------
+    napari_viewer : napari.viewer.Viewer
+        Given by napari.
+    """
+
+    def __init__(self, napari_viewer: napari.viewer.Viewer) -> None:
+        super().__init__()
+        self._viewer = napari_viewer
+        self._preview: ia.Preview | None = None
+        self._made_of: tuple[Any, ...] = ()  # what the preview was made of
+        self._look: ia.Look | None = None
+        self._ratio: _Ratio | None = None
+
+        self.movie = QComboBox()
+        self.config = QLineEdit()
+        self.config.setPlaceholderText("default configuration")
+        browse = QPushButton("…")
+        browse.setMaximumWidth(30)
+        self.window_frames = QLabeledSlider(Qt.Orientation.Horizontal)
+        self.threshold = QLabeledDoubleSlider(Qt.Orientation.Horizontal)
+        self.threshold.setRange(LEAST_THRESHOLD, MOST_THRESHOLD)
+        self.threshold.setDecimals(2)
+        self.follow = QCheckBox("search the frame that is shown, as it changes")
+        self.follow.setChecked(True)
+        self.detect_button = QPushButton("Detect in the current frames")
+        self.ratio_button = QPushButton("Show the contrast as a movie")
+        self.status, self.settings = QLabel(), QLabel()
+        for label in (self.status, self.settings):
+            label.setWordWrap(True)
+            label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.event = EventPanel()
+
+        form = QFormLayout()
+        form.addRow("movie", self.movie)
+        row = QHBoxLayout()
+        row.addWidget(self.config)
+        row.addWidget(browse)
+        form.addRow("configuration", row)
+        form.addRow("window [frames]", self.window_frames)
+        form.addRow("threshold [SNR]", self.threshold)
+        search = QGroupBox("What the search sees here")
+        inside = QVBoxLayout(search)
+        inside.addLayout(form)
+        for widget in (self.follow, self.detect_button, self.ratio_button):
+            inside.addWidget(widget)
+        inside.addWidget(self.status)
+        inside.addWidget(self.settings)
+        whole = QVBoxLayout(self)
+        whole.addWidget(search)
+        whole.addWidget(self.event, 1)
+
+        self._soon = QTimer(self)
+        self._soon.setSingleShot(True)
+        self._soon.setInterval(_SOON_MS)
+        self._soon.timeout.connect(self.detect)
+        browse.clicked.connect(self._browse)
+        self.movie.currentIndexChanged.connect(self._forget)
+        self.config.editingFinished.connect(self._forget)
+        self.window_frames.valueChanged.connect(self._window_changed)
+        self.threshold.valueChanged.connect(self._threshold_changed)
+        self.detect_button.clicked.connect(self.detect)
+        self.ratio_button.clicked.connect(self.show_ratio)
+        layers = self._viewer.layers
+        for event in (layers.events.inserted, layers.events.removed, layers.events.renamed):
+            event.connect(self._list_layers)
+        self._viewer.dims.events.current_step.connect(self._frame_changed)
+        self._viewer.mouse_drag_callbacks.append(self._clicked)
+        self._list_layers()
+
+    # ---- what there is ---------------------------------------------------------------------
+
+    def _list_layers(self, *_: object) -> None:
+        """Offer the movies among the layers; take the configuration of the latest result."""
+        movies = [layer for layer in self._viewer.layers if _is_movie(layer)]
+        chosen = self.movie.currentData()
+        if movies != [self.movie.itemData(k) for k in range(self.movie.count())]:
+            self.movie.blockSignals(True)
+            self.movie.clear()
+            for layer in movies:
+                self.movie.addItem(layer.name, layer)
+            index = movies.index(chosen) if chosen in movies else 0
+            self.movie.setCurrentIndex(index if movies else -1)
+            self.movie.blockSignals(False)
+            if self.movie.currentData() is not chosen:
+                self._forget()
+        for k, layer in enumerate(movies):
+            self.movie.setItemText(k, layer.name)
+        results = [r for r in map(_result_of, self._viewer.layers) if r is not None]
+        if results and not self.config.text():
+            self.config.setText(str(results[-1].folder / "config.toml"))
+            self._forget()
+
+    def _browse(self) -> None:
+        path, _ = QFileDialog.getOpenFileName(self, "Configuration", "", "TOML (*.toml)")
+        if path:
+            self.config.setText(path)
+            self._forget()
+
+    def _forget(self, *_: object) -> None:
+        """Let the next search begin anew: another movie or another configuration was chosen."""
+        self._soon.stop()
+        self._look = None
+
+    @property
+    def frame(self) -> int:
+        """Number of the frame that is shown."""
+        steps = self._viewer.dims.current_step
+        return int(steps[-3]) if len(steps) >= 3 else 0
+
+    # ---- the search ------------------------------------------------------------------------
+
+    def prepare(self) -> ia.Preview | None:
+        """Make ready to search the chosen movie with the chosen configuration.
+
+        Returns
+        -------
+        Preview or None
+            None where that cannot be done; the widget says why.
+        """
+        layer, path = self.movie.currentData(), self.config.text().strip()
+        if layer is None:
+            self._say("open a movie first")
+            return None
+        stamp = Path(path).stat().st_mtime_ns if path and Path(path).is_file() else 0
+        wanted = layer, layer.data, path, stamp
+        if self._preview is not None and _same(wanted, self._made_of):
+            return self._preview
+        with self._told(), _busy():
+            movie = layer.data
+            stack = (
+                movie.stack
+                if isinstance(movie, LazyMovie)
+                else ia.open_stack(movie, name=layer.name)
+            )
+            config = ia.configure(Path(path) if path else None)
+            preview = ia.Preview(stack, config)
+            self._preview, self._made_of = preview, wanted
+            for widget in (self.window_frames, self.threshold):
+                widget.blockSignals(True)
+            self.window_frames.setRange(1, max(preview.longest, 1))
+            self.window_frames.setValue(preview.window)
+            self.threshold.setValue(preview.threshold())
+            for widget in (self.window_frames, self.threshold):
+                widget.blockSignals(False)
+            return preview
+        self._preview = None
+        return None
+
+    def detect(self) -> None:
+        """Search the frames that are shown."""
+        preview = self.prepare()
+        if preview is None:
+            return
+        with self._told():
+            self._look = preview.look(self.frame, self.window_frames.value())
+            self._show_found()
+
+    def _frame_changed(self, *_: object) -> None:
+        if self._look is not None and self.follow.isChecked():
+            self._soon.start()
+
+    def _window_changed(self, *_: object) -> None:
+        if self._preview is None or self._look is None:
+            return
+        window = self.window_frames.value()
+        with self._told():  # as many false alarms as before, whatever the window
+            self.threshold.blockSignals(True)
+            self.threshold.setValue(self._preview.threshold(window))
+            self.threshold.blockSignals(False)
+        if self._ratio is not None and self._ratio.layer in self._viewer.layers:
+            self._ratio.frames.window = window
+            self._ratio.layer.refresh()
+        self.detect()
+
+    def _threshold_changed(self, *_: object) -> None:
+        if self._look is not None:
+            with self._told():
+                self._show_found()
+
+    def _show_found(self) -> None:
+        """Put what exceeds the threshold into its layer, and say what it is."""
+        look, preview = self._look, self._preview
+        if look is None or preview is None:
+            return
+        threshold, window = self.threshold.value(), self.window_frames.value()
+        found = look.found(threshold)
+        points = np.column_stack(
+            [np.full(len(found), self.frame), found[["y_px", "x_px"]].to_numpy(float)]
+        )
+        colours = [_LANDS if mass >= 0 else _LEAVES for mass in found["mass_kda"]]
+        layer = next((one for one in self._viewer.layers if one.name == FOUND), None)
+        if layer is None:
+            active = self._viewer.layers.selection.active
+            layer = self._viewer.add_points(
+                np.zeros((0, 3)), ndim=3, name=FOUND, size=_SPOT_PX, face_color="transparent",
+                symbol="square",
+            )  # fmt: skip
+            self._viewer.layers.selection.active = active or layer
+        layer.data = points
+        layer.features = found
+        layer.border_color = colours or _LANDS
+        layer.selected_data = set()
+        layer.text = {"string": "{snr:.1f}", "size": 8, "anchor": "upper_left", "color": "white"}
+        over = "" if look.before is None else f" over {_span(look.before)}"
+        places = "1 place" if len(found) == 1 else f"{len(found)} places"
+        self._say(
+            f"frames {_span(look.after)}{over}: {places} above {threshold:.2f}; "
+            f"{preview.false_alarms(threshold, window):.2g} false alarms are expected in the movie"
+        )
+        self.settings.setText(self._settings(preview, threshold, window))
+
+    def _settings(self, preview: ia.Preview, threshold: float, window: int) -> str:
+        """Say with which options the command would search so."""
+        said = []
+        if "sliding" in str(preview.config.background.method) and window != preview.window:
+            said.append(f"--set background.window_frames={window}")
+        if abs(threshold - preview.threshold(window)) > 10.0 ** -self.threshold.decimals():
+            alarms = preview.false_alarms(threshold, window)
+            said.append(f"--set detection.false_alarms_per_movie={alarms:.3g}")
+        return "as in the configuration" if not said else " ".join(said)
+
+    def show_ratio(self) -> None:
+        """Add the contrast of the windows at every frame as a movie."""
+        preview = self.prepare()
+        movie = self.movie.currentData()
+        if preview is None or movie is None:
+            return
+        with self._told(), _busy():
+            frames = RatioFrames(preview, movie.data.shape, self.window_frames.value())
+            low, high = limits_of(frames)
+            limit = max(abs(low), abs(high))
+            layer = self._viewer.add_image(
+                frames, name=RATIO, colormap="gray", contrast_limits=(-limit, limit)
+            )
+            self._ratio = _Ratio(layer, frames)
+
+    # ---- events ----------------------------------------------------------------------------
+
+    def _clicked(self, viewer: Any, event: Any) -> None:
+        """Show the event under the mouse."""
+        for layer in reversed(viewer.layers):
+            result = _result_of(layer)
+            if result is None or not layer.visible or not hasattr(layer, "symbol"):
+                continue
+            index = layer.get_value(
+                event.position, view_direction=event.view_direction,
+                dims_displayed=event.dims_displayed, world=True,
+            )  # fmt: skip
+            if index is not None:
+                self.show_event(result, int(layer.features[ROW].iloc[index]))
+                return
+
+    def show_event(self, result: ia.StoredResult, row: int) -> None:
+        """Show data, model and residual of a row of a result.
+
+        Parameters
+        ----------
+        result : StoredResult
+            The result.
+        row : int
+            Position in its table.
+        """
+        with _busy():
+            self.event.show_row(result, row)
+
+    # ---- messages --------------------------------------------------------------------------
+
+    def _say(self, text: str) -> None:
+        self.status.setText(text)
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Show what is wrong with files and settings in place of raising it."""
+        try:
+            yield
+        except ia.IscatError as error:
+            self._look = None
+            self.settings.clear()
+            self._say(str(error))
+
+
+class RatioFrames(LazyFrames):
+    """The contrast at every frame, as the search compares its windows.
+
+    Parameters
+    ----------
+    preview : Preview
+        Of the movie.
+    shape : (int, int, int)
+        Of the movie.
+    window : int
+        Frames that are summed; it may be changed.
+    """
+
+    def __init__(self, preview: ia.Preview, shape: tuple[int, int, int], window: int) -> None:
+        super().__init__(shape, np.float32, lambda t: preview.look(t, self.window).image)
+        self.window = window
+
+
+class _Ratio:
+    """The layer of the contrast and its frames."""
+
+    def __init__(self, layer: Any, frames: RatioFrames) -> None:
+        self.layer, self.frames = layer, frames
+
+
+def _is_movie(layer: Any) -> bool:
+    """Whether a layer may be a camera's movie."""
+    data = layer.data
+    return (
+        getattr(layer, "multiscale", None) is False
+        and getattr(data, "ndim", 0) == 3
+        and np.dtype(data.dtype).kind in "uif"
+        and not isinstance(data, RatioFrames)
+        and not hasattr(layer, "num_colors")  # labels
+    )
+
+
+def _result_of(layer: Any) -> ia.StoredResult | None:
+    found = layer.metadata.get(RESULT)
+    return found if isinstance(found, ia.StoredResult) else None
+
+
+def _same(one: tuple[Any, ...], two: tuple[Any, ...]) -> bool:
+    """Whether the same things were given; arrays are compared by what they are, not by value."""
+    return len(one) == len(two) and all(
+        a is b or (isinstance(a, (str, int)) and a == b) for a, b in zip(one, two, strict=True)
+    )
+
+
+def _span(frames: tuple[int, int]) -> str:
+    return str(frames[0]) if frames[1] == frames[0] + 1 else f"{frames[0]}:{frames[1]}"
+
+
+@contextmanager
+def _busy() -> Iterator[None]:
+    QApplication.setOverrideCursor(Qt.CursorShape.WaitCursor)
+    try:
+        yield
+    finally:
+        QApplication.restoreOverrideCursor()

@@ -1,0 +1,170 @@
+"""Layers of files: movies, read a frame at a time, and results beside their movie."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis import DataError, Status, StoredResult, open_result, open_stack, tracked_rows
+from iscat_napari.frames import LazyFrames, LazyMovie
+
+LayerData = tuple[Any, dict[str, Any], str]
+"""Data, options and kind of a layer, as napari takes them."""
+
+RESULT, ROW = "iscat_result", "row"
+"""Key of a layer's metadata that holds the `StoredResult`, and the feature with its table's row."""
+
+SHOWN = 12.0
+"""Frames around its own in which an event of a landing movie is drawn."""
+
+_SIZE_PX = 12.0
+
+_COLOURS = {Status.OK.value: "lime"}
+_DOUBTFUL = "orange"
+_SAMPLED = 5  # frames from which the contrast limits of a movie are taken
+
+
+def movie_reader(path: str | Sequence[str]) -> Callable[[Any], list[LayerData]] | None:
+    """Tell whether this is a movie that `open_stack` may read.
+
+    Parameters
+    ----------
+    path : str or sequence of str
+        What napari was asked to open.
+
+    Returns
+    -------
+    callable or None
+        Path → its layer; None for several paths and for results.
+    """
+    if not isinstance(path, str) or _is_result(Path(path)):
+        return None
+    return lambda path: [movie_layer(LazyMovie(open_stack(path)))]
+
+
+def result_reader(path: str | Sequence[str]) -> Callable[[Any], list[LayerData]] | None:
+    """Tell whether this is the output folder of a movie.
+
+    Parameters
+    ----------
+    path : str or sequence of str
+        What napari was asked to open.
+
+    Returns
+    -------
+    callable or None
+        Path → its layers; None for anything else.
+    """
+    if not isinstance(path, str) or not _is_result(Path(path)):
+        return None
+    return lambda path: result_layers(open_result(path))
+
+
+def _is_result(path: Path) -> bool:
+    return path.is_dir() and (path.suffix == ".iscat" or (path / "fits.parquet").is_file())
+
+
+def movie_layer(movie: LazyMovie) -> LayerData:
+    """Make the layer of a movie.
+
+    Parameters
+    ----------
+    movie : LazyMovie
+        The movie.
+
+    Returns
+    -------
+    tuple
+        An image layer; its contrast limits are those of a few frames.
+    """
+    options = {"name": movie.stack.name, "contrast_limits": limits_of(movie), "colormap": "gray"}
+    return movie, options, "image"
+
+
+def limits_of(frames: LazyFrames) -> tuple[float, float]:
+    """Give the limits between which most of the pixels of a few frames lie.
+
+    Parameters
+    ----------
+    frames : LazyFrames
+        Frames (t, y, x).
+
+    Returns
+    -------
+    (float, float)
+        Different.
+    """
+    numbers = np.unique(np.linspace(0, len(frames) - 1, _SAMPLED).astype(int))
+    seen = np.concatenate([np.ravel(frames[int(t)]) for t in numbers]).astype(float)
+    seen = seen[np.isfinite(seen)]
+    low, high = np.quantile(seen, [0.001, 0.999]) if seen.size else (0.0, 1.0)
+    return float(low), float(high if high > low else low + 1.0)
+
+
+def result_layers(result: StoredResult) -> list[LayerData]:
+    """Make the layers of a result.
+
+    Parameters
+    ----------
+    result : StoredResult
+        From `open_result`.
+
+    Returns
+    -------
+    list of tuple
+        The movie, where it is found; the tracks of mode ``track``; and a point for each row of the
+        table, whose columns are its features.
+    """
+    layers: list[LayerData] = []
+    name = result.folder.name
+    with contextlib.suppress(DataError):  # the table is worth looking at without the movie
+        layers.append(movie_layer(LazyMovie(open_stack(result.movie_path))))
+    if result.tracks is not None:
+        layers += _tracks_layer(result)
+    table = result.table
+    placed = table[table[["x_px", "y_px"]].notna().all(axis=1)]
+    points = placed[["frame", "y_px", "x_px"]].to_numpy(float)
+    scale = [1.0, 1.0, 1.0]
+    if "landing" in result.summary:  # a slice is one step of the data thick
+        scale[0] = SHOWN
+        points[:, 0] /= SHOWN
+    elif result.tracks is None:  # they are there in all frames after the background
+        points, scale = points[:, 1:], scale[1:]
+    options = {
+        "name": f"{name} events",
+        "features": placed.assign(**{ROW: placed.index}).reset_index(drop=True),
+        "face_color": "transparent",
+        "border_color": [_COLOURS.get(str(status), _DOUBTFUL) for status in placed["status"]]
+        or "lime",
+        "size": _SIZE_PX,
+        "scale": scale,
+        "metadata": {RESULT: result},
+        "ndim": points.shape[1],
+    }
+    return [*layers, (points, options, "points")]
+
+
+def _tracks_layer(result: StoredResult) -> list[LayerData]:
+    """Make the layer of tracks; the features of a place are its row, and its track's."""
+    rows = tracked_rows(result.table)
+    if not len(rows) or result.tracks is None:
+        return []
+    whole = result.tracks.set_index("track").add_prefix("track_")
+    features = rows.drop(columns="track", errors="ignore").join(whole, on="particle")
+    options = {
+        "name": f"{result.folder.name} tracks",
+        "features": _plain(features.assign(**{ROW: rows.index})),
+        "metadata": {RESULT: result},
+    }
+    data = rows[["particle", "frame", "y_px", "x_px"]].to_numpy(float)
+    return [(data, options, "tracks")]
+
+
+def _plain(table: pd.DataFrame) -> pd.DataFrame:
+    """Keep the numbers, which are all that colours of tracks can be made of."""
+    return table.select_dtypes("number").astype(float).reset_index(drop=True)
