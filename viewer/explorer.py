@@ -39,7 +39,7 @@ FOUND, RATIO = "found here", "contrast"
 LEAST_THRESHOLD, MOST_THRESHOLD = 2.0, 20.0
 """Signal-to-noise ratios that can be chosen."""
 
-_SPOT_PX = 12.0
+_SPOT_PX, _THIN = 12.0, 0.03  # side of the mark, and its line's share of it
 _SOON_MS = 30  # after which the search follows the slider of frames
 _LANDS, _LEAVES = "yellow", "deepskyblue"
 
@@ -243,18 +243,23 @@ class Explorer(QWidget):
             active = self._viewer.layers.selection.active
             layer = self._viewer.add_points(
                 np.zeros((0, 3)), ndim=3, name=FOUND, size=_SPOT_PX, face_color="transparent",
-                symbol="square",
+                symbol="square", border_width=_THIN,
             )  # fmt: skip
             self._viewer.layers.selection.active = active or layer
         layer.data = points
         layer.features = found
         layer.border_color = colours or _LANDS
         layer.selected_data = set()
-        layer.text = {"string": "{snr:.1f}", "size": 8, "anchor": "upper_left", "color": "white"}
-        over = "" if look.before is None else f" over {_span(look.before)}"
+        layer.text = {
+            "string": "{snr:.1f}", "size": 8, "color": "white",
+            "translation": [0.0, -_SPOT_PX / 2 - 1, 0.0],
+        }  # fmt: skip
+        first, last = look.after
+        after = f"frame {first}" if last == first + 1 else f"frames {first}:{last}"
+        over = "" if look.before is None else f" over {look.before[0]}:{look.before[1]}"
         places = "1 place" if len(found) == 1 else f"{len(found)} places"
         self._say(
-            f"frames {_span(look.after)}{over}: {places} above {threshold:.2f}; "
+            f"{after}{over}: {places} above {threshold:.2f}; "
             f"{preview.false_alarms(threshold, window):.2g} false alarms are expected in the movie"
         )
         self.settings.setText(self._settings(preview, threshold, window))
@@ -376,10 +381,6 @@ def _same(one: tuple[Any, ...], two: tuple[Any, ...]) -> bool:
     return len(one) == len(two) and all(
         a is b or (isinstance(a, (str, int)) and a == b) for a, b in zip(one, two, strict=True)
     )
-
-
-def _span(frames: tuple[int, int]) -> str:
-    return str(frames[0]) if frames[1] == frames[0] + 1 else f"{frames[0]}:{frames[1]}"
 
 
 @contextmanager

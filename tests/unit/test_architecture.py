@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = sorted([*(ROOT / "iscat_analysis").rglob("*.py"), *(ROOT / "cli").rglob("*.py")])
+SOURCES = sorted(
+    p for room in ("iscat_analysis", "cli", "viewer") for p in (ROOT / room).rglob("*.py")
+)
 TREES = {path: ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in SOURCES}
 
 # The generator interface of numpy.random is its only part without hidden state.

@@ -13,6 +13,9 @@ from pathlib import Path
 
 import pytest
 
+FRONT_ENDS = {"cli": "iscat_cli", "viewer": "iscat_napari"}
+"""Folder → the name it is installed under."""
+
 
 @pytest.fixture(scope="module")
 def project(repo_root: Path) -> dict:
@@ -22,11 +25,13 @@ def project(repo_root: Path) -> dict:
 def test_packages_match_the_folders(repo_root: Path, project: dict) -> None:
     inits = (repo_root / "iscat_analysis").rglob("__init__.py")
     folders = {".".join(p.parent.relative_to(repo_root).parts) for p in inits}
-    assert set(project["tool"]["setuptools"]["packages"]) == folders | {"iscat_cli"}
+    ours = folders | {"iscat_cli", "iscat_napari"}
+    assert set(project["tool"]["setuptools"]["packages"]) == ours
 
 
-def test_the_front_end_has_no_packages_of_its_own(repo_root: Path) -> None:
-    assert [p.parent.name for p in (repo_root / "cli").rglob("__init__.py")] == ["cli"]
+@pytest.mark.parametrize("name", ["cli", "viewer"])
+def test_a_front_end_has_no_packages_of_its_own(repo_root: Path, name: str) -> None:
+    assert [p.parent.name for p in (repo_root / name).rglob("__init__.py")] == [name]
 
 
 def test_every_non_python_file_is_package_data(repo_root: Path, project: dict) -> None:
@@ -69,7 +74,7 @@ def test_the_wheel_holds_what_the_folders_hold(repo_root: Path, tmp_path: Path) 
     # setuptools litters the folder it builds in, so a copy is built.
     source = tmp_path / "source"
     source.mkdir()
-    for name in ("iscat_analysis", "cli"):
+    for name in ("iscat_analysis", *FRONT_ENDS):
         shutil.copytree(
             repo_root / name, source / name, ignore=shutil.ignore_patterns("__pycache__")
         )
@@ -83,12 +88,10 @@ def test_the_wheel_holds_what_the_folders_hold(repo_root: Path, tmp_path: Path) 
         metadata = next(name for name in names if name.endswith("/METADATA"))
         described = email.message_from_bytes(archive.read(metadata))
     expected = {
-        str(path.relative_to(repo_root)).replace("cli/", "iscat_cli/", 1)
-        if path.is_relative_to(repo_root / "cli")
-        else str(path.relative_to(repo_root))
-        for name in ("iscat_analysis", "cli")
+        (Path(FRONT_ENDS.get(name, name)) / path.relative_to(repo_root / name)).as_posix()
+        for name in ("iscat_analysis", *FRONT_ENDS)
         for path in (repo_root / name).rglob("*.py")
     }
     assert expected == {name for name in names if name.endswith(".py")}
-    assert "iscat_analysis/py.typed" in names
+    assert {"iscat_analysis/py.typed", "iscat_napari/napari.yaml"} <= names
     assert described["License-Expression"] == "BSD-3-Clause"

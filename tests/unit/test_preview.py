@@ -51,9 +51,7 @@ MOVING = {
     "simulation.shape": [40, 40],
     "simulation.frames": 40,
     "simulation.photons_per_pixel": 4e5,
-    "simulation.movers": [
-        {"d_um2_s": 0.3, "x_px": 12.0, "y_px": 20.0, "drift_um_s": [8.0, 0.0]}
-    ],
+    "simulation.movers": [{"d_um2_s": 0.3, "x_px": 12.0, "y_px": 20.0, "drift_um_s": [8.0, 0.0]}],
 }
 
 
@@ -89,7 +87,7 @@ def test_what_lands_and_leaves_is_found_where_and_when_it_does(landing) -> None:
         assert len(preview.look((LANDS + LEAVES) // 2).found()) == 0
 
 
-def test_the_threshold_is_the_one_of_an_analysis(landing, sketched) -> None:
+def test_the_threshold_is_the_one_of_an_analysis(landing) -> None:
     path, config = landing
     analysed = ia.fit_movie(path, config=config)
     with ia.open_stack(path) as movie:
@@ -143,7 +141,7 @@ def test_near_the_ends_the_windows_are_as_long_as_there_are_frames(landing) -> N
         assert np.isfinite(last.image).all()
 
 
-def test_over_a_background_the_search_is_the_first_one_of_the_analysis(bound, sketched) -> None:
+def test_over_a_background_the_search_is_the_first_one_of_the_analysis(bound) -> None:
     path, config = bound
     analysed = ia.fit_movie(path, config=config)
     with ia.open_stack(path) as movie:
@@ -191,7 +189,7 @@ def test_bad_arguments_are_refused(landing) -> None:
             with pytest.raises(ia.ConfigError, match="threshold"):
                 preview.false_alarms(threshold)
         late = ia.configure(config, settings={"fit.frames": (0, 500)})
-        with pytest.raises(ia.DataError, match="change fit.frames"):
+        with pytest.raises(ia.DataError, match=r"change fit\.frames"):
             ia.Preview(movie, late)
         long = ia.configure(config, settings={"background.window_frames": 100})
         with pytest.raises(ia.DataError, match="window_frames"):

@@ -1,0 +1,169 @@
+"""Results that were written before: their tables, and the images that their fits saw."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+import iscat_analysis as ia
+
+pytestmark = pytest.mark.usefixtures("all_sketched")
+
+IMAGE_ATOL = 1e-4
+"""Of a contrast, whose peaks here exceed 0.01 and whose noise is 1e-3: the neighbours of a fit move
+by a part of their errors when the last sweep ends."""
+
+LANDING = {
+    "simulation.frames": 160,
+    "simulation.shape": [64, 64],
+    "simulation.count": 0,
+    "simulation.leavings": 0,
+    "simulation.events": [
+        {"frame": 50, "leave": 110, "x_px": 20.3, "y_px": 40.8, "mass_kda": 700.0},
+        {"frame": 62, "x_px": 34.3, "y_px": 32.8, "mass_kda": 1200.0},
+        {"frame": 140, "x_px": 45.0, "y_px": 15.0, "mass_kda": 900.0},
+    ],
+    "background.window_frames": 24,
+    "optics.calibrate": "never",
+}
+BOUND = {
+    "simulation.frames": 100,
+    "simulation.shape": [64, 64],
+    "simulation.events": [
+        {"frame": 50, "x_px": 20.2, "y_px": 22.8, "mass_kda": 900.0},
+        {"frame": 50, "x_px": 35.9, "y_px": 31.1, "mass_kda": 1500.0},
+    ],
+    "background.frames": (0, 50),
+    "fit.frames": (50, 100),
+    "posterior.enabled": False,
+    "optics.calibrate": "never",
+}
+
+
+@pytest.fixture(scope="module")
+def written(sample_configs, tmp_path_factory) -> dict[str, tuple[Path, ia.Result]]:
+    """Analyse a landing movie and one with a background; both folders lie beside their movies."""
+    done = {}
+    for kind, sample, settings in (("landing", "landing", LANDING), ("bound", "mass", BOUND)):
+        folder = tmp_path_factory.mktemp(kind)
+        config = ia.configure(sample_configs[sample], settings=settings)
+        ia.simulate_movie(config, folder / "movie.tif", seed=8)
+        out = folder / "movie.iscat"
+        done[kind] = out, ia.fit_movie(folder / "movie.tif", config=config, out=out)
+    return done
+
+
+@pytest.mark.parametrize(("kind", "rows"), [("landing", 4), ("bound", 2)])
+def test_the_images_are_those_that_the_fit_saw(written, kind: str, rows: int) -> None:
+    folder, analysed = written[kind]
+    with ia.open_result(folder) as result:
+        assert len(result) == rows
+        for row in range(rows):
+            seen, expected = result.images(row), analysed.images(row)
+            assert (seen.event, seen.row_px, seen.column_px) == (
+                row, expected.row_px, expected.column_px,
+            )  # fmt: skip
+            for name in ("contrast", "model"):
+                np.testing.assert_allclose(
+                    getattr(seen, name), getattr(expected, name), atol=IMAGE_ATOL
+                )
+            np.testing.assert_allclose(seen.residual, expected.residual, atol=0.1)
+        # the comparison notices another event
+        one, other = result.images(0).model, result.images(1).model
+        assert one.shape != other.shape or np.abs(one - other).max() > 10 * IMAGE_ATOL
+
+
+def test_tables_and_configuration_are_those_of_the_folder(written) -> None:
+    folder, analysed = written["landing"]
+    with ia.open_result(str(folder)) as result:
+        assert result.mode == "mass"
+        assert result.tracks is None
+        pd.testing.assert_series_equal(result.table["mass_kda"], analysed.table["mass_kda"])
+        assert ia.config_to_toml(result.config) == analysed.config_toml
+        assert isinstance(result.view(1), Figure)
+        result.close()
+        assert result.images(2).contrast.shape  # the movie is opened again
+        assert "4 rows, mode mass" in repr(result)
+
+
+def test_the_movie_is_looked_for_beside_the_folder(written, tmp_path) -> None:
+    folder = shutil.copytree(written["bound"][0], tmp_path / "moved.iscat")
+    summary = folder / "summary.json"
+    text = summary.read_text(encoding="utf-8")
+    said = str(written["bound"][0].parent / "movie.tif")
+    assert said in text
+    summary.write_text(text.replace(said, "gone/movie.tif"), encoding="utf-8")
+    result = ia.open_result(folder)
+    with pytest.raises(ia.DataError, match="nor beside it"):
+        result.images(0)
+    shutil.copy(said, tmp_path / "movie.tif")
+    assert result.movie_path == tmp_path / "movie.tif"
+    assert result.images(0).contrast.shape
+    result.close()
+    with pytest.raises(ia.DataError, match=r"nowhere\.tif"):
+        ia.open_result(folder, movie="nowhere.tif").images(0)
+
+
+def test_another_movie_is_refused(written) -> None:
+    other = written["landing"][0].parent / "movie.tif"
+    with (
+        ia.open_result(written["bound"][0], movie=other) as result,
+        pytest.raises(ia.DataError, match="is not the movie"),
+    ):
+        result.images(0)
+
+
+def test_what_is_no_result_is_refused(written, tmp_path) -> None:
+    with pytest.raises(ia.DataError, match="no result"):
+        ia.open_result(tmp_path)
+    with pytest.raises(ia.DataError, match="no result"):
+        ia.open_result(tmp_path / "absent.iscat")
+    broken = shutil.copytree(written["bound"][0], tmp_path / "broken.iscat")
+    (broken / "summary.json").write_text("{", encoding="utf-8")
+    with pytest.raises(ia.DataError, match="cannot be read"):
+        ia.open_result(broken)
+
+
+def test_rows_that_are_not_there_are_refused(written) -> None:
+    with ia.open_result(written["bound"][0]) as result:
+        for row in (-1, len(result)):
+            with pytest.raises(ia.ConfigError, match=f"row = {row}"):
+                result.images(row)
+
+
+def test_particles_that_move_are_drawn_over_their_background(tmp_path) -> None:
+    settings = {
+        "optics.calibrate": "never",
+        "camera.pixel_size_nm": 84.0,
+        "camera.gain_e_per_adu": 20.0,
+        "camera.frame_rate_hz": 331.0,
+        "calibration.gradient_per_kda": -3.1e-5,
+        "particle.mass_kda": 400.0,
+        "fit.mode": "track",
+        "fit.roi_nm": 2000.0,
+        "posterior.enabled": False,
+        "simulation.shape": [36, 36],
+        "simulation.frames": 30,
+        "simulation.photons_per_pixel": 4e5,
+        "simulation.movers": [
+            {"d_um2_s": 0.2, "x_px": 8.0, "y_px": 17.0, "drift_um_s": [12.0, 0.0]}
+        ],
+    }
+    config = ia.configure(None, settings=settings)
+    ia.simulate_movie(config, tmp_path / "movie.tif", seed=2)
+    analysed = ia.fit_movie(tmp_path / "movie.tif", config=config, out=tmp_path / "movie.iscat")
+    track = analysed.table[analysed.table["track"] == 0]
+    best = int(track["snr"].idxmax())  # the frame that the report shows
+    expected = analysed.images(0)
+    with ia.open_result(tmp_path / "movie.iscat") as result:
+        assert result.tracks is not None
+        seen = result.images(best)
+        np.testing.assert_allclose(seen.model, expected.model, atol=IMAGE_ATOL)
+        np.testing.assert_allclose(seen.contrast, expected.contrast, atol=10 * IMAGE_ATOL)
+        assert np.std(seen.residual) == pytest.approx(1.0, abs=0.1)
+        assert len(ia.tracked_rows(result.table)) == len(ia.to_napari(result.table))
