@@ -39,7 +39,7 @@ FOUND, RATIO = "found here", "contrast"
 LEAST_THRESHOLD, MOST_THRESHOLD = 2.0, 20.0
 """Signal-to-noise ratios that can be chosen."""
 
-_SPOT_PX, _THIN = 12.0, 0.03  # side of the mark, and its line's share of it
+_SPOT_PX, _THIN = 12.0, 0.06  # side of the mark, and its line's share of it
 _SOON_MS = 30  # after which the search follows the slider of frames
 _LANDS, _LEAVES = "yellow", "deepskyblue"
 
@@ -252,7 +252,7 @@ class Explorer(QWidget):
         layer.selected_data = set()
         layer.text = {
             "string": "{snr:.1f}", "size": 8, "color": "white",
-            "translation": [0.0, -_SPOT_PX / 2 - 1, 0.0],
+            "translation": [0.0, -0.75 * _SPOT_PX, 0.0],
         }  # fmt: skip
         first, last = look.after
         after = f"frame {first}" if last == first + 1 else f"frames {first}:{last}"

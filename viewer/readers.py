@@ -142,7 +142,7 @@ def result_layers(result: StoredResult) -> list[LayerData]:
         "border_color": [_COLOURS.get(str(status), _DOUBTFUL) for status in placed["status"]]
         or "lime",
         "size": _SIZE_PX,
-        "border_width": 0.03,
+        "border_width": 0.06,
         "scale": scale,
         "metadata": {RESULT: result},
         "ndim": points.shape[1],
