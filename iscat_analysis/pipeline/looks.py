@@ -124,7 +124,19 @@ class Search(Protocol):
 
 
 class LandingSearch:
-    """What lands or leaves between two windows of a landing movie."""
+    """What lands or leaves between two windows of a landing movie.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        Resolved.
+    camera : Camera
+        Counts → photoelectrons.
+    lines : Lines or None
+        Rows and columns that flicker.
+    """
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self.frames = first, last = config.fit.frames or (0, movie.shape[0])
@@ -204,7 +216,19 @@ class LandingSearch:
 
 
 class BoundSearch:
-    """What is there in some frames and was not in the background."""
+    """What is there in some frames and was not in the background.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        Resolved.
+    camera : Camera
+        Counts → photoelectrons.
+    lines : Lines or None
+        Rows and columns that flicker.
+    """
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self._movie = movie if lines is None else movie.seen_as(SteadyFrames(movie, lines, camera))
@@ -271,7 +295,19 @@ class BoundSearch:
 
 
 class MovingSearch:
-    """What is in one frame and not in the median of the frames around it."""
+    """What is in one frame and not in the median of the frames around it.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        Resolved.
+    camera : Camera
+        Counts → photoelectrons.
+    lines : Lines or None
+        Rows and columns that flicker.
+    """
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self._movie = movie if lines is None else movie.seen_as(SteadyFrames(movie, lines, camera))

@@ -297,8 +297,20 @@ def load_field(
 
     Parameters
     ----------
-    scene, movie, camera, span, check, pool, progress
-        As for `follow`.
+    scene : Scene
+        From `track_scene`.
+    movie : FrameSource
+        The movie.
+    camera : Camera
+        Counts → photoelectrons.
+    span : (int, int)
+        Half-open range of frames.
+    check : callable
+        Refuses impossible counts.
+    pool : ThreadPoolExecutor
+        Runs blocks of frames.
+    progress : Progress
+        Told how many frames are read.
 
     Returns
     -------
