@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from calibrations import configuration, make_sights
+from calibrations import GRID, PHOTONS, configuration, make_sights, microscope
 
-from iscat_analysis.calibration.optics import Measured, maximise, settings_of
+from iscat_analysis.calibration.optics import Measured, build_microscope, maximise, settings_of
 from iscat_analysis.calibration.optics.estimate import optics_limits
 from iscat_analysis.calibration.optics.measure import HELD_OUT_P, _Search, measure_microscope
+from iscat_analysis.calibration.optics.starts import average_sights
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.pipeline.microscope import calibrate_sights, goodness
 
@@ -44,6 +48,33 @@ def _measure(
         side=-1,
         landing=1,
     )
+
+
+def test_a_picture_that_is_registered_far_off_does_not_leave_the_model() -> None:
+    """Its particle lies 750 nm from the centre, and models reach as far as particles may roam."""
+    config = configuration()
+    sights, _, _ = make_sights({}, 8, seed=12)
+    signal = microscope(config, {}).image(GRID, 540.0, -520.0, 5.0, 6000.0)
+    before, after = np.random.default_rng(13).poisson(
+        [np.full(GRID.shape, PHOTONS), PHOTONS * (1 + signal)]
+    )
+    data = sights[-1].data.copy()
+    data[0], data[1] = after, before + after
+    sights[-1] = replace(sights[-1], data=data, x_nm=540.0, y_nm=-520.0, snr=1.0)
+    sights.sort(key=lambda sight: -sight.snr)
+    reach = GRID.diagonal_nm / 2 + 450.0
+
+    def build(settings: Mapping[str, Any]) -> ForwardModel:
+        return build_microscope(config, reach, settings)
+
+    _, placed = average_sights(sights)
+    assert math.hypot(placed[-1].x_nm, placed[-1].y_nm) > 500.0  # the trap is set
+    found = measure_microscope(
+        sights, settings_of(config), build,
+        lambda sight, settings: goodness(sight, build(settings)),
+        free=ROUND, limits=optics_limits(1.515, 1.515), side=-1, landing=1,
+    )  # fmt: skip
+    assert len(found.estimate.sights) >= 6
 
 
 def _pulls(found: Measured, changes: dict[str, Any], config: Config | None = None) -> np.ndarray:  # type: ignore[type-arg]

@@ -179,6 +179,15 @@ class Sight:
         x, y, mass, level = (float(v) for v in private)
         return replace(self, x_nm=x, y_nm=y, mass_kda=mass, level=level)
 
+    def placed(self, x_nm: float, y_nm: float) -> Sight:
+        """Return the same picture with another place, or the nearest where it may be."""
+        (low, high), (left, right) = (
+            (float(np.mean(axis)) - _ROAM_NM, float(np.mean(axis)) + _ROAM_NM)
+            for axis in (self.grid.y_nm, self.grid.x_nm)
+        )
+        x, y = min(max(x_nm, left), right), min(max(y_nm, low), high)
+        return replace(self, x_nm=x, y_nm=y)
+
 
 @dataclass(frozen=True)
 class Estimate:

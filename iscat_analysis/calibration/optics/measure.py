@@ -339,7 +339,7 @@ class _Search:
                 continue
             x_nm, y_nm = (np.median([getattr(a, k) for a in rough.sights]) for k in _PLACE)
             sights = with_masses(
-                [replace(s, x_nm=s.x_nm + float(x_nm), y_nm=s.y_nm + float(y_nm)) for s in placed],
+                [s.placed(s.x_nm + float(x_nm), s.y_nm + float(y_nm)) for s in placed],
                 self.build,
                 rough.values,
             )
