@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from iscat_analysis._kernels.moving import Pictures
-from iscat_analysis.optics.blur import blurred
+from iscat_analysis.optics.blur import blurred, spreads
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.stamp import sample_picture, weights_between
 from iscat_analysis.optics.waves import axial_table
@@ -60,7 +60,13 @@ class PictureBook:
                 _along_z(self._far, variances_nm2, self._z_range),
             )
         inverse = self._one_height.lens.inv_step
-        windows = [weights_between(float(q) * inverse**2) for q in variances_nm2]
+        windows = [
+            sum(
+                share * weights_between(v * inverse**2)
+                for share, v in spreads(float(q), each_axis=True)
+            )
+            for q in variances_nm2
+        ]
         one = self._one_height._replace(windows=np.stack(windows))
         return one, one
 
