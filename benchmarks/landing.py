@@ -34,7 +34,7 @@ from iscat_analysis._kernels.sliding import contrast_map
 from iscat_analysis.config import load_config
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.pipeline.landing import make_landing_scene
+from iscat_analysis.pipeline.chunk_work import make_landing_scene
 from iscat_analysis.search.sliding import make_chunk, make_filter, measure_frames, sliding_maps
 from iscat_analysis.study.simulate import write_stack
 

@@ -15,6 +15,8 @@ from iscat_cli.options import (
     DebugOption,
     JsonOption,
     QuietOption,
+    SchedulerFileOption,
+    SchedulerOption,
     SetOption,
     WorkersOption,
 )
@@ -64,7 +66,8 @@ samples.csv: columns path, sample, condition, concentration_nm, replicate,
 role (sample, calibrant, blank, flat), standards; any other is kept, and one
 named as a key of the configuration, as background.frames, sets it.
 
-Job array: --only K/N in every job, then --merge once.
+Job array: --only K/N in every job, then --merge once.  Dask cluster:
+--scheduler tcp://10.0.0.1:8786; its machines share the file system.
 
 Exit status: 0 done; 2 usage, table or configuration; 3 done, but some movies
 or calibrations failed, which are listed; 130 interrupted, and the same
@@ -109,6 +112,8 @@ def batch(
         bool, typer.Option("--merge", help="Analyse nothing; make the page of what is finished.")
     ] = False,
     workers: WorkersOption = None,
+    scheduler: SchedulerOption = "threads",
+    scheduler_file: SchedulerFileOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
     debug: DebugOption = False,
@@ -137,6 +142,8 @@ def batch(
                 kd_masses_kda=None if kd_masses is None else numbers("--kd-masses", kd_masses),
                 only=part,
                 merge=merge,
+                scheduler=scheduler,
+                scheduler_file=scheduler_file,
                 progress=progress,
                 notify=messages.notify,
                 command=context.obj,

@@ -330,7 +330,7 @@ _OPTIONS = {
         name: name
         for name in ("dark", "draws", "free", "hold", "inactive", "inject", "k", "kd", "ladder",
                      "landing", "maps", "model", "offset", "optimize", "out", "overwrite",
-                     "scan", "standards", "steps", "target")
+                     "scan", "scheduler", "standards", "steps", "target")
     },
     "above_kda": "above",
     "frame_rate_hz": "frame-rate",
@@ -340,6 +340,7 @@ _OPTIONS = {
     "kd_masses_kda": "kd-masses",
     "masses_kda": "masses",
     "offset_adu": "offset",
+    "scheduler_file": "scheduler-file",
     "sigma_kda": "sigma",
     "standards_kda": "standards",
 }  # fmt: skip

@@ -19,6 +19,8 @@ from iscat_cli.options import (
     ModeOption,
     OverwriteOption,
     QuietOption,
+    SchedulerFileOption,
+    SchedulerOption,
     SetOption,
     WorkersOption,
     frame_range,
@@ -92,6 +94,8 @@ def fit(
         ),
     ] = None,
     workers: WorkersOption = None,
+    scheduler: SchedulerOption = "threads",
+    scheduler_file: SchedulerFileOption = None,
     inject: Annotated[
         int | None,
         typer.Option(
@@ -138,12 +142,13 @@ def fit(
 
         from iscat_analysis.movie.addresses import MARK, beside
         from iscat_analysis.pipeline import fit_stack
+        from iscat_analysis.places import open_place
 
         if raw is not None:
             stack = Path(f"{stack}{MARK}{raw}")
         folder = beside(stack, ".iscat") if out is None else out
 
-        with messages.progress() as progress:
+        with open_place(scheduler, scheduler_file) as place, messages.progress() as progress:
             analysis = fit_stack(
                 stack,
                 resolved,
@@ -153,6 +158,7 @@ def fit(
                 notify=messages.notify,
                 command=context.obj,
                 inject=inject or 0,
+                place=place,
             )
         rows: list[dict[str, Any]] = analysis.table.to_dict("records")
         if as_json:

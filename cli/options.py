@@ -80,6 +80,25 @@ WorkersOption = Annotated[
     typer.Option("--workers", min=1, metavar="N", help="Threads.", show_default=False),
 ]
 
+SchedulerOption = Annotated[
+    str,
+    typer.Option(
+        "--scheduler",
+        metavar="threads|tcp://HOST:PORT",
+        help="Where the work runs: threads, here; or the workers of a Dask cluster.",
+    ),
+]
+
+SchedulerFileOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--scheduler-file",
+        metavar="F",
+        help="The file in which the scheduler of the cluster left its address.",
+        show_default=False,
+    ),
+]
+
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace earlier output.")]
 
 JsonOption = Annotated[

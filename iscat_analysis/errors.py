@@ -23,3 +23,7 @@ class ConfigError(IscatError):
     """The configuration or an argument is wrong: names key, value and remedy (status 2)."""
 
     exit_status = 2
+
+
+class SchedulerError(IscatError):
+    """The cluster that does the work is gone, or was told to stop (status 1)."""

@@ -21,6 +21,7 @@ from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.pipeline.calibrations import optics_calibration
 from iscat_analysis.pipeline.microscope import calibrate_movie
+from iscat_analysis.places import THREADS, open_place
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.report import check_output
 from iscat_analysis.result import Bounds, Result
@@ -39,6 +40,8 @@ def fit_movie(
     pixel_size_nm: float | None = None,
     posterior: bool | None = None,
     workers: int | None = None,
+    scheduler: str = THREADS,
+    scheduler_file: str | Path | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
@@ -68,6 +71,12 @@ def fit_movie(
         Sample the posterior of every event; default as configured.
     workers : int, optional
         Threads.
+    scheduler : str
+        Where the chunks of a landing movie are analysed: ``"threads"`` of this process, or the
+        address of a Dask scheduler, as ``"tcp://10.0.0.1:8786"``, whose workers read the file by
+        its path; the result is the same.
+    scheduler_file : str or Path, optional
+        File with that address, instead of `scheduler`.
     out : str or Path, optional
         Folder for the report and the tables; nothing is written without it.
     overwrite : bool
@@ -85,7 +94,10 @@ def fit_movie(
     DataError
         The movie cannot be analysed, or `out` may not be written.
     ConfigError
-        A setting is unknown or impossible, or does not suit the movie.
+        A setting is unknown or impossible, or does not suit the movie; the scheduler does not
+        answer, a worker has other versions, or the movie is an array, which no worker can read.
+    SchedulerError
+        The scheduler went away.
     """
     given = {
         "mode": mode,
@@ -99,9 +111,9 @@ def fit_movie(
     folder = _path(out)
     if folder is not None:
         check_output(folder, overwrite)
-    with open_stack(movie, name=name) as stack:
+    with open_stack(movie, name=name) as stack, open_place(scheduler, scheduler_file) as place:
         command = f"iscat_analysis.fit_movie({str(stack.path)!r})"
-        analysis = analyse(stack, resolved, progress=progress, command=command)
+        analysis = analyse(stack, resolved, progress=progress, command=command, place=place)
     result = Result(analysis)
     if folder is not None:
         result.save(folder, overwrite=overwrite)

@@ -2,11 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import Any
 
 from threadpoolctl import threadpool_limits
+
+
+@dataclass(frozen=True)
+class _Allotment:
+    count: int
+    stop: Callable[[], None]
+
+
+_ALLOTTED: ContextVar[_Allotment | None] = ContextVar("allotted", default=None)
+
+
+class _Watched(ThreadPoolExecutor):
+    """Threads that look before each task whether they are still wanted."""
+
+    def __init__(self, allotment: _Allotment) -> None:
+        super().__init__(allotment.count)
+        self._stop = allotment.stop
+
+    def submit(self, task: Callable[..., Any], /, *args: Any, **options: Any) -> Future[Any]:
+        def watched(*args: Any, **options: Any) -> Any:
+            self._stop()
+            return task(*args, **options)
+
+        return super().submit(watched, *args, **options)
+
+
+@contextmanager
+def one_thread_algebra() -> Iterator[None]:
+    """Keep linear algebra to the thread that calls it, so that its sums have one order.
+
+    Yields
+    ------
+    None
+    """
+    with threadpool_limits(1, user_api="blas"):
+        yield
 
 
 @contextmanager
@@ -19,12 +58,36 @@ def threads(count: int) -> Iterator[ThreadPoolExecutor]:
     Parameters
     ----------
     count : int
-        Threads at most.
+        Threads at most; within `allotted`, what is allotted counts instead.
 
     Yields
     ------
     ThreadPoolExecutor
         Open until the block ends.
     """
-    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(count) as pool:
+    given = _ALLOTTED.get()
+    pool = ThreadPoolExecutor(count) if given is None else _Watched(given)
+    with one_thread_algebra(), pool:
         yield pool
+
+
+@contextmanager
+def allotted(count: int, stop: Callable[[], None]) -> Iterator[None]:
+    """Let `threads` start as many threads as a place has, whatever number it is asked for.
+
+    Parameters
+    ----------
+    count : int
+        Threads.
+    stop : callable
+        Called before each task in them; raises where the work is no longer wanted.
+
+    Yields
+    ------
+    None
+    """
+    token = _ALLOTTED.set(_Allotment(count, stop))
+    try:
+        yield
+    finally:
+        _ALLOTTED.reset(token)

@@ -8,7 +8,12 @@ TOML, and `renamed` keeps old names working for one release.
 
 from __future__ import annotations
 
-from iscat_analysis.config.files import OpticsFile, config_to_toml, read_optics_file
+from iscat_analysis.config.files import (
+    OpticsFile,
+    config_to_toml,
+    read_optics_file,
+    with_absolute_paths,
+)
 from iscat_analysis.config.overrides import configure, load_config, parse_config
 from iscat_analysis.config.schema import (
     ABERRATIONS,
@@ -70,4 +75,5 @@ __all__ = [
     "parse_config",
     "plausible_pixel",
     "read_optics_file",
+    "with_absolute_paths",
 ]

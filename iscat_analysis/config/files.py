@@ -205,6 +205,8 @@ _PATH_KEYS = {
     "simulation": ("background",),
 }
 
+_NOT_PATHS = ("flat", "speckle")
+
 
 def _anchor_paths(values: dict[str, Any], folder: Path) -> None:
     """Make the relative paths of a file relative to the folder it lies in."""
@@ -214,5 +216,31 @@ def _anchor_paths(values: dict[str, Any], folder: Path) -> None:
             continue
         for key in keys:
             value = table.get(key)
-            if isinstance(value, str) and value not in ("flat", "speckle"):
+            if isinstance(value, str) and value not in _NOT_PATHS:
                 table[key] = str(folder / value)
+
+
+def with_absolute_paths(config: Config) -> Config:
+    """Name files so that a process that runs in another folder finds them.
+
+    Parameters
+    ----------
+    config : Config
+        Its relative paths are relative to the current folder.
+
+    Returns
+    -------
+    Config
+        The same files by their absolute paths.
+    """
+    changed = {}
+    for section, keys in _PATH_KEYS.items():
+        table = getattr(config, section)
+        paths = {
+            key: str(Path(value).absolute())
+            for key in keys
+            if isinstance(value := getattr(table, key), str) and value not in _NOT_PATHS
+        }
+        if paths:
+            changed[section] = table.model_copy(update=paths)
+    return config.model_copy(update=changed) if changed else config

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -27,6 +28,7 @@ from iscat_analysis.day.run import Outcome, Runner
 from iscat_analysis.day.state import Records, claim_folder
 from iscat_analysis.day.table import Table, read_standards, read_table
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.places import THREADS, open_place
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.mass_action import Model
 
@@ -97,6 +99,8 @@ def batch(
     only: tuple[int, int] | None = None,
     merge: bool = False,
     retry: bool = True,
+    scheduler: str = THREADS,
+    scheduler_file: str | Path | None = None,
     progress: Progress = silent,
     notify: Callable[[str], None] | None = None,
     command: str = "",
@@ -137,6 +141,12 @@ def batch(
         Make the picture of what is finished, and analyse nothing.
     retry : bool
         Try again what failed, though nothing has changed.
+    scheduler : str
+        Where movies are analysed: ``"threads"``, here and one after the other, or the address of a
+        Dask scheduler, as ``"tcp://10.0.0.1:8786"``, on whose workers several are at a time; the
+        result is the same.
+    scheduler_file : str or Path, optional
+        File with that address, instead of `scheduler`.
     progress : Progress
         Called with the stage and the steps done and in all.
     notify : callable, optional
@@ -152,9 +162,12 @@ def batch(
     Raises
     ------
     ConfigError
-        The table or the configuration is wrong; row and column are named.
+        The table or the configuration is wrong, row and column are named; or the scheduler does
+        not answer, or a worker has other versions.
     DataError
         The folder holds something else.
+    SchedulerError
+        The scheduler went away; finished movies are kept, and the same call goes on.
     KeyboardInterrupt
         The user stopped it; finished movies are kept, and the same call goes on.
     """
@@ -175,18 +188,26 @@ def batch(
     claim_folder(folder)
     tell = notify or (lambda _: None)
     said = command or f"iscat_analysis.batch({str(table.source)!r}, out={str(out)!r})"
-    runner = Runner(folder, Records(folder), merge, progress, tell, said, retry)
     outcomes: dict[str, Outcome] = {}
     try:
-        day = calibrate_day(plan, runner)
-        wanted = part_of(plan.movies, only)
-        for number, movie in enumerate(wanted, 1):
-            progress("movies", number - 1, len(wanted))
-            outcomes[movie.name] = _analyse(plan, day, movie, runner)
-            if outcomes[movie.name].ran:
-                which = f"{number} of {len(wanted)}: " if len(wanted) > 1 else ""
-                tell(f"{which}{movie.name}: {_short(outcomes[movie.name])}")
-        progress("movies", len(wanted), len(wanted))
+        where = (THREADS, None) if merge else (scheduler, scheduler_file)
+        with open_place(*where) as place:
+            for remark in place.remarks(plan.config.compute.memory_limit_mb):
+                tell(remark)
+            runner = Runner(folder, Records(folder), merge, progress, tell, said, place, retry)
+            day = calibrate_day(plan, runner)
+            wanted = part_of(plan.movies, only)
+            progress("movies", 0, len(wanted))
+            analysed = place.each(lambda movie: _analyse(plan, day, movie, runner), wanted)
+            with closing(analysed):
+                for index, outcome in analysed:
+                    name = wanted[index].name
+                    outcomes[name] = outcome
+                    if outcome.ran:
+                        which = f"{len(outcomes)} of {len(wanted)}: " if len(wanted) > 1 else ""
+                        tell(f"{which}{name}: {_short(outcome)}")
+                    progress("movies", len(outcomes), len(wanted))
+        outcomes = {movie.name: outcomes[movie.name] for movie in wanted}
     except KeyboardInterrupt:
         done = sum(outcome.state == "done" for outcome in outcomes.values())
         raise KeyboardInterrupt(

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from iscat_analysis.config import Config
-from iscat_analysis.day.state import Records, key_of, saw, seen
-from iscat_analysis.errors import IscatError
+from iscat_analysis.config import Config, with_absolute_paths
+from iscat_analysis.day.state import STATE, Records, key_of, saw, seen
+from iscat_analysis.errors import IscatError, SchedulerError
 from iscat_analysis.movie import open_stack
+from iscat_analysis.movie.stack import not_shared
 from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.records import Progress
+from iscat_analysis.places import Place
+from iscat_analysis.records import Progress, silent
+from iscat_analysis.threads import one_thread_algebra
 
 Notify = Callable[[str], None]
 
@@ -59,6 +62,8 @@ class Runner:
         Told in one line what was done.
     command : str
         The command line, for the reports.
+    place : Place
+        Where movies are analysed.
     retry : bool
         Try again what failed, though nothing has changed.
     """
@@ -69,6 +74,7 @@ class Runner:
     progress: Progress
     notify: Notify
     command: str
+    place: Place
     retry: bool = True
 
     def job(
@@ -116,6 +122,8 @@ class Runner:
             why = ""
             try:
                 kept = work()
+            except SchedulerError:  # says nothing of this job
+                raise
             except IscatError as error:
                 why = str(error)
             except Exception as error:  # noqa: BLE001  (the other movies go on)
@@ -157,21 +165,72 @@ class Runner:
         """
 
         def work() -> dict[str, Any]:
-            with open_stack(movie) as stack:
-                shape = [int(n) for n in stack.shape]
-            analysis = fit_stack(
-                movie,
-                config,
-                out=folder,
-                overwrite=True,
+            return self.place.call(
+                analyse_movie,
+                self.out.absolute(),
+                name,
+                (movie, seen(movie)),
+                with_absolute_paths(config),
+                folder.absolute(),
+                self.command,
                 progress=self.progress,
-                command=self.command,
             )
-            summary = analysis.summary
-            return {
-                "shape": shape,
-                "events": summary["events"],
-                "inputs": {"movie": {"sha256": summary["input"]["sha256"]}},
-            }
 
         return self.job(name, key_of(config), {"movie": movie}, folder / "summary.json", work)
+
+
+def analyse_movie(
+    out: Path,
+    name: str,
+    movie: tuple[Path, str],
+    config: Config,
+    folder: Path,
+    command: str,
+    *,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Fit a movie of a batch, wherever that is.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the batch.
+    name : str
+        Of the job.
+    movie : (Path, str)
+        The file, and what `iscat_analysis.day.state.seen` says of it where the batch runs.
+    config : Config
+        As it is to be analysed, with absolute paths.
+    folder : Path
+        For the result.
+    command : str
+        For the report.
+    progress : Progress
+        Told how far it is.
+
+    Returns
+    -------
+    dict
+        For the job's record.
+
+    Raises
+    ------
+    DataError
+        The movie cannot be analysed, or movie or folder are not there as the batch sees them.
+    """
+    path, known = movie
+    if not (out / STATE).is_dir():
+        raise not_shared(out)
+    if known and seen(path) != known:
+        raise not_shared(path)
+    with Records(out).held(f"{name}.work", lambda _: None), one_thread_algebra():
+        with open_stack(path) as stack:
+            shape = [int(n) for n in stack.shape]
+        summary = fit_stack(
+            path, config, out=folder, overwrite=True, progress=progress, command=command
+        ).summary
+    return {
+        "shape": shape,
+        "events": summary["events"],
+        "inputs": {"movie": {"sha256": summary["input"]["sha256"]}},
+    }

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+import platform
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self, runtime_checkable
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.addresses import MARK, fingerprint
+from iscat_analysis.movie.addresses import MARK, fingerprint, split_address
 from iscat_analysis.records import StackMetadata
 
 _MB = 1_000_000
@@ -134,6 +135,38 @@ def printable(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
+def not_shared(path: Path) -> DataError:
+    """Say that a file is not, or not the same, where it shall be read.
+
+    Parameters
+    ----------
+    path : Path
+        Where another machine sees it.
+
+    Returns
+    -------
+    DataError
+        To be raised.
+    """
+    return DataError(
+        f"{path}: is not on {platform.node()}, or is another file there; workers read and write by "
+        "path, so that their machines must share the file system"
+    )
+
+
+def _reopened(address: Path, identity: str) -> Stack:
+    """Open a movie that another process has open."""
+    from iscat_analysis.movie import open_stack
+
+    if not split_address(address)[0].exists():
+        raise not_shared(address)
+    stack = open_stack(address)
+    if stack.identity != identity:
+        stack.close()
+        raise not_shared(address)
+    return stack
+
+
 class Stack:
     """A movie in a file or an array; `iscat_analysis.movie.open_stack` makes it.
 
@@ -157,11 +190,19 @@ class Stack:
         self._part = part
         self._files = (path,) if files is None else tuple(files)
         self._closed = False
+        self._own = True
 
     def __repr__(self) -> str:
         t, y, x = self.shape
         state = ", closed" if self._closed else ""
         return f"<Stack {self.name}: {t} frames of {y} x {x} pixels, {self.dtype}{state}>"
+
+    def __reduce__(self) -> tuple[Callable[[Path, str], Stack], tuple[Path, str]]:
+        """Let another process open the same file."""
+        if not self._files or not self._own:
+            raise TypeError(f"{self.name} is no file that another process could open")
+        path = self._path.absolute()
+        return _reopened, (Path(f"{path}{MARK}{self._part}") if self._part else path, self.identity)
 
     def __enter__(self) -> Self:
         return self
@@ -222,7 +263,9 @@ class Stack:
         Stack
             Under the same name.
         """
-        return Stack(self._path, frames, part=self._part, files=self._files)
+        seen = Stack(self._path, frames, part=self._part, files=self._files)
+        seen._own = False
+        return seen
 
     def close(self) -> None:
         """Release the file; closing twice is harmless."""

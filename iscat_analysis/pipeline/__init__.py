@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 import shutil
 import threading
 import time
@@ -10,7 +9,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +67,7 @@ from iscat_analysis.pipeline.tracking import (
     track_particles,
 )
 from iscat_analysis.pipeline.tracks import judge_times, make_films, tracks_of
+from iscat_analysis.places import Here, Place, versions
 from iscat_analysis.records import (
     Analysis,
     Film,
@@ -83,11 +82,6 @@ from iscat_analysis.report import EVENT_FIGURES, write_report
 from iscat_analysis.report.output import claim_output
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.threads import threads
-
-DEPENDENCIES = (
-    "numpy", "scipy", "numba", "tifffile", "emcee", "arviz-stats", "pandas", "pyarrow",
-    "matplotlib",
-)  # fmt: skip
 
 FEW_FIGURES = 2
 """Events of a landing movie that are drawn for print; the page shows hundreds."""
@@ -111,6 +105,7 @@ def fit_stack(
     notify: Notify = _quiet,
     command: str = "",
     inject: int = 0,
+    place: Place | None = None,
 ) -> Analysis:
     """Analyse a movie and write the report.
 
@@ -133,6 +128,8 @@ def fit_stack(
     inject : int
         Known particles to add to a landing movie in a second run, which tells how many are found
         and how well they are measured; ``summary["injection"]``.
+    place : Place, optional
+        Where the chunks of a landing movie are analysed; default in this process.
 
     Returns
     -------
@@ -160,6 +157,7 @@ def fit_stack(
                 command=command,
                 partial=partial_folder(folder.resolve()),
                 inject=inject,
+                place=place,
             )
         sliding = "landing" in analysis.summary
         figures = FEW_FIGURES if sliding else EVENT_FIGURES
@@ -182,6 +180,7 @@ def analyse(
     command: str = "",
     partial: Path | None = None,
     inject: int = 0,
+    place: Place | None = None,
 ) -> Analysis:
     """Analyse an open movie.
 
@@ -196,7 +195,7 @@ def analyse(
     partial : Path, optional
         Folder that keeps the finished chunks of a landing movie, or blocks of one in mode track,
         so that an interrupted run can be resumed; without it nothing is kept.
-    inject : int
+    inject, place
         As in `fit_stack`.
 
     Returns
@@ -204,6 +203,12 @@ def analyse(
     Analysis
         Everything found.
     """
+    place = place or Here()
+    if place.distant and not movie.identity:
+        raise ConfigError(
+            f"{movie.name}: is an array, and workers read a movie from its file: save it, as with "
+            "numpy.save, and give its path; or leave `scheduler` out"
+        )
     started = datetime.now(UTC).isoformat(timespec="seconds")
     clock = _Clock()
     warnings: list[str] = []
@@ -259,7 +264,11 @@ def analyse(
         other = (as_landing if tracked else as_moving)(changes, movie.name)
         if other:
             tell(other)
+    if place.distant and not landing:
+        notify(f"{movie.name}: is analysed in this process: only landing movies have chunks")
     if landing:
+        for remark in place.remarks(config.compute.memory_limit_mb):
+            notify(remark)
         try:
             result = analyse_landings(
                 movie,
@@ -271,6 +280,7 @@ def analyse(
                 partial=partial,
                 identity=movie.identity if partial else "",
                 lines=lines,
+                place=place,
             )
         except FloodError as error:  # what seems to be noise is then particles
             raise FloodError(other) if other else error from None
@@ -285,7 +295,7 @@ def analyse(
         if inject and not result.interrupted:
             try:
                 further["injection"] = inject_and_recover(
-                    movie, config, camera, result, inject, progress=progress
+                    movie, config, camera, result, inject, progress=progress, place=place
                 )
             except KeyboardInterrupt:  # what the movie itself gave is kept
                 found = replace(found, interrupted=True)
@@ -336,7 +346,7 @@ def analyse(
         command=printable(command) or "iscat_analysis.pipeline.analyse",
         input_path=printable(str(movie.path)),
         input_sha256=digest.result(),
-        versions=_versions(),
+        versions=versions(),
         seed=config.compute.seed if sampled else None,
         started=started,
     )
@@ -566,11 +576,3 @@ class _Clock:
         now = time.perf_counter()
         self.seconds[name] = now - self._last
         self._last = now
-
-
-def _versions() -> dict[str, str]:
-    return {
-        "iscat-analysis": version("iscat-analysis"),
-        "python": platform.python_version(),
-        **{name: version(name) for name in DEPENDENCIES},
-    }

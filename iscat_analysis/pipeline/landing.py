@@ -10,9 +10,9 @@ configuration alone, so a finished one can be kept on disk and a resumed run giv
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +20,19 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import Config, with_absolute_paths
 from iscat_analysis.errors import DataError
-from iscat_analysis.inference.posterior import sample_posterior
-from iscat_analysis.inference.prior import Prior
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.movie.lines import Lines, SteadyFrames
-from iscat_analysis.movie.spectrum import NoiseSpectrum
-from iscat_analysis.optics.forward import forward_model
+from iscat_analysis.pipeline.chunk_work import (
+    ChunkSetting,
+    analyse_chunk,
+    chunk_job,
+    make_landing_scene,
+)
 from iscat_analysis.pipeline.chunks import (
-    FRAME_COLUMN,
     REPEATS_COLUMN,
-    VIEWS,
     Done,
     Merged,
     Reader,
@@ -40,19 +40,11 @@ from iscat_analysis.pipeline.chunks import (
     judge_noise,
     plan_chunks,
 )
-from iscat_analysis.pipeline.diagnosis import DRIFT_PX, misfit_warning
+from iscat_analysis.pipeline.diagnosis import DRIFT_PX
 from iscat_analysis.pipeline.injection import InjectedMovie, draw_particles, recovery
-from iscat_analysis.pipeline.pattern import follow
-from iscat_analysis.pipeline.results import Row, table_of, view_of
 from iscat_analysis.pipeline.resume import Store
-from iscat_analysis.pipeline.scene import (
-    Scene,
-    reported_steps,
-    search_both,
-    square_model,
-    square_of,
-)
-from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
+from iscat_analysis.pipeline.scene import Scene, reported_steps
+from iscat_analysis.places import Here, Place
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     CountSource,
@@ -63,9 +55,8 @@ from iscat_analysis.records import (
     Windows,
 )
 from iscat_analysis.search.empty import EmptySpread
-from iscat_analysis.search.sliding import CORRELATION, STRIDES, Chunk, boundaries, stride_of
-from iscat_analysis.search.templates import LARGEST_IMAGE, make_templates
-from iscat_analysis.threads import threads
+from iscat_analysis.search.sliding import boundaries, stride_of
+from iscat_analysis.threads import one_thread_algebra, threads
 
 POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""
@@ -152,6 +143,7 @@ def analyse_landings(
     partial: Path | None = None,
     identity: str = "",
     lines: Lines | None = None,
+    place: Place | None = None,
 ) -> LandingResult:
     """Find and fit every particle that lands or leaves.
 
@@ -175,6 +167,8 @@ def analyse_landings(
         What tells the movie's content from another's; finished chunks of another are not used.
     lines : Lines, optional
         Rows and columns that flicker; they are divided by their light as frames are read.
+    place : Place, optional
+        Where the chunks are analysed; default in this process.
 
     Returns
     -------
@@ -187,6 +181,7 @@ def analyse_landings(
         The movie is shorter than two windows, a frame is impossible, or the chunks do not fit into
         ``compute.memory_limit_mb``.
     """
+    place = place or Here()
     first, last = config.fit.frames or (0, movie.shape[0])
     if last > movie.shape[0]:
         raise DataError(
@@ -207,28 +202,41 @@ def analyse_landings(
     posterior = config.samples_posterior
     sampling = config.posterior.model_copy(update={"enabled": posterior})
     config = config.model_copy(update={"posterior": sampling})
-    scene = make_landing_scene(
-        config, reader.shape, searches=count, noise=noise.spectrum, lines=lines
-    )
+    with one_thread_algebra():
+        scene = make_landing_scene(
+            config, reader.shape, searches=count, noise=noise.spectrum, lines=lines
+        )
     prepare(scene)
     plan = plan_chunks(reader, config, window, stride)
     store = Store(partial, config, identity, reader.shape, (first, last), camera)
+    movie_job = ChunkSetting(
+        frames, camera, with_absolute_paths(config), (first, last), count, window,
+        noise.spectrum, noise.excess, lines,
+    )  # fmt: skip
     merged = Merged(reader.shape)
     interrupted = False
     with threads(config.compute.workers) as pool:
-        try:
-            for number, (core, span) in enumerate(plan):
-                done = None if posterior else store.load(number)
-                if done is None:
+
+        def finish(number: int) -> Done:
+            done = None if posterior else store.load(number)
+            if done is None:
+                core, span = plan[number]
+                budget = POSTERIORS - merged.sampled if posterior else 0
+                if place.distant:
+                    done = place.call(chunk_job, movie_job, core, span, budget)
+                else:
                     chunk = reader.chunk(span, stride, pool)
-                    budget = POSTERIORS - merged.sampled if posterior else 0
-                    done = _analyse_chunk(scene, chunk, core, window, pool, budget, noise.excess)
-                    store.save(number, done)
-                merged.add(done)
-                progress("landing", core[1] - first, last - first)
-                if done.stopped:
-                    interrupted = True
-                    break
+                    done = analyse_chunk(scene, chunk, core, window, pool, budget, noise.excess)
+                store.save(number, done)
+            return done
+
+        try:
+            with closing(_finished(finish, len(plan), place, merged, posterior)) as finished:
+                for frames_done, stopped in finished:
+                    progress("landing", frames_done, last - first)
+                    if stopped:
+                        interrupted = True
+                        break
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
             interrupted = True
@@ -279,6 +287,34 @@ def analyse_landings(
     )
 
 
+def _finished(
+    finish: Callable[[int], Done], count: int, place: Place, merged: Merged, posterior: bool
+) -> Generator[tuple[int, bool]]:
+    """Finish chunks and merge them in their order, whichever comes first.
+
+    Yields the number of frames that are done, and whether it stopped within a chunk.  Each chunk
+    has the posteriors that those before it left to sample: with posteriors, one follows another.
+    """
+
+    def results() -> Iterator[tuple[int, Done]]:
+        alone = 0
+        while posterior and alone < count and merged.sampled < POSTERIORS:
+            yield alone, finish(alone)
+            alone += 1
+        for number, done in place.each(finish, range(alone, count)):
+            yield alone + number, done
+
+    waiting: dict[int, Done] = {}
+    ready = frames = 0
+    for number, done in results():
+        waiting[number] = done
+        frames += done.core[1] - done.core[0]
+        while ready in waiting:
+            merged.add(waiting.pop(ready))
+            ready += 1
+        yield frames, done.stopped
+
+
 def inject_and_recover(
     movie: CountSource,
     config: Config,
@@ -287,6 +323,7 @@ def inject_and_recover(
     count: int,
     *,
     progress: Progress,
+    place: Place | None = None,
 ) -> dict[str, Any]:
     """Add known particles to a movie, analyse it again and compare.
 
@@ -304,6 +341,8 @@ def inject_and_recover(
         Particles.
     progress : Progress
         Told how far it is.
+    place : Place, optional
+        As in `analyse_landings`.
 
     Returns
     -------
@@ -329,6 +368,7 @@ def inject_and_recover(
         tell=_unheard,
         progress=progress,
         lines=result.scene.lines,
+        place=place,
     )
     if again.interrupted:
         raise KeyboardInterrupt
@@ -361,139 +401,6 @@ def _way(trajectory: Trajectory | None) -> dict[str, Any]:
 
 def _unheard(text: str) -> None:
     """Say nothing: the user has been told already."""
-
-
-def make_landing_scene(
-    config: Config,
-    field_px: tuple[int, int],
-    *,
-    searches: int,
-    noise: NoiseSpectrum | None = None,
-    lines: Lines | None = None,
-) -> Scene:
-    """Build the models and the matched filter, at the particles' nominal height.
-
-    Parameters
-    ----------
-    config : Config
-        With a pixel size.
-    field_px : (int, int)
-        Rows and columns.
-    searches : int
-        Boundaries that will be searched; they share the expected false alarms.
-    noise : NoiseSpectrum, optional
-        Of the movie; without it the noise is white and of the expected size.
-    lines : Lines, optional
-        What was divided out of the frames.
-
-    Returns
-    -------
-    Scene
-        Its `wide` model reaches as far as the rings of a strong particle matter.
-
-    Raises
-    ------
-    ConfigError
-        The region is larger than the field, or the calibration has the wrong sign.
-    """
-    pixel, roi_px = square_of(config, field_px)
-    model = square_model(config, pixel, roi_px)
-    return Scene(
-        config=config,
-        model=model,
-        wide=forward_model(config, math.sqrt(2) * (LARGEST_IMAGE * roi_px + 2) * pixel),
-        templates=make_templates(
-            model,
-            search_both(config.detection, searches=searches),
-            pixel_nm=pixel,
-            roi_nm=config.fit.roi_nm,
-            z_range_nm=None,
-            field_px=field_px,
-            noise=noise,
-            correlation=CORRELATION if searches > 1 else 0.0,
-        ),
-        mode=config.fit.mode,
-        lines=lines,
-    )
-
-
-def _analyse_chunk(
-    scene: Scene,
-    chunk: Chunk,
-    core: tuple[int, int],
-    window: int,
-    pool: ThreadPoolExecutor,
-    posteriors: int,
-    excess_noise: str,
-) -> Done:
-    wanted = scene.config.background.drift_correction
-    trajectory = follow(chunk, pool.map) if wanted else None
-    fitter = ChunkFitter(scene, chunk, window, pool, trajectory, excess_noise=excess_noise)
-    seam = max(2, window // STRIDES)
-    steps = fitter.run((core[0] - seam, core[1] + seam))
-    rows = list(pool.map(_row, range(len(steps)), steps))
-    sampled, stopped = 0, False
-    for i, row in enumerate(rows):
-        if sampled >= posteriors or not core[0] <= steps[i].step.at.frame < core[1]:
-            continue
-        settings = scene.config.posterior
-        try:
-            chain = sample_posterior(
-                row.event.likelihood, row.event.fit,
-                walkers=settings.walkers, steps=settings.steps,
-                seed=scene.config.compute.seed + steps[i].step.at.frame,
-                prior=Prior(settings.priors),
-            )  # fmt: skip
-        except KeyboardInterrupt:  # the fits are done, and kept
-            stopped = True
-            break
-        rows[i] = replace(row, posterior=chain)
-        sampled += 1
-    table = table_of(scene, rows, mapper=pool.map)
-    table["frame"] = [s.step.at.frame for s in steps]
-    table["n_before"] = [s.n_before for s in steps]
-    table["n_after"] = [s.n_after for s in steps]
-    sign = np.array([s.step.sign for s in steps], dtype=float)
-    table["mass_kda"] *= sign
-    table["contrast"] *= sign
-    table[FRAME_COLUMN] = [s.step.at.half_width for s in steps]
-    table[REPEATS_COLUMN] = [s.repeats.ravel().tolist() for s in steps]
-    inside = slice(core[0] - chunk.first, core[1] - chunk.first)
-    light = np.where(chunk.good, chunk.power, np.nan) * float(chunk.mean_e.mean())
-    return Done(
-        core=core,
-        table=table,
-        views=tuple(_view(row, step) for row, step in zip(rows, steps, strict=True))[:VIEWS],
-        good=chunk.good[inside].copy(),
-        light=light[inside],
-        masked=~chunk.usable,
-        saturated=chunk.saturated,
-        strongest=fitter.strongest,
-        ends_e=_ends(chunk, inside),
-        sampled=sampled,
-        stopped=stopped,
-        trajectory=trajectory,
-        cause=misfit_warning(scene.config, [s.event for s in steps]),
-        empty=fitter.empty,
-    )
-
-
-def _ends(chunk: Chunk, inside: slice) -> FloatArray:
-    """Mean images of the first and the last quarter of a core, shape (2, y, x)."""
-    lit = np.add.reduceat(chunk.good, chunk.edges[:-1], dtype=np.int64) > 0
-    held = lit & (chunk.edges[:-1] >= inside.start) & (chunk.edges[1:] <= inside.stop)
-    blocks = np.flatnonzero(held if held.any() else lit)
-    few = max(1, blocks.size // 4)
-    return np.stack([chunk.blocks_e[part].mean(axis=0) for part in (blocks[:few], blocks[-few:])])
-
-
-def _row(number: int, step: FittedStep) -> Row:
-    return Row(number, step.event, step.windows)
-
-
-def _view(row: Row, step: FittedStep) -> EventView:
-    view = view_of(row)
-    return replace(view, row_px=step.region.rows[0], column_px=step.region.columns[0])
 
 
 def frame_warnings(

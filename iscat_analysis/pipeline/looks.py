@@ -21,10 +21,10 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.movie.background import measure_windows, start_power
 from iscat_analysis.movie.camera import Camera, check_counts
 from iscat_analysis.movie.lines import Lines, SteadyFrames
+from iscat_analysis.pipeline.chunk_work import make_landing_scene
 from iscat_analysis.pipeline.chunks import Reader, counts_budget, judge_noise
 from iscat_analysis.pipeline.diagnosis import judge_background
 from iscat_analysis.pipeline.field import search_field
-from iscat_analysis.pipeline.landing import make_landing_scene
 from iscat_analysis.pipeline.moving import LEAST_FRAMES, load_field, search_frames, track_scene
 from iscat_analysis.pipeline.pattern import SPAN, MovingPattern, follow
 from iscat_analysis.pipeline.ranges import frame_ranges

@@ -26,10 +26,10 @@ from iscat_analysis.movie.background import measure_windows, refine_power
 from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts
 from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.pipeline.block_store import row_view
+from iscat_analysis.pipeline.chunk_work import make_landing_scene
 from iscat_analysis.pipeline.chunks import HALO, Reader, counts_budget
 from iscat_analysis.pipeline.diagnosis import judge_lines
 from iscat_analysis.pipeline.field import Event, Place, add_signal
-from iscat_analysis.pipeline.landing import make_landing_scene
 from iscat_analysis.pipeline.moving import blurred_rows, exposure_of, load_field, track_scene
 from iscat_analysis.pipeline.neighbours import Neighbours, Step, region_around
 from iscat_analysis.pipeline.pattern import MovingPattern, follow

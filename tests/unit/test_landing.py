@@ -420,7 +420,7 @@ def test_an_interrupted_run_resumes_to_the_same_result(
     monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
     fit_stack(movie, config, out=tmp_path / "whole.iscat")
     assert not partial_folder(tmp_path / "whole.iscat").exists()
-    real: Callable[..., Any] = landing_module._analyse_chunk
+    real: Callable[..., Any] = landing_module.analyse_chunk
     calls: list[int] = []
 
     def stopping(*arguments: Any) -> Any:
@@ -429,7 +429,7 @@ def test_an_interrupted_run_resumes_to_the_same_result(
             raise KeyboardInterrupt
         return real(*arguments)
 
-    monkeypatch.setattr(landing_module, "_analyse_chunk", stopping)
+    monkeypatch.setattr(landing_module, "analyse_chunk", stopping)
     out = tmp_path / "cut.iscat"
     with pytest.raises(KeyboardInterrupt):
         fit_stack(movie, config, out=out)
@@ -578,7 +578,7 @@ def test_an_interrupted_injection_keeps_what_the_movie_gave(
 ) -> None:
     config = _config("posterior.enabled=false")
     monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
-    real, calls = landing_module._analyse_chunk, []
+    real, calls = landing_module.analyse_chunk, []
 
     def stopping(*arguments: Any) -> Any:
         calls.append(1)
@@ -586,7 +586,7 @@ def test_an_interrupted_injection_keeps_what_the_movie_gave(
             raise KeyboardInterrupt
         return real(*arguments)
 
-    monkeypatch.setattr(landing_module, "_analyse_chunk", stopping)
+    monkeypatch.setattr(landing_module, "analyse_chunk", stopping)
     out = tmp_path / "cut.iscat"
     with pytest.raises(KeyboardInterrupt):
         fit_stack(movie, config, out=out, inject=3)
@@ -613,7 +613,7 @@ def test_a_corrected_run_resumes_to_the_same_result(
     drifting: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.005)
-    real, calls = landing_module._analyse_chunk, []
+    real, calls = landing_module.analyse_chunk, []
     whole, _ = _run(drifting, _config(CORRECTED))
 
     def stopping(*arguments: Any) -> Any:
@@ -622,7 +622,7 @@ def test_a_corrected_run_resumes_to_the_same_result(
             raise KeyboardInterrupt
         return real(*arguments)
 
-    monkeypatch.setattr(landing_module, "_analyse_chunk", stopping)
+    monkeypatch.setattr(landing_module, "analyse_chunk", stopping)
     _run(drifting, _config(CORRECTED), partial=tmp_path, identity="movie")
     resumed, _ = _run(drifting, _config(CORRECTED), partial=tmp_path, identity="movie")
     assert len(calls) == 1 + whole.summary["chunks"]
