@@ -32,8 +32,9 @@ settings.load_profile("ci" if os.environ.get("CI") else "here")
 
 
 LONGEST_FIRST = (
-    "test_report_browser", "test_output", "test_report", "test_misfit", "test_landing",
-    "test_misfit_search", "test_optics_forecast", "test_focus_scan", "test_arguments",
+    "test_report_browser", "test_output", "test_report", "test_cluster", "test_misfit",
+    "test_landing", "test_misfit_search", "test_optics_forecast", "test_focus_scan",
+    "test_arguments",
     "test_mass_calibration", "test_optics_calibration", "test_cli_json", "test_bounds_laws",
     "test_shared_errors", "test_robustness", "test_hostile_files", "test_cli_benchmark",
     "test_public", "test_cli_contract", "test_pipeline", "test_bounds", "test_photon_transfer",

@@ -18,7 +18,7 @@ from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.pipeline import analyse, fit_stack
+from iscat_analysis.pipeline import analyse, chunk_work, fit_stack
 from iscat_analysis.pipeline import chunks as chunks_module
 from iscat_analysis.pipeline import landing as landing_module
 from iscat_analysis.pipeline.chunks import FRAME_COLUMN, Done, Merged
@@ -566,7 +566,7 @@ def test_an_interrupt_of_the_chains_keeps_the_fits(
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(landing_module, "sample_posterior", interrupt)
+    monkeypatch.setattr(chunk_work, "sample_posterior", interrupt)
     result, _ = _run(counts, _config("posterior.enabled=true"))
     assert result.interrupted
     pd.testing.assert_frame_equal(result.table, plain[0].table)
