@@ -59,6 +59,7 @@ class Explorer(QWidget):
         self._preview: ia.Preview | None = None
         self._made_of: tuple[Any, ...] = ()  # what the preview was made of
         self._look: ia.Look | None = None
+        self._window = 0  # of the last look
         self._ratio: _Ratio | None = None
 
         self.movie = QComboBox()
@@ -104,18 +105,35 @@ class Explorer(QWidget):
         self._soon.setInterval(_SOON_MS)
         self._soon.timeout.connect(self.detect)
         browse.clicked.connect(self._browse)
-        self.movie.currentIndexChanged.connect(self._forget)
-        self.config.editingFinished.connect(self._forget)
-        self.window_frames.valueChanged.connect(self._window_changed)
+        self.movie.currentIndexChanged.connect(self._search_soon)
+        self.config.editingFinished.connect(self._search_soon)
+        self.window_frames.valueChanged.connect(self._search_soon)
         self.threshold.valueChanged.connect(self._threshold_changed)
         self.detect_button.clicked.connect(self.detect)
         self.ratio_button.clicked.connect(self.show_ratio)
-        layers = self._viewer.layers
-        for event in (layers.events.inserted, layers.events.removed, layers.events.renamed):
-            event.connect(self._list_layers)
-        self._viewer.dims.events.current_step.connect(self._frame_changed)
-        self._viewer.mouse_drag_callbacks.append(self._clicked)
+        self._listen()
         self._list_layers()
+
+    def _listen(self) -> None:
+        """Hear what happens in the viewer, as long as the widget is there."""
+        changes, clicks = self._viewer.layers.events, self._viewer.mouse_drag_callbacks
+        heard = [
+            (changes.inserted, self._list_layers),
+            (changes.removed, self._list_layers),
+            (changes.renamed, self._list_layers),
+            (self._viewer.dims.events.current_step, self._frame_changed),
+        ]
+        for event, callback in heard:
+            event.connect(callback)
+        clicked = self._clicked
+        clicks.append(clicked)
+
+        def leave() -> None:
+            for event, callback in heard:
+                event.disconnect(callback)
+            clicks.remove(clicked)
+
+        self.destroyed.connect(leave)
 
     # ---- what there is ---------------------------------------------------------------------
 
@@ -132,30 +150,27 @@ class Explorer(QWidget):
             self.movie.setCurrentIndex(index if movies else -1)
             self.movie.blockSignals(False)
             if self.movie.currentData() is not chosen:
-                self._forget()
+                self._search_soon()
         for k, layer in enumerate(movies):
             self.movie.setItemText(k, layer.name)
         results = [r for r in map(_result_of, self._viewer.layers) if r is not None]
         if results and not self.config.text():
             self.config.setText(str(results[-1].folder / "config.toml"))
-            self._forget()
 
     def _browse(self) -> None:
         path, _ = QFileDialog.getOpenFileName(self, "Configuration", "", "TOML (*.toml)")
         if path:
             self.config.setText(path)
-            self._forget()
-
-    def _forget(self, *_: object) -> None:
-        """Let the next search begin anew: another movie or another configuration was chosen."""
-        self._soon.stop()
-        self._look = None
+            self._search_soon()
 
     @property
     def frame(self) -> int:
-        """Number of the frame that is shown."""
-        steps = self._viewer.dims.current_step
-        return int(steps[-3]) if len(steps) >= 3 else 0
+        """Number of the frame of the chosen movie that is shown."""
+        layer = self.movie.currentData()
+        if layer is None:
+            return 0
+        place = float(layer.world_to_data(self._viewer.dims.point)[-3])
+        return min(max(round(place), 0), int(layer.data.shape[0]) - 1)
 
     # ---- the search ------------------------------------------------------------------------
 
@@ -185,13 +200,10 @@ class Explorer(QWidget):
             config = ia.configure(Path(path) if path else None)
             preview = ia.Preview(stack, config)
             self._preview, self._made_of = preview, wanted
-            for widget in (self.window_frames, self.threshold):
-                widget.blockSignals(True)
-            self.window_frames.setRange(1, max(preview.longest, 1))
-            self.window_frames.setValue(preview.window)
-            self.threshold.setValue(preview.threshold())
-            for widget in (self.window_frames, self.threshold):
-                widget.blockSignals(False)
+            with _silent(self.window_frames):
+                self.window_frames.setRange(1, max(preview.longest, 1))
+                self.window_frames.setValue(preview.window)
+            self._window = 0
             return preview
         self._preview = None
         return None
@@ -201,26 +213,26 @@ class Explorer(QWidget):
         preview = self.prepare()
         if preview is None:
             return
+        window = self.window_frames.value()
         with self._told():
-            self._look = preview.look(self.frame, self.window_frames.value())
+            if window != self._window:  # each has its threshold, for the same false alarms
+                with _silent(self.threshold):
+                    self.threshold.setValue(preview.threshold(window))
+                self._window = window
+                if self._ratio is not None and self._ratio.frames.preview is preview:
+                    self._ratio.frames.window = window
+                    self._ratio.layer.refresh()
+            self._look = preview.look(self.frame, window)
             self._show_found()
 
-    def _frame_changed(self, *_: object) -> None:
-        if self._look is not None and self.follow.isChecked():
+    def _search_soon(self, *_: object) -> None:
+        """Search again, where that was asked for before, once nothing changes any more."""
+        if self._look is not None:
             self._soon.start()
 
-    def _window_changed(self, *_: object) -> None:
-        if self._preview is None or self._look is None:
-            return
-        window = self.window_frames.value()
-        with self._told():  # as many false alarms as before, whatever the window
-            self.threshold.blockSignals(True)
-            self.threshold.setValue(self._preview.threshold(window))
-            self.threshold.blockSignals(False)
-        if self._ratio is not None and self._ratio.layer in self._viewer.layers:
-            self._ratio.frames.window = window
-            self._ratio.layer.refresh()
-        self.detect()
+    def _frame_changed(self, *_: object) -> None:
+        if self.follow.isChecked():
+            self._search_soon()
 
     def _threshold_changed(self, *_: object) -> None:
         if self._look is not None:
@@ -229,8 +241,8 @@ class Explorer(QWidget):
 
     def _show_found(self) -> None:
         """Put what exceeds the threshold into its layer, and say what it is."""
-        look, preview = self._look, self._preview
-        if look is None or preview is None:
+        look, preview, movie = self._look, self._preview, self.movie.currentData()
+        if look is None or preview is None or movie is None:
             return
         threshold, window = self.threshold.value(), self.window_frames.value()
         found = look.found(threshold)
@@ -246,6 +258,7 @@ class Explorer(QWidget):
                 symbol="square", border_width=_THIN,
             )  # fmt: skip
             self._viewer.layers.selection.active = active or layer
+        layer.scale, layer.translate = movie.scale[-3:], movie.translate[-3:]
         layer.data = points
         layer.features = found
         layer.border_color = colours or _LANDS
@@ -285,8 +298,9 @@ class Explorer(QWidget):
             low, high = limits_of(frames)
             limit = max(abs(low), abs(high))
             layer = self._viewer.add_image(
-                frames, name=RATIO, colormap="gray", contrast_limits=(-limit, limit)
-            )
+                frames, name=RATIO, colormap="gray", contrast_limits=(-limit, limit),
+                scale=movie.scale[-3:], translate=movie.translate[-3:],
+            )  # fmt: skip
             self._ratio = _Ratio(layer, frames)
 
     # ---- events ----------------------------------------------------------------------------
@@ -349,7 +363,7 @@ class RatioFrames(LazyFrames):
 
     def __init__(self, preview: ia.Preview, shape: tuple[int, int, int], window: int) -> None:
         super().__init__(shape, np.float32, lambda t: preview.look(t, self.window).image)
-        self.window = window
+        self.preview, self.window = preview, window
 
 
 class _Ratio:
@@ -364,10 +378,10 @@ def _is_movie(layer: Any) -> bool:
     data = layer.data
     return (
         getattr(layer, "multiscale", None) is False
+        and not getattr(layer, "rgb", True)  # labels have none
         and getattr(data, "ndim", 0) == 3
         and np.dtype(data.dtype).kind in "uif"
         and not isinstance(data, RatioFrames)
-        and not hasattr(layer, "num_colors")  # labels
     )
 
 
@@ -381,6 +395,16 @@ def _same(one: tuple[Any, ...], two: tuple[Any, ...]) -> bool:
     return len(one) == len(two) and all(
         a is b or (isinstance(a, (str, int)) and a == b) for a, b in zip(one, two, strict=True)
     )
+
+
+@contextmanager
+def _silent(widget: QWidget) -> Iterator[None]:
+    """Let a widget be set without telling anybody."""
+    widget.blockSignals(True)
+    try:
+        yield
+    finally:
+        widget.blockSignals(False)
 
 
 @contextmanager

@@ -40,9 +40,11 @@ def movie_reader(path: str | Sequence[str]) -> Callable[[Any], list[LayerData]] 
     Returns
     -------
     callable or None
-        Path → its layer; None for several paths and for results.
+        Path → its layer; None for several paths, for results and for other folders.
     """
     if not isinstance(path, str) or _is_result(Path(path)):
+        return None
+    if Path(path).is_dir() and Path(path).suffix.lower() != ".zarr":
         return None
     return lambda path: [movie_layer(LazyMovie(open_stack(path)))]
 

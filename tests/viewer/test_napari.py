@@ -102,8 +102,8 @@ def searched(viewer, explorer, folder: Path) -> tuple[Any, Any]:
     return viewer, explorer
 
 
-def _settle(milliseconds: int = 200) -> None:
-    """Let Qt do what it was asked to do soon."""
+def _settle(milliseconds: int = 60) -> None:
+    """Let Qt do what it was asked to do soon; of two timers the shorter one is served first."""
     from qtpy.QtCore import QEventLoop, QTimer
 
     loop = QEventLoop()
@@ -219,6 +219,7 @@ def test_what_is_not_ours_is_left_to_others(tmp_path) -> None:
         assert result_reader(path) is None
     assert movie_reader(str(tmp_path / "some.iscat")) is None
     assert movie_reader([str(tmp_path / "a.tif")]) is None
+    assert movie_reader(str(tmp_path)) is None
     reader = result_reader(str(tmp_path / "some.iscat"))
     assert reader is not None
     with pytest.raises(ia.DataError, match="no result"):
@@ -260,6 +261,7 @@ def test_the_window_acts_at_once_and_on_the_contrast(searched) -> None:
     layer = viewer.layers["contrast"]
     wide, snr = np.asarray(layer.data[60]), _found(viewer).features["snr"].iloc[0]
     explorer.window_frames.setValue(8)
+    _settle()
     narrow = np.asarray(layer.data[60])
     assert "--set background.window_frames=8" in explorer.settings.text()
     assert np.std(narrow) > 1.3 * np.std(wide)
@@ -284,18 +286,25 @@ def test_the_search_follows_the_frame(searched) -> None:
 
 def test_an_array_of_another_reader_is_searched_too(viewer, explorer, folder: Path) -> None:
     counts = tifffile.imread(folder / "movie.tif")
-    viewer.add_image(counts, name="counts")
+    scale = [0.5, 0.084, 0.084]  # it may know seconds and micrometres
+    viewer.add_image(counts, name="counts", scale=scale)
     explorer.config.setText(str(folder / "setup.toml"))
-    viewer.dims.set_current_step(0, 110)
+    viewer.dims.set_point(0, 110 * scale[0])
     explorer.detect()
-    np.testing.assert_allclose(_found(viewer).data[0], [110, 15.0, 45.0], atol=0.2)
+    layer = _found(viewer)
+    np.testing.assert_allclose(layer.data[0], [110, 15.0, 45.0], atol=0.2)
+    np.testing.assert_array_equal(layer.scale, scale)
+    explorer.show_ratio()
+    np.testing.assert_array_equal(viewer.layers["contrast"].scale, scale)
 
 
 def test_what_cannot_be_done_is_said_and_not_raised(viewer, explorer, folder: Path) -> None:
     explorer.detect()
     assert "open a movie first" in explorer.status.text()
-    viewer.add_image(np.zeros((8, 8)))  # no movie
-    assert explorer.movie.count() == 0
+    viewer.add_image(np.zeros((8, 8)))
+    viewer.add_image(np.zeros((8, 8, 3), dtype=np.uint8), rgb=True)
+    viewer.add_labels(np.zeros((4, 8, 8), dtype=int))
+    assert explorer.movie.count() == 0  # none of these is a movie
     viewer.open(str(folder / "movie.tif"), plugin=PLUGIN)
     for text, complaint in (
         (str(folder / "absent.toml"), "absent.toml"),
@@ -320,6 +329,32 @@ def test_what_cannot_be_done_is_said_and_not_raised(viewer, explorer, folder: Pa
     viewer.layers.clear()
     explorer.detect()
     assert "open a movie first" in explorer.status.text()
+
+
+def test_another_configuration_is_searched_with_at_once(searched, folder: Path) -> None:
+    _, explorer = searched
+    wide = ia.configure(folder / "setup.toml", settings={"background.window_frames": 40})
+    (folder / "wide.toml").write_text(ia.config_to_toml(wide), encoding="utf-8")
+    explorer.config.setText(str(folder / "wide.toml"))
+    explorer.config.editingFinished.emit()
+    _settle()
+    assert explorer.window_frames.value() == 40
+    assert "frames 60:100 over 20:60" in explorer.status.text()
+
+
+def test_a_widget_that_is_gone_hears_nothing(viewer, folder: Path) -> None:
+    from qtpy.QtCore import QCoreApplication, QEvent
+
+    from iscat_napari.explorer import Explorer
+
+    clicks = len(viewer.mouse_drag_callbacks)
+    widget = Explorer(viewer)
+    assert len(viewer.mouse_drag_callbacks) == clicks + 1
+    widget.deleteLater()
+    QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
+    viewer.open(str(folder / "movie.tif"), plugin=PLUGIN)  # would reach what is deleted
+    viewer.dims.set_current_step(0, 5)
+    assert len(viewer.mouse_drag_callbacks) == clicks
 
 
 # ---- events ----------------------------------------------------------------------------------
