@@ -13,6 +13,7 @@ from iscat_analysis._kernels.moving import (
     Light,
     Pictures,
     cut,
+    directions,
     draw_gradient,
     ready_frame,
     square_of,
@@ -87,37 +88,6 @@ def _left_over(data: FloatArray, here: FloatArray) -> tuple[float, float, float,
             used += 1.0 if d2[j] > 0 else 0.0
             light += d2[j]
     return chi2, used, np.sqrt(worst), light
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _directions(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
-    """Fill the columns of `out` (4, n) with V, V Vᵀ the inverse of F on the free parameters."""
-    n = index.size
-    scale = np.empty(n)
-    for i in range(n):
-        if not fisher[index[i], index[i]] > 0.0:
-            return False
-        scale[i] = 1.0 / np.sqrt(fisher[index[i], index[i]])
-    low = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            total = fisher[index[i], index[j]] * scale[i] * scale[j]
-            for k in range(j):
-                total -= low[i, k] * low[j, k]
-            if i == j:
-                if not total > 1e-12:
-                    return False
-                low[i, i] = np.sqrt(total)
-            else:
-                low[i, j] = total / low[j, j]
-    out[:] = 0.0
-    for k in range(n):  # column k of L⁻ᵀ
-        for i in range(k, -1, -1):
-            total = 1.0 if i == k else 0.0
-            for j in range(i + 1, k + 1):
-                total -= low[j, i] * out[index[j], k] / scale[j]
-            out[index[i], k] = total / low[i, i] * scale[i]
-    return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -205,7 +175,7 @@ def judge_frames(
             chi2, used, worst, amount = _left_over(data, here)
             numbers[r, 0], numbers[r, 1], numbers[r, 2] = value, chi2, used
             numbers[r, 3], numbers[r, 4] = worst, amount / max(used, 1.0)
-            if brief or not _directions(f, index, ways_here):
+            if brief or not directions(f, index, ways_here):
                 continue
             if PART * np.abs(ways_here[:2]).max() > field.pixel_nm:  # as good as singular
                 continue

@@ -458,24 +458,49 @@ def _along(gradient: FloatArray, step: FloatArray, out: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _invert(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
-    """Fill `out` with the inverse information on some parameters; tell whether there is one."""
+def directions(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
+    """Fill the columns of `out` (4, n) with V, V Vᵀ the inverse of F on the free parameters."""
     n = index.size
     scale = np.empty(n)
     for i in range(n):
         if not fisher[index[i], index[i]] > 0.0:
             return False
         scale[i] = 1.0 / np.sqrt(fisher[index[i], index[i]])
-    scaled = np.empty((n, n))
+    low = np.zeros((n, n))
     for i in range(n):
-        for j in range(n):
-            scaled[i, j] = fisher[index[i], index[j]] * scale[i] * scale[j]
-    if not np.linalg.det(scaled) > 1e-9:
+        for j in range(i + 1):
+            total = fisher[index[i], index[j]] * scale[i] * scale[j]
+            for k in range(j):
+                total -= low[i, k] * low[j, k]
+            if i == j:
+                if not total > 1e-9:
+                    return False
+                low[i, i] = np.sqrt(total)
+            else:
+                low[i, j] = total / low[j, j]
+    out[:] = 0.0
+    for k in range(n):  # column k of L⁻ᵀ
+        for i in range(k, -1, -1):
+            total = 1.0 if i == k else 0.0
+            for j in range(i + 1, k + 1):
+                total -= low[j, i] * out[index[j], k] / scale[j]
+            out[index[i], k] = total / low[i, i] * scale[i]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _invert(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
+    """Fill `out` with the inverse information on some parameters; tell whether there is one."""
+    n = index.size
+    ways = np.empty((4, n))
+    if not directions(fisher, index, ways):
         return False
-    inverse = np.linalg.inv(scaled)
     for i in range(n):
         for j in range(n):
-            out[i, j] = inverse[i, j] * scale[i] * scale[j]
+            total = 0.0
+            for k in range(n):
+                total += ways[index[i], k] * ways[index[j], k]
+            out[i, j] = total
     return True
 
 
