@@ -5,8 +5,10 @@ Where they do not, the optics are learned from these particles, and the analysis
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from iscat_analysis.calibration.optics import (
     FREE,
     LEAST_SIGHTS,
     OpticsCalibration,
+    Settings,
     Sight,
     maximise,
     settings_of,
@@ -24,7 +27,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.optics.forward import forward_model
+from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.pipeline.landing import has_landings
 from iscat_analysis.pipeline.microscope import calibrate_sights, goodness, microscopes
 from iscat_analysis.pipeline.sights import bound_sights, landing_sights, reach_nm
@@ -38,6 +41,8 @@ LEAST_TESTED = 4
 """Bright particles without which the optics are not even tested."""
 
 _TESTED = 24
+_STARTS_NM = tuple(range(-400, 401, 100))  # along each axis; rings are some 200 nm apart
+_FITTED = 3  # of these starts
 
 
 def learn_optics(
@@ -121,11 +126,34 @@ def _bound(
 def _median_p(sights: list[Sight], config: Config) -> float:
     """Median p-value of the brightest particles in the configured microscope."""
     settings = settings_of(config)
-    build = microscopes(config, max(map(reach_nm, sights)))
-    tested = with_masses(average_sights(sights[:_TESTED])[1], build, settings)
-    fitted = maximise(tested, build, settings, ()).sights
+    build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
     model = build(settings)
+    averages, placed = average_sights(sights[:_TESTED])
+    x, y = _centre(averages[0], model, build, settings)
+    moved = [replace(sight, x_nm=sight.x_nm + x, y_nm=sight.y_nm + y) for sight in placed]
+    fitted = maximise(with_masses(moved, build, settings), build, settings, ()).sights
     return float(np.median([goodness(sight, model)[1] for sight in fitted]))
+
+
+def _centre(
+    average: Sight,
+    model: ForwardModel,
+    build: Callable[[Settings], ForwardModel],
+    settings: Settings,
+) -> tuple[float, float]:
+    """Find the particle in the average picture [nm], whose brightest spot may be of a ring.
+
+    From a place half a ring away a fit ends in another optimum, with the mass of the other sign.
+    """
+    starts = [replace(average, x_nm=x, y_nm=y) for x in _STARTS_NM for y in _STARTS_NM]
+
+    def misfit(sight: Sight) -> float:
+        return goodness(sight, model)[0]
+
+    likely = sorted(with_masses(starts, build, settings), key=misfit)[:_FITTED]
+    fits = [maximise([sight], build, settings, ()).sights[0] for sight in likely]
+    best = min(fits, key=misfit)
+    return best.x_nm, best.y_nm
 
 
 def _verdict(tested: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,7 @@ from calibrations import configuration, make_sights
 from iscat_analysis.config import Config
 from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.pipeline import learning
-from iscat_analysis.pipeline.learning import LEAST_TESTED, learn_optics
+from iscat_analysis.pipeline.learning import LEAST_TESTED, _median_p, learn_optics
 
 MOVIE: Any = SimpleNamespace(name="movie.tif")
 
@@ -44,6 +45,16 @@ def test_optics_that_describe_the_particles_stay_without_a_word(
     assert summary["tested"] == 14
     assert summary["median_p"] > learning.REJECTED_P
     assert summary["calibrated"] is False
+
+
+@pytest.mark.parametrize("y_nm", [-250.0, 0.0, 250.0])
+def test_places_on_a_ring_do_not_condemn_the_optics(y_nm: float) -> None:
+    """Out of focus the brightest spot may be of a ring, in all pictures alike."""
+    config = configuration(focus_nm=-450.0)
+    for changes, fits in (({}, True), ({"focus_nm": -300.0}, False)):
+        sights, _, _ = make_sights(changes, 8, seed=5, config=config)
+        moved = [replace(sight, y_nm=sight.y_nm + y_nm) for sight in sights]
+        assert (_median_p(moved, config) > learning.REJECTED_P) == fits
 
 
 def test_too_few_particles_to_test_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
