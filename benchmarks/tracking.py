@@ -75,7 +75,7 @@ def judge(movie: Wanderers, result: ia.Result) -> tuple[dict[str, Any], pd.DataF
     of_track = {n: pd.Series(own[number == n]).mode().iloc[0] for n in tracks.index}
     tracks["particle"] = pd.Series(of_track)
     particles = movie.truth.groupby("track")[["mass_kda", "d_um2_s"]].first()
-    tracks = tracks.join(particles, on="particle", rsuffix="_true")
+    tracks = tracks.join(particles.add_suffix("_true"), on="particle")
     false = tracks[(tracks["particle"] < 0) & (tracks["n_frames"] > LONG)]
     true = own >= 0
     fitted = movie.truth.set_index(["track", "frame"]).reindex(

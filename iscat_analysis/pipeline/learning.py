@@ -130,7 +130,7 @@ def _median_p(sights: list[Sight], config: Config) -> float:
     model = build(settings)
     averages, placed = average_sights(sights[:_TESTED])
     x, y = _centre(averages[0], model, build, settings)
-    moved = [replace(sight, x_nm=sight.x_nm + x, y_nm=sight.y_nm + y) for sight in placed]
+    moved = [sight.placed(sight.x_nm + x, sight.y_nm + y) for sight in placed]
     fitted = maximise(with_masses(moved, build, settings), build, settings, ()).sights
     return float(np.median([goodness(sight, model)[1] for sight in fitted]))
 
