@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+import os
+import time
 from typing import Any
 
 import pytest
 from sketches import sketch_figures
+
+from iscat_analysis.threads import threads
 
 
 def dask_setup(worker: Any) -> None:
     """Prepare a worker."""
     del worker
     sketch_figures(pytest.MonkeyPatch())
+
+
+def busy(seconds: float, *, progress: object = None) -> tuple[int, int, float, float]:
+    """Give the process, its threads, and when it was busy."""
+    del progress
+    began = time.monotonic()
+    with threads(7) as pool:
+        count = pool._max_workers
+    time.sleep(seconds)
+    return os.getpid(), count, began, time.monotonic()

@@ -237,7 +237,7 @@ def partial_folder(folder: Path) -> Path:
 
 
 def is_resumable(folder: Path) -> bool:
-    """Whether a folder holds what an interrupted run left, and its chunks are still there.
+    """Whether a folder holds what an interrupted run left, and its chunks, if it finished any.
 
     Parameters
     ----------
@@ -247,10 +247,11 @@ def is_resumable(folder: Path) -> bool:
     Returns
     -------
     bool
-        Whether a run into it would go on where the last one stopped.
+        Whether a run into it would go on where the last one stopped, and nothing is lost.
     """
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        return bool(summary["interrupted"]) and partial_folder(folder).is_dir()
+        goes_on = partial_folder(folder).is_dir() or not summary["events"]
+        return bool(summary["interrupted"]) and goes_on
     except (OSError, ValueError, KeyError, TypeError):
         return False

@@ -11,11 +11,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
+from cluster_worker import busy
 from distributed import Client
 
 import iscat_analysis as ia
@@ -88,7 +91,7 @@ class Workers:
     def add(self, count: int) -> None:
         """Have so many workers."""
         for _ in range(count - len(self.client.nthreads())):
-            self._start("worker", "--nthreads", "1", "--no-nanny", "--preload", "cluster_worker")
+            self._start("worker", "--nthreads", "2", "--no-nanny", "--preload", "cluster_worker")
         wait_until(lambda: len(self.client.nthreads()) == count)
 
     def kill_one_at_work(self) -> str:
@@ -242,6 +245,17 @@ def test_posteriors_are_those_of_one_process(cluster: Workers, landing: Path, mo
         if one.posterior is not None and other.posterior is not None:
             assert np.array_equal(one.posterior.samples, other.posterior.samples)
     assert alone.table.equals(apart.table)
+
+
+def test_a_worker_does_one_job_at_a_time_with_all_its_threads(cluster: Workers) -> None:
+    """Its memory is that of one job, even where others ask it for more at the same time."""
+    cluster.add(2)
+    with places.open_place(scheduler_file=cluster.file) as place, ThreadPoolExecutor(5) as pool:
+        done = list(pool.map(lambda _: place.call(busy, 0.1), range(5)))
+    assert {count for _, count, _, _ in done} == {2}
+    for one, other in combinations(done, 2):
+        apart = one[3] <= other[2] or other[3] <= one[2]
+        assert one[0] != other[0] or apart
 
 
 def test_an_array_is_refused(cluster: Workers) -> None:
