@@ -19,7 +19,7 @@ from iscat_analysis.calibration.mass import STANDARD_ERROR
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.movie.addresses import MARK, beside, split_address
-from iscat_analysis.movie.folders import SUFFIXES, files_of, find_movies
+from iscat_analysis.movie.folders import SUFFIXES, find_movies, members_of
 from iscat_analysis.movie.ome_zarr import is_zarr
 
 ROLES = ("sample", "calibrant", "blank", "flat")
@@ -157,8 +157,8 @@ def read_growing(folder: Path, movies: Sequence[Path]) -> Table:
         raise ConfigError(f"{folder}: holds {' and '.join(TABLES)}; leave one table of the movies")
     root = folder.resolve()
     told = _read_file(tables[0], partial=True) if tables else Table(folder, root, ())
-    known = {file for row in told.rows for file in files_of(row.path)}
-    others = [path for path in movies if known.isdisjoint(files_of(path.resolve()))]
+    known = {file for row in told.rows for file in members_of(row.path)}
+    others = [path for path in movies if known.isdisjoint(members_of(path.resolve()))]
     more = _checked(folder, folder, _named(others), written=True, partial=True)
     return Table(folder, root, (*told.rows, *more.rows), told.absent)
 
@@ -193,7 +193,7 @@ def _checked(
             rows.append(row)
     first: dict[tuple[tuple[Path, ...], str], str] = {}
     for row in rows:
-        movie = (files_of(row.path), split_address(row.path)[1].strip("/"))
+        movie = (members_of(row.path), split_address(row.path)[1].strip("/"))
         if movie in first:
             problems.append(
                 f"{row.where}, path: {row.given} is the movie of {first[movie]} already; leave "

@@ -23,7 +23,7 @@ SUFFIXES = (*_TIFF, ".mp", ".npy", *_HDF5, _ZARR, *RECORDED)
 numbers only where something describes them."""
 
 _SNAPSHOT = "_snapshot"  # single frames, which have settings as well
-_REMEMBERED = 4096  # sets of files
+_REMEMBERED = 4096  # files that were looked into
 
 
 def files_of(address: Path) -> tuple[Path, ...]:
@@ -39,30 +39,58 @@ def files_of(address: Path) -> tuple[Path, ...]:
     tuple of Path
         Those that are there: one file, all files of a folder, or all of a set.
     """
-    path, part = split_address(address)
+    path, _ = split_address(address)
     if path.is_dir():
         return tuple(sorted(file for file in path.rglob("*") if file.is_file()))
-    if path.suffix.lower() in _TIFF:
-        try:
-            state = path.stat()
-        except OSError:
-            return (path,)
-        names = _described(path, state.st_size, state.st_mtime_ns)
+    return members_of(address)
+
+
+def members_of(address: Path) -> tuple[Path, ...]:
+    """Give the files of a set, or the file or folder itself, which tell one movie from another.
+
+    Parameters
+    ----------
+    address : Path
+        Of the movie.
+
+    Returns
+    -------
+    tuple of Path
+        Files of a set that are there; otherwise one path.
+    """
+    path, part = split_address(address)
+    if path.suffix.lower() in _TIFF and path.is_file():
+        names = _described(path, *_state(path))
         if len(names) > 1:
             members = dict.fromkeys(path.with_name(name) if name else path for name in names)
             return tuple(file for file in {**members, path: None} if file.is_file())
     return (path,) if part else recorded_files(path)
 
 
+def _state(path: Path) -> tuple[int, int]:
+    """Give size and time of change of a file, which tell it from earlier ones of its name."""
+    try:
+        state = path.stat()
+    except OSError:
+        return 0, 0
+    return state.st_size, state.st_mtime_ns
+
+
 @lru_cache(maxsize=_REMEMBERED)
 def _described(path: Path, size: int, changed_ns: int) -> tuple[str, ...]:
-    """Name the files of the set that a file describes; size and time tell it from later ones."""
+    """Name the files of the set that a file describes."""
     del size, changed_ns
     try:
         text = next((text for text in first_texts(path) if is_ome(text)), "")
         return files_of_set(text, path) if "FileName" in text else ()
     except (DataError, *WHAT_LIBRARIES_RAISE):  # whoever opens it says what is wrong with it
         return ()
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _holds_one(path: Path, size: int, changed_ns: int) -> bool:
+    del size, changed_ns
+    return is_one_movie(path)
 
 
 def find_movies(folder: Path, *, but: Collection[Path] = ()) -> list[Path]:
@@ -95,13 +123,12 @@ def _is_movie(path: Path) -> bool:
         return path.is_dir()
     if suffix in RECORDED:
         return description_of(path) is not None and not path.stem.endswith(_SNAPSHOT)
-    return path.is_file() and (suffix not in _HDF5 or is_one_movie(path))
+    return path.is_file() and (suffix not in _HDF5 or _holds_one(path, *_state(path)))
 
 
 def _once(paths: Sequence[Path]) -> list[Path]:
     """Leave one file of every set."""
-    sets = {path: frozenset(files) for path in paths if len(files := files_of(path)) > 1}
-    sets = {path: files for path, files in sets.items() if path.is_file()}
+    sets = {path: frozenset(files) for path in paths if len(files := members_of(path)) > 1}
     named: set[frozenset[Path]] = set()
     kept = []
     for path in paths:
