@@ -15,12 +15,14 @@ from iscat_cli.batch import (
     StandardsOption,
     print_batch,
 )
-from iscat_cli.console import Messages, failures, print_json, print_result
+from iscat_cli.console import Messages, failures, print_json, print_result, with_options
 from iscat_cli.options import (
     ConfigOption,
     DebugOption,
     JsonOption,
     QuietOption,
+    SchedulerFileOption,
+    SchedulerOption,
     SetOption,
     WorkersOption,
 )
@@ -61,6 +63,8 @@ def watch(
     standards: StandardsOption = None,
     kd: KdOption = None,
     kd_masses: KdMassesOption = None,
+    scheduler: SchedulerOption = "threads",
+    scheduler_file: SchedulerFileOption = None,
     interval: Annotated[
         float, typer.Option(metavar="S", help="Seconds between two looks at the folder.")
     ] = 10.0,
@@ -90,9 +94,11 @@ def watch(
                 standards=standards,
                 kd=None if kd is None else kd.value,
                 kd_masses_kda=None if kd_masses is None else numbers("--kd-masses", kd_masses),
+                scheduler=scheduler,
+                scheduler_file=scheduler_file,
                 interval_s=interval,
                 progress=progress,
-                notify=messages.notify,
+                notify=lambda line: messages.notify(with_options(line)),
                 command=context.obj,
             )
         if found is None:

@@ -116,7 +116,7 @@ def _page(
     shown.attrs["further"] = list(movies.columns[len(MOVIE_COLUMNS) :])
     scales = {each.summary["mass_scale"] for each in found if each.summary}
     return batch_page(
-        plan.table.source.stem,
+        plan.table.title,
         subtitle=summary_line(movies),
         curves=[_curve(each, groups[each.movie.name]) for each in found],
         movies=shown,

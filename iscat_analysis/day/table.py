@@ -101,6 +101,11 @@ class Table:
     rows: tuple[Row, ...]
     absent: tuple[str, ...] = ()
 
+    @property
+    def title(self) -> str:
+        """Name of the file without its suffix, or of the folder."""
+        return self.root.name if self.source.is_dir() else self.source.stem
+
 
 def read_table(source: Path) -> Table:
     """Read the table of a day.

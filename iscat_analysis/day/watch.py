@@ -21,9 +21,10 @@ from iscat_analysis.day import Batch, batch
 from iscat_analysis.day.equilibria import reaction_of
 from iscat_analysis.day.state import Records, claim_folder
 from iscat_analysis.day.table import TABLES, Table, read_growing, read_standards
-from iscat_analysis.errors import ConfigError, IscatError
+from iscat_analysis.errors import ConfigError, IscatError, SchedulerError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.folders import files_of, find_movies
+from iscat_analysis.places import THREADS
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.mass_action import Model
 
@@ -51,6 +52,8 @@ def watch(
     standards: str | Sequence[float] | None = None,
     kd: Model | None = None,
     kd_masses_kda: Sequence[float] | None = None,
+    scheduler: str = THREADS,
+    scheduler_file: str | Path | None = None,
     interval_s: float = 10.0,
     stop: threading.Event | None = None,
     progress: Progress = silent,
@@ -69,8 +72,9 @@ def watch(
         are, as for `batch`, and may grow as well; movies that it does not name are samples.
     out : str or Path, optional
         Folder of the batch; default ``batch`` in `folder`.
-    config, settings, standards, kd, kd_masses_kda : optional
-        As for `batch`; `standards` are used once there is a calibrant.
+    config, settings, standards, kd, kd_masses_kda, scheduler, scheduler_file : optional
+        As for `batch`; `standards` are used once there is a calibrant, and one movie is analysed
+        after another.
     interval_s : float
         Time between two looks at the folder [s].
     stop : threading.Event, optional
@@ -115,6 +119,8 @@ def watch(
         config=configure(config, settings=settings),
         kd=kd,
         kd_masses_kda=kd_masses_kda,
+        scheduler=scheduler,
+        scheduler_file=scheduler_file,
         retry=False,
         progress=_of_one_movie(progress),
         notify=tell,
@@ -134,7 +140,7 @@ def watch(
                 try:
                     run.bring_up_to_date(found[0], ended)
                     done = found
-                except (OSError, ConfigError) as error:
+                except (OSError, ConfigError, SchedulerError) as error:
                     seen.tell(f"{error}; waiting until it is mended")
     except KeyboardInterrupt:
         tell("ending; the page is being completed")

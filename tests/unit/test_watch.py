@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from tiff_files import write_ome_set
 import iscat_analysis as ia
 from iscat_analysis.day import run
 from iscat_analysis.day.watch import PATIENCE, Look, _Folder
-from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.errors import ConfigError, DataError, SchedulerError
 from iscat_cli import main
 
 pytestmark = pytest.mark.usefixtures("all_sketched")
@@ -345,6 +346,30 @@ def test_a_row_that_is_wrong_is_waited_for(folder: Path, made: Path, fits: list[
     assert found is not None
     assert found.movies["state"].tolist() == ["done"]
     assert fits == ["a.tif"]
+
+
+@pytest.mark.parametrize("error", [SchedulerError("it is gone"), OSError("no disk")])
+def test_what_hinders_all_movies_is_told_once_and_waited_for(
+    folder: Path, made: Path, fits: list[str], monkeypatch, error: Exception
+) -> None:
+    left = [error, error, error]
+
+    def hindered(*arguments: Any, **options: Any) -> ia.Batch:
+        if left:
+            raise left.pop()
+        return ia.batch(*arguments, **options)
+
+    monkeypatch.setattr("iscat_analysis.day.watch.batch", hindered)
+    shutil.copy(made / "movie.tif", folder / "a.tif")
+    day = Day(("1 done", lambda: None))
+    found = day.watch(folder)
+    assert found is not None
+    assert found.failed == ()
+    assert fits == ["a.tif"]
+    assert [line for line in day.told if str(error) in line] == [
+        f"{error}; waiting until it is mended"
+    ]
+    assert f">{folder.name}<" in found.page.read_text(encoding="utf-8")
 
 
 def test_a_folder_without_movies_ends_without_a_page(folder: Path, tmp_path: Path) -> None:
