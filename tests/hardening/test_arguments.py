@@ -164,7 +164,11 @@ def nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         real(*arguments)
         raise ConfigError("that would be enough to begin the work")
 
+    def interrupt(_: object) -> None:
+        raise KeyboardInterrupt
+
     monkeypatch.setattr(config_module, "load_config", enough)
+    monkeypatch.setattr("iscat_analysis.day.watch._Folder.look", interrupt)
     return tmp_path
 
 
@@ -179,6 +183,12 @@ def run(program: Any, arguments: list[str]) -> None:
     if status == 2 and "--debug" not in arguments:
         lines = [line for line in err.getvalue().splitlines() if line.strip()]
         assert len(lines) == 1, err.getvalue()
+
+
+def test_watching_ends_nowhere(nowhere: Path) -> None:
+    run(main, ["watch", "."])
+    run(main, ["watch", "absent"])
+    assert not list(nowhere.iterdir())
 
 
 def test_any_command_line_ends_well(nowhere: Path) -> None:
