@@ -1,4 +1,4 @@
-"""`iscat export`: tracks for other programs."""
+"""`iscat export`: events and tracks for other programs."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ import typer
 from iscat_cli.console import Messages, failures, print_result
 from iscat_cli.options import DebugOption, OverwriteOption, QuietOption
 
-EXAMPLE = """Example: a table that trackpy.imsd and the rest of trackpy take.
+EXAMPLE = """Example: tracks for trackpy, and landings for PhotoMol.
 
     iscat export moving.iscat --to trackpy --out moving.csv
+
+    iscat export standards.iscat --to photomol
 """
 
 
@@ -22,23 +24,28 @@ class Program(StrEnum):
 
     TRACKPY = "trackpy"
     NAPARI = "napari"
+    PHOTOMOL = "photomol"
+    PICASSO = "picasso"
 
 
 def export(
     context: typer.Context,
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Output folder of iscat fit --mode track.")
-    ],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of iscat fit.")],
     *,
     to: Annotated[
         Program,
-        typer.Option("--to", help="trackpy: a CSV table; napari: an array (track, t, y, x)."),
+        typer.Option(
+            "--to",
+            help="trackpy: a CSV table; napari: an array (track, t, y, x), of landings (t, y, x); "
+            "photomol: a CSV table like Refeyn's; picasso: HDF5 and YAML.",
+        ),
     ],
     out: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="The file; default the folder's name with .trackpy.csv or .napari.npy.",
+            help="The file; default the folder's name with .trackpy.csv, .napari.npy, "
+            ".photomol.csv or .picasso.hdf5.",
             show_default=False,
         ),
     ] = None,
@@ -46,15 +53,18 @@ def export(
     quiet: QuietOption = False,
     debug: DebugOption = False,
 ) -> None:
-    """Write the tracks of an analysis as trackpy or napari read them.
+    """Write the events or tracks of an analysis as other programs read them.
 
-    trackpy: columns y, x, frame, particle, mass, signal, ep, z, places in pixels. napari:
-    numpy.load gives what viewer.add_tracks takes.
+    Of landings, those whose status is ok. trackpy: columns y, x, frame, particle (of tracks), mass,
+    signal, ep, z, places in pixels. napari: numpy.load gives what viewer.add_tracks, of landings
+    viewer.add_points, takes. photomol: columns contrasts and masses_kDa, which iscat species reads
+    back with errors. picasso: locs with frame, x, y, photons, lpx, lpy, and mass_kda beside them.
     """
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
-        from iscat_analysis.report.exchange import export_tracks
-        from iscat_analysis.report.numbers import count
+        from iscat_analysis.report.exchange import export_result
 
-        path, tracks = export_tracks(folder, to.value, out=out, overwrite=overwrite)
-        print_result(f"{count(tracks, 'track')} in {path}")
+        written = export_result(folder, to.value, out=out, overwrite=overwrite)
+        for note in written.notes:
+            messages.notify(note)
+        print_result(f"{written.text} in {written.path}")

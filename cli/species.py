@@ -65,9 +65,9 @@ def species(
         list[Path],
         typer.Argument(
             metavar="EVENTS",
-            help="Output folder of iscat fit, fits.csv or .parquet, a table of Refeyn's (h5, csv), "
-            "or any CSV with a column mass_kda. Of several, the others are compared with the "
-            "first.",
+            help="Output folder of iscat fit, fits.csv or .parquet, a table of Refeyn's or for "
+            "PhotoMol (h5, csv), or any CSV with a column mass_kda. Of several, the others are "
+            "compared with the first.",
             show_default=False,
         ),
     ],

@@ -104,6 +104,8 @@ if TYPE_CHECKING:
     from iscat_analysis.records import Status as Status
     from iscat_analysis.records import TrackStatus as TrackStatus
     from iscat_analysis.report.exchange import to_napari as to_napari
+    from iscat_analysis.report.exchange import to_photomol as to_photomol
+    from iscat_analysis.report.exchange import to_picasso as to_picasso
     from iscat_analysis.report.exchange import to_trackpy as to_trackpy
     from iscat_analysis.report.exchange import tracked_rows as tracked_rows
     from iscat_analysis.result import Bounds as Bounds
@@ -146,6 +148,8 @@ _HOME = {
     "StoredResult": "pipeline.stored",
     "Preview": "pipeline.preview",
     "Look": "pipeline.looks",
+    "to_photomol": "report.exchange",
+    "to_picasso": "report.exchange",
     "configure": "config",
     "batch": "day",
     "Batch": "day",
@@ -243,6 +247,8 @@ __all__ = [
     "schema",
     "simulate_movie",
     "to_napari",
+    "to_photomol",
+    "to_picasso",
     "to_trackpy",
     "tracked_rows",
     "watch",

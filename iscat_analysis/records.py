@@ -456,6 +456,61 @@ class PosteriorResult:
 
 
 @dataclass(frozen=True)
+class Trace:
+    """Contrast of one landing or leaving against frame.
+
+    Each frame is set against the mean of those without the particle, and projected onto the fitted
+    picture with the weights of the likelihood: where the picture is right, a frame with the
+    particle has the contrast of the event, and one without it has 0, but for noise.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first frame.
+    contrast : ndarray, shape (t,)
+        Signed peak contrast of the particle in each frame; NaN where a frame was left out.
+    sigma : float
+        Standard deviation of one frame that its photoelectrons and read noise make.
+    frame : int
+        First frame of the new state.
+    half_width : int
+        `frame` ± `half_width` holds the step with a probability of 95 %.
+    used : (int, int)
+        Half-open range of frames within which the event was fitted.
+    before, after : float
+        Fitted contrast before and after the step; one of them is 0.
+    """
+
+    first: int
+    contrast: FloatArray
+    sigma: float
+    frame: int
+    half_width: int
+    used: tuple[int, int]
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Ratiometric images of one landing or leaving, of windows that slide over its step.
+
+    Attributes
+    ----------
+    frames : tuple of int
+        First frame of the window after, of each image.
+    window_frames : int
+        Frames in each of the two windows.
+    contrast : ndarray of float32, shape (n, y, x)
+        After over before minus 1; NaN where a pixel was left out.
+    """
+
+    frames: tuple[int, ...]
+    window_frames: int
+    contrast: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
 class EventView:
     """What a report shows of one fitted event.
 
@@ -473,6 +528,10 @@ class EventView:
         (data − model) in standard deviations.
     posterior : PosteriorResult or None
         The chain, where sampled.
+    trace : Trace or None
+        Contrast against frame, of landing movies.
+    clip : Clip or None
+        Of landing movies, the first events.
     """
 
     event: int
@@ -482,6 +541,8 @@ class EventView:
     model: FloatArray
     residual: FloatArray
     posterior: PosteriorResult | None = None
+    trace: Trace | None = None
+    clip: Clip | None = None
 
 
 @dataclass(frozen=True)

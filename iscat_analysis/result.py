@@ -107,7 +107,8 @@ class Result:
         Returns
         -------
         EventView
-            `contrast`, `model` and `residual`, each of shape (y, x).
+            `contrast`, `model` and `residual`, each of shape (y, x); of landing movies `trace`, the
+            contrast of every frame around the step, and of the first events `clip`.
 
         Raises
         ------
@@ -117,7 +118,7 @@ class Result:
         return view_of(self.analysis, event)
 
     def view(self, event: int) -> Figure:
-        """Draw data, model and residual of one event.
+        """Draw data, model and residual of one event; of landing movies its trace too.
 
         Parameters
         ----------
@@ -127,7 +128,7 @@ class Result:
         Returns
         -------
         matplotlib.figure.Figure
-            Three panels.
+            Three panels, and below them the contrast against frame where there is a trace.
 
         Raises
         ------

@@ -1,4 +1,6 @@
-"""Event tables of Refeyn's programs: what their fits found, and the calibration they used.
+"""Event tables of other programs: Refeyn's, which PhotoMol reads too, and Picasso's.
+
+Of Refeyn's, what their fits found, and the calibration they used.
 
 A calibration is odd-symmetric: contrast c and mass m obey c = s·m + sign(m)·o, so that a particle
 that leaves weighs what it weighed when it landed; m = sign(−c)·(−|c| − o)/s.  A plain line through
@@ -19,11 +21,14 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.hdf5 import SIGNATURE, Hdf5Reader
+from iscat_analysis.movie.hdf5 import SIGNATURE, Hdf5Reader, StoredArray
 from iscat_analysis.records import FloatArray
 
 TABLE_COLUMNS = ("frame", "x_px", "y_px", "contrast", "mass_kda")
 """The columns of `read_events`, in order."""
+
+FURTHER_COLUMNS = ("sigma_mass_kda", "snr")
+"""Columns after them, of tables that ``iscat export`` wrote."""
 
 _NAMES: Mapping[str, tuple[str, ...]] = {
     "frame": ("frame_indices",),
@@ -31,8 +36,16 @@ _NAMES: Mapping[str, tuple[str, ...]] = {
     "y_px": ("y_coords",),
     "contrast": ("contrasts",),
     "mass_kda": ("masses_kDa", "calibrated_values"),
+    "sigma_mass_kda": ("sigma_mass_kda",),
+    "snr": ("snr",),
 }
 """What each column is called in the files, newest last."""
+
+_LOCS: Mapping[str, str] = {
+    "frame": "frame", "x_px": "x", "y_px": "y", "contrast": "contrast", "mass_kda": "mass_kda",
+    "sigma_mass_kda": "sigma_mass_kda", "snr": "snr",
+}  # fmt: skip
+"""The same in Picasso's ``locs``; its own program knows the first three."""
 
 _CALIBRATIONS = (
     ("mass_model/c_1kDa", "mass_model/o_0kDa", "mass_model/contrasts", "mass_model/masses"),
@@ -89,10 +102,12 @@ class StoredCalibration:
 
 
 def read_events(path: Path) -> pd.DataFrame:
-    """Read an event table written by Refeyn's programs.
+    """Read an event table of another program.
 
-    HDF5 (``masses_kDa`` with ``mass_model``, or ``calibrated_values`` with ``calibration``; also
-    inside ``.mpr`` movies) or CSV (``eventsFitted.csv``), told apart by their first bytes.
+    Refeyn's, and tables that PhotoMol reads: HDF5 (``masses_kDa`` with ``mass_model``, or
+    ``calibrated_values`` with ``calibration``; also inside ``.mpr`` movies) or CSV
+    (``eventsFitted.csv``; ``contrasts`` or ``masses_kDa`` are enough).  Picasso's: HDF5 with
+    ``locs``, if these have a column ``mass_kda``, as those of ``iscat export`` do.
 
     Parameters
     ----------
@@ -102,8 +117,9 @@ def read_events(path: Path) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        One row per event: frame (int), x_px, y_px, contrast, mass_kda [kDa], negative for a
-        particle that leaves; NaN where the file has no value.  Masses that are not stored are
+        One row per event: frame (int; NaN without), x_px, y_px, contrast, mass_kda [kDa], negative
+        for a particle that leaves; NaN where the file has no value; then those of
+        `FURTHER_COLUMNS` that it has.  Masses that are not stored are
         computed from the stored calibration.  ``attrs["calibration"]`` is that calibration as a
         mapping (the fields of `StoredCalibration`), or None; `stored_calibration` turns it back.
 
@@ -158,9 +174,10 @@ def _table(
     if len(set(lengths.values())) > 1:
         shown = ", ".join(f"{_NAMES[name][0]} {length}" for name, length in lengths.items())
         raise DataError(f"{path}: its columns differ in length ({shown}); export it again")
-    frame = columns["frame"]
+    nothing = np.full(next(iter(lengths.values())), np.nan)
+    frame = columns.get("frame", nothing)
     bad = ~((np.abs(frame) < _LARGEST_FRAME) & (frame >= 0) & (frame == np.floor(frame)))
-    if bad.any():
+    if bad.any() and "frame" in columns:
         row = int(np.argmax(bad))
         raise DataError(
             f"{path}: frame_indices is {frame[row]:g} in row {row}, which is no frame number; "
@@ -172,12 +189,14 @@ def _table(
     }
     mass = cleaned.get("mass_kda")
     if mass is None or np.isnan(mass).all():
-        contrast = cleaned["contrast"]
+        contrast = cleaned.get("contrast", nothing)
         mass = np.full(contrast.shape, np.nan)
         if calibration is not None:
             mass = calibration.mass_kda(contrast)
-    table = pd.DataFrame({**cleaned, "frame": frame.astype(np.int64), "mass_kda": mass})
-    table = table[list(TABLE_COLUMNS)]
+    known = {**dict.fromkeys(TABLE_COLUMNS, nothing), **cleaned, "mass_kda": mass}
+    if "frame" in columns:
+        known["frame"] = frame.astype(np.int64)
+    table = pd.DataFrame({name: known[name] for name in _NAMES if name in known})
     table.attrs["calibration"] = None
     if calibration is not None:
         table.attrs["calibration"] = {
@@ -192,6 +211,9 @@ def _table(
 def _from_hdf5(path: Path) -> tuple[dict[str, FloatArray], StoredCalibration | None]:
     with closing(Hdf5Reader(path)) as reader:
         try:
+            locs = reader.records("locs")
+            if locs is not None:
+                return _from_locs(locs, path), None
             group = _group(reader, path)
             columns = {}
             for column, names in _NAMES.items():
@@ -199,13 +221,29 @@ def _from_hdf5(path: Path) -> tuple[dict[str, FloatArray], StoredCalibration | N
                 found = next((value for value in values if value is not None), None)
                 if found is not None:
                     columns[column] = found
-                elif column != "mass_kda":
-                    raise DataError(
-                        f"{path}: lacks {names[0]}; it is not an event table, export it again"
-                    )
             return columns, _calibration(reader, group, path)
         finally:
             reader.data.close()
+
+
+def _from_locs(locs: StoredArray, path: Path) -> dict[str, FloatArray]:
+    """Take Picasso's localisations for events, if they have masses."""
+    if "mass_kda" not in (locs.dtype.names or ()):
+        raise DataError(
+            f"{path}: holds localisations of Picasso's, which have photons and no mass; give "
+            "fits.csv, or localisations with a column mass_kda, as iscat export writes them"
+        )
+    if "group" in (locs.dtype.names or ()):
+        raise DataError(
+            f"{path}: holds localisations in groups, many of one particle, and not events; give "
+            "tracks.csv, which has one mass for each track"
+        )
+    rows = locs.read(0, locs.shape[0])
+    return {
+        column: rows[name].astype(np.float64)
+        for column, name in _LOCS.items()
+        if name in (locs.dtype.names or ())
+    }
 
 
 def _group(reader: Hdf5Reader, path: Path) -> str:
@@ -294,9 +332,9 @@ def _places(header: list[str], path: Path) -> dict[str, int]:
         found = next((name for name in names if name in header), None)
         if found is not None:
             places[column] = header.index(found)
-        elif column != "mass_kda":
-            raise DataError(
-                f"{path}: lacks the column {names[0]} in its first line; it is not a table of "
-                "fitted events (eventsFitted.csv), export it again"
-            )
+    if not {"contrast", "mass_kda"} & set(places):
+        raise DataError(
+            f"{path}: lacks the columns contrasts and masses_kDa in its first line, and needs one "
+            "of them; it is not a table of fitted events (eventsFitted.csv), export it again"
+        )
     return places

@@ -182,7 +182,17 @@ class Hdf5Reader:
         """Find a dataset of numbers and all of its bytes; None where there is none."""
         with self._believing_nothing():
             dataset = self._dataset(name)
+            if dataset is not None and dataset.dtype.names:
+                raise self._no_numbers(dataset, name)
             return None if dataset is None else self._stored(dataset, name)
+
+    def records(self, name: str) -> StoredArray | None:
+        """Find a table of named numbers, one value each; None where there is no such thing."""
+        with self._believing_nothing():
+            dataset = self._dataset(name)
+            if dataset is None or not dataset.dtype.names or len(dataset.shape or ()) != 1:
+                return None
+            return self._stored(dataset, name)
 
     def number(self, name: str) -> float | None:
         """Read a dataset of one number; None where there is none, or it is something else."""
@@ -260,12 +270,10 @@ class Hdf5Reader:
                 f"{self._path}: the data of {name} lie in other files; "
                 "export the file with its data inside"
             )
-        plain = dtype.kind in "iuf" and dataset.id.get_type().equal(h5py.h5t.py_create(dtype))
-        if not plain or not shape:
-            raise DataError(
-                f"{self._path}: {name} holds {dtype}, shape {shape}, "
-                "not an array of integers or floats; export it again"
-            )
+        fields = [dtype[field] for field in dtype.names or ()] or [dtype]
+        plain = all(field.kind in "iuf" for field in fields)
+        if not (plain and shape and dataset.id.get_type().equal(h5py.h5t.py_create(dtype))):
+            raise self._no_numbers(dataset, name)
         total = math.prod(shape) * dtype.itemsize
         if total > max(_BOMB_BYTES, _BOMB_RATIO * len(self.data)):
             raise DataError(
@@ -330,6 +338,12 @@ class Hdf5Reader:
         if count != expected or (where[:, :2] <= 0).any():
             raise self._incomplete(name, f"it lists {count} chunks where it needs {expected}")
         return where
+
+    def _no_numbers(self, dataset: h5py.Dataset, name: str) -> DataError:
+        return DataError(
+            f"{self._path}: {name} holds {dataset.dtype}, shape {dataset.shape}, "
+            "not an array of integers or floats; export it again"
+        )
 
     def _incomplete(self, name: str, how: str) -> DataError:
         return DataError(

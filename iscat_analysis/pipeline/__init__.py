@@ -352,7 +352,11 @@ def analyse(
     )
     summary |= {
         **further,
-        "input": {"path": provenance.input_path, "sha256": provenance.input_sha256},
+        "input": {
+            "path": provenance.input_path,
+            "sha256": provenance.input_sha256,
+            "shape": list(movie.shape),
+        },
         "seed": provenance.seed,
         "versions": dict(provenance.versions),
         "interrupted": found.interrupted,

@@ -348,7 +348,13 @@ def read_contrasts(path: Path) -> pd.DataFrame:
         return read_events(path)  # says what is wrong with it
     names = first.decode("utf-8", errors="replace").lstrip("\ufeff").strip().split(",")
     if not {"event", "contrast", "mass_kda", "status"} <= set(names):
-        return read_events(path)
+        table = read_events(path)
+        if table["contrast"].isna().all():
+            raise DataError(
+                f"{path}: has masses and no contrasts, which a calibration begins with; export the "
+                "table with contrasts"
+            )
+        return table
     try:
         table = pd.read_csv(path)
         good = table[table["status"] == Status.OK.value]

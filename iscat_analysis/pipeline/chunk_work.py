@@ -16,6 +16,7 @@ from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.pipeline.chunks import (
+    CLIPS,
     FRAME_COLUMN,
     REPEATS_COLUMN,
     VIEWS,
@@ -238,7 +239,7 @@ def analyse_chunk(
     return Done(
         core=core,
         table=table,
-        views=tuple(_view(row, step) for row, step in zip(rows, steps, strict=True))[:VIEWS],
+        views=tuple(map(_view, rows, fitter.with_traces(steps[:VIEWS], CLIPS))),
         good=chunk.good[inside].copy(),
         light=light[inside],
         masked=~chunk.usable,
@@ -268,4 +269,10 @@ def _row(number: int, step: FittedStep) -> Row:
 
 def _view(row: Row, step: FittedStep) -> EventView:
     view = view_of(row)
-    return replace(view, row_px=step.region.rows[0], column_px=step.region.columns[0])
+    return replace(
+        view,
+        row_px=step.region.rows[0],
+        column_px=step.region.columns[0],
+        trace=step.trace,
+        clip=step.clip,
+    )

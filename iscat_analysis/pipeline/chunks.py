@@ -48,6 +48,9 @@ HALO = 2
 VIEWS = 1000
 """Events whose images are kept for the report."""
 
+CLIPS = 250
+"""Events of which a clip is kept; the page holds fewer."""
+
 FRAME_COLUMN = "frame_ci95"
 """Column after `EVENT_COLUMNS`: half-width of the 95 % interval of ``frame`` [frames]."""
 
@@ -410,6 +413,8 @@ class Merged:
         # the images are merged; holding them for every chunk would grow with the movie
         small = np.empty((2, 0, 0))
         kept = done.views if sum(len(d.views) for d in self._done) < 2 * VIEWS else ()
+        if sum(view.clip is not None for d in self._done for view in d.views) >= 2 * CLIPS:
+            kept = tuple(replace(view, clip=None) for view in kept)
         ends = done.ends_e
         if len(self._done) > 1:
             self._done[-1] = replace(self._done[-1], ends_e=small)

@@ -6,7 +6,7 @@ import hashlib
 import json
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,11 @@ from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pipeline.chunks import Done
-from iscat_analysis.records import EventView, FloatArray
+from iscat_analysis.records import Clip, EventView, FloatArray, Trace
 from iscat_analysis.search.empty import EmptySpread
+
+_NO_TRACE = (0.0,) * 9
+_NO_CLIP = (0,) * 4
 
 
 class Shelf:
@@ -177,7 +180,18 @@ def packed_views(views: Sequence[EventView]) -> dict[str, FloatArray]:
         For `unpacked_views`.
     """
     flat = [np.stack([v.contrast, v.model, v.residual]).reshape(3, -1) for v in views]
+    traces = [v.trace for v in views]
+    clips = [v.clip for v in views]
     return {
+        "traces": np.concatenate([np.empty(0), *(t.contrast for t in traces if t)]),
+        "trace_marks": np.array([_NO_TRACE if t is None else _marks(t) for t in traces]),
+        "clips": np.concatenate(
+            [np.empty(0, dtype=np.float32), *(c.contrast.ravel() for c in clips if c)]
+        ),
+        "clip_frames": np.array([n for c in clips if c for n in c.frames], dtype=np.int64),
+        "clip_marks": np.array(
+            [_NO_CLIP if c is None else (*c.contrast.shape, c.window_frames) for c in clips]
+        ),
         "images": np.concatenate(flat or [np.empty((3, 0))], axis=1),
         "corners": np.array([(v.row_px, v.column_px) for v in views]).reshape(-1, 2),
         "sizes": np.array([v.contrast.shape for v in views]).reshape(-1, 2),
@@ -198,12 +212,48 @@ def unpacked_views(data: Mapping[str, Any]) -> tuple[EventView, ...]:
         Numbered from 0.
     """
     views, at = [], 0
+    traces, clips = _traces(data), _clips(data)
     for i, (row, column) in enumerate(data["corners"]):
         rows, columns = (int(n) for n in data["sizes"][i])
         stack = data["images"][:, at : at + rows * columns].reshape(3, rows, columns)
         at += rows * columns
-        views.append(EventView(i, int(row), int(column), stack[0], stack[1], stack[2]))
+        views.append(
+            EventView(
+                i, int(row), int(column), stack[0], stack[1], stack[2],
+                trace=next(traces), clip=next(clips),
+            )
+        )  # fmt: skip
     return tuple(views)
+
+
+def _marks(trace: Trace) -> tuple[float, ...]:
+    """Give the numbers of a trace beside its contrasts."""
+    return (
+        trace.contrast.size, trace.first, trace.sigma, trace.frame, trace.half_width,
+        *trace.used, trace.before, trace.after,
+    )  # fmt: skip
+
+
+def _traces(data: Mapping[str, Any]) -> Iterator[Trace | None]:
+    at = 0
+    for size, first, sigma, frame, half_width, start, stop, before, after in data["trace_marks"]:
+        end = at + int(size)
+        yield None if end == at else Trace(
+            int(first), data["traces"][at:end], float(sigma), int(frame), int(half_width),
+            (int(start), int(stop)), float(before), float(after),
+        )  # fmt: skip
+        at = end
+
+
+def _clips(data: Mapping[str, Any]) -> Iterator[Clip | None]:
+    at, frame = 0, 0
+    for images, rows, columns, window in data["clip_marks"].tolist():
+        end, stop = at + images * rows * columns, frame + images
+        yield None if not images else Clip(
+            tuple(data["clip_frames"][frame:stop].tolist()), window,
+            data["clips"][at:end].reshape(images, rows, columns),
+        )  # fmt: skip
+        at, frame = end, stop
 
 
 def _columns(way: Trajectory | None) -> FloatArray:

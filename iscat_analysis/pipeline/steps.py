@@ -34,11 +34,14 @@ from iscat_analysis.pipeline.repeats import step_controls, step_repeats
 from iscat_analysis.pipeline.scene import Region, Scene, judge, reported_steps
 from iscat_analysis.pipeline.sidelobes import Sieve
 from iscat_analysis.pipeline.tasks import Task, TaskBuilder
+from iscat_analysis.pipeline.traces import clip_of, trace_of
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     Candidate,
+    Clip,
     FloatArray,
     Status,
+    Trace,
     Windows,
 )
 from iscat_analysis.search.empty import EmptySpread
@@ -82,6 +85,12 @@ class FittedStep:
         Frames before and after the step that were used.
     repeats : ndarray
         From `iscat_analysis.pipeline.repeats.step_repeats`.
+    others : tuple of Step
+        Those that the fit knew of.
+    trace : Trace or None
+        From `iscat_analysis.pipeline.traces.trace_of`.
+    clip : Clip or None
+        From `iscat_analysis.pipeline.traces.clip_of`.
     """
 
     step: Step
@@ -91,6 +100,9 @@ class FittedStep:
     n_before: int
     n_after: int
     repeats: FloatArray
+    others: tuple[Step, ...] = ()
+    trace: Trace | None = None
+    clip: Clip | None = None
 
 
 class ChunkFitter:
@@ -219,6 +231,33 @@ class ChunkFitter:
                 steps=everything, neighbours=self._neighbours,
             )  # fmt: skip
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
+
+    def with_traces(self, fitted: Sequence[FittedStep], clips: int) -> list[FittedStep]:
+        """Add what the report shows of steps beside their images.
+
+        Parameters
+        ----------
+        fitted : sequence of FittedStep
+            From `run`.
+        clips : int
+            How many, the first, have a clip.
+
+        Returns
+        -------
+        list of FittedStep
+            With trace and clip, where the frames allow.
+        """
+        chunk, window = self._chunk, self._window
+
+        def one(number: int) -> FittedStep:
+            step = fitted[number]
+            trace = trace_of(step, chunk, window, self._neighbours, self._tasks)
+            clip = None
+            if number < clips:
+                clip = clip_of(step, self._scene, chunk, window, self._pattern)
+            return replace(step, trace=trace, clip=clip)
+
+        return list(self._pool.map(one, range(len(fitted))))
 
     # ---- search ----------------------------------------------------------------------------
 
@@ -375,12 +414,13 @@ class ChunkFitter:
             return None
         step = replace(step, at=task.at)
         seen = near[index] if scene.lines is None else [i for i in range(len(steps)) if i != index]
+        others = tuple(steps[i] for i in seen)
         repeats = step_repeats(
             self._chunk, event, task.region, task.windows, step,
-            [steps[i] for i in seen], self._neighbours, self._pattern,
+            others, self._neighbours, self._pattern,
         )  # fmt: skip
         fitted = FittedStep(
-            step, event, task.region, task.windows, task.n_before, task.n_after, repeats
+            step, event, task.region, task.windows, task.n_before, task.n_after, repeats, others
         )
         return fitted, task
 

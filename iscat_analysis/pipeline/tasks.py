@@ -211,6 +211,51 @@ class TaskBuilder:
         image = step.image[shared[1]]
         if image.shape != (region.rows[1] - region.rows[0], region.columns[1] - region.columns[0]):
             return None
+        known = self._added(step, neighbours, region, patch, pattern, image)
+        reach = self._stride + self._stride // 2 + 1
+        search = (step.at.frame - reach, step.at.frame + reach + 1)
+        return locate_step(patch, step.sign * image, search, known=step.sign * known)
+
+    def added(
+        self,
+        step: Step,
+        neighbours: Sequence[Step],
+        region: Region,
+        patch: Patch,
+        image: FloatArray,
+    ) -> FloatArray:
+        """Height that neighbours, and the motion of the pattern, add to each frame.
+
+        Parameters
+        ----------
+        step : Step
+            The step.
+        neighbours : sequence of Step
+            Others.
+        region : Region
+            Which pixels, in the full frame.
+        patch : Patch
+            Frames of these pixels.
+        image : ndarray, shape (ny, nx)
+            Contrast of the step there, which is the unit.
+
+        Returns
+        -------
+        ndarray, shape (t,)
+            To be taken off what `frame_heights` measures.
+        """
+        local = self._pattern.local(region, step.at.frame) if self._pattern else None
+        return self._added(step, neighbours, region, patch, local, image)
+
+    def _added(
+        self,
+        step: Step,
+        neighbours: Sequence[Step],
+        region: Region,
+        patch: Patch,
+        pattern: LocalPattern | None,
+        image: FloatArray,
+    ) -> FloatArray:
         known = np.zeros(len(patch.counts))
         frames = np.arange(patch.first, patch.first + known.size)
         for other in neighbours:
@@ -223,11 +268,10 @@ class TaskBuilder:
             padded[here] = other.image[inside]
             height = crosstalk(patch, image, padded)
             known += other.sign * height * (frames >= other.at.frame)
-        if self._pattern and pattern:
-            known += self._drifting(step, image, shared[1], patch, self._pattern, pattern)
-        reach = self._stride + self._stride // 2 + 1
-        search = (step.at.frame - reach, step.at.frame + reach + 1)
-        return locate_step(patch, step.sign * image, search, known=step.sign * known)
+        own = self._neighbours.shared(step, region)
+        if self._pattern and pattern and own is not None:
+            known += self._drifting(step, image, own[1], patch, self._pattern, pattern)
+        return known
 
     def _drifting(
         self,

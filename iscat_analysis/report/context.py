@@ -19,7 +19,7 @@ from iscat_analysis.records import (
     Status,
     free_parameters,
 )
-from iscat_analysis.report.event_figures import event_images
+from iscat_analysis.report.event_figures import event_details
 from iscat_analysis.report.headline import (
     caution,
     headline,
@@ -68,7 +68,7 @@ def report_context(
     """
     source = analysis.provenance.input_path
     tracked = analysis.tracks is not None  # then `tracks_context` says what is said of events
-    images = {} if tracked else event_images(analysis, table)
+    images = {} if tracked else event_details(analysis, table)
     sampled = [view for view in analysis.views if view.posterior is not None]
     started = _when(analysis.provenance.started)
     said = headline(analysis, table)
@@ -98,6 +98,7 @@ def report_context(
         "main_label": main_quantity(analysis).label.capitalize(),
         "signs": _SIGNS.get(main_quantity(analysis).column),
         "events": {} if tracked else event_rows(analysis, table),
+        "has_traces": any(detail.trace for detail in images.values()),
         "images": {str(row): list(packed) for row, packed in images.items()},
         "embedding_note": f"To keep this page small it holds the images of the first {len(images)} "
         f"of {len(table)} events."

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
-import base64
-import io
-import math
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.image import imsave
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from iscat_analysis.records import Analysis, EventView, FloatArray, PosteriorResult
+from iscat_analysis.report.films import clip_shown
 from iscat_analysis.report.numbers import LABELS, UNITS, number
+from iscat_analysis.report.scales import (
+    DIVERGING,
+    GREYS,
+    display_range,
+    png_of,
+    residual_limit,
+    shaded,
+)
 from iscat_analysis.report.style import BLUE, INK, new_figure
+from iscat_analysis.report.traces import draw_trace, trace_svg, trace_words
 
 EVENT_FIGURES = 12
 """Events whose images are drawn into the folder, at most."""
@@ -29,11 +35,9 @@ EVENT_FIGURES = 12
 CORNER_FIGURES = 20
 """Posteriors that are drawn, at most."""
 
-IMAGE_BYTES = 2_000_000
-"""Event images inside the page, at most; the events after that are table rows only."""
-
-RESIDUAL_LIMIT = 4.0
-"""Residual images span at least ± this many standard deviations."""
+DETAIL_BYTES = 2_000_000
+"""Images, traces and clips of events inside the page, at most; the events after that are table rows
+only."""
 
 CREDIBLE_LEVELS = (0.95, 0.75, 0.5, 0.25)
 """Shades of a posterior's joint densities: the share of the probability inside each."""
@@ -41,10 +45,32 @@ CREDIBLE_LEVELS = (0.95, 0.75, 0.5, 0.25)
 POSTERIOR_BINS = 24
 """Bins per axis of a drawn posterior."""
 
-DIVERGING = LinearSegmentedColormap.from_list("residual", ["#00528C", "#FAFAF8", "#BE4600"])
+_TRACE_INCHES = 2.1  # height of a drawn trace
+_SHADES = 64  # of each scale of the images in the page
 
 HALO = [withStroke(linewidth=1.6, foreground="black", alpha=0.7)]
 """Makes white text readable on any image."""
+
+
+class EventDetail(NamedTuple):
+    """What the page shows of one event when its row is opened; empty where there is none.
+
+    Attributes
+    ----------
+    images, scales : str
+        Data, model and residual side by side as a PNG in base64, and the ranges of their scales.
+    trace, words : str
+        Contrast against frame as an SVG element, and what it shows.
+    clip, sliding : str
+        Ratiometric images one after the other as an element, and what it shows.
+    """
+
+    images: str
+    scales: str
+    trace: Markup
+    words: str
+    clip: Markup
+    sliding: str
 
 
 def event_figures(analysis: Analysis, most: int) -> Iterator[tuple[str, Figure]]:
@@ -95,8 +121,8 @@ def corner_figures(analysis: Analysis) -> Iterator[tuple[str, Figure]]:
         yield f"corner_{event:04d}", corner(posterior, event)
 
 
-def event_images(analysis: Analysis, table: pd.DataFrame) -> dict[int, tuple[str, str]]:
-    """Pack the images of the first events for the page, as many as `IMAGE_BYTES` hold.
+def event_details(analysis: Analysis, table: pd.DataFrame) -> dict[int, EventDetail]:
+    """Pack what the page shows of the first events, as many as `DETAIL_BYTES` hold.
 
     Parameters
     ----------
@@ -107,31 +133,44 @@ def event_images(analysis: Analysis, table: pd.DataFrame) -> dict[int, tuple[str
 
     Returns
     -------
-    dict of int to (str, str)
-        By row of the table: data, model and residual side by side as a PNG in base64, and the
-        ranges of their scales in words.
+    dict of int to EventDetail
+        By row of the table.
     """
-    gray = mpl.colormaps["gray"]
     unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
-    packed: dict[int, tuple[str, str]] = {}
+    packed: dict[int, EventDetail] = {}
     spent = 0
     for row, view in views_of_rows(table, analysis.views):
         low, high = display_range([view.contrast, view.model], analysis.scheme)
         limit = residual_limit(view.residual)
-        gap = np.zeros((view.contrast.shape[0], 2, 4))
-        strip = [
-            gray((view.contrast - low) / (high - low)), gap,
-            gray((view.model - low) / (high - low)), gap,
-            DIVERGING((view.residual / limit + 1) / 2),
-        ]  # fmt: skip
-        buffer = io.BytesIO()
-        imsave(buffer, np.concatenate(strip, axis=1), format="png")
-        text = base64.b64encode(buffer.getvalue()).decode("ascii")
-        spent += len(text)
-        if spent > IMAGE_BYTES:
+        scales = f"{unit} {number(low)} to {number(high)}; residual ±{limit:g} σ"
+        images = _strip(view, low, high, limit)
+        trace = clip = Markup()
+        words = sliding = ""
+        if view.trace is not None:
+            trace, words = trace_svg(view.trace), trace_words(view.trace)
+        if view.clip is not None:
+            turn = view.trace.frame if view.trace else view.clip.frames[0]
+            clip, sliding = clip_shown(view.clip, low, high, turn)
+        detail = EventDetail(images, scales, trace, words, clip, sliding)
+        spent += sum(map(len, detail))
+        if spent > DETAIL_BYTES:
             break
-        packed[row] = (text, f"{unit} {number(low)} to {number(high)}; residual ±{limit:g} σ")
+        packed[row] = detail
     return packed
+
+
+def _strip(view: EventView, low: float, high: float, limit: float) -> str:
+    """Put data, model and residual side by side, with a palette of `_SHADES` for each scale."""
+    data, model = (
+        shaded((part - low) / (high - low), _SHADES) for part in (view.contrast, view.model)
+    )
+    residual = shaded((view.residual / limit + 1) / 2, _SHADES, _SHADES)
+    gap = shaded(np.full((view.contrast.shape[0], 2), np.nan), _SHADES)
+    ramp = np.linspace(0, 1, _SHADES)
+    return png_of(
+        np.concatenate([data, gap, model, gap, residual], axis=1),
+        np.concatenate([GREYS(ramp), DIVERGING(ramp)]),
+    )
 
 
 def views_of_rows(table: pd.DataFrame, views: Sequence[EventView]) -> list[tuple[int, EventView]]:
@@ -156,50 +195,6 @@ def views_of_rows(table: pd.DataFrame, views: Sequence[EventView]) -> list[tuple
     for row, event in enumerate(numbers):
         first.setdefault(event, row)
     return [(first[view.event], view) for view in views if view.event in first]
-
-
-def display_range(images: Sequence[FloatArray], scheme: str) -> tuple[float, float]:
-    """Choose the grey scale that images share.
-
-    Parameters
-    ----------
-    images : sequence of ndarray
-        Contrast (dark field: photoelectrons).
-    scheme : str
-        As in `Analysis`.
-
-    Returns
-    -------
-    float, float
-        Symmetric about zero for contrast, from the lowest to the highest in dark field; always a
-        proper interval.
-    """
-    values = np.concatenate([np.ravel(image) for image in images])
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return -1.0, 1.0
-    if scheme == "darkfield":
-        low, high = (float(v) for v in np.quantile(values, [0.002, 0.999]))
-        return (low, high) if high > low else (low, low + 1.0)
-    limit = float(np.quantile(np.abs(values), 0.998))
-    return (-limit, limit) if limit > 0 else (-1.0, 1.0)
-
-
-def residual_limit(residual: FloatArray) -> float:
-    """Choose the range of a residual image: a few standard deviations, more where it needs more.
-
-    Parameters
-    ----------
-    residual : ndarray, shape (y, x)
-        Residual [standard deviations].
-
-    Returns
-    -------
-    float
-        Half the range, at least `RESIDUAL_LIMIT`.
-    """
-    values = np.abs(residual[np.isfinite(residual)])
-    return max(RESIDUAL_LIMIT, math.ceil(np.quantile(values, 0.995))) if values.size else 4.0
 
 
 def credible_shades(counts: FloatArray) -> NDArray[np.int64]:
@@ -256,7 +251,7 @@ def scale_bar(axes: Axes, columns: int, rows: int, pixel_size_nm: float) -> None
 
 
 def triptych(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
-    """Draw data, model and residual of one event.
+    """Draw data, model and residual of one event, and its contrast against frame.
 
     Parameters
     ----------
@@ -270,11 +265,17 @@ def triptych(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
     Returns
     -------
     Figure
-        Three panels.
+        Three panels, and below them a fourth of an event with a trace.
     """
     rows, columns = view.contrast.shape
     aspect = float(np.clip(rows / columns, 0.3, 3.0))
-    figure = new_figure(8.4, 2.55 * aspect + 1.0, constrained=False)
+    below = 0.0 if view.trace is None else _TRACE_INCHES
+    height = 2.55 * aspect + 1.0 + below
+    figure = new_figure(8.4, height, constrained=False)
+    if view.trace is not None:
+        draw_trace(
+            figure.add_axes((0.075, 0.5 / height, 0.875, (below - 0.6) / height)), view.trace
+        )
     low, high = display_range([view.contrast, view.model], scheme)
     limit = residual_limit(view.residual)
     unit = "photoelectrons" if scheme == "darkfield" else "contrast"
@@ -283,15 +284,15 @@ def triptych(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
         ("model", view.model, "gray", low, high, unit),
         ("residual", view.residual, DIVERGING, -limit, limit, "σ"),
     ]
-    bottom = 0.62 / (2.55 * aspect + 1.0)
-    tall = 2.55 * aspect / (2.55 * aspect + 1.0)
+    bar_bottom, bottom = (below + 0.48) / height, (below + 0.62) / height
+    tall = 2.55 * aspect / height
     for place, (title, image, cmap, lower, upper, label) in enumerate(panels):
         x = 0.02 + place * 0.33
         axes = figure.add_axes((x, bottom, 0.3, tall))
         shown = axes.imshow(image, cmap=cmap, vmin=lower, vmax=upper, interpolation="nearest")
         axes.set(xticks=[], yticks=[], title=f"event {view.event}, {title}" if not place else title)
         axes.spines[:].set_visible(False)
-        bar = figure.add_axes((x, bottom * 0.78, 0.3, bottom * 0.1))
+        bar = figure.add_axes((x, bar_bottom, 0.3, 0.062 / height))
         figure.colorbar(shown, cax=bar, orientation="horizontal", label=label).ax.locator_params(
             nbins=4
         )

@@ -1,22 +1,47 @@
-"""Tracks in the layouts of other programs: a table for trackpy, an array for napari."""
+"""Events and tracks in the layouts of other programs: trackpy, napari, PhotoMol, Picasso."""
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
+import h5py
 import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import FloatArray, Status, track_numbers
+from iscat_analysis.report.numbers import count
 from iscat_analysis.report.tables import CSV_DIGITS
 
-Layout = Literal["trackpy", "napari"]
+Layout = Literal["trackpy", "napari", "photomol", "picasso"]
 
-SUFFIXES = {"trackpy": ".csv", "napari": ".npy"}
-"""Files that `export_tracks` writes."""
+SUFFIXES = {"trackpy": ".csv", "napari": ".npy", "photomol": ".csv", "picasso": ".hdf5"}
+"""Files that `export_result` writes; Picasso's has a second one, ``.yaml``, beside it."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written for another program.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    text : str
+        What is in it, as "3 tracks".
+    notes : tuple of str
+        What is not in it, one sentence each.
+    """
+
+    path: Path
+    text: str
+    notes: tuple[str, ...] = ()
 
 
 def to_trackpy(fits: pd.DataFrame) -> pd.DataFrame:
@@ -35,16 +60,7 @@ def to_trackpy(fits: pd.DataFrame) -> pd.DataFrame:
         along one axis [px]), ``z`` [nm], by particle and frame.  ``trackpy.imsd(table, mpp, fps)``
         takes it as it is, with mpp the side of a pixel in µm.
     """
-    rows = _tracked(fits)
-    pixel = (rows["x_nm"] / rows["x_px"]).median() if len(rows) else 1.0
-    error = np.sqrt((rows["sigma_x_nm"] ** 2 + rows["sigma_y_nm"] ** 2) / 2) / pixel
-    return pd.DataFrame(
-        {
-            "y": rows["y_px"], "x": rows["x_px"], "frame": rows["frame"].astype("int64"),
-            "particle": rows["particle"], "mass": rows["mass_kda"],
-            "signal": rows["contrast"].abs(), "ep": error, "z": rows["z_nm"],
-        }
-    ).reset_index(drop=True)  # fmt: skip
+    return _trackpy(_tracked(fits))
 
 
 def to_napari(fits: pd.DataFrame) -> FloatArray:
@@ -82,71 +98,251 @@ def tracked_rows(fits: pd.DataFrame) -> pd.DataFrame:
     return _tracked(fits).drop_duplicates(["particle", "frame"])
 
 
-def _tracked(fits: pd.DataFrame) -> pd.DataFrame:
-    """Rows that belong to a track and have a place, by track and frame."""
-    numbers = track_numbers(fits)
-    known = numbers.notna() & fits["x_px"].notna() & (fits["status"] != Status.SIDELOBE)
-    rows = fits[known].assign(particle=numbers[known].astype("int64"))
-    return rows.sort_values(["particle", "frame"], kind="stable")
+def to_photomol(fits: pd.DataFrame, *, masses: bool = True) -> pd.DataFrame:
+    """Put landings and leavings into the layout of Refeyn's event tables, which PhotoMol reads.
+
+    Parameters
+    ----------
+    fits : pandas.DataFrame
+        One row per event: `Result.table`, or ``fits.csv``.
+    masses : bool
+        Whether the masses are masses; without calibration they are not, and PhotoMol can calibrate
+        the contrasts.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Events whose status is ok: ``frame_indices``, ``x_coords, y_coords`` [px], ``contrasts`` and
+        ``masses_kDa``, negative for a particle that leaves; and ``sigma_mass_kda`` [kDa] and
+        ``snr``, which those programs do not know and ``iscat species`` reads.
+    """
+    rows = _events(fits)
+    table = pd.DataFrame(
+        {
+            "frame_indices": rows["frame"].astype("int64"), "x_coords": rows["x_px"],
+            "y_coords": rows["y_px"], "contrasts": rows["contrast"],
+        }
+    )  # fmt: skip
+    if masses:
+        table["masses_kDa"] = rows["mass_kda"]
+        table["sigma_mass_kda"] = rows["sigma_mass_kda"]
+    table["snr"] = rows["snr"]
+    return table.reset_index(drop=True)
 
 
-def export_tracks(
+def to_picasso(fits: pd.DataFrame, *, tracked: bool = False) -> pd.DataFrame:
+    """Put events, or the fits of mode ``track``, into the layout of Picasso's localisations.
+
+    Parameters
+    ----------
+    fits : pandas.DataFrame
+        One row per event, or per particle and frame: `Result.table`, or ``fits.csv``.
+    tracked : bool
+        Whether it is of mode ``track``.
+
+    Returns
+    -------
+    pandas.DataFrame
+        ``frame, x, y`` [px], ``photons`` (scattered photons that were collected), ``lpx, lpy``
+        (standard errors of x and y [px]); where the height was fitted ``z, lpz`` [nm]; of tracks
+        ``group``, the track.  Then what Picasso does not know: ``contrast, snr``, and where it was
+        fitted ``mass_kda, sigma_mass_kda``.  ``sx, sy, bg, ellipticity, net_gradient`` have no
+        counterpart: a picture with rings has no width of a Gaussian, and its background is divided
+        out.  Events are those whose status is ok.
+    """
+    rows = _tracked(fits) if tracked else _events(fits)
+    rows = rows[rows[["sigma_x_nm", "sigma_y_nm"]].notna().all(axis=1)]
+    pixel = _pixel_nm(rows)
+    columns: dict[str, Any] = {
+        "frame": rows["frame"].to_numpy(np.uint32), "x": rows["x_px"], "y": rows["y_px"],
+        "photons": rows["n_scattered"], "lpx": rows["sigma_x_nm"] / pixel,
+        "lpy": rows["sigma_y_nm"] / pixel,
+    }  # fmt: skip
+    if rows["sigma_z_nm"].notna().any():
+        columns |= {"z": rows["z_nm"], "lpz": rows["sigma_z_nm"]}
+    if tracked:
+        columns["group"] = rows["particle"].to_numpy(np.int32)
+    columns |= {"contrast": rows["contrast"], "snr": rows["snr"]}
+    if rows["sigma_mass_kda"].notna().any():
+        columns |= {"mass_kda": rows["mass_kda"], "sigma_mass_kda": rows["sigma_mass_kda"]}
+    table = pd.DataFrame(columns).reset_index(drop=True)
+    floats = table.select_dtypes("float64").columns
+    return table.astype(dict.fromkeys(floats, np.float32))
+
+
+def export_result(
     folder: Path, layout: Layout, *, out: Path | None = None, overwrite: bool = False
-) -> tuple[Path, int]:
-    """Write the tracks of an output folder as another program reads them.
+) -> Exported:
+    """Write the events or tracks of an output folder as another program reads them.
 
     Parameters
     ----------
     folder : Path
-        Output of mode ``track``.
+        Output of ``iscat fit``.
     layout : str
-        ``"trackpy"``: a CSV table; ``"napari"``: an array in NumPy's format.
+        ``"trackpy"``: a CSV table, of events without ``particle``; ``"napari"``: an array in
+        NumPy's format, (track, t, y, x) for a layer of tracks or (t, y, x) for one of points;
+        ``"photomol"``: a CSV table like Refeyn's, of events; ``"picasso"``: HDF5 with ``locs``, and
+        its metadata in a file ``.yaml`` beside it.
     out : Path, optional
-        The file; default ``tracks_trackpy.csv`` or ``tracks_napari.npy`` beside the folder, after
-        its name.
+        The file; default the folder's name with ``.trackpy.csv``, ``.napari.npy``,
+        ``.photomol.csv`` or ``.picasso.hdf5``.
     overwrite : bool
         Replace an existing file.
 
     Returns
     -------
-    path : Path
-        The file.
-    tracks : int
-        How many tracks are in it.
+    Exported
+        Where, and what.
 
     Raises
     ------
     ConfigError
         There is no such layout.
     DataError
-        The folder holds no tracks, or the file exists or cannot be written.
+        The folder holds nothing that the layout could show, or the file exists or cannot be
+        written.
     """
     if layout not in get_args(Layout):
         raise ConfigError(f"layout = {layout!r}: choose one of {', '.join(get_args(Layout))}")
     path = folder.with_name(f"{folder.stem}.{layout}{SUFFIXES[layout]}") if out is None else out
-    if not (folder / "tracks.csv").exists():
-        raise DataError(f'{folder}: holds no tracks.csv, which fit.mode = "track" writes')
-    if path.exists() and not overwrite:
-        raise DataError(f"{path}: exists already; give another name, or pass `overwrite`")
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    if not (folder / "fits.csv").exists():
+        raise DataError(f"{folder}: holds no fits.csv; give an output folder of iscat fit")
+    beside = path.with_suffix(".yaml")
+    for taken in [path, *([beside] if layout == "picasso" else [])]:
+        if taken.exists() and not overwrite:
+            raise DataError(f"{taken}: exists already; give another name, or pass `overwrite`")
+    if layout == "picasso" and path == beside:
+        raise DataError(f"{path}: is the name of Picasso's metadata; let `out` end in .hdf5")
+    tracked = (folder / "tracks.csv").exists()
+    if tracked and layout == "photomol":
+        raise DataError(
+            f"{folder}: holds tracks, and PhotoMol reads landings and leavings; tracks.csv has the "
+            "mass of every track"
+        )
     try:
         fits = pd.read_csv(folder / "fits.csv", keep_default_na=False, na_values=[""])
         path.parent.mkdir(parents=True, exist_ok=True)
-        if layout == "trackpy":
-            table = to_trackpy(fits)
-            table.to_csv(partial, index=False, float_format=f"%.{CSV_DIGITS}g")
-            tracks = table["particle"].nunique()
+        if layout == "picasso":
+            locs, info = to_picasso(fits, tracked=tracked), _metadata(folder, fits)
+            _replacing(beside, lambda partial: _write_yaml(partial, info))
+            _replacing(path, lambda partial: _write_locs(partial, locs, info))
         else:
-            array = to_napari(fits)
-            with partial.open("wb") as file:
-                np.save(file, array)
-            tracks = np.unique(array[:, 0]).size
-        partial.replace(path)
+            _replacing(path, lambda partial: _write(partial, fits, layout, tracked, folder))
     except OSError as error:
         named = path if error.filename is None else error.filename
         raise DataError(f"{named}: cannot be read or written ({error.strerror})") from None
     except (KeyError, ValueError) as error:  # a table that is none of ours
         raise DataError(f"{folder / 'fits.csv'}: is not a table of fits ({error})") from None
+    if tracked:
+        return Exported(path, count(int(_tracked(fits)["particle"].nunique()), "track"))
+    good = len(_events(fits))
+    notes = []
+    if left := len(fits) - good:
+        notes.append(f"{count(left, 'event')} whose status is not ok, or without a place, left out")
+    if layout == "photomol" and not _calibrated(folder):
+        fixed = _summary(folder).get("mode") == "localize"
+        why = "mode localize fits no mass" if fixed else "without [calibration] there are no masses"
+        notes.append(f"contrasts alone, for {why}")
+    return Exported(path, count(good, "event"), tuple(notes))
+
+
+def _write(partial: Path, fits: pd.DataFrame, layout: Layout, tracked: bool, folder: Path) -> None:
+    if layout == "napari":
+        array = to_napari(fits) if tracked else _events(fits)[["frame", "y_px", "x_px"]].to_numpy()
+        with partial.open("wb") as file:
+            np.save(file, np.ascontiguousarray(array, dtype=np.float64))
+        return
+    if layout == "photomol":
+        table = to_photomol(fits, masses=_calibrated(folder))
+    else:
+        table = to_trackpy(fits) if tracked else _trackpy(_events(fits))
+    table.to_csv(partial, index=False, float_format=f"%.{CSV_DIGITS}g")
+
+
+def _replacing(path: Path, write: Callable[[Path], None]) -> None:
+    """Put a file in place once it is whole."""
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        write(partial)
+        partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
-    return path, int(tracks)
+
+
+def _write_locs(path: Path, locs: pd.DataFrame, info: dict[str, Any]) -> None:
+    with h5py.File(path, "w") as file:
+        file.create_dataset("locs", data=locs.to_records(index=False))
+        file.create_dataset("metadata", data=json.dumps([info]))
+
+
+def _write_yaml(path: Path, info: dict[str, Any]) -> None:
+    """Write plain values as YAML, of which JSON's are a part."""
+    lines = [f"{key}: {json.dumps(value)}\n" for key, value in info.items()]
+    path.write_text("".join(lines), encoding="utf-8")
+
+
+def _metadata(folder: Path, fits: pd.DataFrame) -> dict[str, Any]:
+    """Say of the movie what Picasso must know."""
+    shape = _summary(folder).get("input", {}).get("shape")
+    if not shape:
+        raise DataError(
+            f"{folder / 'summary.json'}: does not say how large the movie is, as newer results do; "
+            "analyse it again"
+        )
+    frames, rows, columns = shape
+    return {
+        "Generated by": f"iscat-analysis {version('iscat-analysis')}",
+        "Width": columns, "Height": rows, "Frames": frames,
+        "Pixelsize": round(_pixel_nm(fits), 6),
+    }  # fmt: skip
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    """Read ``summary.json``; empty where it cannot be read."""
+    try:
+        found = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _calibrated(folder: Path) -> bool:
+    """Whether masses are masses; a table of unknown origin is believed."""
+    summary = _summary(folder)
+    return summary.get("mode") != "localize" and summary.get("mass_scale") != "absolute model"
+
+
+def _trackpy(rows: pd.DataFrame) -> pd.DataFrame:
+    """Give positions in trackpy's columns; ``particle`` where they are linked."""
+    error = np.sqrt((rows["sigma_x_nm"] ** 2 + rows["sigma_y_nm"] ** 2) / 2) / _pixel_nm(rows)
+    table = pd.DataFrame(
+        {
+            "y": rows["y_px"], "x": rows["x_px"], "frame": rows["frame"].astype("int64"),
+            "mass": rows["mass_kda"], "signal": rows["contrast"].abs(), "ep": error,
+            "z": rows["z_nm"],
+        }
+    )  # fmt: skip
+    if "particle" in rows:
+        table.insert(3, "particle", rows["particle"])
+    return table.reset_index(drop=True)
+
+
+def _pixel_nm(rows: pd.DataFrame) -> float:
+    """Give the side of a pixel [nm]."""
+    known = rows[rows["x_px"] != 0]
+    return float((known["x_nm"] / known["x_px"]).median()) if len(known) else 1.0
+
+
+def _events(fits: pd.DataFrame) -> pd.DataFrame:
+    """Give the events that are fit to be used, by frame."""
+    good = (fits["status"] == Status.OK) & fits["x_px"].notna() & fits["contrast"].notna()
+    return fits[good].sort_values("frame", kind="stable")
+
+
+def _tracked(fits: pd.DataFrame) -> pd.DataFrame:
+    """Rows that belong to a track and have a place, by track and frame."""
+    numbers = track_numbers(fits)
+    known = numbers.notna() & fits["x_px"].notna() & (fits["status"] != Status.SIDELOBE)
+    rows = fits[known].assign(particle=numbers[known].astype("int64"))
+    return rows.sort_values(["particle", "frame"], kind="stable")

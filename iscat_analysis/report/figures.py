@@ -18,9 +18,10 @@ from iscat_analysis.records import (
     Status,
     free_parameters,
 )
-from iscat_analysis.report.event_figures import HALO, display_range, scale_bar
+from iscat_analysis.report.event_figures import HALO, scale_bar
 from iscat_analysis.report.headline import as_contrasts, label_of, main_quantity
 from iscat_analysis.report.numbers import UNITS
+from iscat_analysis.report.scales import display_range
 from iscat_analysis.report.spread import counted, spread_figure
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, VERMILLION, new_figure
 from iscat_analysis.report.track_figures import track_figures

@@ -1,4 +1,4 @@
-"""Tracks as small films: data, model and residual, frame by frame, looped."""
+"""Small films, looped: tracks as data, model and residual; landings as ratiometric clips."""
 
 from __future__ import annotations
 
@@ -8,14 +8,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 from PIL import Image
 
-from iscat_analysis.records import Analysis, Film, FloatArray
-from iscat_analysis.report.event_figures import DIVERGING, display_range, residual_limit
-from iscat_analysis.report.numbers import number
+from iscat_analysis.records import Analysis, Clip, Film, FloatArray
+from iscat_analysis.report.numbers import count, number
+from iscat_analysis.report.scales import (
+    DIVERGING,
+    GREYS,
+    display_range,
+    png_of,
+    residual_limit,
+    shaded,
+)
 
 FILM_BYTES = 3_000_000
 """Films inside the page, at most; those after that are left out."""
@@ -23,8 +30,12 @@ FILM_BYTES = 3_000_000
 FRAME_MS = 120
 """Time for which a frame is shown."""
 
+CLIP_MS = 180
+"""The same of a clip."""
+
 _GAP = 2  # pixels between the three pictures
 _SHADES = 48  # of each scale: fewer make smaller films, and noise hides the steps
+_CLIP_SHADES = 24  # of a clip, of which a page holds hundreds
 
 
 @dataclass(frozen=True)
@@ -94,13 +105,48 @@ def films_shown(analysis: Analysis, folder: Path | None = None) -> Iterator[Film
         )
 
 
+def clip_shown(clip: Clip, low: float, high: float, still: int) -> tuple[Markup, str]:
+    """Make the film of a clip: its images below each other, of which a page shows one at a time.
+
+    Parameters
+    ----------
+    clip : Clip
+        Of one event.
+    low, high : float
+        Ends of the grey scale.
+    still : int
+        Frame whose image is shown to those who want no motion.
+
+    Returns
+    -------
+    film : Markup
+        An element; ``style.css`` moves its image.
+    words : str
+        What it shows.
+    """
+    number, rows, columns = clip.contrast.shape
+    grey = shaded((clip.contrast - low) / (high - low), _CLIP_SHADES).reshape(-1, columns)
+    image = png_of(grey, GREYS(np.linspace(0, 1, _CLIP_SHADES)))
+    at = int(np.argmin(np.abs(np.array(clip.frames) - still)))
+    film = Markup(
+        f'<div class="clip" style="aspect-ratio:{columns}/{rows}"><img '
+        f'style="animation:slide {CLIP_MS * number}ms steps({number}) infinite;'
+        f'--still:{-100 * at / number:.4g}%" alt="Ratiometric clip around the step" '
+        f'src="data:image/png;base64,{image}"></div>'
+    )
+    frames = count(clip.window_frames, "frame")
+    return film, (
+        f"{frames} over the {clip.window_frames} before them, from frame {clip.frames[0]} on to "
+        f"{clip.frames[-1]}; grey as in the data"
+    )
+
+
 def _frames(film: Film, low: float, high: float, limit: float) -> NDArray[np.uint8]:
     """Colour data, model and residual side by side, shape (t, y, 3 x + gaps, 3)."""
-    gray = mpl.colormaps["gray"]
     gap = np.zeros((*film.contrast.shape[:2], _GAP, 4))
     strip = [
-        gray(_stepped((film.contrast - low) / (high - low))), gap,
-        gray(_stepped((film.model - low) / (high - low))), gap,
+        GREYS(_stepped((film.contrast - low) / (high - low))), gap,
+        GREYS(_stepped((film.model - low) / (high - low))), gap,
         DIVERGING(_stepped((film.residual / limit + 1) / 2)),
     ]  # fmt: skip
     return np.asarray(255 * np.concatenate(strip, axis=2)[..., :3], dtype=np.uint8)

@@ -71,7 +71,7 @@ def draw_event(analysis: Analysis, event: int) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Three panels.
+        Three panels, and below them a trace where the event has one.
 
     Raises
     ------

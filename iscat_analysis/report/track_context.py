@@ -10,7 +10,7 @@ import pandas as pd
 from markupsafe import Markup, escape
 
 from iscat_analysis.records import Analysis, TrackStatus
-from iscat_analysis.report.event_figures import event_images
+from iscat_analysis.report.event_figures import event_details
 from iscat_analysis.report.films import films_shown
 from iscat_analysis.report.headline import (
     NOT_A_MASS,
@@ -67,7 +67,7 @@ def tracks_context(
     """
     tracks = tracks_of(analysis)
     numbered = tracks.rename(columns={"track": "event"})
-    images = event_images(analysis, numbered)
+    images = event_details(analysis, numbered)
     said = tracks_headline(analysis, fits)
     return {
         "n_events": len(tracks),

@@ -16,8 +16,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from iscat_analysis.records import Analysis, BoolArray, FloatArray, TrackStatus, track_numbers
-from iscat_analysis.report.event_figures import display_range, scale_bar
+from iscat_analysis.report.event_figures import scale_bar
 from iscat_analysis.report.headline import main_quantity
+from iscat_analysis.report.scales import display_range
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, new_figure
 from iscat_analysis.report.tracks import tracks_of
 

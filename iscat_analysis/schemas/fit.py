@@ -136,6 +136,7 @@ class Input(Document):
 
     path: str = key("Path as it was given")
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] = key("SHA-256 of its bytes")
+    shape: tuple[Count, Count, Count] | None = maybe("Frames, rows and columns")
 
 
 class Versions(BaseModel):

@@ -1,4 +1,4 @@
-"""Events of any table: ours, those of Refeyn's programs, or columns of one's own.
+"""Events of any table: ours, those of Refeyn's programs and their like, or columns of one's own.
 
 Light particles are missed, and what tells how many depends on the table.
 
@@ -99,9 +99,10 @@ def event_table(
     Parameters
     ----------
     events : str, Path or pandas.DataFrame
-        A folder of ``iscat fit``, ``fits.csv``, ``fits.parquet``, a table of Refeyn's (h5 or csv),
-        or any table with a column ``mass_kda`` and, if possible, ``sigma_mass_kda``, ``snr``,
-        ``frame`` and ``status``, of which only ``ok`` is used.
+        A folder of ``iscat fit``, ``fits.csv``, ``fits.parquet``, a table of Refeyn's or for
+        PhotoMol (h5 or csv), localisations of Picasso's with masses, or any table with a column
+        ``mass_kda`` and, if possible, ``sigma_mass_kda``, ``snr``, ``frame`` and ``status``, of
+        which only ``ok`` is used.
     name : str, optional
         What messages call it; default its path.
     sigma_kda : float, optional
@@ -257,16 +258,17 @@ def _read(path: Path) -> tuple[pd.DataFrame, Path]:
         path = inside
     try:
         with path.open("rb") as file:
-            first = file.readline(65536)
+            head = file.read(65536)
         if path.stat().st_size > _LARGEST:
             raise DataError(f"{path}: is too large for a table of events; check the path")
     except OSError:
         return read_events(path), path  # says what is wrong with it
     try:
-        if first.startswith(b"PAR1"):
+        if head.startswith(b"PAR1"):
             return pd.read_parquet(path), path
-        names = first.decode("utf-8", errors="replace").lstrip("\ufeff").strip().split(",")
-        if "mass_kda" in [name.strip() for name in names]:
+        first = head.splitlines()[0].decode("utf-8", errors="replace") if head else ""
+        names = [name.strip() for name in first.lstrip("\ufeff").split(",")]
+        if "mass_kda" in names:
             return pd.read_csv(path, keep_default_na=False, na_values=["", "nan", "NaN"]), path
     except (ValueError, OSError, MemoryError) as error:
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -274,8 +276,13 @@ def _read(path: Path) -> tuple[pd.DataFrame, Path]:
     try:
         return read_events(path), path
     except DataError:
-        if first.startswith(HDF5) or b"contrasts" in first:
+        if head.startswith(HDF5) or {"contrasts", "masses_kDa"} & set(names):
             raise
+        if {"x", "y", "frame", "mass", "signal"} <= set(names):
+            raise DataError(
+                f"{path}: is a table of trackpy's, whose mass is a brightness; give fits.csv, or "
+                "name a column of masses in kDa mass_kda"
+            ) from None
         raise DataError(
             f"{path}: is no table of events; give fits.csv, a table of Refeyn's (eventsFitted.csv "
             "or h5), or a CSV file whose first line names a column mass_kda"

@@ -369,6 +369,53 @@ def test_a_row_opens_its_images(browser: Any, pages: dict[str, Path]) -> None:
     assert browser.execute_script(detail) == 0
 
 
+@pytest.mark.parametrize("width", [390, 1440])
+def test_a_landing_shows_its_trace_and_its_clip(
+    browser: Any, pages: dict[str, Path], width: int
+) -> None:
+    show(browser, pages["landing"], width=width)
+    click(browser, "#row-1 .toggle")
+    inside = (
+        "const box = document.querySelector('.detail .trace').getBoundingClientRect();"
+        "return [...document.querySelectorAll('.trace .step, .trace .means, .trace text')]"
+        ".map((n) => n.getBoundingClientRect()).filter((b) => b.left < box.left - 1 ||"
+        " b.right > box.right + 1 || b.top < box.top - 1 || b.bottom > box.bottom + 1).length"
+    )
+    assert browser.execute_script(inside) == 0
+    font = (
+        "const t = document.querySelector('.trace text');"
+        "return parseFloat(getComputedStyle(t).fontSize) * t.getScreenCTM().a"
+    )
+    assert browser.execute_script(font) > 9
+    film = (
+        "const box = document.querySelector('.clip'), image = box.firstElementChild;"
+        "return image.decode().then(() => [image.naturalWidth, image.naturalHeight % 21,"
+        " Math.round(image.getBoundingClientRect().height / box.getBoundingClientRect().height),"
+        " getComputedStyle(image).animationName, image.getAnimations()[0].playState])"
+    )
+    images = browser.execute_script(film)
+    assert images[:2] == [21, 0]
+    assert images[2] > 6
+    assert images[3:] == ["slide", "running"]
+    text = browser.execute_script("return document.querySelector('.story').textContent")
+    assert "the fitted step, at frame" in text
+    assert "frames over the" in text
+
+
+def test_who_wants_no_motion_sees_the_step_alone(browser: Any, pages: dict[str, Path]) -> None:
+    show(browser, pages["landing"])
+    feature = {"name": "prefers-reduced-motion", "value": "reduce"}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+    click(browser, "#row-0 .toggle")
+    seen = (
+        "const image = document.querySelector('.clip img');"
+        "return image.decode().then(() => [getComputedStyle(image).animationName,"
+        " image.getBoundingClientRect().top < document.querySelector('.clip')"
+        ".getBoundingClientRect().top - 1])"
+    )
+    assert browser.execute_script(seen) == ["none", True]
+
+
 def test_posteriors_are_drawn_and_refused_ones_say_why(
     browser: Any, pages: dict[str, Path]
 ) -> None:

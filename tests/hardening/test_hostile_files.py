@@ -324,7 +324,7 @@ def test_a_recording_that_stopped_early_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "lacks the column frame_indices"),
+        ("", "lacks the columns contrasts and masses_kDa"),
         ("a,b\n1,2\n", "lacks the column"),
         ("\0" * 100, "lacks the column"),
         ("frame_indices,x_coords,y_coords,contrasts\n1,2,3\n", "row 0 has 3 values"),
@@ -339,6 +339,26 @@ def test_tables_that_are_not(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "events.csv"
     path.write_text(text)
     refuse(path, message, read_events)
+
+
+def test_records_that_are_not_numbers(tmp_path: Path) -> None:
+    plain = [("frame", "u4"), ("mass_kda", "f4")]
+    for kinds, message in (
+        ([*plain, ("name", "S5")], "not an array of integers or floats"),
+        ([*plain, ("pair", "f4", 2)], "not an array of integers or floats"),
+        ([*plain, ("more", plain)], "not an array of integers or floats"),
+    ):
+        path = tmp_path / "locs.hdf5"
+        with h5py.File(path, "w") as file:
+            file["locs"] = np.zeros(20, kinds)
+        refuse(path, message, read_events)
+    with h5py.File(path, "w") as file:
+        file.create_dataset("locs", (20,), plain)  # nothing was written
+    refuse(path, "incomplete", read_events)
+    refuse(
+        _movie_with(tmp_path / "m.mp", lambda f: f.create_dataset("frame", (6, 10, 14), plain)),
+        "not an array of integers or floats",
+    )
 
 
 def test_bytes_that_are_not_text(tmp_path: Path) -> None:

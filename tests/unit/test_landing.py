@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,8 @@ from iscat_analysis.pipeline.landing import (
     inject_and_recover,
 )
 from iscat_analysis.pipeline.resume import partial_folder
-from iscat_analysis.records import EVENT_COLUMNS
+from iscat_analysis.pipeline.tasks import TaskBuilder
+from iscat_analysis.records import EVENT_COLUMNS, EventView
 from iscat_analysis.study.simulate import Movie
 
 PIXEL_NM = 84.0
@@ -180,6 +182,75 @@ def test_chunks_change_nothing_but_the_last_digits(
         here = here.assign(frame=here["frame"] - part * FRAMES).reset_index(drop=True)
         _assert_all_found(here)
         np.testing.assert_allclose(here["mass_kda"], plain[0].table["mass_kda"], rtol=3e-3)
+    whole = [view.trace for view in cut.views if 80 <= view.trace.frame < 4 * FRAMES - 80]
+    assert len(whole) > 15
+    assert all(trace.contrast.size == 4 * 40 for trace in whole)  # a seam cuts none
+
+
+# ---- traces ----------------------------------------------------------------------------------
+
+
+def _misfit(view: EventView, factor: float = 1.0) -> float:
+    """Say how far a trace is from its step, in standard errors: the worst of means and χ²."""
+    trace = view.trace
+    assert trace is not None
+    frame = trace.first + np.arange(trace.contrast.size)
+    level = factor * np.where(frame < trace.frame, trace.before, trace.after)
+    away = (np.abs(frame - trace.frame) > 2) & np.isfinite(trace.contrast)
+    residual = (trace.contrast - level)[away] / trace.sigma
+    parts = [part for part in np.array_split(residual, 4) if part.size]
+    means = [abs(part.mean()) * np.sqrt(part.size) for part in parts]
+    return float(max(*means, abs((residual**2).mean() - 1) * np.sqrt(residual.size / 2)))
+
+
+def test_a_trace_is_a_step_of_the_height_that_was_fitted(plain: tuple[Any, list[str]]) -> None:
+    result = plain[0]
+    for view, row in zip(result.views, result.table.itertuples(), strict=True):
+        trace = view.trace
+        assert trace.after - trace.before == pytest.approx(row.contrast)
+        assert (trace.before == 0) == (
+            row.mass_kda > 0
+        )  # it shows the particle, which comes or goes
+        assert (trace.frame, trace.half_width) == (row.frame, row.frame_ci95)
+        assert trace.first == max(row.frame - 80, 0)
+        assert trace.used == (row.frame - row.n_before, row.frame + row.n_after)
+        assert _misfit(view) < 4.5
+        assert _misfit(view, 1.3) > 6.0
+
+
+def test_a_trace_is_of_one_particle_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    events = [(150, None, 28.2, 31.6, 146.0), (195, None, 35.2, 31.6, 480.0)]
+    config = _config(events=events)
+    counts = np.array(list(Movie(config, 5).frames(2)))
+    assert all(_misfit(view) < 4.5 for view in _run(counts, config)[0].views)
+    monkeypatch.setattr(TaskBuilder, "added", lambda *_: 0.0)
+    assert _misfit(_run(counts, config)[0].views[0]) > 6.0
+
+
+def test_a_clip_rises_to_the_step_and_falls(plain: tuple[Any, list[str]]) -> None:
+    for view in plain[0].views:
+        clip, trace = view.clip, view.trace
+        assert clip.window_frames == 40
+        at = clip.frames.index(trace.frame)
+        middle = clip.contrast.shape[1] // 2
+        side = slice(middle - 2, middle + 3)
+        height = clip.contrast[:, side, side].mean(axis=(1, 2))
+        sign = np.sign(trace.after - trace.before)
+        assert np.argmax(sign * height) in (at - 1, at, at + 1)
+        assert clip.contrast.shape[1:] == (21, 21)
+        if len(clip.frames) == 13:
+            assert np.all(np.abs(height[[0, -1]]) < 0.3 * abs(height[at]))
+
+
+def test_fine_pixels_of_a_clip_are_summed() -> None:
+    config = _config("camera.pixel_size_nm=28", "fit.roi_nm=1200", events=[(90, None, 30, 32, 480)])
+    config = config.model_copy(
+        update={"simulation": config.simulation.model_copy(update={"frames": 180})}
+    )
+    (view,) = _run(np.array(list(Movie(config, 1).frames(2))), config)[0].views
+    assert view.clip.contrast.shape[1:] == (21, 21)
+    at = view.clip.frames.index(view.trace.frame)
+    assert view.clip.contrast[at].min() == pytest.approx(view.trace.after, rel=0.2)
 
 
 # ---- overlap ---------------------------------------------------------------------------------
@@ -444,6 +515,10 @@ def test_an_interrupted_run_resumes_to_the_same_result(
     assert len(calls) == 2 + chunks
     assert not partial_folder(out).exists()
     assert (out / "fits.csv").read_bytes() == (tmp_path / "whole.iscat" / "fits.csv").read_bytes()
+    pages = [(folder / "report.html").read_text() for folder in (out, tmp_path / "whole.iscat")]
+    details = [page[page.index('id="images"') :] for page in pages]
+    assert details[0] == details[1]
+    assert details[0].count("Ratiometric clip") == len(resumed.table)
 
 
 def test_chunks_of_another_configuration_are_not_used(tmp_path: Path) -> None:
@@ -492,6 +567,7 @@ def test_a_drifting_movie_is_analysed_as_a_still_one(followed: tuple[Any, list[s
     result, told = followed
     _assert_moved(result.table)
     assert set(result.table["status"]) == {"ok"}
+    assert all(_misfit(view) < 4.5 for view in result.views)
     (line,) = told
     assert "+1.6" in line
     assert "-1.2" in line
@@ -629,6 +705,11 @@ def test_a_corrected_run_resumes_to_the_same_result(
     assert len(calls) == 1 + whole.summary["chunks"]
     pd.testing.assert_frame_equal(resumed.table, whole.table)
     assert resumed.summary == whole.summary
+    same = {"contrast": None}
+    for view, other in zip(resumed.views, whole.views, strict=True):
+        np.testing.assert_array_equal(view.trace.contrast, other.trace.contrast)
+        np.testing.assert_array_equal(view.clip.contrast, other.clip.contrast)
+        assert asdict(view.trace) | same == asdict(other.trace) | same
 
 
 def test_injected_particles_drift_along(followed: tuple[Any, list[str]]) -> None:

@@ -29,7 +29,7 @@ from iscat_analysis.schemas import jsonable
 from iscat_analysis.species import describe
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from report_factory import HOSTILE, make_analysis, without_events
+from report_factory import HOSTILE, make_analysis, with_traces, without_events
 
 
 def payload(page: str) -> dict[str, object]:
@@ -217,7 +217,7 @@ def test_everything_missing_still_makes_a_folder(tmp_path: Path) -> None:
 
 
 def test_the_page_of_5000_events_stays_below_5_mb_and_says_what_it_leaves_out() -> None:
-    small = make_analysis(10)
+    small = with_traces(make_analysis(10))
     many = replace(
         small,
         table=pd.concat([small.table] * 500, ignore_index=True).assign(event=np.arange(5000)),
@@ -227,7 +227,9 @@ def test_the_page_of_5000_events_stays_below_5_mb_and_says_what_it_leaves_out() 
     assert len(page.encode()) < 5_000_000
     assert page.count('<tr id="row-') == 5000
     held = payload(page)
+    assert len(held) > 100
     assert f"the images of the first {len(held)} of 5000 events" in page
+    assert "the step as a clip" in page
 
 
 def with_flagged(analysis: Analysis, flagged: int) -> Analysis:

@@ -57,12 +57,23 @@
     const image = Object.assign(new Image(), { src: `data:image/png;base64,${found[0]}`, alt: "Data, model and residual", className: "strip" });
     return [image, Object.assign(document.createElement("p"), { className: "note", textContent: `Data, model, residual: ${found[1]}` })];
   };
+  const made = (tag, properties, ...children) => {
+    const node = Object.assign(document.createElement(tag), properties);
+    node.append(...children);
+    return node;
+  };
+  const story = (row) => {  // what happened in time
+    const [, , trace, words, clip, sliding] = images[row.id.slice(4)] ?? [];
+    const parts = [[trace, words], [clip, sliding]].filter(([drawn]) => drawn).map(([drawn, said]) =>
+      made("figure", {}, made("div", { innerHTML: drawn }), made("figcaption", { className: "note", textContent: said })));
+    return parts.length ? [made("div", { className: "story" }, ...parts)] : [];
+  };
   const open = (row) => {
     const cell = document.createElement("td");
     cell.colSpan = row.cells.length;
     const advice = Object.assign(document.createElement("p"), { textContent: row.lastElementChild.title });
     const inside = Object.assign(document.createElement("div"), { className: "inside" });
-    inside.append(...picture(row), advice);
+    inside.append(...picture(row), ...story(row), advice);
     cell.append(inside);
     const detail = Object.assign(document.createElement("tr"), { className: "detail" });
     detail.append(cell);

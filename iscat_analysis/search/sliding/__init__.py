@@ -7,7 +7,13 @@ having; `search` sets the w frames after every boundary between blocks against t
 
 from __future__ import annotations
 
-from iscat_analysis.search.sliding.dating import CREDIBLE, StepFrame, crosstalk, locate_step
+from iscat_analysis.search.sliding.dating import (
+    CREDIBLE,
+    StepFrame,
+    crosstalk,
+    frame_heights,
+    locate_step,
+)
 from iscat_analysis.search.sliding.frames import Chunk, Patch, make_chunk, measure_frames
 from iscat_analysis.search.sliding.noise import (
     LONGEST_WINDOW,
@@ -53,6 +59,7 @@ __all__ = [
     "choose_window",
     "crosstalk",
     "find_steps",
+    "frame_heights",
     "locate_step",
     "longest_window",
     "make_chunk",

@@ -82,16 +82,9 @@ def locate_step(
     StepFrame
         The most likely frame and its interval.
     """
-    weights, scale = _projector(patch, image)
-    scores = np.empty(len(patch.counts))
-    region_scores(patch.counts, weights * patch.gain, scores)
-    power = patch.power
-    lit = power > 0
-    zero = float(np.sum(weights * patch.gain * patch.offset))
-    heights = (scores - zero) / np.where(lit, power, 1.0) / scale
+    heights, weight, scale = frame_heights(patch, image)
     if known is not None:
         heights = heights - known
-    weight = np.where(lit, power, 0.0) * scale
     n = np.cumsum(weight)
     total = np.cumsum(weight * heights)
     before, after = n[:-1], n[-1] - n[:-1]
@@ -118,6 +111,35 @@ def locate_step(
     sides = (slice(0, max(turn - found.gap, 0)), slice(turn + found.gap, None))
     p = min(_p_constant(heights[side], weight[side]) for side in sides)
     return replace(found, p_constant=1 - (1 - p) ** 2)
+
+
+def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Measure how much of an image every frame holds, whatever its light.
+
+    Parameters
+    ----------
+    patch : Patch
+        The frames; `Patch.mean_e` is what they are set against.
+    image : ndarray, shape (ny, nx)
+        Contrast.
+
+    Returns
+    -------
+    heights : ndarray, shape (t,)
+        In units of `image`; without meaning where a frame has no power.
+    weight : ndarray, shape (t,)
+        One over their variance, by shot and read noise; 0 where a frame has no power.
+    scale : float
+        The weight of a frame of unit power.
+    """
+    weights, scale = _projector(patch, image)
+    scores = np.empty(len(patch.counts))
+    region_scores(patch.counts, weights * patch.gain, scores)
+    power = patch.power
+    lit = power > 0
+    zero = float(np.sum(weights * patch.gain * patch.offset))
+    heights = (scores - zero) / np.where(lit, power, 1.0) / scale
+    return heights, np.where(lit, power, 0.0) * scale, scale
 
 
 def _p_constant(heights: FloatArray, weight: FloatArray) -> float:

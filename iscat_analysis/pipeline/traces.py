@@ -1,0 +1,158 @@
+"""What a report shows of a step in time: its contrast against frame, and a ratiometric clip."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from iscat_analysis.pipeline.neighbours import Neighbours, region_around
+from iscat_analysis.pipeline.pattern import MovingPattern
+from iscat_analysis.pipeline.scene import Region, Scene
+from iscat_analysis.pipeline.tasks import TaskBuilder
+from iscat_analysis.records import BoolArray, Clip, FloatArray, Trace
+from iscat_analysis.search.sliding import Chunk, frame_heights
+
+if TYPE_CHECKING:
+    from iscat_analysis.pipeline.steps import FittedStep
+
+TRACE_WINDOWS = 2
+"""Windows on either side of a step that its trace covers; a chunk holds as many around its core."""
+
+CLIP_NM = 1800.0
+"""Side of the square that a clip shows, at most [nm]."""
+
+CLIP_PIXELS = 25
+"""Pixels along it, at most; smaller ones are summed."""
+
+CLIP_STEPS = 6
+"""Images of a clip from the first that reaches the step to the one at the step."""
+
+
+def trace_of(
+    fitted: FittedStep, chunk: Chunk, window: int, neighbours: Neighbours, tasks: TaskBuilder
+) -> Trace | None:
+    """Measure the contrast of a step's particle in every frame around the step.
+
+    Parameters
+    ----------
+    fitted : FittedStep
+        The step; what its neighbours make is taken off.
+    chunk : Chunk
+        The frames.
+    window : int
+        Frames before and after a step.
+    neighbours : Neighbours
+        Of the chunk.
+    tasks : TaskBuilder
+        Of the chunk.
+
+    Returns
+    -------
+    Trace or None
+        None where the region holds too little of the picture.
+    """
+    fit, windows, region = fitted.event.fit, fitted.windows, fitted.region
+    step, turn = fitted.step, fitted.step.at.frame
+    shown = neighbours.shown(step, region)  # its image of the last sweep, near that of the fit
+    if shown is None or shown[1].shape != region.shape:
+        return None
+    image = shown[1]
+    reach = TRACE_WINDOWS * window
+    patch = chunk.patch(turn - reach, turn + reach, region.rows, region.columns)
+    light = float(chunk.power[chunk.cut(*windows.frames_before)].sum())
+    mean = windows.before_e / light
+    patch = replace(patch, mean_e=mean, usable=patch.usable & (mean > 0))
+    heights, weight, scale = frame_heights(patch, image)
+    heights = heights - tasks.added(step, fitted.others, region, patch, image)
+    frames = np.arange(patch.first, patch.first + heights.size)
+    without = (frames >= windows.frames_before[0]) & (frames < windows.frames_before[1])
+    level = np.average(heights[without], weights=weight[without])
+    unit = fit.contrast * step.start.mass_kda / fit.mass_kda  # contrast of the image
+    contrast = np.where(weight > 0, (heights - level) * unit, np.nan)
+    ranges = windows.frames_before, windows.frames_after
+    return Trace(
+        first=patch.first,
+        contrast=contrast,
+        sigma=abs(unit) / math.sqrt(scale),
+        frame=turn,
+        half_width=step.at.half_width,
+        used=(min(r[0] for r in ranges), max(r[1] for r in ranges)),
+        before=0.0 if step.sign > 0 else fit.contrast,
+        after=fit.contrast if step.sign > 0 else 0.0,
+    )
+
+
+def clip_of(
+    fitted: FittedStep,
+    scene: Scene,
+    chunk: Chunk,
+    window: int,
+    pattern: MovingPattern | None = None,
+) -> Clip | None:
+    """Set windows that slide over a step against those before them.
+
+    Parameters
+    ----------
+    fitted : FittedStep
+        The step.
+    scene : Scene
+        Its pixel size.
+    chunk : Chunk
+        The frames.
+    window : int
+        Frames before and after a step.
+    pattern : MovingPattern, optional
+        Of the chunk, where its motion is corrected.
+
+    Returns
+    -------
+    Clip or None
+        None where the frames around the step are too few for a second image.
+    """
+    turn, start = fitted.step.at.frame, fitted.event.candidate
+    side = min(scene.roi_px, 2 * math.ceil(CLIP_NM / scene.pixel_nm / 2) - 1)
+    fold = math.ceil(side / CLIP_PIXELS)
+    region = region_around(side, chunk.shape, start)
+    ranges = region.rows, region.columns
+    region = Region(*((low, high - (high - low) % fold) for low, high in ranges))
+    local = pattern.local(region, turn) if pattern else None
+    patch = chunk.patch(
+        turn - TRACE_WINDOWS * window, turn + TRACE_WINDOWS * window, region.rows, region.columns
+    )
+    # windows begin and end where others do, so that the parts between are summed once
+    ends = [turn + k * window // CLIP_STEPS for k in range(-2 * CLIP_STEPS, 2 * CLIP_STEPS + 1)]
+    parts = [patch.window(*span) for span in pairwise(ends)]
+    light, n, power = (np.array(values) for values in zip(*parts, strict=True))
+    own = n[CLIP_STEPS : 3 * CLIP_STEPS].reshape(2, -1).sum(axis=1)
+    least = min(window / 2, *own)  # near the ends of a movie, the frames of the fit
+    frames, images = [], []
+    for k in range(CLIP_STEPS, 3 * CLIP_STEPS + 1):
+        before, after = slice(k - CLIP_STEPS, k), slice(k, k + CLIP_STEPS)
+        if min(n[before].sum(), n[after].sum()) < max(least, 1):
+            continue
+        expected = light[before].sum(axis=0) * (power[after].sum() / power[before].sum())
+        if pattern and local:
+            spans = (ends[k - CLIP_STEPS], ends[k]), (ends[k], ends[k + CLIP_STEPS])
+            seen = [pattern.seen(local, chunk.cut(*span)) for span in spans]
+            expected *= seen[1] / seen[0]
+        frames.append(ends[k])
+        images.append(_ratio(light[after].sum(axis=0), expected, patch.usable, fold))
+    if len(images) < 2:
+        return None
+    return Clip(tuple(frames), window, np.array(images, dtype=np.float32))
+
+
+def _ratio(after: FloatArray, expected: FloatArray, used: BoolArray, fold: int) -> FloatArray:
+    """Give counts over those expected, less 1, of squares of pixels; NaN where none is used."""
+    rows, columns = after.shape[0] // fold, after.shape[1] // fold
+    sums = [
+        np.where(used, part, 0.0).reshape(rows, fold, columns, fold).sum(axis=(1, 3))
+        for part in (after, expected)
+    ]
+    ratio = np.full((rows, columns), np.nan)
+    np.divide(sums[0], sums[1], out=ratio, where=sums[1] > 0)
+    return ratio - 1
