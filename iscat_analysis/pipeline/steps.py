@@ -34,7 +34,7 @@ from iscat_analysis.pipeline.repeats import step_controls, step_repeats
 from iscat_analysis.pipeline.scene import Region, Scene, judge, reported_steps
 from iscat_analysis.pipeline.sidelobes import Sieve
 from iscat_analysis.pipeline.tasks import Task, TaskBuilder
-from iscat_analysis.pipeline.traces import clip_of, trace_of
+from iscat_analysis.pipeline.traces import clip_of, patch_of, trace_of
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     Candidate,
@@ -251,10 +251,11 @@ class ChunkFitter:
 
         def one(number: int) -> FittedStep:
             step = fitted[number]
-            trace = trace_of(step, chunk, window, self._neighbours, self._tasks)
+            patch = patch_of(step, chunk, window)
+            trace = trace_of(step, patch, chunk, self._neighbours, self._tasks)
             clip = None
             if number < clips:
-                clip = clip_of(step, self._scene, chunk, window, self._pattern)
+                clip = clip_of(step, patch, self._scene, chunk, window, self._pattern)
             return replace(step, trace=trace, clip=clip)
 
         return list(self._pool.map(one, range(len(fitted))))

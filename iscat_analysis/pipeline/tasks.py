@@ -258,6 +258,7 @@ class TaskBuilder:
     ) -> FloatArray:
         known = np.zeros(len(patch.counts))
         frames = np.arange(patch.first, patch.first + known.size)
+        seen, images = [], []
         for other in neighbours:
             near = distance_px(other, step) < self._roi_px
             both = self._neighbours.shared(other, region) if near else None
@@ -266,7 +267,9 @@ class TaskBuilder:
             here, inside = both
             padded = np.zeros(image.shape)
             padded[here] = other.image[inside]
-            height = crosstalk(patch, image, padded)
+            seen.append(other)
+            images.append(padded)
+        for other, height in zip(seen, crosstalk(patch, image, images), strict=True):
             known += other.sign * height * (frames >= other.at.frame)
         own = self._neighbours.shared(step, region)
         if self._pattern and pattern and own is not None:
@@ -285,14 +288,14 @@ class TaskBuilder:
         """Height that the motion of the pattern, and of the particle itself, adds to each frame."""
         frames = np.arange(patch.first, patch.first + len(patch.counts))
         light = np.maximum(patch.mean_e, 1e-300)
-        centres, heights, own = [], [], []
+        centres, patterns, moved = [], [], []
         for start in range(0, frames.size, self._stride):
             part = frames[start : start + self._stride]
             cut = self._chunk.cut(int(part[0]), int(part[-1]) + 1)
             centres.append(float(part.mean()))
-            heights.append(crosstalk(patch, image, moving.seen(pattern, cut) / light - 1))
-            own.append(crosstalk(patch, image, self._neighbours.seen(step, cut, inside) - image))
+            patterns.append(moving.seen(pattern, cut) / light - 1)
+            moved.append(self._neighbours.seen(step, cut, inside) - image)
         there = (frames >= step.at.frame) == (step.sign > 0)
-        height: FloatArray = np.interp(frames, centres, heights)
-        height += there * np.interp(frames, centres, own)
+        height: FloatArray = np.interp(frames, centres, crosstalk(patch, image, patterns))
+        height += there * np.interp(frames, centres, crosstalk(patch, image, moved))
         return height

@@ -14,7 +14,7 @@ from iscat_analysis.pipeline.pattern import MovingPattern
 from iscat_analysis.pipeline.scene import Region, Scene
 from iscat_analysis.pipeline.tasks import TaskBuilder
 from iscat_analysis.records import BoolArray, Clip, FloatArray, Trace
-from iscat_analysis.search.sliding import Chunk, frame_heights
+from iscat_analysis.search.sliding import Chunk, Patch, frame_heights
 
 if TYPE_CHECKING:
     from iscat_analysis.pipeline.steps import FittedStep
@@ -32,8 +32,29 @@ CLIP_STEPS = 6
 """Images of a clip from the first that reaches the step to the one at the step."""
 
 
+def patch_of(fitted: FittedStep, chunk: Chunk, window: int) -> Patch:
+    """Copy the frames around a step, for `trace_of` and `clip_of`.
+
+    Parameters
+    ----------
+    fitted : FittedStep
+        The step.
+    chunk : Chunk
+        The frames.
+    window : int
+        Frames before and after a step.
+
+    Returns
+    -------
+    Patch
+        `TRACE_WINDOWS` on either side, of the pixels that were fitted.
+    """
+    turn, reach = fitted.step.at.frame, TRACE_WINDOWS * window
+    return chunk.patch(turn - reach, turn + reach, fitted.region.rows, fitted.region.columns)
+
+
 def trace_of(
-    fitted: FittedStep, chunk: Chunk, window: int, neighbours: Neighbours, tasks: TaskBuilder
+    fitted: FittedStep, patch: Patch, chunk: Chunk, neighbours: Neighbours, tasks: TaskBuilder
 ) -> Trace | None:
     """Measure the contrast of a step's particle in every frame around the step.
 
@@ -41,10 +62,10 @@ def trace_of(
     ----------
     fitted : FittedStep
         The step; what its neighbours make is taken off.
+    patch : Patch
+        From `patch_of`.
     chunk : Chunk
         The frames.
-    window : int
-        Frames before and after a step.
     neighbours : Neighbours
         Of the chunk.
     tasks : TaskBuilder
@@ -61,8 +82,6 @@ def trace_of(
     if shown is None or shown[1].shape != region.shape:
         return None
     image = shown[1]
-    reach = TRACE_WINDOWS * window
-    patch = chunk.patch(turn - reach, turn + reach, region.rows, region.columns)
     light = float(chunk.power[chunk.cut(*windows.frames_before)].sum())
     mean = windows.before_e / light
     patch = replace(patch, mean_e=mean, usable=patch.usable & (mean > 0))
@@ -88,6 +107,7 @@ def trace_of(
 
 def clip_of(
     fitted: FittedStep,
+    patch: Patch,
     scene: Scene,
     chunk: Chunk,
     window: int,
@@ -99,6 +119,8 @@ def clip_of(
     ----------
     fitted : FittedStep
         The step.
+    patch : Patch
+        From `patch_of`.
     scene : Scene
         Its pixel size.
     chunk : Chunk
@@ -116,12 +138,19 @@ def clip_of(
     turn, start = fitted.step.at.frame, fitted.event.candidate
     side = min(scene.roi_px, 2 * math.ceil(CLIP_NM / scene.pixel_nm / 2) - 1)
     fold = math.ceil(side / CLIP_PIXELS)
-    region = region_around(side, chunk.shape, start)
-    ranges = region.rows, region.columns
-    region = Region(*((low, high - (high - low) % fold) for low, high in ranges))
+    square, whole = region_around(side, chunk.shape, start), fitted.region
+    sides = []
+    for (low, high), (first, last) in (
+        (square.rows, whole.rows), (square.columns, whole.columns)
+    ):  # fmt: skip
+        low, high = max(low, first), min(high, last)
+        sides.append((low, high - (high - low) % fold))
+    region = Region(sides[0], sides[1])
     local = pattern.local(region, turn) if pattern else None
-    patch = chunk.patch(
-        turn - TRACE_WINDOWS * window, turn + TRACE_WINDOWS * window, region.rows, region.columns
+    (top, bottom), (left, right) = sides
+    patch = patch.part(
+        slice(top - whole.rows[0], bottom - whole.rows[0]),
+        slice(left - whole.columns[0], right - whole.columns[0]),
     )
     # windows begin and end where others do, so that the parts between are summed once
     ends = [turn + k * window // CLIP_STEPS for k in range(-2 * CLIP_STEPS, 2 * CLIP_STEPS + 1)]
@@ -129,7 +158,7 @@ def clip_of(
     light, n, power = (np.array(values) for values in zip(*parts, strict=True))
     own = n[CLIP_STEPS : 3 * CLIP_STEPS].reshape(2, -1).sum(axis=1)
     least = min(window / 2, *own)  # near the ends of a movie, the frames of the fit
-    frames, images = [], []
+    frames, after_e, expected_e = [], [], []
     for k in range(CLIP_STEPS, 3 * CLIP_STEPS + 1):
         before, after = slice(k - CLIP_STEPS, k), slice(k, k + CLIP_STEPS)
         if min(n[before].sum(), n[after].sum()) < max(least, 1):
@@ -140,19 +169,21 @@ def clip_of(
             seen = [pattern.seen(local, chunk.cut(*span)) for span in spans]
             expected *= seen[1] / seen[0]
         frames.append(ends[k])
-        images.append(_ratio(light[after].sum(axis=0), expected, patch.usable, fold))
-    if len(images) < 2:
+        after_e.append(light[after].sum(axis=0))
+        expected_e.append(expected)
+    if len(frames) < 2:
         return None
-    return Clip(tuple(frames), window, np.array(images, dtype=np.float32))
+    images = _ratio(np.array(after_e), np.array(expected_e), patch.usable, fold)
+    return Clip(tuple(frames), window, images.astype(np.float32))
 
 
 def _ratio(after: FloatArray, expected: FloatArray, used: BoolArray, fold: int) -> FloatArray:
     """Give counts over those expected, less 1, of squares of pixels; NaN where none is used."""
-    rows, columns = after.shape[0] // fold, after.shape[1] // fold
+    number, rows, columns = after.shape
+    squares = (number, rows // fold, fold, columns // fold, fold)
     sums = [
-        np.where(used, part, 0.0).reshape(rows, fold, columns, fold).sum(axis=(1, 3))
-        for part in (after, expected)
+        np.where(used, part, 0.0).reshape(squares).sum(axis=(2, 4)) for part in (after, expected)
     ]
-    ratio = np.full((rows, columns), np.nan)
+    ratio = np.full(sums[0].shape, np.nan)
     np.divide(sums[0], sums[1], out=ratio, where=sums[1] > 0)
     return ratio - 1

@@ -203,7 +203,7 @@ def test_a_neighbour_that_is_known_does_not_pull_the_frame() -> None:
     early = np.random.default_rng(2).poisson(np.maximum(other, 0) * counts[38:])
     counts[38:] = counts[38:] - late + early
     patch = _chunk(counts).patch(0, 60, (12, 25), (14, 27))
-    height = crosstalk(patch, image[12:25, 14:27], other[12:25, 14:27])
+    (height,) = crosstalk(patch, image[12:25, 14:27], [other[12:25, 14:27]])
     known = height * (np.arange(60) >= 38)
     assert locate_step(patch, image[12:25, 14:27], (15, 50), known=known).frame == 30
     assert height == pytest.approx(np.sum(image * other) / np.sum(image**2), abs=0.15)

@@ -8,6 +8,7 @@ interval (D. V. Hinkley, Biometrika 57, 1, 1970).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -164,23 +165,28 @@ def _p_constant(heights: FloatArray, weight: FloatArray) -> float:
     return min(tail, 1.0)
 
 
-def crosstalk(patch: Patch, image: FloatArray, other: FloatArray) -> float:
-    """Height that another particle's contrast adds to a frame, in units of `image`.
+def crosstalk(patch: Patch, image: FloatArray, others: Sequence[FloatArray]) -> list[float]:
+    """Heights that other particles' contrasts add to a frame, in units of `image`.
 
     Parameters
     ----------
     patch : Patch
         Gives the weights.
-    image, other : ndarray, shape (ny, nx)
-        Contrasts.
+    image : ndarray, shape (ny, nx)
+        Contrast.
+    others : sequence of ndarray of the same shape
+        Their contrasts.
 
     Returns
     -------
-    float
+    list of float
         To be taken off in `locate_step`.
     """
+    if not others:
+        return []
     weights, scale = _projector(patch, image)
-    return float(np.sum(weights * patch.mean_e * other)) / scale
+    light = weights * patch.mean_e
+    return [float(np.sum(light * other)) / scale for other in others]
 
 
 def _projector(patch: Patch, image: FloatArray) -> tuple[FloatArray, float]:

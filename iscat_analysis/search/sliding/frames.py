@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -149,6 +149,19 @@ class Patch:
         region_sum(self.counts[here], self.good[here], out)
         frames = int(np.count_nonzero(self.good[here]))
         return self.gain * (out - frames * self.offset), frames, float(self.power[here].sum())
+
+    def part(self, rows: slice, columns: slice) -> Patch:
+        """Copy some of its pixels, which count from its own first one."""
+        here = rows, columns
+        return replace(
+            self,
+            counts=np.ascontiguousarray(self.counts[(slice(None), *here)]),
+            gain=_at(self.gain, here),
+            offset=_at(self.offset, here),
+            read_noise_e=_at(self.read_noise_e, here),
+            mean_e=self.mean_e[here],
+            usable=self.usable[here],
+        )
 
 
 def measure_frames(
