@@ -221,6 +221,8 @@ def _from_hdf5(path: Path) -> tuple[dict[str, FloatArray], StoredCalibration | N
                 found = next((value for value in values if value is not None), None)
                 if found is not None:
                     columns[column] = found
+            if "contrast" not in columns:
+                raise DataError(f"{path}: contrasts is no column of numbers; export it again")
             return columns, _calibration(reader, group, path)
         finally:
             reader.data.close()
