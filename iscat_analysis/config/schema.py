@@ -439,6 +439,11 @@ class Detection(Section):
     )
     min_separation_nm: Positive = Field(500.0, description="closer particles are flagged too_close")
 
+    @property
+    def sign(self) -> int:
+        """Sign of the contrast that is reported; 0 where both are."""
+        return {"both": 0, "bright": 1, "dark": -1}[self.polarity]
+
 
 class Fit(Section):
     """The maximum-likelihood fit."""

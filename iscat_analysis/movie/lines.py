@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.spectrum import measure_spectrum
+from iscat_analysis.movie.stack import Stack
 from iscat_analysis.records import CountSource, FloatArray, StackMetadata
 
 _LEAST_LIT = 0.25  # of a line's pixels that must be usable
@@ -206,3 +207,23 @@ def find_lines(counts: NDArray[Any], camera: Camera) -> Lines | None:
     off = find_defects(len(counts) * mean, len(counts) * read)
     off |= camera.saturated(counts.max(axis=0))
     return Lines(np.where(off, 0.0, np.maximum(mean, 0.0)), spectrum.shared)
+
+
+def steady(movie: Stack, lines: Lines | None, camera: Camera) -> Stack:
+    """Give a movie as it is analysed, without the flicker of its lines.
+
+    Parameters
+    ----------
+    movie : Stack
+        As it was recorded.
+    lines : Lines or None
+        What flickers.
+    camera : Camera
+        Counts → photoelectrons.
+
+    Returns
+    -------
+    Stack
+        The movie itself where nothing does.
+    """
+    return movie if lines is None else movie.seen_as(SteadyFrames(movie, lines, camera))

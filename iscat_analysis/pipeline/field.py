@@ -332,7 +332,7 @@ def _refined(scene: Scene, windows: Windows, events: Sequence[Event]) -> Windows
 
 def _wanted(scene: Scene, event: Event) -> bool:
     """Whether the fitted contrast has the polarity that is reported."""
-    sign = {"both": 0, "bright": 1, "dark": -1}[scene.config.detection.polarity]
+    sign = scene.config.detection.sign
     return sign == 0 or scene.additive or sign * event.fit.contrast > 0
 
 

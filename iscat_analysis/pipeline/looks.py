@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
-from typing import Any, Protocol
+from functools import cache, lru_cache, partial
+from typing import Protocol
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from iscat_analysis._kernels.sliding import contrast_map
 from iscat_analysis.config import Config
@@ -20,7 +19,7 @@ from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.background import measure_windows, start_power
 from iscat_analysis.movie.camera import Camera, check_counts
-from iscat_analysis.movie.lines import Lines, SteadyFrames
+from iscat_analysis.movie.lines import Lines, SteadyFrames, steady
 from iscat_analysis.pipeline.chunk_work import make_landing_scene
 from iscat_analysis.pipeline.chunks import Reader, counts_budget, judge_noise
 from iscat_analysis.pipeline.diagnosis import judge_background
@@ -231,8 +230,9 @@ class BoundSearch:
     """
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
-        self._movie = movie if lines is None else movie.seen_as(SteadyFrames(movie, lines, camera))
+        self._movie = steady(movie, lines, camera)
         self._camera, self._config = camera, config
+        self._check = partial(check_counts, name=movie.name, camera=camera)
         before, after = frame_ranges(movie, config)
         self.frames, self.longest = after, after[1] - after[0]
         tracked = config.fit.mode == "track"
@@ -247,9 +247,6 @@ class BoundSearch:
         _, spectrum = judge_background(self._movie, camera, self._windows)
         searches = self.longest if tracked else 1
         self._scene = make_scene(config, shape, searches=searches, noise=spectrum, lines=lines)
-
-    def _check(self, counts: NDArray[Any], first: int) -> None:
-        check_counts(counts, first, self._movie.name, camera=self._camera)
 
     def scene(self, window: int) -> Scene:  # noqa: ARG002
         """Give models and threshold, which are those of every window."""
@@ -278,7 +275,7 @@ class BoundSearch:
         image = field_likelihood(scene, windows).measured_signal()
         if scene.additive:
             image = windows.after_e - windows.power_ratio * windows.before_e
-        wanted = {"both": 0, "bright": 1, "dark": -1}[self._config.detection.polarity]
+        wanted = self._config.detection.sign
 
         def search(threshold: float) -> pd.DataFrame:
             found, _ = search_field(_with_threshold(scene, threshold), windows)
@@ -310,8 +307,9 @@ class MovingSearch:
     """
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
-        self._movie = movie if lines is None else movie.seen_as(SteadyFrames(movie, lines, camera))
+        self._movie = steady(movie, lines, camera)
         self._camera, self._config = camera, config
+        self._check = partial(check_counts, name=movie.name, camera=camera)
         self.frames = first, last = config.fit.frames or (0, movie.shape[0])
         self.longest = last - first
         self.window = min(AROUND, self.longest)
@@ -327,9 +325,6 @@ class MovingSearch:
             return field, field.first_ground(follow_power=config.background.power_normalization)
 
         self._background = background
-
-    def _check(self, counts: NDArray[Any], first: int) -> None:
-        check_counts(counts, first, self._movie.name, camera=self._camera)
 
     def scene(self, window: int) -> Scene:  # noqa: ARG002
         """Give models and threshold, which are those of every window."""

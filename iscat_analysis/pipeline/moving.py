@@ -380,13 +380,12 @@ def search_frames(
     Sightings
         Above the threshold.
     """
-    polarity = {"both": 0, "bright": 1, "dark": -1}[scene.config.detection.polarity]
     side = scene.roi_px
     if scene.mode == "joint":
         side += round(2 * RING_SLOPE * scene.config.fit.z_range_nm[1] / field.pixel_nm)
     search = FrameFilter(
         scene.templates, ground.level, field.read_e2, field.used,
-        polarity=polarity, roi_px=side,
+        polarity=scene.config.detection.sign, roi_px=side,
     )  # fmt: skip
     starts = rows.starts(field.frames)
     pixel = field.pixel_nm

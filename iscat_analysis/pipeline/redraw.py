@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.background import measure_windows, refine_power
 from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts
-from iscat_analysis.movie.lines import Lines, SteadyFrames
+from iscat_analysis.movie.lines import Lines, SteadyFrames, steady
 from iscat_analysis.pipeline.block_store import row_view
 from iscat_analysis.pipeline.chunk_work import make_landing_scene
 from iscat_analysis.pipeline.chunks import HALO, Reader, counts_budget
@@ -80,11 +80,11 @@ def redraw(
     if "landing" in summary:
         window = int(summary["landing"]["window_frames"])
         return _landings(movie, config, camera, lines, table, window)
-    steady = movie if lines is None else movie.seen_as(SteadyFrames(movie, lines, camera))
+    seen = steady(movie, lines, camera)
     if learns_background(config):
         blocks = int(summary["blocks"]["number"])
-        return _moving(steady, config, camera, table, tracks, blocks)
-    return _bound(steady, config, camera, lines, table)
+        return _moving(seen, config, camera, table, tracks, blocks)
+    return _bound(seen, config, camera, lines, table)
 
 
 def _landings(
@@ -155,8 +155,7 @@ def _bound(
     scene = make_scene(config, shape, lines=lines)
     background, whole = config.background, Region((0, shape[0]), (0, shape[1]))
 
-    def check(counts: NDArray[Any], start: int) -> None:
-        check_counts(counts, start, movie.name, camera=camera)
+    check = partial(check_counts, name=movie.name, camera=camera)
 
     def drawn(region: Region, rows: Sequence[int]) -> FloatArray:
         """Draw the signal of some rows in a region."""
@@ -224,8 +223,7 @@ def _moving(
         pairs = zip(tracks["track"], np.nan_to_num(tracks["d_um2_s"].to_numpy(float)), strict=True)
         diffusion = {int(track): float(d) for track, d in pairs}
 
-    def check(counts: NDArray[Any], start: int) -> None:
-        check_counts(counts, start, movie.name, camera=camera)
+    check = partial(check_counts, name=movie.name, camera=camera)
 
     @lru_cache(1)
     def block(start: int, stop: int) -> tuple[MovingField, Ground, Rows, NDArray[np.int64]]:

@@ -494,8 +494,7 @@ def reported_steps(scene: Scene) -> int:
     int
         1 landings, −1 leavings, 0 both.
     """
-    polarity = {"both": 0, "bright": 1, "dark": -1}[scene.config.detection.polarity]
-    return polarity * int(scene.templates.signs[0])
+    return scene.config.detection.sign * int(scene.templates.signs[0])
 
 
 def _uses_conditional(config: Config) -> bool:

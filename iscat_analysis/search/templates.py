@@ -255,7 +255,7 @@ def find_particles(
     """
     snr, strength = signal_to_noise(likelihood, templates, explained)
     ranked = np.abs(snr) if templates.two_sided else snr
-    wanted = {"both": 0, "bright": 1, "dark": -1}[detection.polarity]
+    wanted = detection.sign
     if wanted:
         signs = templates.signs[:, None, None] * np.sign(snr)
         ranked = np.where(signs == wanted, np.abs(snr) if not templates.quadratic else snr, 0.0)
