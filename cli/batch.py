@@ -19,6 +19,7 @@ from iscat_cli.options import (
     SchedulerOption,
     SetOption,
     WorkersOption,
+    with_workers,
 )
 from iscat_cli.tables import numbers
 
@@ -127,7 +128,6 @@ def batch(
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
         part = _part(only)
-        changes = [*(settings or ()), *([f"compute.workers={workers}"] if workers else [])]
 
         from iscat_analysis.day import batch as run
 
@@ -136,7 +136,7 @@ def batch(
                 samples,
                 out=out,
                 config=config,
-                settings=changes,
+                settings=with_workers(settings, workers),
                 standards=standards,
                 kd=None if kd is None else kd.value,
                 kd_masses_kda=None if kd_masses is None else numbers("--kd-masses", kd_masses),

@@ -141,3 +141,21 @@ def frame_range(option: str, text: str) -> tuple[int, int]:
             f"as in {option} 0:200"
         )
     return int(match[1]), int(match[2])
+
+
+def with_workers(settings: list[str] | None, workers: int | None) -> list[str]:
+    """Add the number of threads to changes of the configuration.
+
+    Parameters
+    ----------
+    settings : list of str or None
+        From ``--set``.
+    workers : int or None
+        From ``--workers``.
+
+    Returns
+    -------
+    list of str
+        The threads last: they win.
+    """
+    return [*(settings or ()), *([f"compute.workers={workers}"] if workers else [])]

@@ -25,6 +25,7 @@ from iscat_cli.options import (
     SchedulerOption,
     SetOption,
     WorkersOption,
+    with_workers,
 )
 from iscat_cli.tables import numbers
 
@@ -80,8 +81,6 @@ def watch(
     """
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
-        changes = [*(settings or ()), *([f"compute.workers={workers}"] if workers else [])]
-
         from iscat_analysis.day.watch import FOLDER
         from iscat_analysis.day.watch import watch as run
 
@@ -90,7 +89,7 @@ def watch(
                 folder,
                 out=out,
                 config=config,
-                settings=changes,
+                settings=with_workers(settings, workers),
                 standards=standards,
                 kd=None if kd is None else kd.value,
                 kd_masses_kda=None if kd_masses is None else numbers("--kd-masses", kd_masses),

@@ -7,12 +7,9 @@ finished, `gather` and `compare` make tables of all results, and ``report.batch`
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +22,7 @@ from iscat_analysis.day.gather import Found, read_movie
 from iscat_analysis.day.plan import Movie, Plan, configured, make_plan, part_of
 from iscat_analysis.day.publish import publish_day
 from iscat_analysis.day.run import Outcome, Runner
-from iscat_analysis.day.state import Records, claim_folder
+from iscat_analysis.day.state import Records, claim_folder, hash_of
 from iscat_analysis.day.table import Table, read_standards, read_table
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.places import THREADS, open_place
@@ -309,5 +306,4 @@ def _page_key(
         for o in (outcomes[m.name],)
     ]
     made_of = [str(plan.table.source), repr(day.failed), rows, repr(reaction)]
-    text = json.dumps([version("iscat-analysis"), *made_of])
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hash_of(*made_of)

@@ -5,11 +5,9 @@ What cannot be calibrated stays as configured, and is told: the movies go on.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.config.files import read_toml
 from iscat_analysis.day.plan import Movie, Plan, configured
 from iscat_analysis.day.run import Outcome, Runner
-from iscat_analysis.day.state import sha256_of
+from iscat_analysis.day.state import hash_of, sha256_of
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline.calibrations import camera_calibration, mass_calibration
@@ -113,11 +111,6 @@ def calibrate_day(plan: Plan, runner: Runner) -> Day:
     return Day(settings, outcomes, failed=tuple(failed), standards_kda=standards, **origins)
 
 
-def _key(*parts: Any) -> str:
-    text = json.dumps([version("iscat-analysis"), *parts])
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 def _camera(plan: Plan, runner: Runner) -> tuple[dict[str, Any], dict[str, Outcome]]:
     """Measure the camera on the flats that can be read."""
     outcomes: dict[str, Outcome] = {}
@@ -147,7 +140,7 @@ def _camera(plan: Plan, runner: Runner) -> tuple[dict[str, Any], dict[str, Outco
         )
         return {"inputs": {name: {"sha256": sha256_of(path)} for name, path in paths.items()}}
 
-    outcome = runner.job("camera", _key(offset), paths, out / "camera.toml", work)
+    outcome = runner.job("camera", hash_of(offset), paths, out / "camera.toml", work)
     outcomes |= dict.fromkeys(paths, outcome)
     if outcome.state != "done":
         return {}, outcomes
@@ -193,7 +186,7 @@ def _mass(plan: Plan, tables: Mapping[str, Path], runner: Runner) -> tuple[Outco
         hashes = {name: {"sha256": sha256_of(path)} for name, path in tables.items()}
         return {"standards_kda": masses, "inputs": hashes}
 
-    key = _key(plan.standards)
+    key = hash_of(plan.standards)
     outcome = runner.job("mass", key, tables, out / "calibration.toml", work)
     if outcome.state != "done":
         return outcome, {}

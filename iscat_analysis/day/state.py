@@ -209,9 +209,23 @@ def key_of(config: Config, *further: Any) -> str:
     compute = type(config.compute)(seed=config.compute.seed)
     settings = config.model_copy(update={"compute": compute})
     maps = [sha256_of(Path(v)) for n in _MAPS if isinstance(v := getattr(config.camera, n), str)]
-    text = json.dumps(
-        [version("iscat-analysis"), config_to_toml(settings, comments=False), maps, *further]
-    )
+    return hash_of(config_to_toml(settings, comments=False), maps, *further)
+
+
+def hash_of(*parts: Any) -> str:
+    """Hash what a job is asked for, and the version that does it.
+
+    Parameters
+    ----------
+    *parts : Any
+        Plain values.
+
+    Returns
+    -------
+    str
+        In hexadecimal.
+    """
+    text = json.dumps([version("iscat-analysis"), *parts])
     return hashlib.sha256(text.encode()).hexdigest()
 
 
