@@ -445,7 +445,8 @@ def maximize(
         if not np.isfinite(gain):  # an overflow: a place that is no number must not be looked up
             return value, passes, STALLED
         if damping == 0.0 and gain < tolerance:
-            theta[:] = trial
+            for i in range(5):
+                theta[i] = trial[i]
             return value + gain, passes, CONVERGED
         if free[2]:
             start, stop = span(lens, pixels, trial, width)
@@ -456,7 +457,10 @@ def maximize(
         passes += 1
         if trial_value >= value - 1e-3 * tolerance - 1e-13 * abs(value):
             value = trial_value
-            theta[:], score[:], fisher[:] = trial, trial_score, trial_fisher
+            for i in range(5):  # assigning slices would compile the text of a message beside it
+                theta[i], score[i] = trial[i], trial_score[i]
+                for j in range(5):
+                    fisher[i, j] = trial_fisher[i, j]
             damping = 0.0 if damping < 1e-2 else 0.1 * damping
         else:
             if damping > 1e6:
