@@ -237,16 +237,43 @@ def compile_kernels(model: ForwardModel) -> None:
     model : ForwardModel
         Any.
     """
-    grid = PixelGrid.region((0, 3), (0, 3), 10.0)
-    theta = np.array([10.0, 10.0, model.height_nm, 1.0, 0.0])
-    counts = np.full(grid.shape, 100.0)
-    likelihood = poisson(model, grid, counts, counts, counts)
+    compile_maximisation(model)
+    compile_values(model)
+
+
+def compile_maximisation(model: ForwardModel) -> None:
+    """Run the kernels of a maximisation once on a few pixels: half of `compile_kernels`.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Any.
+    """
+    likelihood, theta = _small(model)
     free = np.array([True, True, True, True, False])
     margin = np.array([1.0, 1.0, 0.0, 1.0, 0.0])
     likelihood.maximize(theta, free, theta - margin, theta + margin, passes=2)
-    likelihood.values(theta[None])
     likelihood.score_fisher(theta)
+
+
+def compile_values(model: ForwardModel) -> None:
+    """Run the kernels of values and curvatures once: the other half of `compile_kernels`.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Any.
+    """
+    likelihood, theta = _small(model)
+    likelihood.values(theta[None])
     likelihood.observed_information(theta)
     likelihood.signal(theta)
-    likelihood.scan_heights(theta[2:3], theta, None)
-    model.gradient(grid, *theta[:4])
+    likelihood.scan_heights(theta[2:3], theta, (0.0, 2.0))
+
+
+def _small(model: ForwardModel) -> tuple[Likelihood, FloatArray]:
+    """Likelihood of nine pixels, and parameters inside them."""
+    grid = PixelGrid.region((0, 3), (0, 3), 10.0)
+    counts = np.full(grid.shape, 100.0)
+    theta = np.array([10.0, 10.0, model.height_nm, 1.0, 0.0])
+    return poisson(model, grid, counts, counts, counts), theta

@@ -143,7 +143,8 @@ def _register(
         for _ in range(_PASSES):
             moved = pattern
             if shift.any():
-                moved = mover.image(spectrum * mover.transfer(shift[None], np.ones(1)))
+                image_there = mover.image(spectrum * mover.transfer(shift[None], np.ones(1)))
+                moved = np.ascontiguousarray(image_there)  # a cut would compile its own kernels
             mismatch(moved, image, usable, pattern_read, image_read, ratio, deviation)
             scale = max(1.4826 * float(np.nanmedian(np.abs(deviation[::2, ::3]))), 1.0)
             spurious = shift_equations(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import ConfigError, FloodError
 from iscat_analysis.inference.achieved import Achieved
-from iscat_analysis.inference.noise import compile_kernels
+from iscat_analysis.inference.noise import compile_maximisation, compile_values
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.inference.prior import Prior
 from iscat_analysis.movie import Stack, beside, open_stack
@@ -36,6 +36,7 @@ from iscat_analysis.pipeline.achieved import (
 )
 from iscat_analysis.pipeline.block_store import BlockStore
 from iscat_analysis.pipeline.blocks import plan_blocks
+from iscat_analysis.pipeline.compilation import Compilation, compiling
 from iscat_analysis.pipeline.diagnosis import (
     EXCESS_NOISE,
     drift_warning,
@@ -85,8 +86,6 @@ from iscat_analysis.threads import threads
 
 FEW_FIGURES = 2
 """Events of a landing movie that are drawn for print; the page shows hundreds."""
-
-_PATIENCE_S = 1.5  # after which a compilation is announced
 
 Notify = Callable[[str], None]
 
@@ -203,7 +202,28 @@ def analyse(
     Analysis
         Everything found.
     """
-    place = place or Here()
+    # particles that move are fitted by kernels of their own, which call those of others
+    workers = 1 if learns_background(config) else config.compute.workers
+    with compiling(notify, workers) as compilation:
+        return _analysed(
+            movie, config, compilation, progress=progress, notify=notify, command=command,
+            partial=partial, inject=inject, place=place or Here(),
+        )  # fmt: skip
+
+
+def _analysed(
+    movie: Stack,
+    config: Config,
+    compilation: Compilation,
+    *,
+    progress: Progress,
+    notify: Notify,
+    command: str,
+    partial: Path | None,
+    inject: int,
+    place: Place,
+) -> Analysis:
+    """Load, calibrate, search and fit; see `analyse`."""
     if place.distant and not movie.identity:
         raise ConfigError(
             f"{movie.name}: is an array, and workers read a movie from its file: save it, as with "
@@ -276,7 +296,7 @@ def analyse(
                 camera,
                 tell=tell,
                 progress=progress,
-                prepare=lambda scene: _warm_up(scene, notify),
+                prepare=lambda scene: _warm_up(scene, compilation),
                 partial=partial,
                 identity=movie.identity if partial else "",
                 lines=lines,
@@ -308,7 +328,7 @@ def analyse(
             )
         scene, found, image, measured = _measured_background(
             steady, config, camera, clock, partial,
-            lines=lines, tell=tell, notify=notify, progress=progress,
+            lines=lines, tell=tell, compilation=compilation, progress=progress,
         )  # fmt: skip
         further |= measured
     windows = found.windows
@@ -391,7 +411,7 @@ def _measured_background(
     *,
     lines: Lines | None,
     tell: Notify,
-    notify: Notify,
+    compilation: Compilation,
     progress: Progress,
 ) -> tuple[Scene, Found, FloatArray, dict[str, Any]]:
     """Find particles against frames before they bound, or against a known background."""
@@ -399,12 +419,12 @@ def _measured_background(
     shape = (movie.shape[1], movie.shape[2])
     if learns_background(config):
         return _moving_particles(
-            movie, config, camera, clock, partial, tell=tell, notify=notify, progress=progress
+            movie, config, camera, clock, partial, tell=tell, progress=progress
         )
     before, after = frame_ranges(movie, config)
     searches = after[1] - after[0] if config.fit.mode == "track" else 1
     scene = make_scene(config, shape, searches=searches, lines=lines)
-    _warm_up(scene, notify)
+    _warm_up(scene, compilation)
     clock.lap("model")
 
     def check(counts: NDArray[Any], first: int) -> None:
@@ -465,14 +485,12 @@ def _moving_particles(
     partial: Path | None,
     *,
     tell: Notify,
-    notify: Notify,
     progress: Progress,
 ) -> tuple[Scene, Found, FloatArray, dict[str, Any]]:
     """Track particles over backgrounds that are learnt with them."""
     first, last = config.fit.frames or (0, movie.shape[0])
     shape = (movie.shape[1], movie.shape[2])
     scene = track_scene(config, shape, max(last - first, 1))
-    _warm_up(scene, notify)
     clock.lap("model")
 
     def check(counts: NDArray[Any], first: int) -> None:
@@ -555,17 +573,11 @@ def _sampled(
     return done, False
 
 
-def _warm_up(scene: Scene, notify: Notify) -> None:
-    """Load the compiled kernels, and say so where they must be compiled first."""
-    timer = threading.Timer(
-        _PATIENCE_S, notify, ["compiling the numerical kernels, once per installation…"]
-    )
-    timer.daemon = True
-    timer.start()
-    try:
-        compile_kernels(scene.model)
-    finally:
-        timer.cancel()
+def _warm_up(scene: Scene, compilation: Compilation) -> None:
+    """Load the compiled kernels of fits, or compile them."""
+    compile_maximisation(scene.model)
+    compilation.wait()
+    compile_values(scene.model)
 
 
 class _Clock:

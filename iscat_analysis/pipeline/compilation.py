@@ -1,0 +1,156 @@
+"""What a first run compiles: said as it happens, and done by two processes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from numba.core import event
+
+from iscat_analysis import _kernels
+
+_PATIENCE_S = 1.0  # of compilation, before it is announced
+_BETWEEN_S = 4.0  # from one line to the next
+_ROOM = f"{_kernels.__name__}."
+_SHARED = ("radial", "image", "scoring")  # whose kernels the other process compiles half of
+_ABOUT = {
+    "diffusion": "diffusion",
+    "drift": "the drift of the pattern",
+    "hessian": "the precision of fits",
+    "judging": "the precision of tracks",
+    "mixture": "species",
+    "moving": "tracks",
+    "radial": "the tables of the microscope",
+    "score_test": "the goodness of fits",
+    "scoring": "fits",
+    "sliding": "sums of frames",
+}
+_PICTURES = "the picture of a particle"
+
+
+class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
+    """Listens to Numba; `compiling` makes one.
+
+    Parameters
+    ----------
+    notify : callable
+        Told one line at a time.
+    together : bool
+        Whether a second process may be started.
+    """
+
+    def __init__(self, notify: Callable[[str], None], *, together: bool) -> None:
+        self._notify = notify
+        self._together = together
+        self._other: subprocess.Popen[bytes] | None = None
+        self._lock = threading.Lock()
+        self._depth = 0
+        self._about = ""
+        self._said: tuple[str, float] | None = None
+        self._timer: threading.Timer | None = None
+
+    def on_start(self, event: event.Event) -> None:
+        """Note that a function is being compiled.
+
+        Parameters
+        ----------
+        event : numba.core.event.Event
+            Whose data hold its dispatcher.
+        """
+        self._depth += 1
+        module = event.data["dispatcher"].py_func.__module__
+        if self._depth > 1 or not module.startswith(_ROOM):
+            return
+        kind = module.removeprefix(_ROOM)
+        self._about = _ABOUT.get(kind, _PICTURES)
+        if self._together and self._other is None and kind in _SHARED:
+            self._other = _started()
+        if self._timer is None:
+            self._timer = threading.Timer(_PATIENCE_S, self._announce)
+            self._timer.daemon = True
+            self._timer.start()
+        elif self._said is not None:
+            about, at = self._said
+            if about != self._about and time.monotonic() - at > _BETWEEN_S:
+                self._say("still compiling")
+
+    def on_end(self, event: event.Event) -> None:
+        """Note that it is compiled.
+
+        Parameters
+        ----------
+        event : numba.core.event.Event
+            As in `on_start`.
+        """
+        del event
+        self._depth -= 1
+
+    def _announce(self) -> None:
+        if self._depth and self._said is None:
+            self._say("compiling the numerical kernels, once per installation")
+
+    def _say(self, text: str) -> None:
+        with self._lock:
+            self._said = self._about, time.monotonic()
+        self._notify(f"{text}: {self._about}…")
+
+    def wait(self) -> None:
+        """Wait for the other process, where there is one."""
+        if self._other is not None:
+            self._other.wait()
+
+    def close(self) -> None:
+        """Say nothing any more, and end the other process."""
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._other is not None and self._other.poll() is None:
+            self._other.kill()
+            self._other.wait()
+
+
+def _started() -> subprocess.Popen[bytes] | None:
+    """Start the other process; what it does not compile is compiled in this one."""
+    if not sys.executable:  # inside another program
+        return None
+    nowhere = subprocess.DEVNULL
+    command = [sys.executable, "-m", "iscat_analysis.inference.ahead"]
+    try:
+        return subprocess.Popen(
+            command, stdin=nowhere, stdout=nowhere, stderr=nowhere, env=_kernels.environment()
+        )
+    except OSError:
+        return None
+
+
+@contextmanager
+def compiling(notify: Callable[[str], None], workers: int) -> Iterator[Compilation]:
+    """Say what is compiled until the block ends.
+
+    Parameters
+    ----------
+    notify : callable
+        Told one line at a time, after a second of compilation.
+    workers : int
+        From two on, a second process compiles half of what fits need.
+
+    Yields
+    ------
+    Compilation
+        Whose `wait` waits for that process.
+    """
+    if _kernels.TEMPORARY:
+        notify(
+            "compiled kernels cannot be kept, because neither the installation nor the home "
+            "folder can be written: every run compiles them anew; set NUMBA_CACHE_DIR to a folder "
+            "that can be written"
+        )
+    listener = Compilation(notify, together=workers > 1)
+    try:
+        with event.install_listener("numba:compile", listener):
+            yield listener
+    finally:
+        listener.close()

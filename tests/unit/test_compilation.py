@@ -1,0 +1,165 @@
+"""Compiled kernels: what is said while they are made, by how many processes, and where they go."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from numba.core import event
+
+import iscat_analysis
+from iscat_analysis import _kernels
+from iscat_analysis._kernels.hessian import signal_hessian
+from iscat_analysis._kernels.score_test import score_statistic
+from iscat_analysis._kernels.scoring import maximize, scan_heights, value_batch
+from iscat_analysis.config import load_config
+from iscat_analysis.inference import ahead
+from iscat_analysis.inference.noise import compile_kernels
+from iscat_analysis.optics.forward import forward_model
+from iscat_analysis.pipeline import compilation as module
+from iscat_analysis.pipeline.compilation import compiling
+
+ROOM = "iscat_analysis._kernels"
+
+
+def kernel(name: str) -> dict[str, SimpleNamespace]:
+    """Give the data of the event of a function of a module that is compiled."""
+    return {"dispatcher": SimpleNamespace(py_func=SimpleNamespace(__module__=name))}
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """Start processes that do nothing, and list them."""
+    begun = []
+
+    def start():
+        begun.append(subprocess.Popen([sys.executable, "-c", ""]))
+        return begun[-1]
+
+    monkeypatch.setattr(module, "_started", start)
+    return begun
+
+
+def test_compilation_is_announced_once_and_its_stages_are_named(monkeypatch, started):
+    monkeypatch.setattr(module, "_PATIENCE_S", 0.0)
+    monkeypatch.setattr(module, "_BETWEEN_S", 0.0)
+    said = []
+    with compiling(said.append, 1):
+        with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.radial")):
+            while not said:
+                time.sleep(0.001)
+            with event.trigger_event("numba:compile", data=kernel("numba.np.arrayobj")):
+                pass
+        for _ in range(2):
+            with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.scoring")):
+                pass
+    with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.moving")):
+        pass
+    assert said == [
+        "compiling the numerical kernels, once per installation: the tables of the microscope…",
+        "still compiling: fits…",
+    ]
+    assert not started
+
+
+def test_nothing_is_said_of_a_kernel_that_is_quick(monkeypatch):
+    monkeypatch.setattr(module, "_PATIENCE_S", 0.05)
+    said = []
+    with compiling(said.append, 1) as compilation:
+        with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.sliding")):
+            pass
+        compilation._timer.join()
+    assert not said
+
+
+def test_a_second_process_is_started_for_the_kernels_of_fits_alone(started):
+    with compiling(print, 2) as compilation:
+        for name in ("sliding", "drift"):
+            with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.{name}")):
+                pass
+        assert not started
+        for _ in range(2):
+            with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.image")):
+                pass
+        assert len(started) == 1
+        compilation.wait()
+        assert started[0].returncode == 0
+
+
+def test_the_second_process_ends_with_the_first(monkeypatch):
+    command = [sys.executable, "-c", "import time; time.sleep(600)"]
+    other = subprocess.Popen(command)
+    monkeypatch.setattr(module, "_started", lambda: other)
+    with (
+        pytest.raises(KeyboardInterrupt),
+        compiling(print, 2),
+        event.trigger_event("numba:compile", data=kernel(f"{ROOM}.radial")),
+    ):
+        raise KeyboardInterrupt
+    assert other.returncode not in (None, 0)
+
+
+def test_the_second_process_compiles_what_the_first_needs():
+    shared = (value_batch, signal_hessian, scan_heights, score_statistic)
+    ahead.main()
+    made = [set(kernel.signatures) for kernel in shared]
+    assert all(made)
+    config = load_config(Path("sample_configs/joint.toml"), [])
+    compile_kernels(forward_model(config, 2000.0))
+    assert [set(kernel.signatures) for kernel in shared] == made
+    assert len(maximize.signatures) == 1
+
+
+def test_kernels_are_kept_where_nothing_can_be_written(tmp_path):
+    package = tmp_path / "iscat_analysis"
+    shutil.copytree(
+        Path(iscat_analysis.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+    )
+    blocked = tmp_path / "file"
+    blocked.write_text("a file is no folder, for whoever runs this", encoding="utf-8")
+    (package / "_kernels" / "__pycache__").write_text("", encoding="utf-8")
+    environment = {
+        **{name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"},
+        "PYTHONPATH": str(tmp_path),
+        "HOME": str(blocked),
+        "XDG_CACHE_HOME": str(blocked),
+        "LOCALAPPDATA": str(blocked),
+        "TMPDIR": str(tmp_path),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    code = """
+import os, numpy as np
+from iscat_analysis import _kernels
+from iscat_analysis._kernels.score_test import _dot
+assert _dot(np.ones(4), np.ones(4)) == 4
+folder = _kernels.environment()["NUMBA_CACHE_DIR"]
+print(_kernels.TEMPORARY, folder, sum(len(files) for _, _, files in os.walk(folder)))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment,
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    temporary, folder, files = done.stdout.split()
+    assert temporary == "True"
+    assert Path(folder).parent == tmp_path
+    assert int(files) == 2
+    assert not Path(folder).exists()
+
+
+def test_it_is_said_where_kernels_cannot_be_kept(monkeypatch):
+    said = []
+    with compiling(said.append, 1):
+        pass
+    assert not said
+    monkeypatch.setattr(_kernels, "TEMPORARY", True)
+    with compiling(said.append, 1):
+        pass
+    assert len(said) == 1
+    assert "NUMBA_CACHE_DIR" in said[0]
