@@ -228,6 +228,31 @@ def _row_signal(
         out[j] += weight * a * (2 * rho * eu_r + a * power)
 
 
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _row_parts(
+    profile: FloatArray,
+    lens: Lens,
+    x: FloatArray,
+    x_p: float,
+    dy: float,
+    weight: float,
+    f: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Add weight × what multiplies a and a² in one row of signals to `out` (2, nx)."""
+    inv_step, rho, cos_psi, sin_psi = lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi
+    co, cross, ring = lens.co, lens.cross, lens.ring
+    _row_fields(profile, inv_step, x, x_p, dy, False, f)
+    for j in range(x.size):
+        dx = x[j] - x_p
+        u, v = cos_psi * dx + sin_psi * dy, cos_psi * dy - sin_psi * dx
+        c2, s2 = co * (u * u - v * v), cross * (2 * u * v) + ring * (u * u + v * v)
+        eu_r, eu_i = f[0, j] + f[2, j] * c2, f[1, j] + f[3, j] * c2
+        ev_r, ev_i = f[2, j] * s2, f[3, j] * s2
+        out[0, j] += weight * 2 * rho * eu_r
+        out[1, j] += weight * (eu_r * eu_r + eu_i * eu_i + ev_r * ev_r + ev_i * ev_i)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def workspace(lens: Lens, pixels: Pixels) -> FloatArray:
     """Scratch for the rows of an image, wherever the particle is."""
@@ -310,6 +335,41 @@ def row_signal(
                 profile, lens, pixels.x, x_p - pixels.offsets[j], dy, amplitude,
                 pixels.weights[i] * pixels.weights[j], f, out,
             )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def signal_parts(
+    profile: FloatArray,
+    lens: Lens,
+    pixels: Pixels,
+    x_p: float,
+    y_p: float,
+    unit: float,
+    f: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Fill `out` (ny, 2, nx) with P and Q of the signal a P + a² Q.
+
+    `unit` is an amplitude at which neither drowns in the other, `f` the work space.
+    """
+    begin_image(profile, lens, pixels, x_p, y_p, False, f)
+    for row in range(pixels.y.size):
+        p, q = out[row, 0], out[row, 1]
+        if lens.fine or lens.half:
+            row_signal(profile, lens, pixels, row, x_p, y_p, unit, f, p)
+            row_signal(profile, lens, pixels, row, x_p, y_p, -unit, f, q)
+            for j in range(p.size):
+                up, down = p[j], q[j]
+                p[j], q[j] = (up - down) / (2 * unit), (up + down) / (2 * unit * unit)
+            continue
+        out[row] = 0.0
+        for i in range(pixels.offsets.size):
+            dy = pixels.y[row] + pixels.offsets[i] - y_p
+            for j in range(pixels.offsets.size):
+                _row_parts(
+                    profile, lens, pixels.x, x_p - pixels.offsets[j], dy,
+                    pixels.weights[i] * pixels.weights[j], f, out[row],
+                )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

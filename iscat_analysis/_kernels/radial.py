@@ -246,6 +246,22 @@ def _turn(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _add_carrier(
+    kappa: float,
+    re: FloatArray,
+    im: FloatArray,
+    slope_re: FloatArray,
+    slope_im: FloatArray,
+    bend_re: FloatArray,
+    bend_im: FloatArray,
+) -> None:
+    """Add to ∂²/∂z² what the carrier gives, 2iκ (∂z + iκ) + κ², the slopes having theirs."""
+    for j in range(re.size):
+        bend_re[j] += kappa * (kappa * re[j] - 2 * slope_im[j])
+        bend_im[j] += kappa * (kappa * im[j] + 2 * slope_re[j])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def profile_at(
     axial: AxialTable,
     z_nm: float,
@@ -264,17 +280,17 @@ def profile_at(
         Height [nm], inside the table.
     start, stop : int
         Range of the flattened profile.
-    work : ndarray, shape (channels, 2, width)
+    work : ndarray, shape (channels, orders, width)
         Scratch.
-    profile : ndarray, shape (channels or twice as many, …, …)
-        Filled; with twice the channels of the table ∂/∂z too.
+    profile : ndarray, shape (orders·channels, …, …)
+        Filled; with twice the channels of the table ∂/∂z too, with three times ∂²/∂z² as well.
     """
     heights, first_nm, step_nm, kappa = axial
     place = (z_nm - first_nm) / step_nm
     i = min(max(int(place), 0), heights.shape[0] - 2)
     t = place - i
     t2, t3, t4, t5 = t**2, t**3, t**4, t**5
-    v, d = np.empty(6), np.empty(6)
+    v, d, b = np.empty(6), np.empty(6), np.empty(6)
     v[3] = 10 * t3 - 15 * t4 + 6 * t5
     v[0] = 1 - v[3]
     v[1] = t - 6 * t3 + 8 * t4 - 3 * t5
@@ -288,14 +304,24 @@ def profile_at(
     d[4] = -12 * t2 + 28 * t3 - 15 * t4
     d[5] = 1.5 * t2 - 4 * t3 + 2.5 * t4
     d /= step_nm
+    b[3] = 60 * t - 180 * t2 + 120 * t3
+    b[0] = -b[3]
+    b[1] = -36 * t + 96 * t2 - 60 * t3
+    b[2] = 1 - 9 * t + 18 * t2 - 10 * t3
+    b[4] = -24 * t + 84 * t2 - 60 * t3
+    b[5] = 3 * t - 12 * t2 + 10 * t3
+    b /= step_nm * step_nm
     channels, width = heights.shape[2:]
     with_slope = profile.shape[0] > channels
+    with_bend = profile.shape[0] > 2 * channels
     cos, sin = np.cos(kappa * z_nm), np.sin(kappa * z_nm)
     flat = profile.reshape(profile.shape[0], width)
     for channel in range(channels):
         _mix(heights, i, channel, start, v, work[channel, 0, start:stop])
         if with_slope:
             _mix(heights, i, channel, start, d, work[channel, 1, start:stop])
+        if with_bend:
+            _mix(heights, i, channel, start, b, work[channel, 2, start:stop])
     for c in range(0, channels, 2):
         re, im = work[c, 0, start:stop], work[c + 1, 0, start:stop]
         if with_slope:
@@ -307,4 +333,108 @@ def profile_at(
                 slope_re, slope_im, cos, sin,
                 flat[c + channels, start:stop], flat[c + channels + 1, start:stop],
             )  # fmt: skip
+        if with_bend:
+            _add_carrier(kappa, re, im, work[c, 1, start:stop], work[c + 1, 1, start:stop],
+                         work[c, 2, start:stop], work[c + 1, 2, start:stop])  # fmt: skip
+            there = c + 2 * channels
+            _turn(
+                work[c, 2, start:stop], work[c + 1, 2, start:stop], cos, sin,
+                flat[there, start:stop], flat[there + 1, start:stop],
+            )  # fmt: skip
         _turn(re, im, cos, sin, flat[c, start:stop], flat[c + 1, start:stop])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def profile_between(axial: AxialTable, z_nm: float, profile: FloatArray) -> None:
+    """Fill a whole profile of one order or more by interpolation along z."""
+    channels, width = axial.heights.shape[2:]
+    work = np.empty((channels, profile.shape[0] // channels, width))
+    profile_at(axial, z_nm, 0, width, work, profile)
+
+
+@njit(inline="always")
+def _quintic(profile: FloatArray, channel: int, i: int, t: float) -> float:
+    """Evaluate one channel in an interval."""
+    v = profile[channel, i, 5]
+    v = v * t + profile[channel, i, 4]
+    v = v * t + profile[channel, i, 3]
+    v = v * t + profile[channel, i, 2]
+    v = v * t + profile[channel, i, 1]
+    value: float = v * t + profile[channel, i, 0]
+    return value
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _extremes(
+    profile: FloatArray,
+    inv_step: float,
+    place: float,
+    amplitude: float,
+    rho: float,
+    circular: bool,
+    analyzer: bool,
+    parts: FloatArray,
+) -> int:
+    """Fill the linear and quadratic part (3, 2) of the signal in the directions that matter.
+
+    At fixed r the signal is a function of cos 2φ, with its extremes at ±1 or where its slope
+    vanishes.  `place` is r in steps; the number of directions is returned.
+    """
+    i = min(int(place), profile.shape[1] - 1)
+    t, a = place - i, amplitude
+    square = (place / inv_step) ** 2
+    f0r, f0i = _quintic(profile, 0, i, t), _quintic(profile, 1, i, t)
+    f2r, f2i = square * _quintic(profile, 2, i, t), square * _quintic(profile, 3, i, t)
+    if circular:
+        other = 0.0 if analyzer else f2r * f2r + f2i * f2i
+        parts[0, 0] = 2 * rho * a * f0r
+        parts[0, 1] = a * a * (f0r * f0r + f0i * f0i + other)
+        return 1
+    ways = 3 if analyzer else 2
+    for way in range(ways):
+        turn = 1.0 - 2.0 * way
+        if way == 2:
+            slope = rho * f2r + a * (f0r * f2r + f0i * f2i)
+            sign = -1.0 if a < 0 else 1.0
+            bend = max(abs(a) * (f2r * f2r + f2i * f2i), 1e-300)
+            turn = min(max(-slope / bend * sign, -1.0), 1.0)
+        re, im = f0r + turn * f2r, f0i + turn * f2i
+        parts[way, 0] = 2 * rho * a * re
+        parts[way, 1] = a * a * (re * re + im * im)
+    return ways
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def largest_signal(
+    profile: FloatArray,
+    inv_step: float,
+    per_step: int,
+    amplitude: float,
+    rho: float,
+    circular: bool,
+    analyzer: bool,
+) -> tuple[float, float]:
+    """Parts of the signal of largest magnitude that are linear and quadratic in the amplitude.
+
+    The largest on a radial grid of `per_step` points in each interval of the profile, then that of
+    a parabola through its neighbours.
+    """
+    count = per_step * profile.shape[1]
+    sums, parts = np.empty((3, count)), np.empty((3, 2))
+    way = best = 0
+    top = -1.0
+    for j in range(count):
+        ways = _extremes(profile, inv_step, j / per_step, amplitude, rho, circular, analyzer, parts)
+        for k in range(ways):
+            sums[k, j] = parts[k, 0] + parts[k, 1]
+            size = abs(sums[k, j])
+            if size > top:
+                top, way, best = size, k, j
+    place = best / per_step
+    if 0 < best < count - 1:
+        low, mid, high = sums[way, best - 1], sums[way, best], sums[way, best + 1]
+        bend = low - 2 * mid + high
+        if bend != 0.0:
+            place += 0.5 * (low - high) / bend / per_step
+    _extremes(profile, inv_step, place, amplitude, rho, circular, analyzer, parts)
+    return parts[way, 0], parts[way, 1]

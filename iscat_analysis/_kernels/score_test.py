@@ -1,9 +1,13 @@
-"""Rao's score test against modes, with the fitted directions projected out.
+"""Residuals of a fit and Rao's score test against modes, with the fitted directions projected out.
 
-Everything is a vector over the pixels, in units of their standard deviation.  Modified
-Gram–Schmidt, fitted directions first, makes every mode orthogonal to what precedes it; the squares
-of the residual's components along the modes then add up to a χ².  Written out because a threaded
-BLAS is slower than this by far on matrices so small.
+A mode is a product H_i(x) H_j(y).  The information between two of them is therefore a sum over rows
+of pixels of H_j H_l Σ_x ω H_i H_k, ω the information of a pixel on the logarithm of its light: a
+few multiply-adds per pixel, whatever the number of modes.  With G the information of the fitted
+directions and the modes, G = L Lᵀ in this order and b the residual along them, the squares of L⁻¹b
+that belong to the modes add up to a χ².
+
+Data are those of `iscat_analysis._kernels.scoring`, `rows` those of `iscat_analysis._kernels.image`
+or `iscat_analysis._kernels.hessian`: s and its derivatives in (x, y, z, a), each row of pixels.
 """
 
 from __future__ import annotations
@@ -13,45 +17,274 @@ from numba import njit
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+_DARK = 1e-100  # expected light below which a pixel knows nothing of relative changes
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _dot(a: FloatArray, b: FloatArray) -> float:
-    """Scalar product, shape (n,) each."""
-    total = 0.0
-    for i in range(a.size):
-        total += a[i] * b[i]
-    return total
+def _row_residuals(
+    kind: int,
+    data: FloatArray,
+    row: int,
+    level: float,
+    s: FloatArray,
+    rate: FloatArray,
+    residual: FloatArray,
+    t: FloatArray,
+) -> None:
+    """Fill expectation and residual, and t (4, nx); see `residuals`."""
+    c0, c1, c2, c3 = data[0, row], data[1, row], data[2, row], data[3, row]
+    for j in range(s.size):
+        if kind == CONDITIONAL:
+            bright = max(1.0 + s[j], FLOOR)
+            part = 1.0 / (1.0 + c2[j] * level * bright)
+            rate[j] = c1[j] * (1.0 - part)
+            t[0, j] = c3[j] * rate[j] * part
+            t[1, j] = (c0[j] - rate[j]) * c3[j]
+            t[2, j] = 1.0 / bright
+            total = c1[j] if c1[j] > 0 else 1.0
+            t[3, j] = c3[j] * (1.0 / max(rate[j] * part, 1.0) - 6.0 / total)
+        else:
+            # A background of read noise alone may be measured below zero.
+            raw = level * (c1[j] + c2[j] * s[j])
+            used = c2[j] > 0
+            light = max(raw, FLOOR) if used else 0.0
+            rate[j] = max(raw + c3[j], FLOOR)
+            t[0, j] = light * light / rate[j]
+            t[1, j] = light * (c0[j] - rate[j]) / rate[j]
+            t[2, j] = c2[j] * level / light if light > _DARK else 0.0
+            t[3, j] = 1.0 / rate[j] if used else 0.0
+    if kind == CONDITIONAL:
+        for j in range(s.size):
+            residual[j] = t[1, j] / max(np.sqrt(t[0, j]), FLOOR)
+    else:
+        for j in range(s.size):
+            residual[j] = (c0[j] - rate[j]) / np.sqrt(rate[j]) if c2[j] > 0 else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def residuals(
+    kind: int,
+    data: FloatArray,
+    level: float,
+    rows: FloatArray,
+    rate: FloatArray,
+    residual: FloatArray,
+    terms: FloatArray,
+) -> None:
+    """Fill what every pixel expects and how far its count is from it.
+
+    Parameters
+    ----------
+    kind, data, level
+        As in `iscat_analysis._kernels.scoring.row_value`.
+    rows : ndarray, shape (ny, 5 or more, nx)
+        Signal and gradient.
+    rate : ndarray, shape (ny, nx)
+        Filled with the expected counts after landing.
+    residual : ndarray, shape (ny, nx)
+        Filled with the residuals in standard deviations; 0 where masked.
+    terms : ndarray, shape (ny, 4, nx)
+        Filled with the information ω on the logarithm of the light, the residual times √ω, the
+        derivative of that logarithm by the signal, and the excess kurtosis of the counts; all but
+        the third are 0 where masked.
+    """
+    for row in range(rows.shape[0]):
+        _row_residuals(kind, data, row, level, rows[row, 0], rate[row], residual[row], terms[row])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def largest(residual: FloatArray, index: IntArray) -> None:
+    """Fill `index` (k) with the flat places of the residuals of largest size, largest first."""
+    flat = residual.reshape(-1)
+    size = np.full(index.size, -1.0)
+    last = index.size - 1
+    for i in range(flat.size):
+        here = abs(flat[i])
+        if here > size[last]:
+            k = last
+            while k > 0 and here > size[k - 1]:
+                size[k], index[k] = size[k - 1], index[k - 1]
+                k -= 1
+            size[k], index[k] = here, i
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _subtract(a: FloatArray, b: FloatArray, factor: float) -> None:
-    """Take factor·b off a, shape (n,) each."""
-    for i in range(a.size):
-        a[i] -= factor * b[i]
+def hermite(axis: FloatArray, centre: float, waist: float, order: int) -> FloatArray:
+    """Hermite functions of order 0 to `order`, shape (order + 1, n), by their recurrence."""
+    out = np.empty((order + 1, axis.size))
+    for j in range(axis.size):
+        t = (axis[j] - centre) / waist
+        out[0, j] = np.exp(-t * t / 2)
+        if order:
+            out[1, j] = np.sqrt(2.0) * t * out[0, j]
+        for n in range(2, order + 1):
+            out[n, j] = np.sqrt(2.0 / n) * t * out[n - 1, j] - np.sqrt((n - 1) / n) * out[n - 2, j]
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _products(functions: FloatArray) -> FloatArray:
+    """Products of all pairs i ≤ k of functions (n, size), at k (k + 1)/2 + i."""
+    count, size = functions.shape
+    out = np.empty((count * (count + 1) // 2, size))
+    for k in range(count):
+        for i in range(k + 1):
+            for j in range(size):
+                out[k * (k + 1) // 2 + i, j] = functions[i, j] * functions[k, j]
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _moments(lines: FloatArray, functions: FloatArray, out: FloatArray) -> None:
+    """Fill `out` (m, n) with the scalar products of lines (m, size) and functions (n, size)."""
+    for i in range(lines.shape[0]):
+        for k in range(functions.shape[0]):
+            total = 0.0
+            for j in range(lines.shape[1]):
+                total += lines[i, j] * functions[k, j]
+            out[i, k] = total
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _add_outer(moments: FloatArray, line: FloatArray, out: FloatArray) -> None:
+    """Add the moments (m, n) times a line (k) to `out` (m, n, k)."""
+    for i in range(moments.shape[0]):
+        for k in range(moments.shape[1]):
+            t = moments[i, k]
+            for j in range(line.size):
+                out[i, k, j] += t * line[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pair(i: int, k: int) -> int:
+    """Place of a pair among `_products`."""
+    low, high = min(i, k), max(i, k)
+    return high * (high + 1) // 2 + low
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _directions(
+    rows: FloatArray, row: int, index: IntArray, relative: FloatArray, out: FloatArray
+) -> None:
+    """Fill the first rows of `out` (k or more, nx) with d ln(light) along the fitted parameters."""
+    for k in range(index.size):
+        if index[k] == 4:
+            for j in range(relative.size):
+                out[k, j] = 1.0
+        else:
+            for j in range(relative.size):
+                out[k, j] = rows[row, 1 + index[k], j] * relative[j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _add_fitted(
+    directions: FloatArray,
+    fitted: int,
+    weight: FloatArray,
+    pull: FloatArray,
+    heavy: FloatArray,
+    matrix: FloatArray,
+    vector: FloatArray,
+) -> None:
+    """Add one row's share of what concerns the fitted directions only; fill `heavy` (k + 1, nx)."""
+    for j in range(weight.size):
+        heavy[fitted, j] = pull[j]
+    for f in range(fitted):
+        total = 0.0
+        for j in range(weight.size):
+            heavy[f, j] = weight[j] * directions[f, j]
+            total += pull[j] * directions[f, j]
+        vector[f] += total
+        for g in range(f + 1):
+            total = 0.0
+            for j in range(weight.size):
+                total += heavy[f, j] * directions[g, j]
+            matrix[f, g] += total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def mode_information(
+    rows: FloatArray,
+    terms: FloatArray,
+    free: BoolArray,
+    along: FloatArray,
+    across: FloatArray,
+    matrix: FloatArray,
+    vector: FloatArray,
+) -> None:
+    """Fill the information on the fitted directions and the modes, and the residual along them.
+
+    Parameters
+    ----------
+    rows, terms
+        From `signal_gradient` or `signal_hessian`, and from `residuals`.
+    free : ndarray of bool, shape (5,)
+        Fitted parameters.
+    along, across : ndarray, shape (n, nx), (n, ny)
+        H_i(x) and H_j(y).
+    matrix : ndarray, shape (k + m, k + m)
+        Lower triangle filled; the k fitted directions come first, then the m = n (n + 1)/2 modes
+        with i + j < n, j running faster.
+    vector : ndarray, shape (k + m,)
+        Filled.
+    """
+    index = np.flatnonzero(free)
+    fitted, count, nx = index.size, along.shape[0], along.shape[1]
+    products, lines = _products(along), np.ascontiguousarray(_products(across).T)
+    turned = np.ascontiguousarray(across.T)
+    directions, heavy = np.empty((fitted, nx)), np.empty((fitted + 1, nx))
+    moments = np.empty((1, products.shape[0]))
+    tensor = np.zeros((1, products.shape[0], products.shape[0]))
+    cross_moments = np.empty((fitted + 1, count))
+    cross = np.zeros((fitted + 1, count, count))
+    matrix[:] = 0.0
+    vector[:] = 0.0
+    for row in range(rows.shape[0]):
+        _directions(rows, row, index, terms[row, 2], directions)
+        _add_fitted(directions, fitted, terms[row, 0], terms[row, 1], heavy, matrix, vector)
+        _moments(terms[row, :1], products, moments)
+        _add_outer(moments, lines[row], tensor)
+        _moments(heavy, along, cross_moments)
+        _add_outer(cross_moments, turned[row], cross)
+    m = fitted
+    for i in range(count):
+        for j in range(count - i):
+            vector[m] = cross[fitted, i, j]
+            for f in range(fitted):
+                matrix[m, f] = cross[f, i, j]
+            n = fitted
+            for k in range(i + 1):
+                for other in range(count - k):
+                    if n <= m:
+                        matrix[m, n] = tensor[0, _pair(i, k), _pair(j, other)]
+                    n += 1
+            m += 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def score_statistic(
-    vectors: FloatArray, fitted: int, residual: FloatArray, dependent: float, leverage: FloatArray
+    matrix: FloatArray, vector: FloatArray, fitted: int, dependent: float, used: BoolArray
 ) -> tuple[float, int]:
     """Sum of squares of the residual along the modes.
 
     Parameters
     ----------
-    vectors : ndarray, shape (m, n)
-        Fitted directions, then modes; overwritten with the orthonormal ones.
+    matrix : ndarray, shape (n, n)
+        Lower triangle of the information; overwritten with its Cholesky factor.
+    vector : ndarray, shape (n,)
+        The residual; overwritten with its components along orthonormal directions.
     fitted : int
         How many of them are fitted directions.
-    residual : ndarray, shape (n,)
-        Data minus model.
     dependent : float
-        Squared share of a vector outside the preceding ones that counts as none; such a vector is
-        left out.
-    leverage : ndarray, shape (n,)
-        Filled with each pixel's part in the statistic: the sum of its squared mode components.
+        Share of a direction outside the preceding ones that counts as none; it is left out.
+    used : ndarray of bool, shape (n,)
+        Filled: which took part.
 
     Returns
     -------
@@ -60,28 +293,79 @@ def score_statistic(
     freedom : int
         Modes that took part.
     """
-    used = np.zeros(vectors.shape[0], dtype=np.bool_)
-    leverage[:] = 0.0
-    chi2 = 0.0
-    freedom = 0
-    for k in range(vectors.shape[0]):
-        v = vectors[k]
-        size = _dot(v, v)
-        if not size > 0.0:
-            continue
+    chi2, freedom = 0.0, 0
+    used[:] = False
+    for k in range(vector.size):
+        size = matrix[k, k]
         for j in range(k):
             if used[j]:
-                _subtract(v, vectors[j], _dot(v, vectors[j]))
-        left = _dot(v, v)
-        if not left > dependent * size:
+                total = matrix[k, j]
+                for i in range(j):
+                    if used[i]:
+                        total -= matrix[k, i] * matrix[j, i]
+                matrix[k, j] = total / matrix[j, j]
+        left = size
+        for j in range(k):
+            if used[j]:
+                left -= matrix[k, j] ** 2
+        if not (size > 0.0 and left > dependent * size):
             continue
         used[k] = True
-        length = np.sqrt(left)
-        for i in range(v.size):
-            v[i] /= length
+        matrix[k, k] = np.sqrt(left)
+        for j in range(k):
+            if used[j]:
+                vector[k] -= matrix[k, j] * vector[j]
+        vector[k] /= matrix[k, k]
         if k >= fitted:
-            chi2 += _dot(v, residual) ** 2
+            chi2 += vector[k] ** 2
             freedom += 1
-            for i in range(v.size):
-                leverage[i] += v[i] * v[i]
     return chi2, freedom
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _orthonormal(w: FloatArray, factor: FloatArray, used: BoolArray) -> None:
+    """Turn directions (n, nx) into orthonormal ones, by their Cholesky factor."""
+    for k in range(used.size):
+        if not used[k]:
+            continue
+        for i in range(k):
+            if used[i]:
+                t = factor[k, i]
+                for j in range(w.shape[1]):
+                    w[k, j] -= t * w[i, j]
+        t = 1.0 / factor[k, k]
+        for j in range(w.shape[1]):
+            w[k, j] *= t
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def leverages(
+    rows: FloatArray,
+    terms: FloatArray,
+    free: BoolArray,
+    along: FloatArray,
+    across: FloatArray,
+    factor: FloatArray,
+    used: BoolArray,
+    out: FloatArray,
+) -> None:
+    """Fill `out` (ny, nx) with each pixel's part in the statistic, after `score_statistic`.
+
+    It is the sum of the squares of the pixel's components of the orthonormal modes.
+    """
+    index = np.flatnonzero(free)
+    fitted, count = index.size, along.shape[0]
+    w = np.empty((used.size, along.shape[1]))
+    for row in range(rows.shape[0]):
+        _directions(rows, row, index, terms[row, 2], w)
+        k = fitted
+        for i in range(count):
+            for j in range(count - i):
+                w[k] = along[i] * across[j, row]
+                k += 1
+        w *= np.sqrt(terms[row, 0])
+        _orthonormal(w, factor, used)
+        out[row] = 0.0
+        for k in range(fitted, used.size):
+            if used[k]:
+                out[row] += w[k] ** 2

@@ -36,8 +36,11 @@ BoolArray = NDArray[np.bool_]
 
 CONDITIONAL, POISSON = 0, 1
 
-CONVERGED, STALLED, EXHAUSTED = 0, 1, 2
-"""How a fit ended: step below tolerance; no step improves; iterations used up."""
+CONVERGED, STALLED, EXHAUSTED, HOPELESS = 0, 1, 2, 3
+"""How a fit ended: step below tolerance; no step improves; iterations used up; little to gain."""
+
+HOPE = 4.0
+"""Multiple of the expected gain in log-likelihood that a fit is trusted to make."""
 
 SERIES = 0.2
 """Largest |x| at which ln(1+x) is taken from its series."""
@@ -243,7 +246,7 @@ def scratch(axial: AxialTable, lens: Lens, orders: int) -> tuple[FloatArray, Flo
     if lens.fine:
         return np.empty((0, 0, 0)), np.empty((0, 0, 0))
     last = 2 * lens.half + 1 if lens.half else 6
-    work = np.empty((channels, 2, width))
+    work = np.empty((channels, orders, width))
     return work, np.empty((orders * channels, width // last, last))
 
 
@@ -378,6 +381,7 @@ def maximize(
     theta: FloatArray,
     score: FloatArray,
     fisher: FloatArray,
+    least: float = -np.inf,
 ) -> tuple[float, int, int]:
     """Damped Fisher scoring inside a box, from θ, which is overwritten with the estimate.
 
@@ -403,6 +407,9 @@ def maximize(
         Start; overwritten.
     score, fisher : ndarray, shape (5,), (5, 5)
         Filled with those at the last pass.
+    least : float
+        Log-likelihood below which the maximum is of no interest: the search ends, as if converged,
+        where `HOPE` times the expected gain would not reach it.
 
     Returns
     -------
@@ -411,7 +418,7 @@ def maximize(
     passes : int
         Passes over the data.
     outcome : int
-        CONVERGED, STALLED or EXHAUSTED.
+        CONVERGED, STALLED, EXHAUSTED or HOPELESS.
     """
     work, profile = scratch(axial, lens, 2)
     width = axial.heights.shape[3]
@@ -434,6 +441,9 @@ def maximize(
                 return value, passes, STALLED
             damping = max(10 * damping, 1e-3)
             continue
+        hoped = 0.0
+        for i in range(5):
+            hoped += 0.5 * HOPE * score[i] * step[i]
         shrink = 1.0
         for i in range(5):
             if active[i] and abs(step[i]) * shrink > max_step[i]:
@@ -448,6 +458,9 @@ def maximize(
             for i in range(5):
                 theta[i] = trial[i]
             return value + gain, passes, CONVERGED
+        if damping == 0.0 and value + hoped < least:
+            theta[:] = trial
+            return value + gain, passes, HOPELESS
         if free[2]:
             start, stop = span(lens, pixels, trial, width)
             profile_at(axial, trial[2], start, stop, work, profile)
@@ -467,39 +480,3 @@ def maximize(
                 return value, passes, STALLED
             damping = max(10 * damping, 1e-3)
     return value, passes, EXHAUSTED
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def scan_heights(
-    axial: AxialTable,
-    lens: Lens,
-    pixels: Pixels,
-    kind: int,
-    data: FloatArray,
-    heights: FloatArray,
-    amplitude_range: tuple[float, float],
-    theta: FloatArray,
-    values: FloatArray,
-    amplitudes: FloatArray,
-) -> None:
-    """Profile log-likelihood along z at fixed (x, y): the amplitude takes two scoring steps.
-
-    Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the rest and the start.  An
-    empty amplitude range holds the amplitude fixed.
-    """
-    work, profile = scratch(axial, lens, 2)
-    score, fisher = np.empty(5), np.empty((5, 5))
-    here = theta.copy()
-    low, high = amplitude_range
-    for k in range(heights.size):
-        here[2] = heights[k]
-        here[3] = theta[3]
-        start, stop = span(lens, pixels, here, axial.heights.shape[3])
-        profile_at(axial, here[2], start, stop, work, profile)
-        if low < high:
-            for _ in range(2):
-                score_pass(profile, lens, pixels, kind, data, here, score, fisher)
-                if fisher[3, 3] > 0:
-                    here[3] = min(max(here[3] + score[3] / fisher[3, 3], low), high)
-        values[k] = value_pass(profile, lens, pixels, kind, data, here)
-        amplitudes[k] = here[3]

@@ -17,12 +17,14 @@ the level is a nuisance, and bounds count it as one.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
+from iscat_analysis._kernels.curvature import invert
 from iscat_analysis.inference.bias import first_order_bias
 from iscat_analysis.inference.goodness import goodness_of_fit
-from iscat_analysis.inference.likelihood import LEVEL, Derivatives, Likelihood, Optimum
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     PARAMETERS,
@@ -41,6 +43,9 @@ AMBIGUITY_ODDS = 1000.0
 
 POOR_FIT_P = 1e-3
 """p-value below which the model is said not to describe the data: 1 good fit in 1000."""
+
+FOLLOWED = 30.0
+"""Log-likelihood below the best optimum down to which others are followed to their ends."""
 
 OUTWARD = 3.0
 """Standard deviations by which the data pull a height beyond the end of its range before the fit is
@@ -168,9 +173,9 @@ def fit_particle(
     model = likelihood.model
     alternatives = _alternatives(optima, model.fringe_nm)
     names = tuple(name for name, free in zip(PARAMETERS, box.free[:4], strict=True) if free)
-    derivatives = likelihood.derivatives(best.theta)
+    derivatives = likelihood.derivatives(best.theta, box.free)
     sigma, covariance = _uncertainty(likelihood, best, box, derivatives)
-    chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free)
+    chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free, derivatives)
     walls = _walls(best.theta, box)
     flags = []
     if not best.converged or not np.all(np.isfinite(sigma[box.free[:4]])):
@@ -201,7 +206,7 @@ def fit_particle(
         free=names,
         sigma=sigma,
         covariance=covariance,
-        contrast=model.amplitude_contrast(z, amplitude),
+        contrast=model.amplitude_contrast(z, amplitude, "between" if box.free[2] else "exact"),
         log_likelihood=best.log_likelihood,
         snr=detection_snr(likelihood, best, box),
         iterations=best.passes,
@@ -265,30 +270,49 @@ def start_theta(likelihood: Likelihood, start: Candidate) -> FloatArray:
 
 
 def _optima(likelihood: Likelihood, start: Candidate, box: Box) -> list[Optimum]:
-    """Every optimum that was reached, best first."""
+    """Every optimum that was reached, best first.
+
+    Starts are followed in the order of their likelihood, each from the place of the best before it,
+    and no farther than shows that the optimum cannot be within `FOLLOWED` of the best; such an
+    optimum is known to one step of scoring.
+    """
     theta = start_theta(likelihood, start)
     theta = np.where(box.free, np.clip(theta, box.lower, box.upper), theta)
-    starts = _heights(likelihood, theta, box) if box.free[2] else [theta]
-    optima = [likelihood.maximize(s, box.free, box.lower, box.upper) for s in starts]
+    if not box.free[2]:
+        return [likelihood.maximize(theta, box.free, box.lower, box.upper)]
+    optima: list[Optimum] = []
+    best = -math.inf
+    for begin, value in _heights(likelihood, theta, box):
+        if box.free[3] and begin[3] == 0.0 and best > 0.0:
+            optima.append(Optimum(begin, value, 0, False, np.zeros((5, 5))))  # no particle there
+            continue
+        found = likelihood.maximize(begin, box.free, box.lower, box.upper, least=best - FOLLOWED)
+        optima.append(found)
+        if found.converged and found.log_likelihood > best:
+            best = found.log_likelihood
+            theta[:2], theta[LEVEL] = found.theta[:2], found.theta[LEVEL]
     return sorted(optima, key=lambda o: (not o.converged, -o.log_likelihood))
 
 
-def _heights(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[FloatArray]:
-    """Start at the local maxima of the likelihood along z, and at the given height."""
+def _heights(
+    likelihood: Likelihood, theta: FloatArray, box: Box
+) -> Iterator[tuple[FloatArray, float]]:
+    """Start at the local maxima of the likelihood along z, best first.
+
+    Each start is θ at the time when it is asked for, with a maximum's height and amplitude; beside
+    it the log-likelihood that was found there.
+    """
     low, high = box.lower[2], box.upper[2]
     count = math.ceil((high - low) / likelihood.model.fringe_nm * SCANS_PER_FRINGE) + 1
-    heights = np.linspace(low, high, max(count, 3))
+    heights = np.unique(np.append(np.linspace(low, high, max(count, 3)), theta[2]))
     bounds = (float(box.lower[3]), float(box.upper[3])) if box.free[3] else None
     values, amplitudes = likelihood.scan_heights(heights, theta, bounds)
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
     peaks = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]))
-    peaks = peaks[np.argsort(-values[peaks])][:_STARTS]
-    starts = [theta]
-    for i in peaks:
+    for i in peaks[np.argsort(-values[peaks], kind="stable")][:_STARTS]:
         begin = theta.copy()
         begin[2], begin[3] = heights[i], amplitudes[i]
-        starts.append(begin)
-    return starts
+        yield begin, float(values[i])
 
 
 def _alternatives(optima: list[Optimum], fringe_nm: float) -> tuple[Alternative, ...]:
@@ -306,23 +330,21 @@ def _alternatives(optima: list[Optimum], fringe_nm: float) -> tuple[Alternative,
 
 
 def _uncertainty(
-    likelihood: Likelihood, best: Optimum, box: Box, derivatives: Derivatives
+    likelihood: Likelihood, best: Optimum, box: Box, derivatives: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """σ of (x, y, z, mass) and the covariance of the free ones; NaN unless positive definite."""
-    index = np.flatnonzero(box.free)
-    information = likelihood.observed_information(best.theta, derivatives)[np.ix_(index, index)]
-    scale = 1 / np.sqrt(np.maximum(np.diag(best.fisher)[index], 1e-300))
-    scaled = information * np.outer(scale, scale)
+    free = box.free
+    information = likelihood.observed_information(best.theta, derivatives)
+    scale = 1 / np.sqrt(np.maximum(best.fisher.diagonal(), 1e-300))
+    inverse = np.empty((5, 5))
     sigma = np.full(4, np.nan)
-    particle = index < 4
-    try:
-        np.linalg.cholesky(scaled)
-        covariance = np.linalg.inv(scaled) * np.outer(scale, scale)
-    except np.linalg.LinAlgError:
-        return sigma, np.full((int(particle.sum()), int(particle.sum())), np.nan)
-    units = np.where(index == 3, abs(likelihood.model.scale.slope(float(best.theta[3]))), 1.0)
-    covariance = (covariance * np.outer(units, units))[np.ix_(particle, particle)]
-    sigma[index[particle]] = np.sqrt(np.diag(covariance))
+    known = invert(information, scale, free, inverse)
+    inverse[AMPLITUDE] *= abs(likelihood.model.scale.slope(float(best.theta[AMPLITUDE])))
+    inverse[:, AMPLITUDE] *= abs(likelihood.model.scale.slope(float(best.theta[AMPLITUDE])))
+    particle = np.flatnonzero(free[:4])
+    covariance = inverse[particle][:, particle]
+    if known:
+        sigma[particle] = np.sqrt(covariance.diagonal())
     return sigma, covariance
 
 

@@ -23,8 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betainc, gammainc, gammaincc, ndtr, pdtr, pdtrc
 
-from iscat_analysis._kernels.score_test import score_statistic
-from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR
+from iscat_analysis._kernels.score_test import (
+    hermite,
+    largest,
+    leverages,
+    mode_information,
+    residuals,
+    score_statistic,
+)
+from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 
 FloatArray = NDArray[np.float64]
@@ -42,16 +49,20 @@ POOLED_COUNTS = 5.0
 MANY_COUNTS = 1e6
 """Counts above which tails are normal: 5 σ out to a few per cent."""
 
-_DARK = 1e-100  # expected light below which a pixel knows nothing of relative changes
 _TESTS = 3
 _NARROWEST = 0.1  # variance of a sum of squares over that of normal residuals, at least
 _SUSPECTS = 8  # largest residuals whose exact tail is looked up
 _DEPENDENT = 1e-8  # share of a mode outside the fitted directions that counts as none
+_NORMAL = 1e-4  # excess kurtosis that changes no p-value
+_MODES = (ORDER + 1) * (ORDER + 2) // 2
 _FINEST = 1e-11  # tail below which whole counts are not told from continuous ones
 
 
 def goodness_of_fit(
-    likelihood: Likelihood, theta: FloatArray, free: BoolArray
+    likelihood: Likelihood,
+    theta: FloatArray,
+    free: BoolArray,
+    derivatives: FloatArray | None = None,
 ) -> tuple[float, float]:
     """Judge one fit.
 
@@ -63,6 +74,8 @@ def goodness_of_fit(
         The estimate.
     free : ndarray of bool, shape (5,)
         Which parameters were fitted.
+    derivatives : ndarray, shape (ny, ROWS, nx), optional
+        Of the signal at θ, where they are known already.
 
     Returns
     -------
@@ -76,7 +89,7 @@ def goodness_of_fit(
     -----
     Z. Šidák, J. Am. Stat. Assoc. 62, 626 (1967).
     """
-    view = _look(likelihood, theta)
+    view = _look(likelihood, theta, derivatives)
     chi2, spread_p = _scatter(view, free)
     if not math.isfinite(spread_p):
         return chi2, math.nan
@@ -154,42 +167,31 @@ def outlier(likelihood: Likelihood, theta: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class _View:
-    """Used pixels of one fit, each array of shape (n,) but the last two."""
+    """One fit as its pixels see it."""
 
-    observed: FloatArray  # counts after landing
-    rate: FloatArray  # their expectation
-    total: FloatArray | None  # counts before and after; None unless conditional
-    share: FloatArray  # of the variance that is not read noise; 1 where that is part of the rate
-    residual: FloatArray  # in standard deviations
-    weight: FloatArray  # root of the information on ln(intensity)
-    relative: FloatArray  # d ln(intensity) / d signal
-    gradient: FloatArray  # (4, n), of the signal
+    data: FloatArray  # (4, ny, nx)
+    conditional: bool
     used: BoolArray  # (ny, nx)
+    rows: FloatArray  # (ny, 5 or more, nx), signal and derivatives
+    rate: FloatArray  # (ny, nx), expected counts after landing
+    residual: FloatArray  # (ny, nx), in standard deviations
+    terms: FloatArray  # (ny, 4, nx), see `residuals`
+
+    @property
+    def kurtosis(self) -> FloatArray:
+        """Excess kurtosis of each pixel's counts, shape (ny, nx); 0 where masked."""
+        return self.terms[:, 3]
 
 
-def _look(likelihood: Likelihood, theta: FloatArray) -> _View:
-    place = (float(value) for value in theta[:4])
-    signal, gradient = likelihood.model.amplitude_gradient(likelihood.grid, *place)
+def _look(likelihood: Likelihood, theta: FloatArray, rows: FloatArray | None = None) -> _View:
+    if rows is None:
+        rows = likelihood.derivatives(theta)
+    rate, residual = np.empty(likelihood.grid.shape), np.empty(likelihood.grid.shape)
+    terms = np.empty((rate.shape[0], 4, rate.shape[1]))
+    level = math.exp(theta[LEVEL])
+    residuals(likelihood.kind, likelihood.data, level, rows, rate, residual, terms)
     conditional = likelihood.kind == CONDITIONAL
-    used = likelihood.data[3 if conditional else 2] > 0
-    c0, c1, c2, c3 = (c[used] for c in likelihood.data)
-    level, s = math.exp(theta[LEVEL]), signal[used]
-    if conditional:
-        bright = np.maximum(1 + s, FLOOR)
-        p = c2 * level * bright / (1 + c2 * level * bright)
-        rate, total, share = c1 * p, c1, c3
-        weight = np.sqrt(share * rate * (1 - p))
-        residual = (c0 - rate) * share / np.maximum(weight, FLOOR)
-        relative = 1 / bright
-    else:
-        # A background of read noise alone may be measured below zero.
-        rate = np.maximum(level * (c1 + c2 * s) + c3, FLOOR)
-        light = np.maximum(level * (c1 + c2 * s), FLOOR)
-        total, share = None, np.ones(s.size)
-        weight = light / np.sqrt(rate)
-        residual = (c0 - rate) / np.sqrt(rate)
-        relative = c2 * level / np.where(light > _DARK, light, math.inf)
-    return _View(c0, rate, total, share, residual, weight, relative, gradient[:, used], used)
+    return _View(likelihood.data, conditional, likelihood.used, rows, rate, residual, terms)
 
 
 def _scatter(view: _View, free: BoolArray) -> tuple[float, float]:
@@ -197,7 +199,7 @@ def _scatter(view: _View, free: BoolArray) -> tuple[float, float]:
     freedom = residual.size - int(np.count_nonzero(free))
     if freedom <= 0:
         return math.nan, math.nan
-    chi2 = float(np.sum(residual**2))
+    chi2 = float(residual @ residual)
     above = _gamma_above(chi2, freedom, float(kurtosis.mean()))
     return chi2 / freedom, 2 * min(above, 1 - above)
 
@@ -208,72 +210,86 @@ def _gamma_above(chi2: float, freedom: float, excess: float) -> float:
     return float(gammaincc(freedom / spread / 2, chi2 / spread / 2))
 
 
-def _kurtosis(view: _View) -> FloatArray:
-    """Excess kurtosis of each pixel's counts."""
-    if view.total is None:
-        return 1 / view.rate
-    p = view.rate / view.total
-    return view.share * (1 / np.maximum(view.rate * (1 - p), 1.0) - 6 / view.total)
-
-
 def _cells(view: _View) -> tuple[FloatArray, FloatArray]:
     """Residuals in standard deviations and their excess kurtosis, cells of few counts pooled."""
-    if view.total is not None:
-        return view.residual, _kurtosis(view)
-    rate, excess = view.rate, view.observed - view.rate
+    used = view.used
+    if view.conditional:
+        return view.residual[used], view.kurtosis[used]
+    rate = view.rate[used]
     few = rate < POOLED_COUNTS
-    if np.any(few):
-        order = np.argsort(-rate[few])
-        bins = (np.cumsum(rate[few][order]) / POOLED_COUNTS).astype(int)
-        pooled = (np.bincount(bins, v[few][order]) for v in (rate, excess))
-        together, surplus = (np.asarray(v) for v in pooled)
-        filled = together > 0
-        rate = np.concatenate([rate[~few], together[filled]])
-        excess = np.concatenate([excess[~few], surplus[filled]])
+    if not np.any(few):
+        return view.residual[used], 1 / rate
+    excess = view.data[0][used] - rate
+    order = np.argsort(-rate[few])
+    bins = (np.cumsum(rate[few][order]) / POOLED_COUNTS).astype(int)
+    pooled = (np.bincount(bins, v[few][order]) for v in (rate, excess))
+    together, surplus = (np.asarray(v) for v in pooled)
+    filled = together > 0
+    rate = np.concatenate([rate[~few], together[filled]])
+    excess = np.concatenate([excess[~few], surplus[filled]])
     return excess / np.sqrt(rate), 1 / rate
 
 
 def _structure(likelihood: Likelihood, theta: FloatArray, free: BoolArray, view: _View) -> float:
-    level = np.ones((1, view.rate.size))
-    fitted = np.concatenate([view.gradient * view.relative, level])[np.asarray(free, dtype=bool)]
-    modes = _modes(likelihood, theta)[:, view.used]
-    vectors = np.concatenate([fitted, modes]) * view.weight
-    leverage = np.empty(view.rate.size)
-    chi2, freedom = score_statistic(vectors, len(fitted), view.residual, _DEPENDENT, leverage)
+    free = np.asarray(free, dtype=bool)
+    optics, grid = likelihood.model.optics, likelihood.grid
+    waist = WAIST * optics.wavelength_nm / optics.na
+    along = hermite(grid.x_nm, theta[0], waist, ORDER)
+    across = hermite(grid.y_nm, theta[1], waist, ORDER)
+    fitted = int(np.count_nonzero(free))
+    matrix = np.empty((fitted + _MODES, fitted + _MODES))
+    vector, took_part = np.empty(len(matrix)), np.empty(len(matrix), dtype=bool)
+    where = view.rows, view.terms, free, along, across
+    mode_information(*where, matrix, vector)
+    chi2, freedom = score_statistic(matrix, vector, fitted, _DEPENDENT, took_part)
     if not freedom:
         return 1.0
-    return _gamma_above(chi2, freedom, float(np.sum(_kurtosis(view) * leverage**2)) / freedom)
+    # the leverages are at most 1 and their sum is `freedom`, so that this much is all they could do
+    excess = float(np.abs(view.kurtosis).max())
+    if excess > _NORMAL:
+        leverage = np.empty(view.rate.shape)
+        leverages(*where, matrix, took_part, leverage)
+        excess = float(np.sum(view.kurtosis * leverage**2)) / freedom
+    return _gamma_above(chi2, freedom, excess)
 
 
 def _outlier(view: _View) -> float:
-    suspects = np.argsort(-np.abs(view.residual))[:_SUSPECTS]
-    least = min((_tail(view, int(i)) for i in suspects), default=1.0)
-    if view.total is not None:
-        return -math.expm1(view.rate.size * math.log1p(-min(least, 1 - 1e-16)))
+    suspects = np.empty(min(_SUSPECTS, view.residual.size), dtype=np.int64)
+    largest(view.residual, suspects)
+    suspects = suspects[view.used.flat[suspects]]
+    least = float(np.min(_tails(view, suspects), initial=1.0))
+    pixels = int(np.count_nonzero(view.used))
+    if view.conditional:
+        return -math.expm1(pixels * math.log1p(-min(least, 1 - 1e-16)))
     # counts are whole: what each pixel can attain below `least` is less than that
-    below = _attainable(view.rate, least)
+    below = _attainable(view.rate[view.used], least)
     return -math.expm1(float(np.sum(np.log1p(-np.minimum(below, 1 - 1e-16)))))
 
 
-def _tail(view: _View, i: int) -> float:
-    """Two-sided probability of a count as far out as pixel i's."""
-    k, mean = float(view.observed[i]), float(view.rate[i])
-    n = math.inf if view.total is None else float(view.total[i]) * float(view.share[i])
-    variance = (
-        mean if view.total is None else n * (mean / view.total[i]) * (1 - mean / view.total[i])
-    )
-    if variance > MANY_COUNTS:
-        return float(2 * ndtr(-abs(view.residual[i])))
-    if view.total is None:
-        k = max(math.floor(k + 1e-9), 0)
-        above = float(gammainc(k, mean)) if k > 0 else 1.0
-        return min(1.0, 2 * min(above, float(gammaincc(k + 1, mean))))
-    # read noise takes its share of the variance, as if that share of the counts were lost
-    share, total = float(view.share[i]), float(view.total[i])
-    n, p, k = share * total, mean / total, share * k
-    above = float(betainc(k, n - k + 1, p)) if k > 0 else 1.0
-    below = float(betainc(n - k, k + 1, 1 - p)) if k < n else 1.0
-    return min(1.0, 2 * min(above, below))
+def _tails(view: _View, suspects: NDArray[np.int64]) -> FloatArray:
+    """Two-sided probability of counts as far out as those of some pixels."""
+    observed, total, _, share = view.data.reshape(4, -1)[:, suspects]
+    mean = view.rate.flat[suspects]
+    variance = share * mean * (1 - mean / total) if view.conditional else mean
+    normal = 2 * ndtr(-np.abs(view.residual.flat[suspects]))
+    if np.all(variance > MANY_COUNTS):
+        return np.asarray(normal)
+    if view.conditional:
+        # read noise takes its share of the variance, as if that share of the counts were lost
+        n, p, k = share * total, mean / total, share * observed
+        above, below = _between(k, n, p), _between(n - k, n, 1 - p)
+    else:
+        k = np.maximum(np.floor(observed + 1e-9), 0)
+        above = np.where(k > 0, gammainc(np.maximum(k, 1), mean), 1.0)
+        below = gammaincc(k + 1, mean)
+    exact = np.minimum(2 * np.minimum(above, below), 1.0)
+    return np.asarray(np.where(variance > MANY_COUNTS, normal, exact))
+
+
+def _between(k: FloatArray, n: FloatArray, p: FloatArray) -> FloatArray:
+    """Probability that a binomial count is at least k."""
+    possible = np.clip(k, 1e-9, n)
+    return np.asarray(np.where(k > 0, betainc(possible, n - possible + 1, p), 1.0))
 
 
 def _attainable(rate: FloatArray, tail: float) -> FloatArray:
@@ -304,25 +320,3 @@ def _first(
         there = holds(middle)
         low, high = np.where(there, low, middle), np.where(there, middle, high)
     return high
-
-
-def _modes(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
-    """Hermite–Gauss modes around the particle, shape (modes, ny, nx)."""
-    optics, grid = likelihood.model.optics, likelihood.grid
-    waist = WAIST * optics.wavelength_nm / optics.na
-    along, across = (
-        _hermite((axis - centre) / waist)
-        for axis, centre in ((grid.x_nm, theta[0]), (grid.y_nm, theta[1]))
-    )
-    pairs = [(i, j) for i in range(ORDER + 1) for j in range(ORDER + 1 - i)]
-    return np.stack([across[j][:, None] * along[i] for i, j in pairs])
-
-
-def _hermite(t: FloatArray) -> FloatArray:
-    """Hermite functions of order 0 to ORDER, shape (ORDER + 1, n), by their recurrence."""
-    out = np.empty((ORDER + 1, t.size))
-    out[0] = np.exp(-(t**2) / 2)
-    out[1] = math.sqrt(2) * t * out[0]
-    for n in range(2, ORDER + 1):
-        out[n] = math.sqrt(2 / n) * t * out[n - 1] - math.sqrt((n - 1) / n) * out[n - 2]
-    return out

@@ -12,20 +12,22 @@ log-likelihood is −∞ and what has no limit there is refused.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.curvature import observed_information
 from iscat_analysis._kernels.image import Lens, Pixels
 from iscat_analysis._kernels.radial import AxialTable
+from iscat_analysis._kernels.scan import scan_heights
 from iscat_analysis._kernels.scoring import (
     CONDITIONAL,
     CONVERGED,
     POISSON,
     maximize,
-    scan_heights,
     score_pass,
     supported,
     value_batch,
@@ -36,9 +38,6 @@ from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-Derivatives = tuple[FloatArray, FloatArray, FloatArray]
-"""Signal (ny, nx), gradient (4, ny, nx) and second derivatives (4, 4, ny, nx) in (x, y, z, a)."""
-
 LEVEL = 4
 """Index of the level in θ."""
 
@@ -216,6 +215,7 @@ class Likelihood:
         *,
         tolerance: float = 2e-4,
         passes: int = 60,
+        least: float = -math.inf,
     ) -> Optimum:
         """Maximise by damped Fisher scoring inside a box.
 
@@ -230,6 +230,9 @@ class Likelihood:
             deviations, after which less than 0.005 remain.
         passes : int
             Passes over the data at most.
+        least : float
+            Log-likelihood below which the maximum is of no interest; a search that cannot reach it
+            ends early, unconverged.
 
         Returns
         -------
@@ -265,6 +268,7 @@ class Likelihood:
             theta,
             score,
             fisher,
+            least,
         )
         return Optimum(theta, value, used, outcome == CONVERGED, fisher)
 
@@ -306,29 +310,32 @@ class Likelihood:
         values[inside], amplitudes[inside] = found, refitted
         return values, amplitudes
 
-    def derivatives(self, theta: FloatArray) -> Derivatives:
+    def derivatives(self, theta: FloatArray, free: BoolArray | None = None) -> FloatArray:
         """Signal and its first and second derivatives.
 
         Parameters
         ----------
         theta : ndarray, shape (5,)
             Parameters, in the support.
+        free : ndarray of bool, shape (5,), optional
+            What was fitted, where that is what they are for: those in z then may be 0 if it was
+            not, and if it was the profile at z is interpolated.
 
         Returns
         -------
-        signal, gradient, hessian : ndarray
-            See `Derivatives`.
+        ndarray, shape (ny, ROWS, nx)
+            See `iscat_analysis._kernels.hessian.signal_hessian`.
 
         Raises
         ------
         ConfigError
             θ lies outside the support.
         """
-        x, y, z, amplitude, _ = (float(value) for value in self._supported(theta))
-        return self.model.amplitude_hessian(self.grid, x, y, z, amplitude)
+        height = "exact" if free is None else "between" if free[2] else "fixed"
+        return self.model.derivative_rows(self.grid, self._supported(theta), height)
 
     def observed_information(
-        self, theta: FloatArray, derivatives: Derivatives | None = None
+        self, theta: FloatArray, derivatives: FloatArray | None = None
     ) -> FloatArray:
         """Negative Hessian of the log-likelihood.
 
@@ -336,7 +343,7 @@ class Likelihood:
         ----------
         theta : ndarray, shape (5,)
             Parameters.
-        derivatives : Derivatives, optional
+        derivatives : ndarray, shape (ny, ROWS, nx), optional
             Of the signal at θ, where they are known already.
 
         Returns
@@ -349,33 +356,9 @@ class Likelihood:
         ConfigError
             θ lies outside the support.
         """
-        s, first, second = derivatives or self.derivatives(theta)
-        level = np.exp(theta[LEVEL])
-        used = self.used
-        c0, c1, c2, c3 = (np.where(used, c, 0.0) for c in self.data)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            if self.kind == CONDITIONAL:
-                q = c2 * level * (1 + s)
-                p = q / (1 + q)
-                slope = c3 * (c0 - c1 * p) / (1 + s)
-                bend = c3 * (-c0 / (1 + s) ** 2 + c1 * (p / (1 + s)) ** 2)
-                level_bend = -c3 * c1 * p * (1 - p)
-                cross = level_bend / (1 + s)
-            else:
-                expected = level * (c1 + c2 * s)
-                rate, gain = expected + c3, level * c2
-                slope = gain * (c0 / rate - 1)
-                bend = -(gain**2) * c0 / rate**2
-                level_bend = expected * (c0 / rate - 1) - (expected / rate) ** 2 * c0
-                cross = slope - expected * gain * c0 / rate**2
-        slope, bend, level_bend, cross = (
-            np.where(used, t, 0.0) for t in (slope, bend, level_bend, cross)
-        )
+        rows = self.derivatives(theta) if derivatives is None else derivatives
         info = np.empty((5, 5))
-        info[:4, :4] = -np.einsum("yx,ijyx->ij", slope, second)
-        info[:4, :4] -= np.einsum("yx,iyx,jyx->ij", bend, first, first)
-        info[LEVEL, :4] = info[:4, LEVEL] = -np.einsum("yx,iyx->i", cross, first)
-        info[LEVEL, LEVEL] = -level_bend.sum()
+        observed_information(self.kind, self.data, math.exp(theta[LEVEL]), rows, info)
         return info
 
     def residuals(self, theta: FloatArray) -> FloatArray:

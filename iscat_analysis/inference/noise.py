@@ -19,7 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis._kernels.scoring import CONDITIONAL, POISSON
 from iscat_analysis.errors import DataError
+from iscat_analysis.inference.bias import first_order_bias
 from iscat_analysis.inference.checks import mask_of, pixels_of
+from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 
@@ -266,8 +268,13 @@ def compile_values(model: ForwardModel) -> None:
     """
     likelihood, theta = _small(model)
     likelihood.values(theta[None])
-    likelihood.observed_information(theta)
     likelihood.signal(theta)
+    free = np.array([True, True, False, True, False])
+    likelihood.derivatives(theta, ~free)
+    derivatives = likelihood.derivatives(theta, free)
+    likelihood.observed_information(theta, derivatives)
+    first_order_bias(likelihood, theta, free, derivatives)
+    goodness_of_fit(likelihood, theta, free, derivatives)
     likelihood.scan_heights(theta[2:3], theta, (0.0, 2.0))
 
 

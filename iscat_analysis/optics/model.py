@@ -15,9 +15,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.hessian import signal_hessian
+from iscat_analysis._kernels.curvature import derivatives_between
+from iscat_analysis._kernels.hessian import PAIRS, ROWS, signal_hessian
 from iscat_analysis._kernels.image import Lens, Pixels, signal_gradient, signal_image
-from iscat_analysis._kernels.radial import AxialTable
+from iscat_analysis._kernels.radial import AxialTable, profile_between
 from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.aperture import Aperture, weight_on
@@ -31,7 +32,7 @@ from iscat_analysis.optics.sensitivity import (
     sensitivity_lattices,
     signal_derivatives,
 )
-from iscat_analysis.optics.waves import Field, axial_table
+from iscat_analysis.optics.waves import Field, RadialField, axial_table
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -280,11 +281,43 @@ class ForwardModel:
         hessian : ndarray, shape (4, 4, ny, nx)
             Second derivatives.
         """
-        first = np.empty((5, *grid.shape))
+        rows = self.derivative_rows(grid, np.array([x_nm, y_nm, z_nm, amplitude]))
+        out = np.moveaxis(rows, 1, 0)
         second = np.empty((4, 4, *grid.shape))
-        geometry = self._geometry(grid, x_nm, y_nm, amplitude)
-        signal_hessian(self.profile(z_nm, 3), *geometry, first, second)
-        return first[0], first[1:], second
+        for values, (i, j) in zip(out[5:], PAIRS, strict=True):
+            second[i, j] = second[j, i] = values
+        return out[0], out[1:5], second
+
+    def derivative_rows(
+        self, grid: PixelGrid, theta: FloatArray, height: str = "exact"
+    ) -> FloatArray:
+        """Signal and its derivatives up to the second, as the kernels of a fit take them.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate them.
+        theta : ndarray, shape (4,) or more
+            x, y, z [nm] and amplitude.
+        height : {"exact", "between", "fixed"}
+            Between the heights of `axial_table` second derivatives are known to 1e-6 of the
+            largest.  Where the height is fixed those in z may be 0.
+
+        Returns
+        -------
+        ndarray, shape (ny, ROWS, nx)
+            See `iscat_analysis._kernels.hessian.signal_hessian`.
+        """
+        rows = np.empty((grid.shape[0], ROWS, grid.shape[1]))
+        x, y, z, amplitude = (float(value) for value in theta[:4])
+        geometry = self._geometry(grid, x, y, amplitude)
+        if height == "between":
+            derivatives_between(self.axial_table, *geometry[:2], theta, rows)
+        elif height == "fixed" and not self.lens.half:
+            signal_hessian(self.profile(z, 1), *geometry, False, rows)
+        else:
+            signal_hessian(self.profile(z, 3), *geometry, True, rows)
+        return rows
 
     def joint_gradient(
         self,
@@ -389,7 +422,7 @@ class ForwardModel:
         """
         return self.amplitude_contrast(z_nm, self.scale.amplitude(mass_kda))
 
-    def amplitude_contrast(self, z_nm: float, amplitude: float) -> float:
+    def amplitude_contrast(self, z_nm: float, amplitude: float, height: str = "exact") -> float:
         """Peak contrast of an amplitude; see `peak_contrast` and `amplitude_image`.
 
         Parameters
@@ -398,13 +431,19 @@ class ForwardModel:
             Height [nm].
         amplitude : float
             Amplitude, see `MassScale`.
+        height : {"exact", "between"}
+            As in `derivative_rows`; of a height that only one fit asks for.
 
         Returns
         -------
         float
             Peak contrast, or the peak of |E_sca|² in dark field.
         """
-        return sum(self.wave.peak(z_nm, amplitude, self.rho))
+        if height == "exact" or not isinstance(self.wave, RadialField):
+            return sum(self.wave.peak(z_nm, amplitude, self.rho))
+        profile = np.empty((4, self.wave.table.shape[3] - 1, 6))
+        profile_between(self.axial_table, z_nm, profile)
+        return sum(self.wave.peak(z_nm, amplitude, self.rho, profile))
 
     def collected_area_nm2(self, z_nm: float, mass_kda: float) -> float:
         """Scattered light that the pupil collects, as an equivalent area of reference.

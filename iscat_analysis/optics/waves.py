@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.hessian import signal_hessian
+from iscat_analysis._kernels.hessian import ROWS, signal_hessian
 from iscat_analysis._kernels.image import Lens, Pixels, signal_image
 from iscat_analysis._kernels.lattice import (
     LATTICE_STEP,
@@ -26,7 +26,13 @@ from iscat_analysis._kernels.lattice import (
     sum_waves,
     window,
 )
-from iscat_analysis._kernels.radial import STEP, AxialTable, bessel_table, radial_profile
+from iscat_analysis._kernels.radial import (
+    STEP,
+    AxialTable,
+    bessel_table,
+    largest_signal,
+    radial_profile,
+)
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.kept import kept
 from iscat_analysis.optics.measured import MeasuredField
@@ -39,6 +45,7 @@ TABLE_LIMIT_MB = 400
 
 _HEIGHTS_KEPT = 8  # profiles at hand; where z is fixed, every image asks for the same one
 _PEAK_STEP = 1 / 3  # of the lattice: the grid on which the largest signal is looked for
+_PEAK_POINTS = 8  # the same, in each step of the radial table
 _NEWTON = 4  # steps from there
 _AT_ONCE = 16  # heights of the axial table made together
 
@@ -148,49 +155,16 @@ class RadialField:
             both = np.stack([f0 + f2 * (u**2 - v**2), f2 * (2 * u * v)])
         return both[:1] if self.analyzer else both
 
-    def peak(self, z_nm: float, amplitude: float, rho: float) -> tuple[float, float]:
-        """Parts of the signal of largest magnitude that are linear and quadratic in a.
-
-        At fixed r the signal is a function of cos 2φ, with its extremes at ±1 or where its slope
-        vanishes.
-        """
-        r, f0, f2 = self._line(z_nm)
-        linear, quadratic = self._extremes(f0, f2, amplitude, rho)
-        way, best = np.unravel_index(np.argmax(np.abs(linear + quadratic)), linear.shape)
-        place = r[best]
-        if 0 < best < r.size - 1:
-            low, mid, high = (linear + quadratic)[way, best - 1 : best + 2]
-            bend = low - 2 * mid + high
-            place += 0.5 * (low - high) / bend * r[1] if bend else 0.0
-        at = np.array([place])
-        f0, f2 = self._radial(at, z_nm)
-        linear, quadratic = self._extremes(f0, f2 * at**2, amplitude, rho)
-        return float(linear[way, 0]), float(quadratic[way, 0])
-
-    def _extremes(
-        self, f0: ComplexArray, f2: ComplexArray, a: float, rho: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Linear and quadratic part of the signal in the directions that matter, (k, n)."""
-        if self.circular:
-            along, power = f0[None], np.abs(f0) ** 2 + (0 if self.analyzer else np.abs(f2) ** 2)
-            return 2 * rho * a * along.real, a**2 * np.atleast_2d(power)
-        turns = [np.ones(f0.size), -np.ones(f0.size)]
-        if self.analyzer:
-            slope = rho * f2.real + a * (f0.conj() * f2).real
-            turns.append(np.clip(-slope / np.maximum(abs(a) * np.abs(f2) ** 2, 1e-300)
-                                 * np.sign(a or 1.0), -1, 1))  # fmt: skip
-        along = f0 + np.stack(turns) * f2
-        return 2 * rho * a * along.real, a**2 * np.abs(along) ** 2
-
-    @cached_property
-    def _line(self) -> Callable[[float], tuple[FloatArray, ComplexArray, ComplexArray]]:
-        r = np.linspace(0, self.reach_nm, 8 * (self.table.shape[3] - 1), endpoint=False)
-
-        def at(z_nm: float) -> tuple[FloatArray, ComplexArray, ComplexArray]:
-            f0, f2 = self._radial(r, z_nm)
-            return r, f0, f2 * r**2
-
-        return kept(_HEIGHTS_KEPT, at)
+    def peak(
+        self, z_nm: float, amplitude: float, rho: float, profile: FloatArray | None = None
+    ) -> tuple[float, float]:
+        """Parts of the signal of largest magnitude that are linear and quadratic in a."""
+        if profile is None:
+            profile = self.profile(z_nm, 1)
+        parts: tuple[float, float] = largest_signal(
+            profile, 1 / self.step_nm, _PEAK_POINTS, amplitude, rho, self.circular, self.analyzer
+        )
+        return parts
 
     def _radial(self, r: FloatArray, z_nm: float) -> tuple[ComplexArray, ComplexArray]:
         """F0 and F2 at distances r, from the table."""
@@ -328,14 +302,15 @@ class LatticeField:
         x, y = float(grid.x[column]), float(grid.y[row])
         lens, step = self.lens(rho), float(grid.x[1] - grid.x[0])
         point, one = np.zeros(1), np.ones(1)
-        first, second = np.empty((5, 1, 1)), np.empty((4, 4, 1, 1))
+        out = np.empty((1, ROWS, 1))
         if 0 < row < grid.y.size - 1 and 0 < column < grid.x.size - 1:
             profile = self.profile(z_nm, 3)
             for _ in range(_NEWTON):
                 pixels = Pixels(np.array([x]), np.array([y]), point, one)
-                signal_hessian(profile, lens, pixels, 0.0, 0.0, amplitude, first, second)
+                signal_hessian(profile, lens, pixels, 0.0, 0.0, amplitude, True, out)
                 # the particle's derivatives: those of the camera's position with the sign changed
-                move = np.linalg.solve(second[:2, :2, 0, 0], first[1:3, 0, 0])
+                _, s_x, s_y, _, _, s_xx, s_xy, s_yy = out[0, :8, 0]
+                move = np.linalg.solve([[s_xx, s_xy], [s_xy, s_yy]], [s_x, s_y])
                 x, y = (
                     x + float(np.clip(move[0], -step, step)),
                     y + float(np.clip(move[1], -step, step)),

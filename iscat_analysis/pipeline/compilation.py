@@ -18,6 +18,7 @@ _BETWEEN_S = 4.0  # from one line to the next
 _ROOM = f"{_kernels.__name__}."
 _SHARED = ("radial", "image", "scoring")  # whose kernels the other process compiles half of
 _ABOUT = {
+    "curvature": "the precision of fits",
     "diffusion": "diffusion",
     "drift": "the drift of the pattern",
     "hessian": "the precision of fits",
@@ -25,6 +26,7 @@ _ABOUT = {
     "mixture": "species",
     "moving": "tracks",
     "radial": "the tables of the microscope",
+    "scan": "the search of heights",
     "score_test": "the goodness of fits",
     "scoring": "fits",
     "sliding": "sums of frames",

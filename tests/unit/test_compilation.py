@@ -16,8 +16,9 @@ from numba.core import event
 import iscat_analysis
 from iscat_analysis import _kernels
 from iscat_analysis._kernels.hessian import signal_hessian
+from iscat_analysis._kernels.scan import scan_heights
 from iscat_analysis._kernels.score_test import score_statistic
-from iscat_analysis._kernels.scoring import maximize, scan_heights, value_batch
+from iscat_analysis._kernels.scoring import maximize, value_batch
 from iscat_analysis.config import load_config
 from iscat_analysis.inference import ahead
 from iscat_analysis.inference.noise import compile_kernels
@@ -136,8 +137,8 @@ def test_kernels_are_kept_where_nothing_can_be_written(tmp_path):
     code = """
 import os, numpy as np
 from iscat_analysis import _kernels
-from iscat_analysis._kernels.score_test import _dot
-assert _dot(np.ones(4), np.ones(4)) == 4
+from iscat_analysis._kernels.curvature import _weighted
+assert _weighted(np.ones(4), np.ones(4)) == 4
 folder = _kernels.environment()["NUMBA_CACHE_DIR"]
 print(_kernels.TEMPORARY, folder, sum(len(files) for _, _, files in os.walk(folder)))
 """

@@ -1,0 +1,282 @@
+"""Each fast way of a fit against a slow one that is obviously right."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scenes import PIXEL_NM, gold, make_config
+
+from iscat_analysis._kernels.hessian import PAIRS
+from iscat_analysis._kernels.scoring import CONDITIONAL
+from iscat_analysis.inference import noise
+from iscat_analysis.inference.bias import first_order_bias
+from iscat_analysis.inference.fit import FOLLOWED, fit_particle, search_box
+from iscat_analysis.inference.goodness import ORDER, WAIST, _gamma_above, structure
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.records import BoolArray, Candidate, FloatArray
+
+GRID = PixelGrid.region((0, 14), (0, 13), PIXEL_NM)
+SETTLED = 0.02  # σ: how far apart two fits of one optimum may end
+FREE = [(True, True, True, True, True), (True, True, False, True, False)]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A region and a place in it."""
+
+    likelihood: Likelihood
+    theta: FloatArray
+
+    @property
+    def model(self) -> ForwardModel:
+        return self.likelihood.model
+
+
+def _case(kind: str, *, light: float = 3e3, pupil: str = "round", seed: int = 4) -> Case:
+    sections = gold() if pupil == "gold" else {"optics": {"focus_nm": -400.0}}
+    if pupil == "coma":
+        sections["optics"]["aberrations_nm"] = {"z7": 15.0}
+    if pupil == "dark":
+        sections["optics"]["scheme"] = "darkfield"
+    config = make_config(calibrated=False, fit={"z_range_nm": [0.0, 600.0]}, **sections)
+    model = forward_model(config, 2200.0)
+    theta = np.array([520.0, 610.0, 90.0, 2 * model.material.mass_kda, 0.02])
+    rng = np.random.default_rng(seed)
+    signal, masked = model.amplitude_image(GRID, *theta[:4]), rng.random(GRID.shape) < 0.1
+    if kind == "conditional":
+        before, after = rng.poisson(light, GRID.shape), rng.poisson(1.02 * light * (1 + signal))
+        likelihood = noise.conditional(
+            model, GRID, before, after, 1.0, read_variance_after_e2=50.0, masked=masked
+        )
+    else:
+        scale = light if model.rho else 30 / signal.max()
+        after = rng.poisson(light + scale * signal)
+        likelihood = noise.poisson(
+            model, GRID, after, light, scale, extra_variance_e2=20.0, masked=masked
+        )
+    return Case(likelihood, theta)
+
+
+CASES = [
+    ("conditional", "round"), ("conditional", "gold"), ("conditional", "coma"),
+    ("poisson", "round"), ("poisson", "dark"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=CASES, ids=lambda case: "-".join(case))
+def case(request: pytest.FixtureRequest) -> Case:
+    kind, pupil = request.param
+    return _case(kind, pupil=pupil)
+
+
+# ---- derivatives and what is made of them --------------------------------------------------------
+
+
+def test_derivatives_between_heights_and_at_a_fixed_one(case: Case) -> None:
+    exact = np.moveaxis(case.likelihood.derivatives(case.theta), 1, 0)
+    size = np.abs(exact).max(axis=(1, 2), keepdims=True)
+    free = np.array(FREE[0])
+    between = np.moveaxis(case.likelihood.derivatives(case.theta, free), 1, 0)
+    np.testing.assert_allclose(between / size, exact / size, atol=1e-6)
+    fixed = np.moveaxis(case.likelihood.derivatives(case.theta, np.array(FREE[1])), 1, 0)
+    known = [0, 1, 2, 4, *(5 + k for k, pair in enumerate(PAIRS) if 2 not in pair)]
+    np.testing.assert_allclose((fixed / size)[known], (exact / size)[known], atol=1e-12)
+
+
+def _bias(which: Likelihood, theta: FloatArray, free: BoolArray) -> FloatArray:
+    """Give the bias by tensors over the pixels, as the papers write it."""
+    signal, first, second = which.model.amplitude_hessian(GRID, *theta[:4])
+    _, c1, c2, c3 = which.data
+    level = math.exp(theta[LEVEL])
+    gradient, bend = np.zeros((5, *GRID.shape)), np.zeros((5, 5, *GRID.shape))
+    if which.kind == CONDITIONAL:
+        odds = c2 * level * (1 + signal)
+        variance = c3 * c1 * odds / (1 + odds) ** 2
+        skewness = variance * (1 - odds) / (1 + odds)
+        gradient[:4], gradient[LEVEL] = first / (1 + signal), 1.0
+        bend[:4, :4] = second / (1 + signal) - gradient[:4, None] * gradient[None, :4]
+    else:
+        light = level * (c1 + c2 * signal)
+        rate = np.where(which.used, light + c3, 1.0)
+        variance = skewness = np.where(which.used, rate, 0.0)
+        gradient[:4], gradient[LEVEL] = level * c2 / rate * first, light / rate
+        bend[:4, :4] = level * c2 / rate * second
+        bend[LEVEL, :4] = bend[:4, LEVEL] = gradient[:4]
+        bend[LEVEL, LEVEL] = gradient[LEVEL]
+        bend -= gradient[:, None] * gradient[None]
+    index = np.flatnonzero(free)
+    slope, bend = gradient[index], bend[np.ix_(index, index)]
+    unit = 1 / np.sqrt(np.einsum("iyx,yx->i", slope**2, variance))
+    fisher = np.einsum("iyx,jyx,yx->ij", slope, slope, variance)
+    inverse = np.linalg.inv(fisher * np.outer(unit, unit)) * np.outer(unit, unit)
+    curved = np.einsum("ij,ijyx->yx", inverse, bend)
+    skewed = np.einsum("ij,iyx,jyx->yx", inverse, slope, slope)
+    out = np.zeros(5)
+    pull = np.einsum("iyx,yx->i", slope, skewness * skewed + variance * curved)
+    out[index] = -0.5 * inverse @ pull
+    return out
+
+
+@pytest.mark.parametrize("free", FREE)
+def test_bias(case: Case, free: tuple[bool, ...]) -> None:
+    which, free_array = case.likelihood, np.array(free)
+    derivatives = which.derivatives(case.theta)
+    got = first_order_bias(which, case.theta, free_array, derivatives)
+    slow = _bias(which, case.theta, free_array)
+    scale = 1 / np.sqrt(np.diag(which.score_fisher(case.theta)[2]))
+    np.testing.assert_allclose(got / scale, slow / scale, atol=1e-9)
+    assert np.abs(slow / scale).max() > 1e-5
+    nowhere = case.theta * np.array([1, 1, 1, 0, 1])
+    lost = first_order_bias(which, nowhere, free_array, which.derivatives(nowhere))
+    assert np.isnan(lost).any() or not case.model.rho
+
+
+# ---- the score test ------------------------------------------------------------------------------
+
+
+def _structure(which: Likelihood, theta: FloatArray, free: BoolArray) -> float:
+    """Give the p-value by Gram–Schmidt on vectors over the pixels."""
+    signal, gradient = which.model.amplitude_gradient(GRID, *theta[:4])
+    c0, c1, c2, c3 = (c[which.used] for c in which.data)
+    level, s = math.exp(theta[LEVEL]), signal[which.used]
+    if which.kind == CONDITIONAL:
+        p = c2 * level * (1 + s) / (1 + c2 * level * (1 + s))
+        weight = np.sqrt(c3 * c1 * p * (1 - p))
+        residual, relative = (c0 - c1 * p) * c3 / weight, 1 / (1 + s)
+        kurtosis = c3 * (1 / (c1 * p * (1 - p)) - 6 / c1)
+    else:
+        light = level * (c1 + c2 * s)
+        rate = light + c3
+        weight, residual = light / np.sqrt(rate), (c0 - rate) / np.sqrt(rate)
+        relative, kurtosis = c2 * level / light, 1 / rate
+    waist = WAIST * which.model.optics.wavelength_nm / which.model.optics.na
+    along, across = (
+        [
+            np.polynomial.Hermite.basis(n)(t)
+            * np.exp(-(t**2) / 2)
+            / math.sqrt(2.0**n * math.factorial(n))
+            for n in range(ORDER + 1)
+        ]
+        for t in ((GRID.x_nm - theta[0]) / waist, (GRID.y_nm - theta[1]) / waist)
+    )
+    fitted = [*(gradient[:, which.used] * relative), np.ones(s.size)]
+    vectors = [v for v, is_free in zip(fitted, free, strict=True) if is_free]
+    count = len(vectors)
+    vectors += [
+        np.outer(across[j], along[i])[which.used]
+        for i, j in itertools.product(range(ORDER + 1), repeat=2)
+        if i + j <= ORDER
+    ]
+    basis = np.linalg.qr((np.array(vectors) * weight).T)[0]
+    modes = basis[:, count:].T
+    leverage = np.sum(modes**2, axis=0)
+    excess = float(kurtosis @ leverage**2) / len(modes)
+    return _gamma_above(float(np.sum((modes @ residual) ** 2)), len(modes), excess)
+
+
+@pytest.mark.parametrize("free", FREE)
+def test_structure(case: Case, free: tuple[bool, ...]) -> None:
+    for moved in (0.0, 25.0):  # a place where it is good, and one where it is not
+        theta = case.theta + np.array([moved, 0, 0, 0, 0])
+        got = structure(case.likelihood, theta, np.array(free))
+        slow = _structure(case.likelihood, theta, np.array(free))
+        assert math.log(got) == pytest.approx(math.log(slow), rel=1e-6, abs=1e-7)
+
+
+def test_structure_of_many_counts() -> None:
+    """Where no leverage matters, none is looked at."""
+    many = _case("conditional", light=3e6)
+    got = structure(many.likelihood, many.theta, np.array(FREE[0]))
+    slow = _structure(many.likelihood, many.theta, np.array(FREE[0]))
+    assert got == pytest.approx(slow, rel=1e-5)
+
+
+# ---- the search along z --------------------------------------------------------------------------
+
+
+def test_scan_takes_two_steps_in_the_amplitude(case: Case) -> None:
+    heights = np.array([0.0, 77.0, 90.0, 333.0, 600.0])
+    start = case.theta * np.array([1, 1, 1, 0.7, 1])
+    values, amplitudes = case.likelihood.scan_heights(heights, start, (0.0, 1e9))
+    held, same = case.likelihood.scan_heights(heights, start, None)
+    for k, z in enumerate(heights):
+        theta = start.copy()
+        theta[2] = z
+        assert same[k] == start[3]
+        unmoved = case.likelihood.values(theta[None])[0]
+        assert held[k] == pytest.approx(unmoved, rel=1e-6, abs=1e-6)
+        for _ in range(2):
+            _, score, fisher = case.likelihood.score_fisher(theta)
+            if fisher[3, 3] > 0:
+                theta[3] = np.clip(theta[3] + score[3] / fisher[3, 3], 0.0, 1e9)
+        assert amplitudes[k] == pytest.approx(theta[3], rel=1e-6, abs=1e-9)
+        value = case.likelihood.values(theta[None])[0]
+        assert values[k] == pytest.approx(value, rel=1e-6, abs=1e-6)
+
+
+def _every_start(
+    which: Likelihood, start: Candidate, z_range: tuple[float, float]
+) -> list[Optimum]:
+    """Follow a start at every height of a fine grid to its end; best first."""
+    box = search_box(which, start, "joint", z_range)
+    found = []
+    for z in np.arange(z_range[0], z_range[1], 15.0):
+        theta = np.array([start.x_px * PIXEL_NM, start.y_px * PIXEL_NM, z, 1.0, 0.0])
+        theta[3] = which.model.scale.amplitude(start.mass_kda)
+        found.append(which.maximize(theta, box.free, box.lower, box.upper))
+    return sorted((o for o in found if o.converged), key=lambda o: -o.log_likelihood)
+
+
+@pytest.mark.parametrize("mass", [150.0, 1200.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_starts_that_are_given_up_change_nothing(mass: float, seed: int) -> None:
+    """The best optimum and all that come near it, as if every start had been followed."""
+    model = forward_model(make_config(optics={"focus_nm": -500.0}), 2500.0)
+    grid, rng = PixelGrid.region((0, 20), (0, 20), PIXEL_NM), np.random.default_rng(seed)
+    signal = model.image(grid, 9.2 * PIXEL_NM, 10.1 * PIXEL_NM, rng.uniform(0, 600), mass)
+    before, after = rng.poisson(2e6, grid.shape), rng.poisson(2e6 * (1 + signal))
+    which = noise.conditional(model, grid, before, after, 1.0)
+    start = Candidate(9.6, 9.8, 300.0, 1.5 * mass, 10.0)
+    fit = fit_particle(which, start, "joint", (0.0, 600.0), level=False)
+    slow = _every_start(which, start, (0.0, 600.0))
+    sigma = np.append(fit.sigma, 1.0)
+    assert np.all(np.abs(fit.theta - slow[0].theta)[:3] < SETTLED * sigma[:3])
+    assert fit.log_likelihood == pytest.approx(slow[0].log_likelihood, abs=1e-3)
+    near = {}
+    for other in slow:
+        gap, z = slow[0].log_likelihood - other.log_likelihood, float(other.theta[2])
+        if gap < FOLLOWED and all(abs(z - old) > model.fringe_nm / 8 for old in (*near, fit.z_nm)):
+            near[z] = gap
+    told = [(a.z_nm, a.log_likelihood_gap) for a in fit.alternatives]
+    for z, gap in near.items():
+        assert any(abs(z - t) < 2.0 and gap == pytest.approx(g, abs=0.01) for t, g in told), (
+            z,
+            gap,
+        )
+    for z, gap in told:
+        if gap < FOLLOWED and z not in (0.0, 600.0) and gap < fit.log_likelihood - 1e-9:
+            assert any(abs(z - n) < 2.0 for n in near), (z, gap)
+
+
+# ---- the largest contrast ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("optics", [
+    {}, {"analyzer": True}, {"polarization": "circular"},
+    {"polarization": "circular", "analyzer": True}, {"scheme": "darkfield"},
+])  # fmt: skip
+def test_largest_contrast(optics: dict[str, object]) -> None:
+    model = forward_model(make_config(calibrated=False, optics=optics), 1500.0)
+    fine = PixelGrid.centred(401, 4.0)
+    for z, mass in ((5.0, 1000.0), (80.0, 1e5), (60.0, -2e4)):
+        image = model.amplitude_image(fine, 0.0, 0.0, z, mass)
+        largest = float(image.flat[np.argmax(np.abs(image))])
+        assert model.amplitude_contrast(z, mass) == pytest.approx(largest, rel=2e-4)
+        assert model.amplitude_contrast(z, mass, "between") == pytest.approx(
+            model.amplitude_contrast(z, mass), rel=1e-7
+        )
