@@ -15,7 +15,7 @@ import mmap
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from iscat_analysis.movie.descriptions import (
 from iscat_analysis.movie.file_set import FileSet, open_set
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, map_file, refuse_changed, release
 from iscat_analysis.movie.ome import is_ome, read_ome, read_ome_set
+from iscat_analysis.movie.tiff_headers import Repetition, repetition_of
 from iscat_analysis.records import StackMetadata
 
 _DESCRIPTION, _MICRO_MANAGER = 270, 51123
@@ -310,8 +311,22 @@ def _open(
 def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[_Image]:
     """Read the images one by one, and refuse the file where tifffile would repair it."""
     seen: set[int] = set()
-    following = values = 0
+    following = values = long_values = 0
+    image: _Image | None = None
+    pattern: Repetition | None = None
     for number in itertools.count():
+        again = None
+        if pattern is not None and following not in seen:
+            again = pattern.find(data, following)
+        if again is not None and image is not None:
+            seen.add(following)
+            start, following = again
+            values += long_values
+            _refuse_overlap(values, data, path)
+            yield replace(image, offsets=(start,), start=None if image.start is None else start)
+            continue
+        if number and not following:
+            break
         try:
             page = file.pages[number]
         except IndexError:
@@ -322,12 +337,11 @@ def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[_I
         tags, following = _declared_tags(file.tiff, data, page.offset)
         if len(tags) != len(page.tags) and set(tags) & _ESSENTIAL - set(page.tags.keys()):
             raise _damaged(path, f"the header of image {number} is truncated or cannot be read")
-        # Images that share one long value would cost its length each time.
-        values += sum(tag.valuebytecount for tag in page.tags if tag.count > _INLINE)
-        if values > _OVERLAP * len(data) + _OVERLAP_BYTES:
-            raise _damaged(path, "the headers of its images overlap")
+        long_values = sum(tag.valuebytecount for tag in page.tags if tag.count > _INLINE)
+        values += long_values
+        _refuse_overlap(values, data, path)
         _refuse_unread_pixels(page, len(data), path)
-        yield _Image(
+        image = _Image(
             page.shape,
             page.dtype,
             page.hash,
@@ -337,6 +351,8 @@ def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[_I
             page.databytecounts,
             page.dataoffsets[0] if page.is_final else None,
         )
+        pattern = repetition_of(file.tiff, data, page.offset, sum(image.sizes))
+        yield image
     if not seen and not any(data[4:8] if not file.tiff.is_bigtiff else data[8:16]):
         raise DataError(
             f"{path}: holds no image; it was not finished when it was written, export it again"
@@ -346,6 +362,12 @@ def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[_I
             f"{path}: is truncated (its list of frames breaks off after {len(seen)} of them); "
             "copy it again or export it again"
         )
+
+
+def _refuse_overlap(values: int, data: mmap.mmap, path: Path) -> None:
+    """Images that share one long value would cost its length each time."""
+    if values > _OVERLAP * len(data) + _OVERLAP_BYTES:
+        raise _damaged(path, "the headers of its images overlap")
 
 
 def _declared_tags(
