@@ -6,11 +6,11 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -82,12 +82,14 @@ from iscat_analysis.records import (
 from iscat_analysis.report import EVENT_FIGURES, write_report
 from iscat_analysis.report.output import claim_output
 from iscat_analysis.report.spread import rejection
+from iscat_analysis.search.changes import Changes
 from iscat_analysis.threads import threads
 
 FEW_FIGURES = 2
 """Events of a landing movie that are drawn for print; the page shows hundreds."""
 
 Notify = Callable[[str], None]
+T = TypeVar("T")
 
 
 def _quiet(text: str) -> None:
@@ -261,9 +263,7 @@ def _analysed(
     shape = (movie.shape[1], movie.shape[2])
     camera = camera_from_config(config.camera, shape, movie.dtype)
     refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
-    hashing = ThreadPoolExecutor(1)
-    digest = hashing.submit(movie.sha256)
-    hashing.shutdown(wait=False)
+    digest = _beside(movie.sha256)
     further: dict[str, Any] = {}
     lines = judge_lines(movie, config, camera)
     steady = movie
@@ -271,15 +271,21 @@ def _analysed(
         tell(f"{movie.name}: {lines.message}")
         further["lines"] = lines.summary
         steady = movie.seen_as(SteadyFrames(movie, lines, camera))
+    landing, tracked = has_landings(config), config.fit.mode == "track"
+    looking: Future[Changes] | None = None
+    if landing or tracked:
+        span = fitted_frames(movie, config, config.background.frames)
+        looking = _beside(look_at_changes, steady, config, camera, span)
+    configured = config
     config, learned = learn_optics(steady, config, camera, tell=tell)
     if learned:
         further["optics"] = learned
     clock.lap("optics")
-    landing, tracked = has_landings(config), config.fit.mode == "track"
     other = ""
-    if landing or tracked:
-        span = fitted_frames(movie, config, config.background.frames)
-        changes = look_at_changes(steady, config, camera, span)
+    if looking is not None:
+        changes = looking.result()
+        if config.optics.na != configured.optics.na:
+            changes = look_at_changes(steady, config, camera, span)
         further["changes"] = changes_summary(changes)
         other = (as_landing if tracked else as_moving)(changes, movie.name)
         if other:
@@ -400,6 +406,14 @@ def _analysed(
         tracks=tracks,
         films=films,
     )
+
+
+def _beside(work: Callable[..., T], *arguments: Any) -> Future[T]:
+    """Begin work in a thread of its own."""
+    pool = ThreadPoolExecutor(1)
+    begun = pool.submit(work, *arguments)
+    pool.shutdown(wait=False)
+    return begun
 
 
 def _measured_background(

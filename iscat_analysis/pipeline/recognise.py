@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from iscat_analysis.config import Config
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.records import FloatArray, FrameSource
+from iscat_analysis.records import FrameSource
 from iscat_analysis.search.changes import Changes, find_changes, spot_of
 
 MOST_FRAMES = 2000
@@ -48,19 +49,20 @@ def look_at_changes(
         Of blocks of `BLOCK` frames, whatever light each had.
     """
     last = min(span[1], span[0] + MOST_FRAMES, movie.shape[0])
-    images: list[FloatArray] = []
+    images: list[NDArray[np.float32]] = []  # noise is a thousand times what they round away
     for first in range(span[0], last - BLOCK + 1, BLOCK):
-        light = camera.to_electrons(movie.read(first, first + BLOCK)).mean(axis=0)
+        light = camera.to_electrons(movie.read(first, first + BLOCK).mean(axis=0))
         if light.mean() > 0:
-            images.append(light / light.mean())
+            images.append((light / light.mean()).astype(np.float32))
     if not images:
         return Changes(0, float("nan"), float("nan"))
-    blocks = np.stack(images)
-    level = blocks.mean(axis=0)
+    level = np.mean(images, axis=0, dtype=np.float64)
     usable = level > 0.1 * np.median(level)
-    blocks = np.where(usable, blocks / np.where(usable, level, 1.0), 1.0)
+    for image in images:
+        image /= np.where(usable, level, 1.0)
+        image[~usable] = 1.0
     pixel = config.camera.pixel_size_nm or config.optics.wavelength_nm / config.optics.na
-    return find_changes(blocks, spot_of(config.optics.wavelength_nm, config.optics.na, pixel))
+    return find_changes(images, spot_of(config.optics.wavelength_nm, config.optics.na, pixel))
 
 
 def as_landing(changes: Changes, name: str) -> str:

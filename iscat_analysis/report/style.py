@@ -107,7 +107,7 @@ def publish(
             if folder is not None:
                 path = folder / f"{name}.png"
                 dpi = PRINT_DPI if printed else DPI
-                figure.savefig(path, dpi=dpi, pil_kwargs={"compress_level": 3})
+                figure.savefig(path, dpi=dpi, pil_kwargs={"compress_level": 1})
             if folder is not None and printed:
                 figure.savefig(folder / f"{name}.pdf", metadata=_NO_PDF_METADATA)
             buffer = io.StringIO()

@@ -13,9 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.ndimage import gaussian_filter
 
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
+from iscat_analysis.search.peaks import maxima
 from iscat_analysis.search.sliding import STRIDES, Chunk, locate_step
 
 THRESHOLD = 7.0
@@ -228,10 +229,10 @@ def find_bright_places(
 
 def _maxima(energy: FloatArray, shadow_px: float) -> list[tuple[int, int, int]]:
     """Maxima of a stack of maps, brightest first, without what belongs to a brighter one."""
-    peaks = (energy > THRESHOLD) & (energy == maximum_filter(energy, size=(3, 5, 5)))
-    order = np.argsort(-energy[peaks], kind="stable")
+    peaks = maxima(energy, THRESHOLD, (1, 2, 2))
+    order = np.argsort(-energy[tuple(peaks.T)], kind="stable")
     taken: list[tuple[int, int, int]] = []
-    for k, i, j in np.argwhere(peaks)[order]:
+    for k, i, j in peaks[order]:
         if not any(
             abs(k - kk) < 2 * STRIDES and math.hypot(i - ii, j - jj) < shadow_px
             for kk, ii, jj in taken

@@ -10,12 +10,14 @@ steadily changes by S_j/2 each time, which is neither.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, maximum_filter
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
-from iscat_analysis.records import FloatArray
+from iscat_analysis.search.peaks import maxima
 
 CLEAR = 12.0
 """Standard deviations of noise that a change must exceed: the ratios below then have errors of a
@@ -28,7 +30,7 @@ beyond noise, it does not stay, for rings of others make less; below the second 
 _QUIET = 4.0  # standard deviations of noise
 _SPOT = 0.21  # standard deviation of a spot, in wavelengths over NA
 _NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
-_BESIDE = 5  # changes are the largest within so many pixels
+_BESIDE = 1, 2, 2  # blocks and pixels on either side within which a change is the largest
 _LEAST_BLOCKS = 5
 
 
@@ -51,12 +53,12 @@ class Changes:
     undone: float
 
 
-def find_changes(blocks: FloatArray, spot_px: float) -> Changes:
+def find_changes(blocks: Sequence[NDArray[np.floating]], spot_px: float) -> Changes:
     """Look for changes from block to block, and at what becomes of them.
 
     Parameters
     ----------
-    blocks : ndarray, shape (n, y, x)
+    blocks : sequence of ndarray, shape (y, x)
         Mean images of successive blocks of frames, over that of all: 1 where nothing changes.
     spot_px : float
         Standard deviation of a particle's picture [px], from `spot_of`.
@@ -68,15 +70,16 @@ def find_changes(blocks: FloatArray, spot_px: float) -> Changes:
     """
     if len(blocks) < _LEAST_BLOCKS:
         return Changes(0, float("nan"), float("nan"))
-    smooth = np.stack([
-        gaussian_filter(image, spot_px) - gaussian_filter(image, 4 * spot_px) for image in blocks
-    ])  # fmt: skip
+    smooth = np.empty((len(blocks), *blocks[0].shape), dtype=np.float32)
+    for image, out in zip(blocks, smooth, strict=True):
+        contrast = image - 1  # whose noise single precision holds
+        out[:] = gaussian_filter(contrast, spot_px)
+        out -= gaussian_filter(contrast, 4 * spot_px)
     lag = np.diff(smooth, axis=0)
-    noise = _NORMAL * float(np.median(np.abs(lag - np.median(lag))))
+    noise = _NORMAL * _median_deviation(lag)
     change = smooth[3:-1] - smooth[1:-3]
     size = np.abs(change)
-    largest = maximum_filter(size, (3, _BESIDE, _BESIDE))
-    found = np.nonzero((size == largest) & (size > CLEAR * noise) & (size > 0))
+    found = tuple(maxima(size, max(CLEAR * noise, 0.0), _BESIDE).T)
     if not found[0].size:
         return Changes(0, float("nan"), float("nan"))
     before, after = (part[found] / change[found] for part in (lag[: len(change)], lag[3:]))
@@ -84,6 +87,13 @@ def find_changes(blocks: FloatArray, spot_px: float) -> Changes:
     staying = np.maximum(np.abs(before), np.abs(after)) < quiet
     undone = np.minimum(before, after) < UNDONE
     return Changes(found[0].size, float(staying.mean()), float(undone.mean()))
+
+
+def _median_deviation(values: NDArray[np.floating]) -> float:
+    """Median of the magnitudes of deviations from the median."""
+    deviation = values - np.median(values)
+    np.abs(deviation, out=deviation)
+    return float(np.median(deviation, overwrite_input=True))
 
 
 def spot_of(wavelength_nm: float, na: float, pixel_nm: float) -> float:

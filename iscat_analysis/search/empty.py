@@ -122,7 +122,8 @@ class EmptyField:
         for (i, j), value in zip(pairs, information, strict=True):
             fisher[..., i, j] = fisher[..., j, i] = value
         full = fisher[..., 0, 0] > 0.5 * np.median(fisher[..., 0, 0])
-        full &= np.linalg.cond(np.where(full[..., None, None], fisher, np.eye(n))) < 1e10
+        eigenvalues = np.linalg.eigvalsh(np.where(full[..., None, None], fisher, np.eye(n)))
+        full &= eigenvalues[..., -1] < 1e10 * eigenvalues[..., 0]
         self._known = full & (self._weight[inner] > 0)
         inverse = np.linalg.inv(np.where(full[..., None, None], fisher, np.eye(n)))
         self._inverse = inverse[..., :n_free, :]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,31 @@ SAMPLED = 0.85
 _ORDER = 5  # of the spline: a parabola misses 1 % of the height of a peak between four pixels
 _REACH_PX = 6  # of the pixels that the spline goes through
 _FINE = np.linspace(-0.625, 0.625, 11)
+
+
+def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> NDArray[np.int64]:
+    """Find what stands out of a stack of fields and has nothing higher beside it.
+
+    Parameters
+    ----------
+    fields : ndarray, shape (k, y, x)
+        The fields.
+    least : float
+        What a maximum exceeds.
+    reach : (int, int, int)
+        Fields, rows and columns on either side in which nothing is higher.
+
+    Returns
+    -------
+    ndarray of int, shape (n, 3)
+        Field, row and column of each, in this order; of equal neighbours all.
+    """
+    at = np.argwhere(fields > least)
+    last = np.array(fields.shape) - 1
+    for offset in product(*(range(-n, n + 1) for n in reach)):
+        beside = np.clip(at + offset, 0, last)  # at an edge, what is nearer to the place itself
+        at = at[fields[tuple(at.T)] >= fields[tuple(beside.T)]]
+    return at
 
 
 def summits(
