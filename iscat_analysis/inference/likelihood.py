@@ -35,12 +35,14 @@ from iscat_analysis._kernels.scoring import (
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import vector_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+from iscat_analysis.optics.stamp import margin_nm
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 LEVEL = 4
 """Index of the level in θ."""
 
+_MOST_PICTURED = 128  # pixels along an axis; the table of a larger picture would not be worth it
 LARGEST_LEVEL = 50.0
 """Logarithm of the level beyond which no light is meant, and counts would overflow."""
 
@@ -255,10 +257,19 @@ class Likelihood:
         score, fisher = np.empty(5), np.empty((5, 5))
         wavelength = self.model.optics.wavelength_nm
         max_step = np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, np.inf, 1.0])
-        table = self.model.axial_table if free[2] else self.model.height_table(theta[2])
+        lens, pixels, kind, data = self._arguments
+        if free[2]:
+            table = self.model.axial_table
+        elif self._is_pictured(theta[2], lower, upper):
+            lens, table = self.model.picture_table(self.grid.pixel_nm, max(self.grid.shape))
+        else:
+            table = self.model.height_table(theta[2])
         value, used, outcome = maximize(
             table,
-            *self._arguments,
+            lens,
+            pixels,
+            kind,
+            data,
             free,
             lower,
             upper,
@@ -455,6 +466,20 @@ class Likelihood:
                 f"lower = {_listed(lower)}, upper = {_listed(upper)}: {self._support()}; narrow "
                 "the box or give forward_model a larger reach_nm or z_max_nm"
             )
+
+    def _is_pictured(self, z_nm: float, lower: FloatArray, upper: FloatArray) -> bool:
+        """Whether a table of the picture at the model's height serves all places in a box.
+
+        One serves all particles at that height; others are met once.
+        """
+        model, grid = self.model, self.grid
+        if z_nm != model.height_nm or max(grid.shape) > _MOST_PICTURED or model.is_measured:
+            return False
+        far_x = max(upper[0] - grid.x_nm[0], grid.x_nm[-1] - lower[0])
+        far_y = max(upper[1] - grid.y_nm[0], grid.y_nm[-1] - lower[1])
+        inside = max(far_x, far_y) < max(grid.shape) * grid.pixel_nm
+        reach = model.reach_nm - math.sqrt(2) * margin_nm(model.optics, grid.pixel_nm)
+        return inside and math.hypot(far_x, far_y) < reach and grid.is_regular
 
     def _support(self) -> str:
         low, high = self.model.z_range_nm

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,12 @@ class PixelGrid:
         """Return a square field with centres (i − (n−1)/2)·pixel."""
         axis = (np.arange(pixels, dtype=np.float64) - (pixels - 1) / 2) * pixel_nm
         return cls(axis, axis, pixel_nm)
+
+    @cached_property
+    def is_regular(self) -> bool:
+        """Whether neighbours are one pixel apart everywhere, to a millionth of it."""
+        steps = np.concatenate([np.diff(self.x_nm), np.diff(self.y_nm)])
+        return bool(np.all(np.abs(steps - self.pixel_nm) < 1e-6 * self.pixel_nm))
 
     @property
     def shape(self) -> tuple[int, int]:

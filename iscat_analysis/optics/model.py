@@ -32,6 +32,7 @@ from iscat_analysis.optics.sensitivity import (
     sensitivity_lattices,
     signal_derivatives,
 )
+from iscat_analysis.optics.stamp import sample_picture
 from iscat_analysis.optics.waves import Field, RadialField, axial_table
 
 FloatArray = NDArray[np.float64]
@@ -158,6 +159,33 @@ class ForwardModel:
     @cached_property
     def _height_tables(self) -> Callable[[float], AxialTable]:
         return kept(_TABLES_KEPT, lambda z_nm: axial_table(self.wave, (z_nm, z_nm)))
+
+    def picture_table(self, pixel_nm: float, half_px: int) -> tuple[Lens, AxialTable]:
+        """Picture at `height_nm` on the pixels' own grid; the last few are kept.
+
+        Parameters
+        ----------
+        pixel_nm : float
+            Side of a pixel [nm].
+        half_px : int
+            Largest distance of a pixel from the particle along an axis [pixels].
+
+        Returns
+        -------
+        lens : Lens
+            How the kernels take it.
+        table : AxialTable
+            For kernels that stay at this height; see `iscat_analysis.optics.stamp`.
+        """
+        return self._picture_tables(pixel_nm, half_px)
+
+    @cached_property
+    def _picture_tables(self) -> Callable[[float, int], tuple[Lens, AxialTable]]:
+        def of(pixel_nm: float, half_px: int) -> tuple[Lens, AxialTable]:
+            lens, samples = sample_picture(self, pixel_nm, half_px)
+            return lens, AxialTable(samples.reshape(1, 1, 2, -1), self.height_nm, 1.0, 0.0)
+
+        return kept(_TABLES_KEPT, of)
 
     def image(
         self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float

@@ -16,13 +16,17 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from iscat_analysis._kernels.image import Lens, Pixels, signal_image
 from iscat_analysis._kernels.lattice import DEGREE, TAPS
-from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.records import FloatArray
+
+if TYPE_CHECKING:
+    from iscat_analysis.config import Optics
+    from iscat_analysis.optics.model import ForwardModel
 
 BAND = 0.8
 """Largest u of the interference: the sharp picture errs by 4e-6, its gradient by 1e-5."""
@@ -31,13 +35,13 @@ _BEYOND = 1e-3  # weight of the band from there to twice that, where there is li
 _POINTS = 24  # of the quadrature over each band
 
 
-def samples_per_pixel(model: ForwardModel, pixel_nm: float) -> int:
+def samples_per_pixel(optics: Optics, pixel_nm: float) -> int:
     """Give how many samples per pixel the picture needs along each axis.
 
     Parameters
     ----------
-    model : ForwardModel
-        The picture.
+    optics : Optics
+        Of the model.
     pixel_nm : float
         Side of a pixel [nm].
 
@@ -46,8 +50,27 @@ def samples_per_pixel(model: ForwardModel, pixel_nm: float) -> int:
     int
         At least 1.
     """
-    bandwidth = model.wavenumber * model.optics.na * (1 if model.rho else 2)
+    bandwidth = 2 * math.pi / optics.wavelength_nm * optics.na
+    bandwidth *= 2 if optics.scheme == "darkfield" else 1
     return max(1, math.ceil(bandwidth * pixel_nm / BAND))
+
+
+def margin_nm(optics: Optics, pixel_nm: float) -> float:
+    """Give how far a model must reach beyond the pixels for its picture to be known at all of them.
+
+    Parameters
+    ----------
+    optics : Optics
+        Of the model.
+    pixel_nm : float
+        Side of a pixel [nm].
+
+    Returns
+    -------
+    float
+        Distance along an axis [nm].
+    """
+    return pixel_nm + TAPS / 2 * pixel_nm / samples_per_pixel(optics, pixel_nm)
 
 
 def sample_picture(model: ForwardModel, pixel_nm: float, half_px: float) -> tuple[Lens, FloatArray]:
@@ -70,7 +93,7 @@ def sample_picture(model: ForwardModel, pixel_nm: float, half_px: float) -> tupl
         P and Q of a P + a² Q, columns in the order that `iscat_analysis._kernels.stamp` needs; 0
         beyond the model's reach.
     """
-    fine = samples_per_pixel(model, pixel_nm)
+    fine = samples_per_pixel(model.optics, pixel_nm)
     step = pixel_nm / fine
     half = math.ceil(half_px * fine) + TAPS
     nodes = np.asarray(step * np.arange(-half, half + 1), dtype=np.float64)

@@ -16,6 +16,7 @@ from iscat_analysis.movie.background import smooth_background
 from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.optics.stamp import margin_nm
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     BoolArray,
@@ -233,8 +234,9 @@ def square_model(config: Config, pixel_nm: float, roi_px: int) -> ForwardModel:
     ForwardModel
         It reaches over the square from wherever a fit may put the particle.
     """
+    margin = pixel_nm + margin_nm(config.optics, pixel_nm)
     return forward_model(
-        config, math.sqrt(2) * (roi_px * pixel_nm / 2 + window_nm(pixel_nm) + pixel_nm)
+        config, math.sqrt(2) * (roi_px * pixel_nm / 2 + window_nm(pixel_nm) + margin)
     )
 
 

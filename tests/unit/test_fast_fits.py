@@ -263,6 +263,63 @@ def test_starts_that_are_given_up_change_nothing(mass: float, seed: int) -> None
             assert any(abs(z - n) < 2.0 for n in near), (z, gap)
 
 
+# ---- the picture at a fixed height ---------------------------------------------------------------
+
+
+def _through_the_field(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Likelihood, "_is_pictured", lambda *_: False)
+
+
+@pytest.mark.parametrize("optics", [
+    {}, {"polarization_deg": 30.0, "analyzer": True}, {"scheme": "darkfield"},
+    {"aberrations_nm": {"z7": 15.0, "z5": 10.0}},
+])  # fmt: skip
+@pytest.mark.parametrize("level", [False, True])
+def test_a_picture_gives_the_fit_of_the_field(
+    optics: dict[str, object], level: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Estimates and their errors to a thousandth of a standard deviation."""
+    model = forward_model(make_config(calibrated=False, optics=optics), 2500.0)
+    grid, rng = PixelGrid.region((0, 20), (0, 19), PIXEL_NM), np.random.default_rng(8)
+    signal = model.image(grid, 9.2 * PIXEL_NM, 10.1 * PIXEL_NM, model.height_nm, 600.0)
+    scale = 2e6 if model.rho else 3000 / signal.max()
+    before = rng.poisson(1e3 if not model.rho else scale, grid.shape).astype(float)
+    after = rng.poisson(before.mean() + scale * signal).astype(float)
+    which = (
+        noise.conditional(model, grid, before, after, 1.0)
+        if model.rho
+        else noise.poisson(model, grid, after, 1e3, scale)
+    )
+    start = Candidate(9.6, 9.8, model.height_nm, 800.0, 10.0)
+    box = search_box(which, start, "mass", (0.0, 600.0), level=level)
+    assert which._is_pictured(model.height_nm, box.lower, box.upper)
+    fast = fit_particle(which, start, "mass", (0.0, 600.0), level=level)
+    tight = which.maximize(fast.theta, box.free, box.lower, box.upper, tolerance=1e-10)
+    _through_the_field(monkeypatch)
+    slow = fit_particle(which, start, "mass", (0.0, 600.0), level=level)
+    same = which.maximize(fast.theta, box.free, box.lower, box.upper, tolerance=1e-10)
+    known = [0, 1, 3]
+    units = 1 / np.sqrt(np.diag(same.fisher))
+    assert np.all(np.abs(tight.theta - same.theta)[box.free] < 1e-3 * units[box.free])
+    assert fast.status == slow.status
+    np.testing.assert_allclose(fast.sigma[known], slow.sigma[known], rtol=1e-3)
+    assert fast.snr == pytest.approx(slow.snr, abs=1e-3)
+
+
+def test_what_has_no_picture_takes_the_field() -> None:
+    """Another height, a place whose pixels lie beyond the model, and pixels out of line."""
+    model = forward_model(make_config(), 2500.0)
+    grid = PixelGrid.region((0, 20), (0, 20), PIXEL_NM)
+    which = noise.poisson(model, grid, np.full(grid.shape, 1e4), 1e4, 1e4)
+    low, high = np.full(5, 700.0), np.full(5, 900.0)
+    assert which._is_pictured(model.height_nm, low, high)
+    assert not which._is_pictured(model.height_nm + 1.0, low, high)
+    assert not which._is_pictured(model.height_nm, low - 700, high + 700)
+    askew = PixelGrid(np.sort(np.append(grid.x_nm[:-1], 10.0)), grid.y_nm, PIXEL_NM)
+    other = noise.poisson(model, askew, np.full(grid.shape, 1e4), 1e4, 1e4)
+    assert not other._is_pictured(model.height_nm, low, high)
+
+
 # ---- the largest contrast ------------------------------------------------------------------------
 
 
