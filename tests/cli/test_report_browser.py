@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -220,6 +221,22 @@ def first_cells(browser: Any, column: int) -> list[str]:
 
 def click(browser: Any, selector: str) -> None:
     browser.execute_script("document.querySelector(arguments[0]).click()", selector)
+
+
+def shown_rows(browser: Any, least: int = 0) -> int:
+    """Rows of the table that take room, once there are so many, or two seconds have gone by."""
+    script = """
+    const [least, done] = arguments;
+    const begun = performance.now();
+    const look = () => {
+      const rows = [...document.querySelectorAll("#table tbody tr[id]")];
+      const shown = rows.filter((row) => row.getClientRects().length).length;
+      if (shown >= least || performance.now() - begun > 2000) return done(shown);
+      setTimeout(look, 20);
+    };
+    look();
+    """
+    return int(browser.execute_async_script(script, least))
 
 
 REPORTS = ("mass", "joint", "localize", "track", "darkfield", "one", "landing")
@@ -537,3 +554,29 @@ def test_a_batch_sorts_narrows_and_links(browser: Any, pages: dict[str, Path]) -
         "return [...document.querySelectorAll('[src], link')].map((e) => e.src || e.href)"
     )
     assert all(address.startswith("data:") for address in addresses)
+
+
+def test_rows_beyond_the_first_200_are_laid_out_when_they_are_looked_for(
+    browser: Any, tmp_path: Path
+) -> None:
+    page = tmp_path / "many.html"
+    few = make_analysis(10)
+    table = pd.concat([few.table] * 26, ignore_index=True).assign(event=np.arange(260))
+    page.write_text(render_report(replace(few, table=table)), encoding="utf-8")
+    looks = {
+        "document.getElementById('row-199').scrollIntoView()": 260,
+        "document.querySelector('#table th:nth-child(2) button').click()": 260,
+        "const f = document.getElementById('filter'); f.value = '259'; "
+        " f.dispatchEvent(new Event('input'))": 1,
+        "window.dispatchEvent(new KeyboardEvent('keydown', {key: 'f', ctrlKey: true}))": 260,
+        "window.dispatchEvent(new Event('beforeprint'))": 260,
+    }
+    for look, rows in looks.items():
+        show(browser, page)
+        assert shown_rows(browser) == 200, look
+        browser.execute_script(look)
+        assert shown_rows(browser, rows) >= rows, look
+        assert browser.execute_script(
+            "return document.getElementById('row-259').getClientRects().length"
+        ), look
+        assert not errors(browser), look

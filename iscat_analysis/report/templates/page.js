@@ -27,6 +27,7 @@
         table.querySelectorAll("th").forEach((th) => th.setAttribute("aria-sort", "none"));
         head.setAttribute("aria-sort", down < 0 ? "descending" : "ascending");
         [...table.tBodies[0].rows].forEach(close);
+        table.classList.remove("late");
         const rows = [...table.tBodies[0].rows].map((row) => [row, row.cells[column].textContent.trim()]);
         const numeric = rows.every(([, text]) => text === "—" || Number.isFinite(number(text)));
         rows.sort(([, a], [, b]) => {
@@ -90,6 +91,7 @@
   const narrow = () => {
     const rows = [...table.tBodies[0].rows];
     rows.forEach(close);
+    if (filter.value) table.classList.remove("late");
     const kept = rows.filter((row) => row.id).filter((row) => {
       row.hidden = !row.textContent.includes(filter.value.trim());
       return !row.hidden;
@@ -99,6 +101,13 @@
   };
   filter.addEventListener("input", narrow);
   narrow();
+
+  // To lay out thousands of rows takes a second: they wait until they are looked for.
+  const whole = () => table.classList.remove("late");
+  const near = new IntersectionObserver((seen) => { if (seen.some((row) => row.isIntersecting)) whole(); }, { rootMargin: "1000px" });
+  if (table.tBodies[0].rows[199]) near.observe(table.tBodies[0].rows[199]);
+  window.addEventListener("beforeprint", whole);
+  window.addEventListener("keydown", (event) => { if (event.key === "F3" || ((event.ctrlKey || event.metaKey) && event.key === "f")) whole(); });
 
   // A figure names the rows of its points in order: the n-th point of the group rows-4_7_9 is the n-th of these.
   const tip = document.getElementById("tip");
@@ -125,6 +134,7 @@
     tip.hidden = true;
     filter.value = "";
     narrow();
+    whole();
     open(row);
     row.scrollIntoView({ block: "center" });
   });
