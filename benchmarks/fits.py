@@ -82,8 +82,11 @@ def run_peer(python: Path, count: int) -> dict[str, float]:
     return found
 
 
-def experiment(side: int) -> Setting:
-    """One protein of 1 MDa, 5000 scattered photons, on side × side pixels."""
+def experiment(side: int, mode: str = "joint") -> Setting:
+    """One protein of 1 MDa, 5000 scattered photons, on side × side pixels.
+
+    Its height is 100 nm where it is fitted, else that of the configuration.
+    """
     return make_setting(
         parse_config(
             {
@@ -95,9 +98,9 @@ def experiment(side: int) -> Setting:
                 "bounds": {"n_before": 200, "n_after": 200, "x_nm": 17.0, "y_nm": -29.0},
             }
         ),
-        "joint",
+        mode,
         collected=PHOTONS,
-        z_nm=100.0,
+        z_nm=100.0 if mode == "joint" else None,
     )
 
 
@@ -116,6 +119,14 @@ class Batch:
             start = Candidate(x, y, truth[2] + random.uniform(-20, 20), truth[3] * 1.2, 0.0)
             box = search_box(likelihood, start, "joint", (0.0, 500.0), level=True)
             self.sets.append((likelihood, start_theta(likelihood, start), box))
+        fixed = experiment(side, "mass")
+        some = range(min(max(count // 10, 10), count))
+        self.whole = {
+            "joint": (self.setting, 50.0, [self.sets[i][0] for i in some]),
+            "mass": (fixed, float(fixed.truth[2]), [
+                fixed.likelihood(fixed.draw(fixed.truth, trial_generator(6, side, i))) for i in some
+            ]),
+        }  # fmt: skip
         self.estimates = np.empty((count, 5))
         self.passes = np.empty(count)
         self.converged = np.empty(count, dtype=bool)
@@ -146,15 +157,15 @@ class Batch:
         crb = np.sqrt(np.diag(np.linalg.inv(fisher)))
         return [float(r) for r in np.std(self.estimates, axis=0, ddof=1) / crb]
 
-    def whole_fits_per_second(self) -> float:
+    def whole_fits_per_second(self, mode: str) -> float:
         """Fits with the search of heights, uncertainty and goodness of fit, as a movie's are."""
-        setting, some = self.setting, self.sets[: max(len(self.sets) // 10, 10)]
+        setting, z_nm, some = self.whole[mode]
         pixel, truth = setting.scene.pixel_nm, setting.truth
-        start = Candidate(truth[0] / pixel + 0.3, truth[1] / pixel - 0.3, 50.0, 800.0, 0.0)
-        fit_particle(some[0][0], start, "joint", (0.0, 500.0), level=False)
+        start = Candidate(truth[0] / pixel + 0.3, truth[1] / pixel - 0.3, z_nm, 800.0, 0.0)
+        fit_particle(some[0], start, mode, (0.0, 500.0), level=False)
         begun = time.process_time()
-        for likelihood, _, _ in some:
-            fit_particle(likelihood, start, "joint", (0.0, 500.0), level=False)
+        for likelihood in some:
+            fit_particle(likelihood, start, mode, (0.0, 500.0), level=False)
         return len(some) / (time.process_time() - begun)
 
     def evaluations_per_second(self, repeats: int) -> float:
@@ -176,7 +187,8 @@ def measure(batches: dict[int, Batch], repeats: int) -> dict[str, float]:
         found[f"fits_per_s_{side}"] = batch.per_second(1, processor=True)
         found[f"wall_fits_per_s_{side}_1_thread"] = batch.per_second(1, processor=False)
         found[f"wall_fits_per_s_{side}_2_threads"] = batch.per_second(2, processor=False)
-        found[f"whole_fits_per_s_{side}"] = batch.whole_fits_per_second()
+        for mode in batch.whole:
+            found[f"whole_fits_per_s_{mode}_{side}"] = batch.whole_fits_per_second(mode)
         found[f"log_likelihoods_per_s_{side}"] = batch.evaluations_per_second(repeats)
     return found
 

@@ -295,6 +295,36 @@ def supported(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def box_supported(
+    start: FloatArray,
+    free: BoolArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+    half_pixel: float,
+    reach: float,
+    low: float,
+    high: float,
+    largest_level: float,
+) -> tuple[bool, bool]:
+    """Tell whether a box holds the start of what is free, and whether `supported` holds in it."""
+    inside = True
+    corners = np.empty((4, 5))
+    for i in range(5):
+        if free[i] and not lower[i] <= start[i] <= upper[i]:
+            inside = False
+        moves = free[i] and i < 3
+        corners[:, i] = start[i]
+        if moves:
+            corners[0, i], corners[1, i] = lower[i], upper[i]
+            corners[2, i] = lower[i] if i == 0 else upper[i]
+            corners[3, i] = upper[i] if i == 0 else lower[i]
+    known = supported(corners, x, y, half_pixel, reach, low, high, largest_level)
+    return inside, known[0] and known[1] and known[2] and known[3]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def value_batch(
     axial: AxialTable,
     lens: Lens,

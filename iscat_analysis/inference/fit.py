@@ -178,7 +178,9 @@ def fit_particle(
     chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free, derivatives)
     walls = _walls(best.theta, box)
     flags = []
-    if not best.converged or not np.all(np.isfinite(sigma[box.free[:4]])):
+    particle = box.free[:4]
+    known = bool(np.isfinite(sigma[particle]).all())
+    if not best.converged or not known:
         flags.append(Status.NOT_CONVERGED)
     if _at_bound(likelihood, best.theta, walls, sigma[2]):
         flags.append(Status.AT_BOUND)
@@ -187,12 +189,13 @@ def fit_particle(
     if p_value < POOR_FIT_P:
         flags.append(Status.POOR_FIT)
     estimate = best.theta
-    if correct_bias and np.all(np.isfinite(sigma[box.free[:4]])):
+    if correct_bias and known:
         bias = first_order_bias(likelihood, best.theta, box.free & ~walls, derivatives)
-        units = np.array([1.0, 1.0, 1.0, abs(model.scale.slope(float(best.theta[3])))])
+        size = np.abs(bias[:4])
+        size[AMPLITUDE] *= abs(model.scale.slope(float(best.theta[AMPLITUDE])))
         # an expansion whose first term exceeds the error has lost its meaning
-        if np.all(np.abs(bias[:4] * units)[box.free[:4]] <= sigma[box.free[:4]]):
-            estimate = np.where(box.free, np.clip(estimate - bias, box.lower, box.upper), estimate)
+        if (size <= sigma)[particle].all():
+            estimate = np.minimum(np.maximum(estimate - bias, box.lower), box.upper)
     x, y, z, amplitude = (float(value) for value in estimate[:4])
     status, noticed = verdict(flags)
     return FitResult(
@@ -339,8 +342,9 @@ def _uncertainty(
     inverse = np.empty((5, 5))
     sigma = np.full(4, np.nan)
     known = invert(information, scale, free, inverse)
-    inverse[AMPLITUDE] *= abs(likelihood.model.scale.slope(float(best.theta[AMPLITUDE])))
-    inverse[:, AMPLITUDE] *= abs(likelihood.model.scale.slope(float(best.theta[AMPLITUDE])))
+    slope = abs(likelihood.model.scale.slope(float(best.theta[AMPLITUDE])))
+    inverse[AMPLITUDE] *= slope
+    inverse[:, AMPLITUDE] *= slope
     particle = np.flatnonzero(free[:4])
     covariance = inverse[particle][:, particle]
     if known:
@@ -365,7 +369,7 @@ def _at_bound(
     The ends of the heights mean something: the coverslip, or what the user knows.  Noise alone puts
     a particle near such an end onto it, and the fit is good unless the data pull on significantly.
     """
-    if np.any(np.delete(walls, 2)):
+    if walls[0] or walls[1] or walls[3] or walls[LEVEL]:
         return True
     if not walls[2]:
         return False

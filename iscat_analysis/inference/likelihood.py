@@ -27,6 +27,7 @@ from iscat_analysis._kernels.scoring import (
     CONDITIONAL,
     CONVERGED,
     POISSON,
+    box_supported,
     maximize,
     score_pass,
     supported,
@@ -172,10 +173,7 @@ class Likelihood:
             False for heights outside the model's `z_range_nm`, for places with a pixel of the grid
             beyond its `reach_nm`, and for values that are not finite.
         """
-        inside: BoolArray = supported(
-            thetas, self.grid.x_nm, self.grid.y_nm, self.grid.pixel_nm / 2, self.model.reach_nm,
-            *self.model.z_range_nm, LARGEST_LEVEL,
-        )  # fmt: skip
+        inside: BoolArray = supported(thetas, *self._support)
         return inside
 
     def score_fisher(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -444,7 +442,7 @@ class Likelihood:
         point = vector_of("theta", theta, (5,))
         if not self.supports(point[None])[0]:
             raise ConfigError(
-                f"theta = {_listed(point)}: {self._support()}; move the particle or give "
+                f"theta = {_listed(point)}: {self._supports()}; move the particle or give "
                 "forward_model a larger reach_nm or z_max_nm"
             )
         return point
@@ -453,17 +451,15 @@ class Likelihood:
         self, start: FloatArray, free: BoolArray, lower: FloatArray, upper: FloatArray
     ) -> None:
         """Refuse a box that a fit could leave the support in."""
-        if np.any(free & ~((lower <= start) & (start <= upper))):
+        inside, known = box_supported(start, free, lower, upper, *self._support)
+        if not inside:
             raise ConfigError(
                 f"start = {_listed(start)} lies outside the box from {_listed(lower)} to "
                 f"{_listed(upper)}: clip it, or widen the box"
             )
-        low, high = np.where(free, lower, start), np.where(free, upper, start)
-        low[3:], high[3:] = start[3:], start[3:]
-        corners = np.stack([low, high, [low[0], *high[1:]], [high[0], *low[1:]]])
-        if not self.supports(corners).all():
+        if not known:
             raise ConfigError(
-                f"lower = {_listed(lower)}, upper = {_listed(upper)}: {self._support()}; narrow "
+                f"lower = {_listed(lower)}, upper = {_listed(upper)}: {self._supports()}; narrow "
                 "the box or give forward_model a larger reach_nm or z_max_nm"
             )
 
@@ -481,7 +477,7 @@ class Likelihood:
         reach = model.reach_nm - math.sqrt(2) * margin_nm(model.optics, grid.pixel_nm)
         return inside and math.hypot(far_x, far_y) < reach and grid.is_regular
 
-    def _support(self) -> str:
+    def _supports(self) -> str:
         low, high = self.model.z_range_nm
         return (
             f"the model is known for z_nm from {low:g} to {high:g} and up to "
@@ -493,6 +489,13 @@ class Likelihood:
         fixed = self.model.height_nm
         at_it = bool(np.all(heights_nm == fixed))
         return self.model.height_table(fixed) if at_it else self.model.axial_table
+
+    @cached_property
+    def _support(self) -> tuple[FloatArray, FloatArray, float, float, float, float, float]:
+        """What `supported` takes after θ."""
+        grid, model = self.grid, self.model
+        half = grid.pixel_nm / 2
+        return grid.x_nm, grid.y_nm, half, model.reach_nm, *model.z_range_nm, LARGEST_LEVEL
 
     @cached_property
     def _arguments(self) -> tuple[Lens, Pixels, int, FloatArray]:

@@ -103,7 +103,7 @@ class ForwardModel:
         """Whether the picture was measured, so that nothing is known of the light in the pupil."""
         return isinstance(self.wave, MeasuredField)
 
-    @property
+    @cached_property
     def lens(self) -> Lens:
         """What turns a profile into a signal, as the kernels take it."""
         return self.wave.lens(self.rho)
