@@ -275,9 +275,10 @@ def start_theta(likelihood: Likelihood, start: Candidate) -> FloatArray:
 def _optima(likelihood: Likelihood, start: Candidate, box: Box) -> list[Optimum]:
     """Every optimum that was reached, best first.
 
-    Starts are followed in the order of their likelihood, each from the place of the best before it,
-    and no farther than shows that the optimum cannot be within `FOLLOWED` of the best; such an
-    optimum is known to one step of scoring.
+    Starts are followed in the order of their likelihood, and no farther than shows that the optimum
+    cannot be within `FOLLOWED` of the best; such an optimum is known to one step of scoring.  Where
+    the best is that much above no particle, the others begin at its place.  Of fainter particles
+    every start is followed from the given place, the given one among them.
     """
     theta = start_theta(likelihood, start)
     theta = np.where(box.free, np.clip(theta, box.lower, box.upper), theta)
@@ -293,7 +294,10 @@ def _optima(likelihood: Likelihood, start: Candidate, box: Box) -> list[Optimum]
         optima.append(found)
         if found.converged and found.log_likelihood > best:
             best = found.log_likelihood
-            theta[:2], theta[LEVEL] = found.theta[:2], found.theta[LEVEL]
+            if best > FOLLOWED:
+                theta[:2], theta[LEVEL] = found.theta[:2], found.theta[LEVEL]
+    if best <= FOLLOWED:
+        optima.append(likelihood.maximize(theta, box.free, box.lower, box.upper))
     return sorted(optima, key=lambda o: (not o.converged, -o.log_likelihood))
 
 
