@@ -28,13 +28,7 @@ from iscat_analysis._kernels.lattice_rows import (
     lattice_signal,
     rows_needed,
 )
-from iscat_analysis._kernels.stamp import (
-    ROWS,
-    begin_stamp,
-    stamp_gradient,
-    stamp_signal,
-    stamp_width,
-)
+from iscat_analysis._kernels.stamp import stamp_gradient, stamp_signal
 
 FloatArray = NDArray[np.float64]
 
@@ -256,8 +250,6 @@ def _row_parts(
 @njit(cache=True, nogil=True, error_model="numpy")
 def workspace(lens: Lens, pixels: Pixels) -> FloatArray:
     """Scratch for the rows of an image, wherever the particle is."""
-    if lens.fine:
-        return np.zeros((ROWS, stamp_width(lens, pixels.x.size)))
     rows = rows_needed(lens, pixels) if lens.half else SCRATCH
     return np.empty((rows, pixels.x.size))
 
@@ -273,9 +265,7 @@ def begin_image(
     f: FloatArray,
 ) -> None:
     """Prepare the scratch for the rows of one image."""
-    if lens.fine:
-        begin_stamp(lens, pixels, x_p, y_p, f)
-    elif lens.half:
+    if lens.half:
         interpolate_columns(profile, lens, pixels, x_p, y_p, with_gradient, f)
 
 
@@ -292,9 +282,6 @@ def row_gradient(
     out: FloatArray,
 ) -> None:
     """Fill `out` (5, nx) with signal and gradient of one row, averaged over the samples."""
-    if lens.fine:
-        stamp_gradient(profile, lens, row, amplitude, f, out)
-        return
     if lens.half:
         lattice_gradient(lens, pixels, row, y_p, amplitude, f, out)
         return
@@ -321,9 +308,6 @@ def row_signal(
     out: FloatArray,
 ) -> None:
     """Fill `out` (nx,) with the signal of one row, averaged over the samples in each pixel."""
-    if lens.fine:
-        stamp_signal(profile, lens, row, amplitude, f, out)
-        return
     if lens.half:
         lattice_signal(lens, pixels, row, y_p, amplitude, f, out)
         return
@@ -383,6 +367,9 @@ def signal_image(
     out: FloatArray,
 ) -> None:
     """Fill `out` (ny, nx) with the signal on a pixel grid; the rest as in `signal_gradient`."""
+    if lens.fine:
+        stamp_signal(profile, lens, pixels, x_p, y_p, amplitude, out)
+        return
     f = workspace(lens, pixels)
     begin_image(profile, lens, pixels, x_p, y_p, False, f)
     for row in range(pixels.y.size):
@@ -416,6 +403,9 @@ def signal_gradient(
     out : ndarray, shape (ny, 5, nx)
         Filled with s, ∂s/∂x_p, ∂s/∂y_p, ∂s/∂z, ∂s/∂a.
     """
+    if lens.fine:
+        stamp_gradient(profile, lens, pixels, x_p, y_p, amplitude, out)
+        return
     f = workspace(lens, pixels)
     begin_image(profile, lens, pixels, x_p, y_p, True, f)
     for row in range(pixels.y.size):

@@ -22,10 +22,8 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.image import (
     Lens,
     Pixels,
-    begin_image,
-    row_gradient,
-    row_signal,
-    workspace,
+    signal_gradient,
+    signal_image,
 )
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lattice_rows import lattice_span
@@ -185,15 +183,13 @@ def score_pass(
 ) -> float:
     """Fill score (5) and Fisher matrix (5, 5) at θ and return the log-likelihood."""
     level = np.exp(theta[4])
-    f = workspace(lens, pixels)
-    begin_image(profile, lens, pixels, theta[0], theta[1], True, f)
-    g = np.empty((5, pixels.x.size))
+    g = np.empty((pixels.y.size, 5, pixels.x.size))
+    signal_gradient(profile, lens, pixels, theta[0], theta[1], theta[3], g)
     sums = np.zeros(20)
     total = 0.0
     for row in range(pixels.y.size):
-        row_gradient(profile, lens, pixels, row, theta[0], theta[1], theta[3], f, g)
-        total += row_value(kind, data, row, level, g[0])
-        row_score(kind, data, row, level, g, sums)
+        total += row_value(kind, data, row, level, g[row, 0])
+        row_score(kind, data, row, level, g[row], sums)
     k = 5
     for i in range(5):
         score[i] = sums[i]
@@ -214,13 +210,11 @@ def value_pass(
 ) -> float:
     """Log-likelihood at θ, without derivatives."""
     level = np.exp(theta[4])
-    f = workspace(lens, pixels)
-    begin_image(profile, lens, pixels, theta[0], theta[1], False, f)
-    s = np.empty(pixels.x.size)
+    s = np.empty((pixels.y.size, pixels.x.size))
+    signal_image(profile, lens, pixels, theta[0], theta[1], theta[3], s)
     total = 0.0
     for row in range(pixels.y.size):
-        row_signal(profile, lens, pixels, row, theta[0], theta[1], theta[3], f, s)
-        total += row_value(kind, data, row, level, s)
+        total += row_value(kind, data, row, level, s[row])
     return total
 
 

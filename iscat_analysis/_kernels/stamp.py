@@ -1,4 +1,4 @@
-"""Rows of pixels of a particle at one height, from samples of its picture.
+"""The image of a particle at one height, from samples of its picture.
 
 At one height the signal is a P(x, y) + a² Q(x, y), both averaged over a pixel and band-limited,
 P at k·NA and Q at twice that.  Sampled `fine` times per pixel they need no pupil, no fields and no
@@ -9,6 +9,10 @@ along x.
 A *profile* has shape (2, nodes along y, nodes along x): P and Q.  The nodes along x are in the
 order of their place in a pixel: all that are the first in theirs, all that are the second, …, so
 that what one weight multiplies for all columns of pixels follows one another in memory.
+
+`STRIP` rows of pixels are made at once.  Their nodes are copied into lines of one length, so that
+what one weight multiplies for all of these pixels follows one another as well: every loop is then
+long, runs in vector registers, and finds its numbers in the first cache.
 """
 
 from __future__ import annotations
@@ -28,22 +32,25 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-ROWS = 5
-"""Rows of work space: the weights, then P and Q of a row of pixels, and their slopes along y."""
+STRIP = 16
+"""Rows of pixels that are made at once."""
 
 _WEIGHTS = 4 * TAPS + 2  # of x and y, their slopes, and the first nodes
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def stamp_width(lens: Lens, columns: int) -> int:
-    """Columns of work space that a row of pixels needs."""
-    return max(lens.fine * (columns + TAPS + 1), _WEIGHTS)
+def _sizes(lens: Lens, columns: int) -> tuple[int, int, int, int]:
+    """Length of a line, of a block of nodes, of what is made of them, and of a strip's pixels."""
+    more = (TAPS + lens.fine - 2) // lens.fine
+    line = columns + more
+    return line, (STRIP + more) * line, STRIP * line + more, STRIP * line
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def begin_stamp(lens: Lens, pixels: Pixels, x_p: float, y_p: float, f: FloatArray) -> None:
-    """Put the weights of all pixels into the first row of the work space."""
-    w = f[0]
+def _begin(lens: Lens, pixels: Pixels, x_p: float, y_p: float) -> FloatArray:
+    """Work space of an image, the weights of all of its pixels at the beginning."""
+    _, block, made, strip = _sizes(lens, pixels.x.size)
+    w = np.empty(_WEIGHTS + lens.fine * (2 * block + 3 * made) + 4 * strip)
     x = (pixels.x[0] - x_p) * lens.inv_step + lens.half
     y = (pixels.y[0] - y_p) * lens.inv_step + lens.half
     i, j = int(x), int(y)
@@ -53,119 +60,161 @@ def begin_stamp(lens: Lens, pixels: Pixels, x_p: float, y_p: float, f: FloatArra
         w[TAPS + k] *= lens.inv_step
         w[3 * TAPS + k] *= lens.inv_step
     w[4 * TAPS], w[4 * TAPS + 1] = i - BEFORE, j - BEFORE
+    return w
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _down(
-    nodes: FloatArray, row: int, first: int, w: FloatArray, v: FloatArray,
+def _copy(
+    profile: FloatArray, row: int, step: int, first: int, last: int, line: int, a: float,
+    signal: FloatArray, slope: FloatArray,
+) -> None:  # fmt: skip
+    """Fill lines of `signal` with P + a Q, of `slope` with P + 2a Q, from every `step`-th row."""
+    for m in range(signal.size // line):
+        p, q = profile[0, row + step * m, first:last], profile[1, row + step * m, first:last]
+        s, d = signal[m * line : (m + 1) * line], slope[m * line : (m + 1) * line]
+        for j in range(p.size):
+            s[j] = p[j] + a * q[j]
+            d[j] = p[j] + 2.0 * a * q[j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _mix(nodes: FloatArray, at: IntArray, w: FloatArray, out: FloatArray) -> None:
+    """Fill `out` with the combination w of what begins at TAPS places of `nodes`.
+
+    Four at a time: against more that might overlap, the compiler gives up on vectors.
+    """
+    n = out.size
+    for k in range(0, TAPS, 4):
+        a, b = nodes[at[k] : at[k] + n], nodes[at[k + 1] : at[k + 1] + n]
+        c, d = nodes[at[k + 2] : at[k + 2] + n], nodes[at[k + 3] : at[k + 3] + n]
+        wa, wb, wc, wd = w[k], w[k + 1], w[k + 2], w[k + 3]
+        if k == 0:
+            for j in range(n):
+                out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+        else:
+            for j in range(n):
+                out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _mix_both(
+    nodes: FloatArray, at: IntArray, w: FloatArray, v: FloatArray,
     out: FloatArray, other: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill `out` and `other` with the combinations w and v of TAPS rows of nodes."""
-    last = first + out.size
-    for part in range(0, TAPS, 4):
-        a, b = nodes[row + part, first:last], nodes[row + part + 1, first:last]
-        c, d = nodes[row + part + 2, first:last], nodes[row + part + 3, first:last]
-        wa, wb, wc, wd = w[part], w[part + 1], w[part + 2], w[part + 3]
-        va, vb, vc, vd = v[part], v[part + 1], v[part + 2], v[part + 3]
-        if part == 0:
-            for j in range(out.size):
+    """Fill `out` and `other` with two combinations of the same nodes; see `_mix`."""
+    n = out.size
+    for k in range(0, TAPS, 4):
+        a, b = nodes[at[k] : at[k] + n], nodes[at[k + 1] : at[k + 1] + n]
+        c, d = nodes[at[k + 2] : at[k + 2] + n], nodes[at[k + 3] : at[k + 3] + n]
+        wa, wb, wc, wd = w[k], w[k + 1], w[k + 2], w[k + 3]
+        va, vb, vc, vd = v[k], v[k + 1], v[k + 2], v[k + 3]
+        if k == 0:
+            for j in range(n):
                 out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
                 other[j] = va * a[j] + vb * b[j] + vc * c[j] + vd * d[j]
         else:
-            for j in range(out.size):
+            for j in range(n):
                 out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
                 other[j] += va * a[j] + vb * b[j] + vc * c[j] + vd * d[j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _down_once(nodes: FloatArray, row: int, first: int, w: FloatArray, out: FloatArray) -> None:
-    """Fill `out` with the combination w of TAPS rows of nodes."""
-    last = first + out.size
-    for part in range(0, TAPS, 4):
-        a, b = nodes[row + part, first:last], nodes[row + part + 1, first:last]
-        c, d = nodes[row + part + 2, first:last], nodes[row + part + 3, first:last]
-        wa, wb, wc, wd = w[part], w[part + 1], w[part + 2], w[part + 3]
-        if part == 0:
-            for j in range(out.size):
-                out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
-        else:
-            for j in range(out.size):
-                out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+@njit(cache=True, nogil=True, error_model="numpy")
+def _make_strip(
+    profile: FloatArray, lens: Lens, row: int, rows: int, columns: int, a: float,
+    gradient: bool, w: FloatArray,
+) -> int:  # fmt: skip
+    """Make a strip: P + a Q of its pixels, and with `gradient` ∂/∂x and ∂/∂y of it and P + 2a Q.
 
-
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _across(
-    nodes: FloatArray, length: int, phase: int, fine: int, w: FloatArray, out: FloatArray
-) -> None:
-    """Fill `out` with the combination w of nodes, those of each place in a pixel `length` apart."""
-    n = out.size
-    for part in range(0, TAPS, 4):
-        i = phase + part
-        a0 = i % fine * length + i // fine
-        b0 = (i + 1) % fine * length + (i + 1) // fine
-        c0 = (i + 2) % fine * length + (i + 2) // fine
-        d0 = (i + 3) % fine * length + (i + 3) // fine
-        a, b, c, d = nodes[a0 : a0 + n], nodes[b0 : b0 + n], nodes[c0 : c0 + n], nodes[d0 : d0 + n]
-        wa, wb, wc, wd = w[part], w[part + 1], w[part + 2], w[part + 3]
-        if part == 0:
-            for j in range(n):
-                out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
-        else:
-            for j in range(n):
-                out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+    Returns where in the work space it begins; each of its images is `STRIP` lines long.
+    """
+    fine = lens.fine
+    line, block, made, strip = _sizes(lens, columns)
+    wx, vx, wy, vy = w[:TAPS], w[TAPS : 2 * TAPS], w[2 * TAPS : 3 * TAPS], w[3 * TAPS : 4 * TAPS]
+    left, top = int(w[4 * TAPS]), int(w[4 * TAPS + 1]) + fine * row
+    per_phase = profile.shape[2] // fine
+    nodes = w[_WEIGHTS : _WEIGHTS + 2 * fine * block]
+    sums = w[_WEIGHTS + 2 * fine * block :]
+    at = np.empty(TAPS, dtype=np.int64)
+    for k in range(TAPS):
+        at[k] = k % fine * block + k // fine * line
+    more, used = line - columns, rows * line
+    kept = fine * block
+    for phase in range(fine):
+        first = left // fine
+        last = min(first + line, per_phase)
+        for k in range(fine):
+            here = slice(k * block, k * block + (rows + (TAPS - 1 - k) // fine) * line)
+            _copy(
+                profile, top + k, fine, phase * per_phase + first, phase * per_phase + last, line,
+                a, nodes[here], nodes[kept + here.start : kept + here.stop],
+            )  # fmt: skip
+        one = sums[phase * made : phase * made + used]
+        if not gradient:
+            _mix(nodes[:kept], at, wy, one)
+            continue
+        two, three = (
+            sums[(fine + phase) * made : (fine + phase) * made + used],
+            sums[(2 * fine + phase) * made : (2 * fine + phase) * made + used],
+        )
+        _mix_both(nodes[:kept], at, wy, vy, one, two)
+        _mix(nodes[kept:], at, wy, three)
+    phase = left % fine
+    for k in range(TAPS):
+        at[k] = (phase + k) % fine * made + (phase + k) // fine
+    out = _WEIGHTS + 2 * fine * block + 3 * fine * made
+    used -= more
+    if not gradient:
+        _mix(sums, at, wx, w[out : out + used])
+        return out
+    size = fine * made
+    _mix_both(sums, at, wx, vx, w[out : out + used], w[out + strip : out + strip + used])
+    _mix(sums[size:], at, wx, w[out + 2 * strip : out + 2 * strip + used])
+    _mix(sums[2 * size :], at, wx, w[out + 3 * strip : out + 3 * strip + used])
+    return out
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def stamp_gradient(
-    profile: FloatArray, lens: Lens, row: int, amplitude: float, f: FloatArray, out: FloatArray
-) -> None:
-    """Fill `out` (5, nx) with signal and gradient of one row of pixels; ∂s/∂z is left 0."""
-    fine, n, a = lens.fine, out.shape[1], amplitude
-    w = f[0]
-    left, top = int(w[4 * TAPS]), int(w[4 * TAPS + 1]) + fine * row
-    wy, vy = w[2 * TAPS : 3 * TAPS], w[3 * TAPS : 4 * TAPS]
-    per_phase = profile.shape[2] // fine
-    length = n + TAPS // fine + 1
-    for k in range(fine):
-        here, first = k * length, k * per_phase + left // fine
-        last = here + min(length, per_phase - left // fine)
-        _down(profile[0], top, first, wy, vy, f[1, here:last], f[2, here:last])
-        _down(profile[1], top, first, wy, vy, f[3, here:last], f[4, here:last])
-    p, p_y, q, q_y = f[1], f[2], f[3], f[4]
-    for j in range(fine * length):
-        s = a * (p[j] + a * q[j])
-        p_y[j] = a * (p_y[j] + a * q_y[j])
-        q[j] = p[j] + 2.0 * a * q[j]
-        p[j] = s
-    phase = left % fine
-    wx, vx = w[:TAPS], w[TAPS : 2 * TAPS]
-    _across(p, length, phase, fine, wx, out[0])
-    _across(p, length, phase, fine, vx, out[1])
-    _across(p_y, length, phase, fine, wx, out[2])
-    _across(q, length, phase, fine, wx, out[4])
-    for j in range(n):
-        out[1, j] = -out[1, j]
-        out[2, j] = -out[2, j]
-        out[3, j] = 0.0
+    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Fill `out` (ny, 5, nx) with signal and gradient of an image; ∂s/∂z is 0."""
+    rows, n = pixels.y.size, pixels.x.size
+    line, _, _, strip = _sizes(lens, n)
+    f = _begin(lens, pixels, x_p, y_p)
+    for row in range(rows):
+        if row % STRIP == 0:
+            begin = _make_strip(
+                profile, lens, row, min(STRIP, rows - row), n, amplitude, True, f
+            )
+        s, x = f[begin : begin + n], f[begin + strip : begin + strip + n]
+        y = f[begin + 2 * strip : begin + 2 * strip + n]
+        d = f[begin + 3 * strip : begin + 3 * strip + n]
+        begin += line
+        here = out[row]
+        for j in range(n):
+            here[0, j] = amplitude * s[j]
+            here[1, j] = -amplitude * x[j]
+            here[2, j] = -amplitude * y[j]
+            here[3, j] = 0.0
+            here[4, j] = d[j]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def stamp_signal(
-    profile: FloatArray, lens: Lens, row: int, amplitude: float, f: FloatArray, out: FloatArray
-) -> None:
-    """Fill `out` (nx,) with the signal of one row of pixels."""
-    fine, a = lens.fine, amplitude
-    w = f[0]
-    left, top = int(w[4 * TAPS]), int(w[4 * TAPS + 1]) + fine * row
-    wy = w[2 * TAPS : 3 * TAPS]
-    per_phase = profile.shape[2] // fine
-    length = out.size + TAPS // fine + 1
-    for k in range(fine):
-        here, first = k * length, k * per_phase + left // fine
-        last = here + min(length, per_phase - left // fine)
-        _down_once(profile[0], top, first, wy, f[1, here:last])
-        _down_once(profile[1], top, first, wy, f[3, here:last])
-    p, q = f[1], f[3]
-    for j in range(fine * length):
-        p[j] = a * (p[j] + a * q[j])
-    _across(p, length, left % fine, fine, w[:TAPS], out)
+    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Fill `out` (ny, nx) with the signal of an image."""
+    rows, n = pixels.y.size, pixels.x.size
+    line = _sizes(lens, n)[0]
+    f = _begin(lens, pixels, x_p, y_p)
+    for row in range(rows):
+        if row % STRIP == 0:
+            begin = _make_strip(
+                profile, lens, row, min(STRIP, rows - row), n, amplitude, False, f
+            )
+        s, here = f[begin : begin + n], out[row]
+        begin += line
+        for j in range(n):
+            here[j] = amplitude * s[j]
