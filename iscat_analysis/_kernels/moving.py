@@ -31,6 +31,7 @@ from iscat_analysis._kernels.scoring import (
     maximize,
     picture_at,
     row_score,
+    row_value,
     scoring_step,
     scratch,
     span,
@@ -367,12 +368,11 @@ def fit_frames(
     near_work = scratch(table_of(near, 0), near.lens, 1)
     far_work = scratch(table_of(far, 0), far.lens, 1)
     image = np.empty(max(field.drawn, field.side) ** 2)
-    square, before = np.empty(4 * field.side**2), np.empty(5 * field.side**2)
-    change, step = np.empty(field.side**2), np.empty(5)
-    index = np.flatnonzero(search.free[:4])
+    square, change = np.empty(4 * field.side**2), np.empty(field.side**2)
+    gradients = np.empty(10 * field.side**2)
+    step, index = np.empty(5), np.flatnonzero(search.free[:4])
     slope_work = scratch(table_of(near, 0), near.lens, 2)
-    score, fisher = np.empty(5), np.empty((5, 5))
-    lower, upper = np.empty(5), np.empty(5)
+    fisher = np.empty((5, 5))
     for t in range(first, last):
         ready_frame(field, near, far, starts, t, theta, group, canvas, near_work, far_work, image)
         total = canvas.total[t]
@@ -385,28 +385,18 @@ def fit_frames(
                     continue
                 ny, nx = r1 - r0, c1 - c0
                 pixels = cut(field.pixels, r0, r1, c0, c1)
-                here = before[: 5 * ny * nx].reshape(ny, 5, nx)
-                draw_gradient(near, group[r], p, pixels, slope_work[0], slope_work[1], here)
+                both = gradients[: 10 * ny * nx].reshape(2, ny, 5, nx)
+                draw_gradient(near, group[r], p, pixels, slope_work[0], slope_work[1], both[0])
                 data = square[: 4 * ny * nx].reshape(4, ny, nx)
-                stage(light, t, total, here[:, 0], r0, c0, data)
+                stage(light, t, total, both[0, :, 0], r0, c0, data)
                 moved = change[: ny * nx].reshape(ny, nx)
-                if _last_step(search, data, here, p, fisher, step):
-                    outcome[r] = CONVERGED
-                    _along(here, step, moved)
-                else:
-                    for i in range(5):
-                        lower[i] = max(search.lower[i], p[i] - search.reach[i])
-                        upper[i] = min(search.upper[i], p[i] + search.reach[i])
-                        if search.free[i]:
-                            p[i] = min(max(p[i], lower[i]), upper[i])
-                    _, _, outcome[r] = maximize(
-                        table_of(near, group[r]), lens_of(near, group[r]), pixels, POISSON, data,
-                        search.free, lower, upper, search.max_step, search.tolerance,
-                        search.passes, p, score, fisher,
-                    )  # fmt: skip
-                    moved[:] = here[:, 0]
-                    draw_gradient(near, group[r], p, pixels, slope_work[0], slope_work[1], here)
-                    moved[:] = here[:, 0] - moved
+                for i in range(ny):
+                    moved[i] = -both[0, i, 0]
+                outcome[r], last_one = _climb(
+                    near, group[r], pixels, data, search, p, both, slope_work, fisher, step
+                )
+                here = both[last_one]
+                _add_signal(here, step, moved)
                 add(total, r0, c0, 1.0, moved)
                 canvas.squares[r] = p
                 if _invert(fisher, index, response.inverse[r]):
@@ -416,11 +406,67 @@ def fit_frames(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _last_step(
-    search: Search, data: FloatArray, here: FloatArray, theta: FloatArray, fisher: FloatArray,
-    step: FloatArray,
-) -> bool:  # fmt: skip
-    """Take the step of `maximize`, where its first is its last; tell whether it is."""
+def _climb(
+    near: Pictures, group: int, pixels: Pixels, data: FloatArray, search: Search, p: FloatArray,
+    both: FloatArray, work: tuple[FloatArray, FloatArray], fisher: FloatArray, step: FloatArray,
+) -> tuple[int, int]:  # fmt: skip
+    """Fit one row from p, at which both[0] is drawn.
+
+    As long as they lie inside the box and improve, the steps of Fisher scoring are taken as they
+    are: every picture is drawn once.  `maximize` takes over where they do not.
+
+    Returns how the fit ended and which of `both` holds the picture at the estimate minus `step`,
+    which the last step leaves so small that the gradient tells the rest.
+    """
+    lower, upper, trial, score = np.empty(5), np.empty(5), np.empty(5), np.empty(5)
+    for i in range(5):
+        lower[i] = max(search.lower[i], p[i] - search.reach[i])
+        upper[i] = min(search.upper[i], p[i] + search.reach[i])
+    at, value = 0, np.nan
+    for _ in range(search.passes):
+        gain = _step(search, data, both[at], p, lower, upper, fisher, step, trial)
+        if gain < search.tolerance:
+            p[:] = trial
+            return CONVERGED, at
+        if gain == np.inf:
+            break
+        if np.isnan(value):
+            value = _value(data, both[at])
+        draw_gradient(near, group, trial, pixels, work[0], work[1], both[1 - at])
+        there = _value(data, both[1 - at])
+        if not there > value:
+            break
+        p[:], value, at = trial, there, 1 - at
+    for i in range(5):
+        if search.free[i]:
+            p[i] = min(max(p[i], lower[i]), upper[i])
+    _, _, outcome = maximize(
+        table_of(near, group), lens_of(near, group), pixels, POISSON, data, search.free, lower,
+        upper, search.max_step, search.tolerance, search.passes, p, score, fisher,
+    )  # fmt: skip
+    draw_gradient(near, group, p, pixels, work[0], work[1], both[0])
+    step[:] = 0.0
+    return outcome, 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _value(data: FloatArray, here: FloatArray) -> float:
+    """Log-likelihood of a square whose signal and gradient are `here` (ny, 5, nx)."""
+    total = 0.0
+    for i in range(data.shape[1]):
+        total += row_value(POISSON, data, i, 1.0, here[i, 0])
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _step(
+    search: Search, data: FloatArray, here: FloatArray, p: FloatArray, lower: FloatArray,
+    upper: FloatArray, fisher: FloatArray, step: FloatArray, trial: FloatArray,
+) -> float:  # fmt: skip
+    """Fill the step of Fisher scoring and where it leads; return the gain that it promises.
+
+    It is infinite where the step is no good as it is: too long, out of the box, or undetermined.
+    """
     sums = np.zeros(20)
     for i in range(data.shape[1]):
         row_score(POISSON, data, i, 1.0, here[i], sums)
@@ -430,31 +476,27 @@ def _last_step(
             fisher[i, j] = fisher[j, i] = sums[k]
             k += 1
     if not scoring_step(sums[:5], fisher, search.free, 0.0, step):
-        return False
+        return np.inf
     gain = 0.0
     for i in range(5):
-        there = theta[i] + step[i]
+        trial[i] = p[i] + step[i]
         if search.free[i] and not (
-            search.lower[i] <= there <= search.upper[i] and abs(step[i]) <= search.max_step[i]
+            lower[i] <= trial[i] <= upper[i] and abs(step[i]) <= search.max_step[i]
         ):
-            return False
+            return np.inf
         gain += 0.5 * sums[i] * step[i]
-    if not gain < search.tolerance:
-        return False
-    for i in range(5):
-        theta[i] += step[i]
-    return True
+    return gain
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _along(gradient: FloatArray, step: FloatArray, out: FloatArray) -> None:
-    """Fill `out` with the change of the signal along a small step."""
+def _add_signal(here: FloatArray, step: FloatArray, out: FloatArray) -> None:
+    """Add the signal after a small step to `out`."""
     dx, dy, dz, da = step[0], step[1], step[2], step[3]
     for i in range(out.shape[0]):
-        x, y, z, a = gradient[i, 1], gradient[i, 2], gradient[i, 3], gradient[i, 4]
+        s, x, y, z, a = here[i, 0], here[i, 1], here[i, 2], here[i, 3], here[i, 4]
         line = out[i]
         for j in range(line.size):
-            line[j] = dx * x[j] + dy * y[j] + dz * z[j] + da * a[j]
+            line[j] += s[j] + dx * x[j] + dy * y[j] + dz * z[j] + da * a[j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

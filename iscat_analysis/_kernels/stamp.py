@@ -139,34 +139,31 @@ def _make_strip(
         at[k] = k % fine * block + k // fine * line
     more, used = line - columns, rows * line
     kept = fine * block
+    first, size = left // fine, fine * made
+    last = min(first + line, per_phase)
     for phase in range(fine):
-        first = left // fine
-        last = min(first + line, per_phase)
         for k in range(fine):
-            here = slice(k * block, k * block + (rows + (TAPS - 1 - k) // fine) * line)
+            start = k * block
+            stop = start + (rows + (TAPS - 1 - k) // fine) * line
             _copy(
                 profile, top + k, fine, phase * per_phase + first, phase * per_phase + last, line,
-                a, nodes[here], nodes[kept + here.start : kept + here.stop],
+                a, nodes[start:stop], nodes[kept + start : kept + stop],
             )  # fmt: skip
-        one = sums[phase * made : phase * made + used]
+        start = phase * made
+        here = sums[start : start + used]
         if not gradient:
-            _mix(nodes[:kept], at, wy, one)
+            _mix(nodes[:kept], at, wy, here)
             continue
-        two, three = (
-            sums[(fine + phase) * made : (fine + phase) * made + used],
-            sums[(2 * fine + phase) * made : (2 * fine + phase) * made + used],
-        )
-        _mix_both(nodes[:kept], at, wy, vy, one, two)
-        _mix(nodes[kept:], at, wy, three)
+        _mix_both(nodes[:kept], at, wy, vy, here, sums[start + size : start + size + used])
+        _mix(nodes[kept:], at, wy, sums[start + 2 * size : start + 2 * size + used])
     phase = left % fine
     for k in range(TAPS):
         at[k] = (phase + k) % fine * made + (phase + k) // fine
-    out = _WEIGHTS + 2 * fine * block + 3 * fine * made
+    out: int = _WEIGHTS + 2 * fine * block + 3 * fine * made
     used -= more
     if not gradient:
         _mix(sums, at, wx, w[out : out + used])
         return out
-    size = fine * made
     _mix_both(sums, at, wx, vx, w[out : out + used], w[out + strip : out + strip + used])
     _mix(sums[size:], at, wx, w[out + 2 * strip : out + 2 * strip + used])
     _mix(sums[2 * size :], at, wx, w[out + 3 * strip : out + 3 * strip + used])
@@ -184,9 +181,7 @@ def stamp_gradient(
     f = _begin(lens, pixels, x_p, y_p)
     for row in range(rows):
         if row % STRIP == 0:
-            begin = _make_strip(
-                profile, lens, row, min(STRIP, rows - row), n, amplitude, True, f
-            )
+            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, amplitude, True, f)
         s, x = f[begin : begin + n], f[begin + strip : begin + strip + n]
         y = f[begin + 2 * strip : begin + 2 * strip + n]
         d = f[begin + 3 * strip : begin + 3 * strip + n]
@@ -211,9 +206,7 @@ def stamp_signal(
     f = _begin(lens, pixels, x_p, y_p)
     for row in range(rows):
         if row % STRIP == 0:
-            begin = _make_strip(
-                profile, lens, row, min(STRIP, rows - row), n, amplitude, False, f
-            )
+            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, amplitude, False, f)
         s, here = f[begin : begin + n], out[row]
         begin += line
         for j in range(n):

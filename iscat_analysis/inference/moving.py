@@ -183,10 +183,13 @@ class MovingField:
         power = np.ones(self.frames)
         if follow_power:
             power = self._frame_totals / self._frame_totals.mean()
-        level = np.empty((self.used.shape[0], self.used.shape[1]))
         scale = (1 / power).astype(np.float32)
-        for row in range(len(level)):
-            level[row] = np.median(self.counts_e[:, row] * scale[:, None], axis=0)
+
+        def median(row: int) -> FloatArray:
+            each = np.ascontiguousarray((self.counts_e[:, row] * scale[:, None]).T)
+            return np.asarray(np.median(each, axis=1, overwrite_input=True), dtype=float)
+
+        level = np.stack(list(self._pool.map(median, range(len(self.used)))))
         return Ground(np.maximum(level, 1e-3), power)
 
     @cached_property
@@ -350,6 +353,18 @@ class MovingField:
         )
         return np.asarray(np.clip(step.reshape(move.shape), -_FARTHEST, _FARTHEST))
 
+    def draw(self, ground: Ground, rows: Rows) -> None:
+        """Draw rows in all frames, with what is drawn already, so that `residual` need not.
+
+        Parameters
+        ----------
+        ground : Ground
+            Background.
+        rows : Rows
+            Particles.
+        """
+        self.fit(ground, rows, sweeps=0, coarse=True)
+
     def residual(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
         """Give the counts of some frames minus what is expected.
 
@@ -367,6 +382,20 @@ class MovingField:
         ndarray of float32, shape (last - first, y, x)
             Photoelectrons [e]; 0 in pixels that are not used.
         """
+        here = slice(first, last)
+        if self._canvas is not None and self._canvas.rows is rows and self._canvas.coarse:
+            signal = self._canvas.canvas.total[here]
+        else:
+            signal = self._signal(ground, rows, first, last)
+        left = np.add(signal, 1.0, dtype=np.float32)
+        left *= ground.level.astype(np.float32)
+        left *= ground.power[here, None, None].astype(np.float32)
+        np.subtract(self.counts_e[here], left, out=left)
+        left[:, ~self.used] = 0.0
+        return left
+
+    def _signal(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
+        """Draw the rows of some frames alone."""
         within = rows.only((rows.frame >= first) & (rows.frame < last))
         canvas, (near, far) = self._blank(last - first, within), self._pictures
         light = self._light(ground)
@@ -378,8 +407,7 @@ class MovingField:
             within.group, canvas, self._response_of(n, 0), np.zeros(n, dtype=np.int64),
             np.zeros(last - first), np.zeros(self.used.shape),
         )  # fmt: skip
-        expected = (1.0 + canvas.total) * (part.power[:, None, None] * ground.level)
-        return np.where(self.used, part.counts - expected, 0.0).astype(np.float32)
+        return canvas.total
 
     def judge(
         self, ground: Ground, rows: Rows, *, brief: bool = False, coarse: bool = False
@@ -617,7 +645,8 @@ class MovingField:
     @cached_property
     def _frame_totals(self) -> FloatArray:
         """Photoelectrons in the used pixels of each frame."""
-        return np.asarray(self.counts_e[:, self.used].sum(axis=1, dtype=np.float64))
+        unused = self.counts_e[:, ~self.used].sum(axis=1, dtype=np.float64)
+        return np.asarray(self.counts_e.sum(axis=(1, 2), dtype=np.float64) - unused)
 
     def _light(self, ground: Ground) -> Light:
         return Light(self.counts_e, ground.power, ground.level, self.read_e2, self.used)

@@ -126,6 +126,7 @@ def _values(field: MovingField, ground: Ground, rows: Rows) -> FloatArray:
     counts for more than a fringe does.
     """
     out = np.zeros(field.frames)
+    field.draw(ground, rows)
     for first in range(0, field.frames, _BLOCK):
         last = min(first + _BLOCK, field.frames)
         left = field.residual(ground, rows, first, last)

@@ -253,7 +253,7 @@ def follow(
             rows, tried = held(config, field, rows)
             added += tried
         # the background that is told of all frames, before these are fitted over it
-        _, found_ground, _ = field.fit(ground, typical(rows), sweeps=0)
+        _, found_ground, _ = field.fit(ground, typical(rows), sweeps=0, coarse=True)
         ground = replace(ground, level=found_ground.level) if follow_level else ground
         if added <= _FEW * len(rows.frame):
             break
@@ -387,6 +387,8 @@ def search_frames(
         scene.templates, ground.level, field.read_e2, field.used,
         polarity=scene.config.detection.sign, roi_px=side,
     )  # fmt: skip
+    if frames is None:
+        field.draw(ground, rows)
     starts = rows.starts(field.frames)
     pixel = field.pixel_nm
     snr = field.snr_of(ground, rows) if len(rows.frame) else np.zeros(0)
@@ -394,9 +396,10 @@ def search_frames(
 
     def block(first: int) -> Sightings:
         last = min(first + _BLOCK, end)
-        residual = field.residual(ground, rows, first, last)
         known = [places[starts[t] : starts[t + 1]] for t in range(first, last)]
-        return search.find(residual, ground.power[first:last], first, known)
+        return search.find(
+            field.residual(ground, rows, first, last), ground.power[first:last], first, known
+        )
 
     begin, end = frames or (0, field.frames)
     parts = list(pool.map(block, range(begin, end, _BLOCK)))

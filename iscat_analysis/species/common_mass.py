@@ -27,6 +27,8 @@ from scipy.special import chdtrc
 
 from iscat_analysis.records import FloatArray
 
+_Factor = tuple[FloatArray, bool]
+
 _ROUNDS = 8  # of mass and weights in turn; each has an error (p σ/m)²/n of the one before
 _SETTLED = 1e-9  # of the mass
 
@@ -86,17 +88,17 @@ def combine_masses(
     CommonMass
         Mass, error, bound, and whether the frames agree.
     """
-    own = np.eye(mass_kda.size) if correlation is None else correlation
+    factor = None if correlation is None else cho_factor(correlation)
     mass = float(np.median(mass_kda))
     for _ in range(_ROUNDS):
         before, there = mass, _at(mass, mass_kda, power)
-        mass, variance = _least_squares(mass_kda, sigma_kda * there, own)
+        mass, variance = _least_squares(mass_kda, sigma_kda * there, factor)
         if abs(mass - before) <= _SETTLED * abs(mass):
             break
     there = _at(mass, mass_kda, power)
-    _, bound = _least_squares(mass_kda, crb_kda * there, own)
+    _, bound = _least_squares(mass_kda, crb_kda * there, factor)
     off = (mass_kda - mass) / (sigma_kda * there)
-    inside = float(off @ cho_solve(cho_factor(own), off))
+    inside = float(off @ _without_correlation(off, factor))
     free = mass_kda.size - 1
     return CommonMass(
         mass_kda=mass,
@@ -139,10 +141,14 @@ def _at(common: float, own: FloatArray, power: float) -> FloatArray:
 
 
 def _least_squares(
-    values: FloatArray, sigma: FloatArray, correlation: FloatArray
+    values: FloatArray, sigma: FloatArray, factor: _Factor | None
 ) -> tuple[float, float]:
-    """Mean of correlated values, and its variance."""
-    factor = cho_factor(correlation)
-    weights = cho_solve(factor, 1 / sigma) / sigma
+    """Mean of values whose correlation has this factor, and its variance."""
+    weights = _without_correlation(1 / sigma, factor) / sigma
     total = float(weights.sum())
     return float(weights @ values) / total, 1 / total
+
+
+def _without_correlation(values: FloatArray, factor: _Factor | None) -> FloatArray:
+    """Solve correlation · x = values; without a factor the values are independent."""
+    return values if factor is None else np.asarray(cho_solve(factor, values))

@@ -148,8 +148,8 @@ def anomalous_test(
         return -_dense(track, free * math.exp(theta[0]) * _covariance(track, lags, float(theta[1])))
 
     found = minimize(
-        lost, [0.0, 1.0], method="L-BFGS-B", jac="3-point", bounds=[(-20.0, 20.0), _EXPONENTS],
-        options={"ftol": 1e-10, "finite_diff_rel_step": _PART},
+        lost, [0.0, 1.0], method="L-BFGS-B", jac="2-point", bounds=[(-20.0, 20.0), _EXPONENTS],
+        options={"ftol": 1e-9, "finite_diff_rel_step": _PART},
     )  # fmt: skip
     d, exponent = free * math.exp(found.x[0]), float(found.x[1])
     ratio = max(2 * (-float(found.fun) - track.likelihood(free).value), 0.0)
