@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
-from scipy.linalg.blas import dsyrk
+from scipy.linalg.blas import ssyrk
 
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Judged, Rows
@@ -40,6 +40,7 @@ MOST_PIXELS = 1800
 """Pixels of a track whose information is taken as a whole."""
 
 _SINGULAR = 1e-9
+_TOGETHER = 128  # rows whose products are added in single precision, with errors of 1e-7
 _STEPS = 4  # of Newton's method; each leaves the square of the error before
 _SETTLED = 0.01  # standard deviations
 
@@ -181,7 +182,10 @@ def _undetermined(
     slopes = patterns[:, index][:, :, pixels]
     root = np.linalg.cholesky(inverse)
     felt = np.swapaxes(root, 1, 2) @ slopes
-    taken = dsyrk(1.0, felt.reshape(-1, felt.shape[2]).T, lower=True)
+    taken = np.zeros((felt.shape[2], felt.shape[2]))
+    for first in range(0, len(felt), _TOGETHER):
+        some = felt[first : first + _TOGETHER].reshape(-1, felt.shape[2])
+        taken += ssyrk(1.0, some.astype(np.float32).T, lower=True)
     return root @ felt, _factor(np.diag(1 / weight[pixels]) - taken)
 
 

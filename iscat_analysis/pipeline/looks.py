@@ -322,7 +322,8 @@ class MovingSearch:
                 field = load_field(
                     self._scene, self._movie, camera, span, self._check, pool, silent
                 )
-            return field, field.first_ground(follow_power=config.background.power_normalization)
+                power = config.background.power_normalization
+                return field, field.first_ground(follow_power=power)
 
         self._background = background
 
@@ -347,7 +348,13 @@ class MovingSearch:
         def search(threshold: float) -> pd.DataFrame:
             with threads(self._config.compute.workers) as pool:
                 found = search_frames(
-                    _with_threshold(scene, threshold), field, ground, rows, pool, (here, here + 1)
+                    _with_threshold(scene, threshold),
+                    field,
+                    ground,
+                    rows,
+                    np.zeros(0),
+                    pool,
+                    (here, here + 1),
                 )
             mass = np.asarray(scene.model.scale.mass(found.strength))
             each = zip(found.x_px, found.y_px, found.snr, found.z_nm, mass, strict=True)

@@ -22,7 +22,7 @@ from iscat_analysis.inference.common import (
     shared_errors,
     variances_left,
 )
-from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.moving import MOST_TURNS, MovingField
 from iscat_analysis.inference.rows import Ground, Judged, Rows
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
@@ -66,7 +66,7 @@ _LEAST_POSITIONS = 4  # of a track whose D is fitted
 _USELESS = 300.0  # times the median error of a track: such a place says nothing
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
-_FEW = 2e-3  # of all rows: a search that adds no more is the last
+_FEW = 5e-3  # of all rows: a search that adds no more is the last
 _FIRST_HEIGHTS = 1  # searches after which every row is put into its fringe
 _HELD_ROUNDS = 2  # in which slow particles are tried where they were not seen
 
@@ -203,11 +203,11 @@ def follow(
     follow_level = config.background.method != "median"
     ground = field.first_ground(follow_power=follow_power)
     nothing = np.zeros(0, dtype=np.int64)
-    rows = Rows.of(nothing, nothing, np.zeros((0, 5)))
+    rows, snr = Rows.of(nothing, nothing, np.zeros((0, 5))), np.zeros(0)
     total = ROUNDS + 3
     for number in range(ROUNDS):
         progress("track", number, total)
-        found = search_frames(scene, field, ground, rows, pool)
+        found = search_frames(scene, field, ground, rows, snr, pool)
         before = len(rows.frame)
         if number and len(found.frame) <= _FEW * before:
             break
@@ -222,7 +222,7 @@ def follow(
         )
         if scene.mode == "joint" and number < _FIRST_HEIGHTS:
             rows = _in_their_fringes(scene, field, ground, rows)
-        rows = _credible(scene, field, ground, rows, done)
+        rows, snr = _credible(scene, field, ground, rows, done)
         if scene.mode == "joint" and number == 0:  # sharp pictures leave over of gold what is seen
             rows = linked(config, rows, mass_places(config, field, ground, rows))
             rows, variances, _ = _moved(config, field, ground, rows)
@@ -231,6 +231,7 @@ def follow(
                 ground, rows, follow_power=follow_power, follow_level=follow_level,
                 turns=_NEXT_TURNS, coarse=True,
             )  # fmt: skip
+            snr = field.snr_of(ground, rows)
         if number and len(rows.frame) <= (1 + _FEW) * before:
             break
     progress("track", ROUNDS, total)
@@ -263,7 +264,7 @@ def follow(
             rows = _in_their_fringes(scene, field, ground, rows)
         rows, ground, done, _ = field.settle(
             ground, rows, follow_power=follow_power, follow_level=follow_level,
-            coarse=stage == 0,
+            turns=MOST_TURNS if stage else _NEXT_TURNS, coarse=not stage,
         )  # fmt: skip
         progress("track", ROUNDS + 1 + stage, total)
         if stage == 0:
@@ -355,6 +356,7 @@ def search_frames(
     field: MovingField,
     ground: Ground,
     rows: Rows,
+    snr: FloatArray,
     pool: ThreadPoolExecutor,
     frames: tuple[int, int] | None = None,
 ) -> Sightings:
@@ -370,6 +372,8 @@ def search_frames(
         The light without particles.
     rows : Rows
         Particles that are known.
+    snr : ndarray, shape (n,)
+        Their signal-to-noise ratios.
     pool : ThreadPoolExecutor
         Runs blocks of frames; the result does not depend on its size.
     frames : (int, int), optional
@@ -391,7 +395,6 @@ def search_frames(
         field.draw(ground, rows)
     starts = rows.starts(field.frames)
     pixel = field.pixel_nm
-    snr = field.snr_of(ground, rows) if len(rows.frame) else np.zeros(0)
     places = np.column_stack([rows.theta[:, :2] / pixel, snr])
 
     def block(first: int) -> Sightings:
@@ -441,10 +444,10 @@ def _joined(scene: Scene, rows: Rows, found: Sightings) -> Rows:
 
 def _credible(
     scene: Scene, field: MovingField, ground: Ground, rows: Rows, done: BoolArray
-) -> Rows:
-    """Keep the rows that a particle explains, each particle once."""
+) -> tuple[Rows, FloatArray]:
+    """Keep the rows that a particle explains, each particle once; give their SNRs as well."""
     if not len(rows.frame):
-        return rows
+        return rows, np.zeros(0)
     snr = field.snr_of(ground, rows)
     kept = done & (rows.theta[:, 3] > 0) & (snr > AS_FOUND * scene.templates.threshold)
     near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na)
@@ -456,7 +459,7 @@ def _credible(
                 apart = np.hypot(*(rows.theta[a, :2] - rows.theta[b, :2]))
                 if kept[a] and kept[b] and apart < near:
                     kept[a] = False
-    return rows.only(kept)
+    return rows.only(kept), snr[kept]
 
 
 def _moved(

@@ -170,6 +170,7 @@ def confinement_test(
     frame_rate_hz: float,
     exposure_ms: float | None = None,
     resamples: int = 199,
+    enough: int | None = None,
     rng: np.random.Generator | None = None,
 ) -> ConfinementTest:
     """Test free diffusion against diffusion in a harmonic well of unknown place.
@@ -190,6 +191,9 @@ def confinement_test(
         As in `fit_diffusion` [ms].
     resamples : int
         Free tracks that are drawn; the smallest p-value is 1/(resamples + 1).
+    enough : int, optional
+        Draw no more once so many of them have a likelihood ratio at least as large: the p-value is
+        then their share (Besag & Clifford), and a track that moves freely soon says so.
     rng : numpy.random.Generator, optional
         Draws them; absent, one with seed 1.
 
@@ -201,30 +205,37 @@ def confinement_test(
     Raises
     ------
     ConfigError
-        The frame rate or exposure is impossible, or `resamples` is not a positive number.
+        The frame rate or exposure is impossible, or `resamples` or `enough` is no positive number.
     DataError
         The arrays are not those of a track.
 
     References
     ----------
     Uhlenbeck & Ornstein, Phys. Rev. 36, 823 (1930).
+    Besag & Clifford, Biometrika 78, 301 (1991).
     """
     track = gather(
         frames, positions_nm, sigma_nm, frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms
     )
-    if isinstance(resamples, bool) or not isinstance(resamples, int) or resamples < 1:
-        raise ConfigError(f"resamples = {resamples!r}: give a whole number of at least 1")
+    most = resamples if enough is None else enough
+    for name, count in (("resamples", resamples), ("enough", most)):
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise ConfigError(f"{name} = {count!r}: give a whole number of at least 1")
     draw = np.random.default_rng(1) if rng is None else rng
     free = most_likely(track)
     if not free > 0:
         return ConfinementTest(1.0, 0.0, math.inf, 0.0)
     ratio, d, stiffness = _well(track, free)
-    larger = 1
-    for _ in range(resamples):
+    larger, p_value = 0, math.nan
+    for number in range(1, resamples + 1):
         drawn = _free_track(track, free, draw)
         larger += _well(drawn, most_likely(drawn))[0] >= ratio
+        p_value = (larger + 1) / (number + 1)
+        if larger == enough:
+            p_value = larger / number
+            break
     size = math.sqrt(d / stiffness) if ratio > 0 else math.inf
-    return ConfinementTest(larger / (resamples + 1), ratio, size, d / _UM2)
+    return ConfinementTest(p_value, ratio, size, d / _UM2)
 
 
 class _Lags(NamedTuple):

@@ -50,6 +50,7 @@ SLOWED = 0.05
 
 _FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
 _DOUBT = 0.1
+_ENOUGH = 3  # of the first that are as surprising leave none
 _NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
 _STEPS = 3.0  # standard deviations of a displacement within which it may end beyond the border
 _LOOKS = 3  # at D, on which it depends which displacements tell it
@@ -320,7 +321,7 @@ def _tests(rows: pd.DataFrame, setup: TrackSetup, rng: np.random.Generator) -> d
     """Ask whether the motion is free, of the first positions of a long track."""
     track = _positions(_placed(rows).iloc[:TESTED_POSITIONS])
     times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
-    walls = confinement_test(*track, **times, resamples=_FIRST_LOOK, rng=rng)
+    walls = confinement_test(*track, **times, resamples=_FIRST_LOOK, enough=_ENOUGH, rng=rng)
     if walls.p_value <= _DOUBT:
         walls = confinement_test(*track, **times, resamples=_FULL_LOOK, rng=rng)
     power = anomalous_test(*track, **times)

@@ -318,6 +318,19 @@ def test_a_well_is_found() -> None:
     assert free.p_value > 0.05
 
 
+def test_a_free_track_soon_says_so() -> None:
+    """What stops early gives the share of those drawn, by the same tracks in the same order."""
+    arguments = given(make_track(n=60))
+    soon = ia.confinement_test(**arguments, resamples=99, enough=3, rng=np.random.default_rng(4))
+    drawn = round(3 / soon.p_value)
+    assert 3 <= drawn < 99 and soon.p_value == 3 / drawn
+    exact = ia.confinement_test(**arguments, resamples=drawn, rng=np.random.default_rng(4))
+    assert exact.p_value == (3 + 1) / (drawn + 1)
+    assert (exact.ratio, exact.confinement_nm) == (soon.ratio, soon.confinement_nm)
+    walled = in_a_well(60.0, 200, 0)
+    assert ia.confinement_test(**walled, resamples=99, enough=3).p_value == 0.01
+
+
 def test_a_direction_is_found() -> None:
     """4 µm/s along each axis: 3 µm in 0.75 s, six times what diffusion makes of it."""
     track = make_track(n=200)
@@ -399,6 +412,8 @@ def test_other_impossible_arguments() -> None:
     for resamples in (0, 1.5, True):
         with pytest.raises(ia.ConfigError, match="resamples = "):
             ia.confinement_test(**GOOD, resamples=resamples)  # type: ignore[arg-type]
+        with pytest.raises(ia.ConfigError, match="enough = "):
+            ia.confinement_test(**GOOD, enough=resamples)  # type: ignore[arg-type]
     many = motion.MOST_POSITIONS + 1
     with pytest.raises(ia.DataError, match="give a part of the track"):
         ia.anomalous_test(range(many), np.zeros(many), 5.0, frame_rate_hz=100.0)
