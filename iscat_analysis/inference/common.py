@@ -27,8 +27,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, solve_triangular
-from scipy.linalg.blas import ssyrk
+from scipy.linalg import cholesky
+from scipy.linalg.blas import ssyrk, strsm
 
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Judged, Rows
@@ -40,7 +40,7 @@ MOST_PIXELS = 1800
 """Pixels of a track whose information is taken as a whole."""
 
 _SINGULAR = 1e-9
-_TOGETHER = 128  # rows whose products are added in single precision, with errors of 1e-7
+_TOGETHER = 128  # rows whose products are added in single precision
 _STEPS = 4  # of Newton's method; each leaves the square of the error before
 _SETTLED = 0.01  # standard deviations
 
@@ -167,26 +167,33 @@ def _all_pixels(
     if left is None:
         unknown = np.broadcast_to(np.diag(np.full(index.size, np.inf)), inverse.shape)
         return unknown, np.full_like(own, np.inf)
-    root = solve_triangular(left, follows.reshape(-1, follows.shape[2]).T, lower=True)
+    every = follows.reshape(-1, follows.shape[2])
+    root = strsm(1.0, left.astype(np.float32), every.T, lower=True, overwrite_b=True)
     root = root.T.reshape(follows.shape)
-    extra = np.einsum("nip,njp->nij", root, root)
-    return extra, own + root[:, -1] @ root[:, -1].T
+    extra = (root @ np.swapaxes(root, 1, 2)).astype(np.float64)
+    return extra, own + (root[:, -1] @ root[:, -1].T).astype(np.float64)
 
 
 def _undetermined(
     field: MovingField, ground: Ground, rows: Rows, inverse: FloatArray, index: IntArray
-) -> tuple[FloatArray, FloatArray | None]:
-    """Give F⁻¹ G of the pixels that have weight (n, free, pixels), and the lower factor of M."""
+) -> tuple[NDArray[np.float32], FloatArray | None]:
+    """Give F⁻¹ G of the pixels that have weight (n, free, pixels), and the lower factor of M.
+
+    What has as many numbers as all rows have pixels is in single precision, whose errors of 1e-7
+    are far below those of the patterns.
+    """
     patterns, weight = field.patterns(ground, rows)
     pixels = weight > 0
-    slopes = patterns[:, index][:, :, pixels]
+    slopes = patterns.reshape(*patterns.shape[:2], -1)[:, index]
+    if not pixels.all():
+        slopes = slopes[:, :, pixels.ravel()]
     root = np.linalg.cholesky(inverse)
-    felt = np.swapaxes(root, 1, 2) @ slopes
+    felt = np.swapaxes(root, 1, 2).astype(np.float32) @ slopes
     taken = np.zeros((felt.shape[2], felt.shape[2]))
     for first in range(0, len(felt), _TOGETHER):
         some = felt[first : first + _TOGETHER].reshape(-1, felt.shape[2])
-        taken += ssyrk(1.0, some.astype(np.float32).T, lower=True)
-    return root @ felt, _factor(np.diag(1 / weight[pixels]) - taken)
+        taken += ssyrk(1.0, some.T, lower=True)
+    return root.astype(np.float32) @ felt, _factor(np.diag(1 / weight[pixels]) - taken)
 
 
 def _factor(matrix: FloatArray) -> FloatArray | None:

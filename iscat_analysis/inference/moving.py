@@ -560,7 +560,7 @@ class MovingField:
         rows_, columns = self.box(rows)
         return int((rows_.stop - rows_.start) * (columns.stop - columns.start))
 
-    def patterns(self, ground: Ground, rows: Rows) -> tuple[FloatArray, FloatArray]:
+    def patterns(self, ground: Ground, rows: Rows) -> tuple[NDArray[np.float32], FloatArray]:
         """Give what each row changes of the light of every pixel of its track.
 
         Parameters
@@ -572,15 +572,17 @@ class MovingField:
 
         Returns
         -------
-        patterns : ndarray, shape (n, 4, y, x)
+        patterns : ndarray of float32, shape (n, 4, y, x)
             w B ∂C of each row, in (x, y, z, a) [e per unit].
         weight : ndarray, shape (y, x)
             One over the counts of all frames; less where there is read noise, 0 where not used.
         """
         cut = self.box(rows)
-        out = np.empty((len(rows.frame), 4, *ground.level[cut].shape))
+        one = np.empty((4, *ground.level[cut].shape))
+        out = np.empty((len(rows.frame), *one.shape), dtype=np.float32)
         for i in range(len(out)):
-            self._modes(ground, rows.only(np.arange(len(out)) == i), cut, out[i])
+            self._modes(ground, rows.only(np.arange(len(out)) == i), cut, one)
+            out[i] = one
         return out, self._weight(ground, cut)
 
     def box(self, rows: Rows) -> tuple[slice, slice]:
