@@ -358,14 +358,18 @@ def leverages(
     w = np.empty((used.size, along.shape[1]))
     for row in range(rows.shape[0]):
         _directions(rows, row, index, terms[row, 2], w)
-        k = fitted
-        for i in range(count):
-            for j in range(count - i):
-                w[k] = along[i] * across[j, row]
-                k += 1
-        w *= np.sqrt(terms[row, 0])
+        for p in range(along.shape[1]):
+            root = np.sqrt(terms[row, 0, p])
+            out[row, p] = 0.0
+            for k in range(fitted):
+                w[k, p] *= root
+            k = fitted
+            for i in range(count):
+                for j in range(count - i):
+                    w[k, p] = root * along[i, p] * across[j, row]
+                    k += 1
         _orthonormal(w, factor, used)
-        out[row] = 0.0
         for k in range(fitted, used.size):
             if used[k]:
-                out[row] += w[k] ** 2
+                for p in range(along.shape[1]):
+                    out[row, p] += w[k, p] * w[k, p]

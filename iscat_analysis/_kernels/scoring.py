@@ -308,9 +308,9 @@ def box_supported(
     for i in range(5):
         if free[i] and not lower[i] <= start[i] <= upper[i]:
             inside = False
-        moves = free[i] and i < 3
-        corners[:, i] = start[i]
-        if moves:
+        for k in range(4):
+            corners[k, i] = start[i]
+        if free[i] and i < 3:
             corners[0, i], corners[1, i] = lower[i], upper[i]
             corners[2, i] = lower[i] if i == 0 else upper[i]
             corners[3, i] = upper[i] if i == 0 else lower[i]
