@@ -334,12 +334,13 @@ def signal_parts(
 ) -> None:
     """Fill `out` (ny, 2, nx) with P and Q of the signal a P + a² Q.
 
-    `unit` is an amplitude at which neither drowns in the other, `f` the work space.
+    `unit` is an amplitude at which neither drowns in the other, `f` the work space.  Not for
+    samples at one height, which are P and Q themselves.
     """
     begin_image(profile, lens, pixels, x_p, y_p, False, f)
     for row in range(pixels.y.size):
         p, q = out[row, 0], out[row, 1]
-        if lens.fine or lens.half:
+        if lens.half:
             row_signal(profile, lens, pixels, row, x_p, y_p, unit, f, p)
             row_signal(profile, lens, pixels, row, x_p, y_p, -unit, f, q)
             for j in range(p.size):

@@ -102,6 +102,7 @@ def residuals(
 def largest(residual: FloatArray, index: IntArray) -> None:
     """Fill `index` (k) with the flat places of the residuals of largest size, largest first."""
     flat = residual.reshape(-1)
+    index[:] = 0
     size = np.full(index.size, -1.0)
     last = index.size - 1
     for i in range(flat.size):

@@ -37,7 +37,7 @@ CONDITIONAL, POISSON = 0, 1
 CONVERGED, STALLED, EXHAUSTED, HOPELESS = 0, 1, 2, 3
 """How a fit ended: step below tolerance; no step improves; iterations used up; little to gain."""
 
-HOPE = 4.0
+HOPE = 16.0
 """Multiple of the expected gain in log-likelihood that a fit is trusted to make."""
 
 SERIES = 0.2
@@ -432,8 +432,8 @@ def maximize(
     score, fisher : ndarray, shape (5,), (5, 5)
         Filled with those at the last pass.
     least : float
-        Log-likelihood below which the maximum is of no interest: the search ends, as if converged,
-        where `HOPE` times the expected gain would not reach it.
+        Log-likelihood below which the maximum is of no interest: where `HOPE` times the expected
+        gain would not reach it, the search ends after that step, HOPELESS.
 
     Returns
     -------
@@ -483,7 +483,8 @@ def maximize(
                 theta[i] = trial[i]
             return value + gain, passes, CONVERGED
         if damping == 0.0 and value + hoped < least:
-            theta[:] = trial
+            for i in range(5):
+                theta[i] = trial[i]
             return value + gain, passes, HOPELESS
         if free[2]:
             start, stop = span(lens, pixels, trial, width)

@@ -24,11 +24,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky
-from scipy.linalg.blas import ssyrk, strsm
+from scipy.linalg import cholesky, get_blas_funcs, solve_triangular
 
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Judged, Rows
@@ -41,6 +41,7 @@ MOST_PIXELS = 1800
 
 _SINGULAR = 1e-9
 _TOGETHER = 128  # rows whose products are added in single precision
+_DOUBTFUL = 2.5  # logarithm of the largest pivot over the least, where 1e-7 may count
 _STEPS = 4  # of Newton's method; each leaves the square of the error before
 _SETTLED = 0.01  # standard deviations
 
@@ -162,38 +163,40 @@ def _all_pixels(
 ) -> tuple[FloatArray, FloatArray]:
     """Covariance of every row besides its own, and that of the amplitudes of all rows."""
     inverse = _inverse(fisher, index)
-    follows, left = _undetermined(field, ground, rows, inverse, index)
+    patterns, weight = field.patterns(ground, rows)
+    pixels = np.flatnonzero(weight > 0)
+    slopes = patterns.reshape(*patterns.shape[:2], -1)[:, index]
+    if pixels.size < weight.size:
+        slopes = slopes[:, :, pixels]
+    follows, left = _undetermined(slopes, weight.flat[pixels], inverse)
+    if left is None or np.ptp(np.log(left.diagonal())) > _DOUBTFUL:
+        follows, left = _undetermined(slopes.astype(np.float64), weight.flat[pixels], inverse)
     own = np.diag(inverse[:, -1, -1])
     if left is None:
         unknown = np.broadcast_to(np.diag(np.full(index.size, np.inf)), inverse.shape)
         return unknown, np.full_like(own, np.inf)
     every = follows.reshape(-1, follows.shape[2])
-    root = strsm(1.0, left.astype(np.float32), every.T, lower=True, overwrite_b=True)
+    root = solve_triangular(left.astype(every.dtype), every.T, lower=True, overwrite_b=True)
     root = root.T.reshape(follows.shape)
     extra = (root @ np.swapaxes(root, 1, 2)).astype(np.float64)
     return extra, own + (root[:, -1] @ root[:, -1].T).astype(np.float64)
 
 
 def _undetermined(
-    field: MovingField, ground: Ground, rows: Rows, inverse: FloatArray, index: IntArray
-) -> tuple[NDArray[np.float32], FloatArray | None]:
-    """Give F⁻¹ G of the pixels that have weight (n, free, pixels), and the lower factor of M.
+    slopes: NDArray[Any], weight: FloatArray, inverse: FloatArray
+) -> tuple[NDArray[Any], FloatArray | None]:
+    """Give F⁻¹ G, shape (n, free, pixels), and the lower factor of M.
 
-    What has as many numbers as all rows have pixels is in single precision, whose errors of 1e-7
-    are far below those of the patterns.
+    The products are of the precision of the slopes.
     """
-    patterns, weight = field.patterns(ground, rows)
-    pixels = weight > 0
-    slopes = patterns.reshape(*patterns.shape[:2], -1)[:, index]
-    if not pixels.all():
-        slopes = slopes[:, :, pixels.ravel()]
-    root = np.linalg.cholesky(inverse)
-    felt = np.swapaxes(root, 1, 2).astype(np.float32) @ slopes
-    taken = np.zeros((felt.shape[2], felt.shape[2]))
+    root = np.linalg.cholesky(inverse).astype(slopes.dtype)
+    felt = np.swapaxes(root, 1, 2) @ slopes
+    (product,) = get_blas_funcs(("syrk",), (felt,))
+    taken = np.zeros((weight.size, weight.size))
     for first in range(0, len(felt), _TOGETHER):
-        some = felt[first : first + _TOGETHER].reshape(-1, felt.shape[2])
-        taken += ssyrk(1.0, some.T, lower=True)
-    return root.astype(np.float32) @ felt, _factor(np.diag(1 / weight[pixels]) - taken)
+        some = felt[first : first + _TOGETHER].reshape(-1, weight.size)
+        taken += product(1.0, some.T, lower=True)
+    return root @ felt, _factor(np.diag(1 / weight) - taken)
 
 
 def _factor(matrix: FloatArray) -> FloatArray | None:

@@ -275,10 +275,8 @@ def start_theta(likelihood: Likelihood, start: Candidate) -> FloatArray:
 def _optima(likelihood: Likelihood, start: Candidate, box: Box) -> list[Optimum]:
     """Every optimum that was reached, best first.
 
-    Starts are followed in the order of their likelihood, and no farther than shows that the optimum
-    cannot be within `FOLLOWED` of the best; such an optimum is known to one step of scoring.  Where
-    the best is that much above no particle, the others begin at its place.  Of fainter particles
-    every start is followed from the given place, the given one among them.
+    Starts are followed in the order of their likelihood, the given one last, and no farther than
+    shows that the optimum cannot be within `FOLLOWED` of the best.
     """
     theta = start_theta(likelihood, start)
     theta = np.where(box.free, np.clip(theta, box.lower, box.upper), theta)
@@ -286,7 +284,7 @@ def _optima(likelihood: Likelihood, start: Candidate, box: Box) -> list[Optimum]
         return [likelihood.maximize(theta, box.free, box.lower, box.upper)]
     optima: list[Optimum] = []
     best = -math.inf
-    for begin, value in _heights(likelihood, theta, box):
+    for begin, value in [*_heights(likelihood, theta, box), (theta, 0.0)]:
         if box.free[3] and begin[3] == 0.0 and best > 0.0:
             optima.append(Optimum(begin, value, 0, False, np.zeros((5, 5))))  # no particle there
             continue
@@ -294,10 +292,6 @@ def _optima(likelihood: Likelihood, start: Candidate, box: Box) -> list[Optimum]
         optima.append(found)
         if found.converged and found.log_likelihood > best:
             best = found.log_likelihood
-            if best > FOLLOWED:
-                theta[:2], theta[LEVEL] = found.theta[:2], found.theta[LEVEL]
-    if best <= FOLLOWED:
-        optima.append(likelihood.maximize(theta, box.free, box.lower, box.upper))
     return sorted(optima, key=lambda o: (not o.converged, -o.log_likelihood))
 
 
@@ -306,8 +300,7 @@ def _heights(
 ) -> Iterator[tuple[FloatArray, float]]:
     """Start at the local maxima of the likelihood along z, best first.
 
-    Each start is θ at the time when it is asked for, with a maximum's height and amplitude; beside
-    it the log-likelihood that was found there.
+    Each start is θ with a maximum's height and amplitude; beside it the log-likelihood there.
     """
     low, high = box.lower[2], box.upper[2]
     count = math.ceil((high - low) / likelihood.model.fringe_nm * SCANS_PER_FRINGE) + 1

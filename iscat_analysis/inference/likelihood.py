@@ -258,7 +258,9 @@ class Likelihood:
         lens, pixels, kind, data = self._arguments
         if free[2]:
             table = self.model.axial_table
-        elif self._is_pictured(theta[2], lower, upper):
+        elif self._is_pictured(
+            theta[2], np.where(free, lower, theta), np.where(free, upper, theta)
+        ):
             lens, table = self.model.picture_table(self.grid.pixel_nm, max(self.grid.shape))
         else:
             table = self.model.height_table(theta[2])

@@ -250,7 +250,8 @@ class MovingField:
         level = np.where(stretch > 0, self._total / np.where(stretch > 0, stretch, 1.0), 1.0)
         totals = self._frame_totals
         power = np.where(expected > 0, totals / np.where(expected > 0, expected, 1.0), 1.0)
-        fitted = replace(rows, theta=theta)
+        fitted = replace(rows, theta=theta) if sweeps else rows
+        self._canvas = _Sheet(fitted, canvas, coarse)
         return fitted, Ground(np.maximum(level, 1e-3), power / power.mean()), outcome == CONVERGED
 
     def settle(
@@ -354,7 +355,7 @@ class MovingField:
         return np.asarray(np.clip(step.reshape(move.shape), -_FARTHEST, _FARTHEST))
 
     def draw(self, ground: Ground, rows: Rows) -> None:
-        """Draw rows in all frames, with what is drawn already, so that `residual` need not.
+        """Draw the rows of all frames at once; `residual` of the same object then only subtracts.
 
         Parameters
         ----------
@@ -363,6 +364,7 @@ class MovingField:
         rows : Rows
             Particles.
         """
+        self._canvas = None  # rings that stayed where rows were before are not good enough
         self.fit(ground, rows, sweeps=0, coarse=True)
 
     def residual(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:

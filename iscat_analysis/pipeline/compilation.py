@@ -116,10 +116,10 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
 
 def _started() -> subprocess.Popen[bytes] | None:
     """Start the other process; what it does not compile is compiled in this one."""
-    if not sys.executable:  # inside another program
+    if not sys.executable or getattr(sys, "frozen", False):  # inside another program
         return None
     nowhere = subprocess.DEVNULL
-    command = [sys.executable, "-m", "iscat_analysis.inference.ahead"]
+    command = [sys.executable, "-P", "-m", "iscat_analysis.inference.ahead"]
     try:
         return subprocess.Popen(
             command, stdin=nowhere, stdout=nowhere, stderr=nowhere, env=_kernels.environment()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scenes import PIXEL_NM, make_config
 
+from iscat_analysis.inference import common
 from iscat_analysis.inference.common import common_amplitudes, shared_errors
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
@@ -31,10 +32,14 @@ def model() -> ForwardModel:
     return forward_model(make_config(), 1e4)
 
 
+def _level() -> np.ndarray:
+    """Light without particles."""
+    return LEVEL_E * (1 + 0.1 * np.random.default_rng(2).standard_normal(SHAPE))
+
+
 def _expected(model: ForwardModel, paths: np.ndarray) -> tuple[np.ndarray, Rows]:
     """Mean counts of particles on paths (tracks, frames, 2), NaN where they are not, and rows."""
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
-    level = LEVEL_E * (1 + 0.1 * np.random.default_rng(2).standard_normal(SHAPE))
     signal = np.zeros((FRAMES, *SHAPE))
     amplitude = model.scale.amplitude(MASS)
     frame, track, theta = [], [], []
@@ -46,7 +51,7 @@ def _expected(model: ForwardModel, paths: np.ndarray) -> tuple[np.ndarray, Rows]
                 track.append(k)
                 theta.append([*place, model.height_nm, amplitude, 0.0])
     rows = Rows.of(np.array(frame), np.array(track), np.array(theta))
-    return level * (1 + signal), rows
+    return _level() * (1 + signal), rows
 
 
 def _field(model: ForwardModel, counts: np.ndarray, pool: ThreadPoolExecutor) -> MovingField:
@@ -112,6 +117,27 @@ def test_common_mass_and_shared_errors_are_right(
     assert abs(np.std(amplitude) / sigma - 1) < SIGMAS / math.sqrt(2 * TRIALS)
     for pulls in np.moveaxis(np.array(errors), 2, 0):  # of x, y, a: (trials, frames)
         assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * TRIALS)
+
+
+def test_a_particle_that_hardly_moves_is_worked_out_in_double_precision(
+    model: ForwardModel, pool: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over its background it is known so badly that single precision makes errors of its own."""
+    path = np.random.default_rng(4).normal(0.0, 0.01 * PIXEL_NM, (1, FRAMES, 2)) + 1250.0
+    mean, truth = _expected(model, path)
+    field, ground = _field(model, 100 * mean, pool), Ground(100 * _level(), np.ones(FRAMES))
+    judged = field.judge(ground, truth)
+
+    usual = common._DOUBTFUL
+
+    def amplitude_error(doubtful: float) -> float:
+        monkeypatch.setattr(common, "_DOUBTFUL", doubtful)
+        (mine, covariance) = shared_errors(field, ground, truth, judged).together[0]
+        return float(1 / math.sqrt(np.linalg.solve(covariance, np.ones(mine.size)).sum()))
+
+    exact = amplitude_error(-1.0)
+    assert amplitude_error(usual) == pytest.approx(exact, rel=1e-2)
+    assert amplitude_error(math.inf) != pytest.approx(exact, rel=0.1)
 
 
 def test_tracks_go_on_through_a_meeting(model: ForwardModel, pool: ThreadPoolExecutor) -> None:

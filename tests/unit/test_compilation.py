@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -93,6 +94,25 @@ def test_a_second_process_is_started_for_the_kernels_of_fits_alone(started):
         assert started[0].returncode == 0
 
 
+def test_the_second_process_runs_nothing_of_the_folder_it_is_in(monkeypatch, tmp_path):
+    ran = tmp_path / "ran"
+    for name in ("numba.py", "iscat_analysis.py"):
+        (tmp_path / name).write_text("open('ran', 'w').close()\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    other = module._started()
+    with suppress(subprocess.TimeoutExpired):
+        other.wait(timeout=5)  # long after its imports begin
+    other.kill()
+    other.wait()
+    assert not ran.exists()
+    subprocess.run(
+        [sys.executable, "-m", "iscat_analysis.inference.ahead"],
+        stderr=subprocess.DEVNULL,
+        check=False,
+    )
+    assert ran.exists()
+
+
 def test_the_second_process_ends_with_the_first(monkeypatch):
     command = [sys.executable, "-c", "import time; time.sleep(600)"]
     other = subprocess.Popen(command)
@@ -108,13 +128,14 @@ def test_the_second_process_ends_with_the_first(monkeypatch):
 
 def test_the_second_process_compiles_what_the_first_needs():
     shared = (value_batch, signal_hessian, scan_heights, score_statistic)
+    others = set(maximize.signatures)  # of other tests
     ahead.main()
     made = [set(kernel.signatures) for kernel in shared]
     assert all(made)
     config = load_config(Path("sample_configs/joint.toml"), [])
     compile_kernels(forward_model(config, 2000.0))
     assert [set(kernel.signatures) for kernel in shared] == made
-    assert len(maximize.signatures) == 1
+    assert len(set(maximize.signatures) - others) <= 1
 
 
 def test_kernels_are_kept_where_nothing_can_be_written(tmp_path):

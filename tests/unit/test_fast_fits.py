@@ -263,6 +263,33 @@ def test_starts_that_are_given_up_change_nothing(mass: float, seed: int) -> None
             assert any(abs(z - n) < 2.0 for n in near), (z, gap)
 
 
+@pytest.mark.parametrize("seed", [308, 13, 4, 6])
+def test_a_bad_start_costs_no_optimum(seed: int) -> None:
+    """Gold, a pixel and half of the mass off, at times beside a particle nobody knows of."""
+    config = make_config(calibrated=False, fit={"z_range_nm": [0.0, 600.0]}, **gold())
+    model, grid = forward_model(config, 2500.0), PixelGrid.region((0, 20), (0, 20), PIXEL_NM)
+    rng = np.random.default_rng(seed)
+    mass = model.material.mass_kda * np.exp(rng.uniform(-1, 1))
+    z, (x, y) = rng.uniform(0, 600), 10 + rng.uniform(-3, 3, 2)
+    signal = model.image(grid, x * PIXEL_NM, y * PIXEL_NM, z, mass)
+    if seed % 2:
+        beside = np.array([x, y]) + rng.uniform(-5, 5, 2)
+        signal = signal + model.image(
+            grid, *(beside * PIXEL_NM), rng.uniform(0, 600), mass * rng.uniform(0.3, 1)
+        )
+    light = 3000.0 * np.array([np.ones(grid.shape), 1 + np.maximum(signal, -0.9)])
+    which = noise.conditional(model, grid, *rng.poisson(light), 1.0)
+    start = Candidate(
+        x + rng.normal(0, 1), y + rng.normal(0, 1), 300.0, mass * math.exp(rng.normal(0, 0.5)), 10.0
+    )
+    fit = fit_particle(which, start, "joint", (0.0, 600.0), level=True)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("iscat_analysis.inference.fit.FOLLOWED", math.inf)
+        slow = fit_particle(which, start, "joint", (0.0, 600.0), level=True)
+    assert fit.log_likelihood == pytest.approx(slow.log_likelihood, abs=0.1)
+    assert fit.status == slow.status
+
+
 # ---- the picture at a fixed height ---------------------------------------------------------------
 
 
@@ -337,3 +364,18 @@ def test_largest_contrast(optics: dict[str, object]) -> None:
         assert model.amplitude_contrast(z, mass, "between") == pytest.approx(
             model.amplitude_contrast(z, mass), rel=1e-7
         )
+
+
+@pytest.mark.parametrize("place", [600.0, -900.0])
+def test_a_place_that_is_held_may_lie_outside_the_bounds(place: float) -> None:
+    """Bounds of what is not free do not say how far a picture must reach."""
+    model, grid = forward_model(make_config(), 4000.0), PixelGrid.region((0, 20), (0, 20), PIXEL_NM)
+    counts = np.random.default_rng(0).poisson(1e4, grid.shape).astype(float)
+    which = noise.poisson(model, grid, counts, 1e4, 1e4)
+    amplitude = model.scale.amplitude(model.material.mass_kda)
+    start = np.array([place, place, model.height_nm, amplitude, 0.0])
+    end = 100 * abs(amplitude)
+    lower, upper = np.array([0.0, 0.0, 0.0, -end, 0.0]), np.array([1200.0, 1200.0, 500.0, end, 0.0])
+    free = np.array([False, False, False, True, False])
+    found = which.maximize(start, free, lower, upper, passes=1)
+    assert found.log_likelihood == pytest.approx(which.values(start[None])[0], abs=1e-3)

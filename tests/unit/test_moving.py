@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -193,6 +194,20 @@ def test_rows_are_fitted_by_the_one_likelihood(pool: ThreadPoolExecutor) -> None
         assert judged.worst[row] == pytest.approx(np.nanmax(np.abs(residuals)), rel=1e-4)
         gain = likelihood.values(theta[None])[0]
         assert judged.gain[row] == pytest.approx(gain, rel=1e-4)
+
+
+def test_residuals_are_of_the_rows_that_are_asked_for(pool: ThreadPoolExecutor) -> None:
+    """Whatever the canvas holds: rows drawn together, alone, or moved by a fit in between."""
+    counts, ground, rows = _movie(_paths(30.0), noise=True)
+    field = _field(counts, pool, READ_E2)
+    start = replace(rows, theta=rows.theta + np.array([8.0, -8.0, 0.0, 0.0, 0.0]))
+    alone = field.residual(ground, start, 0, FRAMES)
+    fitted, _, _ = field.fit(ground, start, coarse=True)
+    assert np.abs(field.residual(ground, start, 0, FRAMES) - alone).max() < 1.0  # e, of noise 630
+    assert np.abs(field.residual(ground, fitted, 0, FRAMES) - alone).max() > 30.0
+    field.draw(ground, rows)
+    field.draw(ground, start)
+    assert np.abs(field.residual(ground, start, 0, FRAMES) - alone).max() < 1.0
 
 
 def test_threads_do_not_change_the_result() -> None:
