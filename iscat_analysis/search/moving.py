@@ -11,15 +11,15 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, FloatArray
-from iscat_analysis.search.peaks import SAMPLED, summits
+from iscat_analysis.search.peaks import SAMPLED, maxima, summits
 from iscat_analysis.search.templates import FAR_LOBE, NEAR, SIDELOBE, Templates
 
 IntArray = NDArray[np.int64]
@@ -27,6 +27,8 @@ IntArray = NDArray[np.int64]
 LEFT_OVER = 0.2
 """Of a particle's signal-to-noise ratio that a candidate beside it must reach when what was fitted
 has been taken off: less may be what the model leaves over."""
+
+_FIELDS = 32  # of frames and templates that are filtered at a time
 
 
 @dataclass(frozen=True)
@@ -90,13 +92,14 @@ class FrameFilter:
         self._share = np.where(used, level_e / (level_e + read_e2), 0.0).astype(np.float32)
         images = templates.images
         half = images.shape[1] // 2
-        self._half, (rows, columns) = half, level_e.shape
-        self._padded = [next_fast_len(n + 2 * half, real=True) for n in (rows, columns)]
+        self._half = half
+        self._padded = [next_fast_len(n + 2 * half, real=True) for n in level_e.shape]
         flipped = images[:, ::-1, ::-1]
-        norm = self._filtered(light, rfft2(flipped**2, self._padded))
-        self._norm = np.maximum(norm, 1e-9 * norm.max())
-        self._duals = rfft2(flipped.astype(np.float32), self._padded)
         self._layers = np.flatnonzero((polarity == 0) | (templates.signs == polarity))
+        norm = self._cut(rfft2(light, self._padded) * rfft2(flipped**2, self._padded))
+        norm = np.sqrt(np.maximum(norm, 1e-9 * norm.max()))
+        self._norm = norm[self._layers].astype(np.float32)
+        self._duals = rfft2(flipped[self._layers].astype(np.float32), self._padded)
 
     def find(
         self,
@@ -125,27 +128,34 @@ class FrameFilter:
         """
         found: list[tuple[float, ...]] = []
         threshold = self._templates.threshold
-        for i, frame in enumerate(residual_e):
-            spectrum = rfft2(frame * self._share, self._padded)
-            overlap = self._filtered_by(spectrum)
-            snr = overlap / np.sqrt(power[i] * self._norm[self._layers])
-            best = snr.max(axis=0) if len(snr) > 1 else snr[0]
-            at = _maxima(best, SAMPLED * threshold)
-            layers = snr[:, *at].argmax(axis=0)
-            dy, dx, above = summits(snr, np.stack([layers, *at], axis=1))
-            tops = [best[*at] + above, layers, *at, at[0] + dy, at[1] + dx]
-            peaks = sorted(zip(*(t.tolist() for t in tops), strict=True), reverse=True)
-            kept: list[tuple[float, float, float]] = []
-            for height, k, row, column, y, x in peaks:
-                if height <= threshold:
-                    break
-                if self._is_lobe(height, x, y, kept) or self._is_left_over(height, x, y, known[i]):
-                    continue
-                kept.append((height, x, y))
-                layer = int(self._layers[k])
-                strength = height / np.sqrt(power[i] * self._norm[layer, row, column])
-                z = float(self._templates.z_nm[layer])
-                found.append((first + i, x, y, z, float(strength), height))
+        together = max(_FIELDS // len(self._layers), 1)
+        for start in range(0, len(residual_e), together):
+            stop = start + together
+            snr = self._snr(residual_e[start:stop], power[start:stop])
+            best = snr.max(axis=1)
+            at = maxima(best, SAMPLED * threshold, (0, 1, 1))
+            frame, row, column = at.T
+            layer = snr[frame, :, row, column].argmax(axis=1)
+            field = frame * len(self._layers) + layer
+            dy, dx, above = summits(
+                snr.reshape(-1, *snr.shape[2:]), np.stack([field, row, column], 1)
+            )
+            tops = [best[frame, row, column] + above, layer, row, column, row + dy, column + dx]
+            each = list(zip(*(t.tolist() for t in tops), strict=True))
+            edges = np.searchsorted(frame, np.arange(len(snr) + 1))
+            for i, (low, high) in enumerate(pairwise(edges), start):
+                kept: list[tuple[float, float, float]] = []
+                for height, k, y_px, x_px, y, x in sorted(each[low:high], reverse=True):
+                    if height <= threshold:
+                        break
+                    if self._is_lobe(height, x, y, kept):
+                        continue
+                    if self._is_left_over(height, x, y, known[i]):
+                        continue
+                    kept.append((height, x, y))
+                    strength = height / (np.sqrt(power[i]) * self._norm[k, y_px, x_px])
+                    z = float(self._templates.z_nm[self._layers[k]])
+                    found.append((first + i, x, y, z, float(strength), height))
         columns = np.array(found).reshape(-1, 6).T
         return Sightings(columns[0].astype(np.int64), *columns[1:])
 
@@ -168,25 +178,17 @@ class FrameFilter:
         near = np.hypot(known[:, 0] - x, known[:, 1] - y) < NEAR * self._roi_px
         return bool(np.any(near & (height < LEFT_OVER * known[:, 2])))
 
-    def _filtered(self, image: FloatArray, duals: NDArray[np.complex128]) -> FloatArray:
-        """Correlate an image with every kernel, shape (n, y, x)."""
-        half, (rows, columns) = self._half, image.shape
-        full = irfft2(rfft2(image, self._padded) * duals, self._padded)
-        return np.asarray(full[:, half : half + rows, half : half + columns])
+    def _snr(self, residual_e: NDArray[np.float32], power: FloatArray) -> NDArray[np.float32]:
+        """Give the signal-to-noise ratio of each template at each pixel, shape (n, k, y, x)."""
+        spectrum = rfft2(residual_e * self._share, self._padded)[:, None]
+        noise = np.sqrt(power).astype(np.float32)[:, None, None, None] * self._norm
+        return np.asarray(self._cut(spectrum * self._duals) / noise)
 
-    def _filtered_by(self, spectrum: NDArray[np.complex64]) -> NDArray[np.float32]:
-        half, (_, rows, columns) = self._half, self._norm.shape
-        full = irfft2(spectrum * self._duals[self._layers], self._padded)
-        return np.asarray(full[:, half : half + rows, half : half + columns])
-
-
-def _maxima(field: FloatArray, level: float) -> tuple[IntArray, IntArray]:
-    """Rows and columns of the pixels above a level that none of their neighbours exceeds."""
-    row, column = np.nonzero(field > level)
-    padded = np.pad(field, 1, constant_values=-np.inf)
-    around = sliding_window_view(padded, (3, 3))[row, column].max(axis=(1, 2))
-    highest = field[row, column] == around
-    return row[highest], column[highest]
+    def _cut(self, spectrum: NDArray[Any]) -> NDArray[Any]:
+        """Transform back and keep the pixels of the field."""
+        (rows, columns), half = self._share.shape, self._half
+        full = irfft2(spectrum, self._padded)
+        return np.asarray(full[..., half : half + rows, half : half + columns])
 
 
 def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int) -> IntArray:
