@@ -66,8 +66,8 @@ TRACK_COLUMNS = (
     "d_um2_s", "sigma_d_um2_s", "crb_d_um2_s", "diameter_nm", "sigma_diameter_nm",
     "refractive_index", "confinement_nm", "status", "flags",
     "d_low_um2_s", "d_high_um2_s", "d_disagreement", "p_confinement", "exponent", "sigma_exponent",
-    "p_anomalous", "sigma_refractive_index", "contrast", "mass_scatter", "p_mass", "n_mass_frames",
-    "n_d_frames", "x_nm", "y_nm", "z_nm", "nearest_nm", "begins", "ends",
+    "p_anomalous", "p_steady", "sigma_refractive_index", "contrast", "mass_scatter", "p_mass",
+    "n_mass_frames", "n_d_frames", "x_nm", "y_nm", "z_nm", "nearest_nm", "begins", "ends",
 )  # fmt: skip
 """The columns of ``tracks.csv``, in order."""
 
@@ -198,8 +198,8 @@ _TRACK_ADVICE = {
     "selection: see the status of its rows in fits.csv.",
     TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors: motion blurs "
     "the picture, particles met, or the particle changed.",
-    TrackStatus.NOT_FREE: "It does not diffuse freely: p_confinement and p_anomalous say which "
-    "way, and D is that of free diffusion.",
+    TrackStatus.NOT_FREE: "It does not diffuse freely: p_confinement, p_anomalous and p_steady "
+    "say which way, and D is that of free diffusion.",
     TrackStatus.STANDS_STILL: "Its D is not above zero within its error: take d_high_um2_s as an "
     "upper limit, or record for longer.",
     TrackStatus.NEAR_WALL: "The coverslip, so near, slows it by more than 5 %: its diameter "

@@ -35,6 +35,7 @@ _COLUMNS = (
     ("diameter_nm", "diameter [nm]"), ("sigma_diameter_nm", "σ [nm]"),
     ("refractive_index", "index"), ("sigma_refractive_index", "σ of index"),
     ("exponent", "exponent"), ("p_confinement", "p, confined"), ("p_anomalous", "p, anomalous"),
+    ("p_steady", "p, one D"),
     ("confinement_nm", "well [nm]"), ("mass_scatter", "scatter / σ"),
 )  # fmt: skip
 _ERROR_OF = {
@@ -43,7 +44,7 @@ _ERROR_OF = {
     "diameter_nm": "sigma_diameter_nm",
     "refractive_index": "sigma_refractive_index",
 }
-_TWO = ("exponent", "p_confinement", "p_anomalous", "mass_scatter")
+_TWO = ("exponent", "p_confinement", "p_anomalous", "p_steady", "mass_scatter")
 
 
 def tracks_context(

@@ -64,6 +64,7 @@ class Track(Closed):
     exponent: Number = key("Exponent of time in the mean-squared displacement; 1 where free")
     sigma_exponent: Positive = key("Its standard error")
     p_anomalous: Share = key("Chance of a free track with an exponent as far from 1")
+    p_steady: Share = key("Chance of one D in all stretches of the track that differ as much")
     sigma_refractive_index: NotNegative | None = key("Standard error of the refractive index")
     contrast: Number = key("Signed peak contrast of a particle of mass_kda; null in dark field")
     mass_scatter: NotNegative | None = key("Scatter of the frames' masses over their σ")

@@ -1,6 +1,6 @@
-"""Is the motion of a track free?  Tests against an anomalous exponent and against confinement.
+"""Is the motion of a track free?  Tests against an exponent, confinement, and a D that changes.
 
-Both compare the highest likelihood of a wider model with that of free diffusion.  An anomalous
+All compare the highest likelihood of a wider model with that of free diffusion.  An anomalous
 exponent lies inside its range when the motion is free, so that twice the difference is χ² with one
 degree of freedom.  A well of vanishing stiffness is a unit root, for which no such law holds; what
 the difference comes to without a well is therefore found from tracks drawn with the same frames,
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,10 @@ from iscat_analysis.species.diffusion import most_likely
 from iscat_analysis.species.displacements import Displacements, gather
 
 _UM2 = 1e6  # nm²
+STRETCH = 40
+"""Displacements at least of a stretch of a track whose D is compared with that of the others."""
+
+_MOST_STRETCHES = 25
 MOST_POSITIONS = 4000
 """Of a track whose exponent is tested."""
 
@@ -236,6 +241,68 @@ def confinement_test(
             break
     size = math.sqrt(d / stiffness) if ratio > 0 else math.inf
     return ConfinementTest(p_value, ratio, size, d / _UM2)
+
+
+def steadiness_test(
+    frames: ArrayLike,
+    positions_nm: ArrayLike,
+    sigma_nm: ArrayLike,
+    *,
+    frame_rate_hz: float,
+    exposure_ms: float | None = None,
+) -> float:
+    """Test whether a track has one D from its beginning to its end.
+
+    A track that was continued by another particle after they met has not.
+
+    Parameters
+    ----------
+    frames : array_like of int, shape (n,)
+        As in `fit_diffusion`.
+    positions_nm : array_like, shape (n,) or (n, c)
+        As in `fit_diffusion` [nm].
+    sigma_nm : array_like
+        As in `fit_diffusion` [nm].
+    frame_rate_hz : float
+        As in `fit_diffusion`.
+    exposure_ms : float, optional
+        As in `fit_diffusion` [ms].
+
+    Returns
+    -------
+    float
+        Chance that the likelihoods of the stretches, each with its own D, exceed those with the
+        one D of all by at least as much; 1 of a track too short for two stretches.
+
+    Raises
+    ------
+    ConfigError
+        The frame rate or exposure is impossible.
+    DataError
+        The arrays are not those of a track.
+
+    Notes
+    -----
+    Twice the difference of the logarithms is χ² with one degree of freedom fewer than there are
+    stretches (S. S. Wilks, Ann. Math. Stat. 9, 60, 1938).
+    """
+    track = gather(
+        frames, positions_nm, sigma_nm, frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms
+    )
+    last = track.frames.size - 1
+    count = min(last // STRETCH, _MOST_STRETCHES)
+    if count < 2:
+        return 1.0
+    ends = np.linspace(0, last, count + 1).astype(int)
+    places, errors = track.positions_nm.T, np.sqrt(track.variance_nm2.T)
+    common, ratio = most_likely(track), 0.0
+    for a, b in pairwise(ends):
+        part = gather(
+            track.frames[a : b + 1], places[a : b + 1], errors[a : b + 1],
+            frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms,
+        )  # fmt: skip
+        ratio += 2 * (part.likelihood(most_likely(part)).value - part.likelihood(common).value)
+    return float(chdtrc(count - 1, max(ratio, 0.0)))
 
 
 class _Lags(NamedTuple):

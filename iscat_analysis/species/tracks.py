@@ -33,14 +33,14 @@ from iscat_analysis.records import (
 from iscat_analysis.species.common_mass import CommonMass, combine_masses, information_power
 from iscat_analysis.species.diffusion import Diffusion, fit_diffusion, hydrodynamic_diameter
 from iscat_analysis.species.displacements import LEAST_POSITIONS
-from iscat_analysis.species.motion import anomalous_test, confinement_test
+from iscat_analysis.species.motion import anomalous_test, confinement_test, steadiness_test
 from iscat_analysis.species.refraction import refractive_index
 
 TESTED_POSITIONS = 300
 """Positions of a track whose motion is tested, from its first: the time of a test grows fast."""
 
 SURPRISING = 0.005
-"""A p-value this small is remarked on: of free tracks one in a hundred, with two tests."""
+"""A p-value this small is remarked on: of free tracks one or two in a hundred, with three tests."""
 
 COVERAGE = 0.95
 """Of the interval of D."""
@@ -52,6 +52,7 @@ _FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
 _DOUBT = 0.1
 _ENOUGH = 3  # of the first that are as surprising leave none
 _NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
+_FREE = ("p_confinement", "p_anomalous", "p_steady")
 _STEPS = 3.0  # standard deviations of a displacement within which it may end beyond the border
 _LOOKS = 3  # at D, on which it depends which displacements tell it
 _USELESS = 300.0  # times the median error: such a place says nothing
@@ -318,8 +319,9 @@ def _size(record: Mapping[str, Any], setup: TrackSetup) -> dict[str, float]:
 
 
 def _tests(rows: pd.DataFrame, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:
-    """Ask whether the motion is free, of the first positions of a long track."""
-    track = _positions(_placed(rows).iloc[:TESTED_POSITIONS])
+    """Ask whether the motion is free, two tests of the first positions of a long track."""
+    placed = _placed(rows)
+    track = _positions(placed.iloc[:TESTED_POSITIONS])
     times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
     walls = confinement_test(*track, **times, resamples=_FIRST_LOOK, enough=_ENOUGH, rng=rng)
     if walls.p_value <= _DOUBT:
@@ -331,6 +333,7 @@ def _tests(rows: pd.DataFrame, setup: TrackSetup, rng: np.random.Generator) -> d
         "exponent": power.exponent,
         "sigma_exponent": power.sigma_exponent,
         "p_anomalous": power.p_value,
+        "p_steady": steadiness_test(*_positions(placed), **times),
     }
 
 
@@ -340,7 +343,7 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
         TrackStatus.FEW_FRAMES: record["n_d_frames"] < max(LEAST_POSITIONS, setup.min_frames),
         TrackStatus.POOR_FITS: record["n_mass_frames"] < record["n_frames"] / 2,
         TrackStatus.MASS_VARIES: record["p_mass"] < SURPRISING / 10,
-        TrackStatus.NOT_FREE: min(record["p_confinement"], record["p_anomalous"]) <= SURPRISING,
+        TrackStatus.NOT_FREE: min(record[name] for name in _FREE) <= SURPRISING,
         TrackStatus.STANDS_STILL: record["d_low_um2_s"] == 0,
         TrackStatus.NEAR_WALL: 9 / 32 * record["diameter_nm"] > SLOWED * record["z_nm"],
     }

@@ -332,6 +332,23 @@ def test_a_free_track_soon_says_so() -> None:
     assert ia.confinement_test(**walled, resamples=99, enough=3).p_value == 0.01
 
 
+def test_a_track_that_another_took_over_has_no_one_d() -> None:
+    """100 of 900 steps of a particle five times as fast; of free tracks few say so, and evenly."""
+    rng = np.random.default_rng(3)
+
+    def p_of(n: int, fast: int) -> float:
+        d = np.where(np.arange(n) < n - fast, 0.15e6, 0.8e6)[:, None, None]
+        kicks = np.sqrt(2 * d / RATE_HZ / 8) * rng.standard_normal((n, 8, 2))
+        mean = np.cumsum(kicks.reshape(-1, 2), axis=0).reshape(n, 8, 2).mean(axis=1)
+        places = mean + 25.0 * rng.standard_normal((n, 2))
+        return motion.steadiness_test(np.arange(n), places, 25.0, frame_rate_hz=RATE_HZ)
+
+    assert p_of(900, 100) < 1e-6
+    assert p_of(motion.STRETCH * 2, 0) == 1.0  # one displacement fewer than two stretches
+    free = np.array([p_of(400, 0) for _ in range(60)])
+    assert abs(free.mean() - 0.5) < 4 / math.sqrt(12 * 60)
+
+
 def test_a_direction_is_found() -> None:
     """4 µm/s along each axis: 3 µm in 0.75 s, six times what diffusion makes of it."""
     track = make_track(n=200)
