@@ -15,7 +15,7 @@ from iscat_analysis._kernels.hessian import signal_hessian
 from iscat_analysis._kernels.image import Lens, Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.radial import AxialTable, profile_at
-from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, row_score, scratch, span
+from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, image_score, scratch, span
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -166,21 +166,6 @@ def invert(matrix: FloatArray, scale: FloatArray, active: BoolArray, out: FloatA
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def expected_information(
-    kind: int, data: FloatArray, level: float, rows: FloatArray, out: FloatArray
-) -> None:
-    """Fill `out` (5, 5) with the Fisher information."""
-    sums = np.zeros(20)
-    for row in range(rows.shape[0]):
-        row_score(kind, data, row, level, rows[row], sums)
-    k = 5
-    for i in range(5):
-        for j in range(i, 5):
-            out[i, j] = out[j, i] = sums[k]
-            k += 1
-
-
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _row_bias(
     kind: int,
@@ -246,8 +231,9 @@ def first_order_bias(
     out: FloatArray,
 ) -> None:
     """Fill `out` (5) with the bias of order 1/N, NaN where the free parameters are not known."""
-    fisher, inverse, scale = np.empty((5, 5)), np.empty((5, 5)), np.empty(5)
-    expected_information(kind, data, level, rows, fisher)
+    fisher, inverse = np.empty((5, 5)), np.empty((5, 5))
+    score, scale = np.empty(5), np.empty(5)
+    image_score(kind, data, level, rows, score, fisher)
     for i in range(5):
         scale[i] = 1.0 / np.sqrt(max(fisher[i, i], FLOOR))
     invert(fisher, scale, free, inverse)

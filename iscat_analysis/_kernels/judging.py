@@ -20,7 +20,7 @@ from iscat_analysis._kernels.moving import (
     stage,
     table_of,
 )
-from iscat_analysis._kernels.scoring import FLOOR, POISSON, row_score, row_value, scratch
+from iscat_analysis._kernels.scoring import FLOOR, POISSON, image_score, image_value, scratch
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -145,6 +145,7 @@ def judge_frames(
     square = np.empty(4 * field.side**2)
     g, up = np.empty(5 * field.side**2), np.empty(5 * field.side**2)
     down = np.empty(5 * field.side**2)
+    pull, known = np.empty(5), np.empty((5, 5))
     ways_here, trial, ahead, behind = np.empty((4, n)), np.empty(5), np.empty(4), np.empty(4)
     for t in range(first, last):
         ready_frame(field, near, far, starts, t, theta, group, canvas, near_work, far_work, image)
@@ -161,17 +162,12 @@ def judge_frames(
             draw_gradient(near, group[r], p, pixels, work[0], work[1], here)
             data = square[: 4 * ny * nx].reshape(4, ny, nx)
             stage(light, t, canvas.total[t], here[:, 0], r0, c0, data)
-            sums, value = np.zeros(20), 0.0
-            for i in range(ny):
-                value += row_value(POISSON, data, i, 1.0, here[i, 0])
-                row_score(POISSON, data, i, 1.0, here[i], sums)
-            k = 5
+            value = image_value(POISSON, data, 1.0, here)
+            image_score(POISSON, data, 1.0, here, pull, known)
             for i in range(4):
-                score[r, i] = sums[i]
-                for j in range(i, 5):
-                    if j < 4:
-                        f[i, j] = f[j, i] = sums[k]
-                    k += 1
+                score[r, i] = pull[i]
+                for j in range(4):
+                    f[i, j] = known[i, j]
             chi2, used, worst, amount = _left_over(data, here)
             numbers[r, 0], numbers[r, 1], numbers[r, 2] = value, chi2, used
             numbers[r, 3], numbers[r, 4] = worst, amount / max(used, 1.0)

@@ -28,10 +28,10 @@ from iscat_analysis._kernels.scoring import (
     CONVERGED,
     POISSON,
     STALLED,
+    image_score,
+    image_value,
     maximize,
     picture_at,
-    row_score,
-    row_value,
     scoring_step,
     scratch,
     span,
@@ -424,16 +424,16 @@ def _climb(
         upper[i] = min(search.upper[i], p[i] + search.reach[i])
     at, value = 0, np.nan
     for _ in range(search.passes):
-        gain = _step(search, data, both[at], p, lower, upper, fisher, step, trial)
+        gain = _step(search, data, both[at], p, lower, upper, score, fisher, step, trial)
         if gain < search.tolerance:
             p[:] = trial
             return CONVERGED, at
         if gain == np.inf:
             break
         if np.isnan(value):
-            value = _value(data, both[at])
+            value = image_value(POISSON, data, 1.0, both[at])
         draw_gradient(near, group, trial, pixels, work[0], work[1], both[1 - at])
-        there = _value(data, both[1 - at])
+        there = image_value(POISSON, data, 1.0, both[1 - at])
         if not there > value:
             break
         p[:], value, at = trial, there, 1 - at
@@ -450,32 +450,16 @@ def _climb(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _value(data: FloatArray, here: FloatArray) -> float:
-    """Log-likelihood of a square whose signal and gradient are `here` (ny, 5, nx)."""
-    total = 0.0
-    for i in range(data.shape[1]):
-        total += row_value(POISSON, data, i, 1.0, here[i, 0])
-    return total
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _step(
     search: Search, data: FloatArray, here: FloatArray, p: FloatArray, lower: FloatArray,
-    upper: FloatArray, fisher: FloatArray, step: FloatArray, trial: FloatArray,
+    upper: FloatArray, score: FloatArray, fisher: FloatArray, step: FloatArray, trial: FloatArray,
 ) -> float:  # fmt: skip
     """Fill the step of Fisher scoring and where it leads; return the gain that it promises.
 
     It is infinite where the step is no good as it is: too long, out of the box, or undetermined.
     """
-    sums = np.zeros(20)
-    for i in range(data.shape[1]):
-        row_score(POISSON, data, i, 1.0, here[i], sums)
-    k = 5
-    for i in range(5):
-        for j in range(i, 5):
-            fisher[i, j] = fisher[j, i] = sums[k]
-            k += 1
-    if not scoring_step(sums[:5], fisher, search.free, 0.0, step):
+    image_score(POISSON, data, 1.0, here, score, fisher)
+    if not scoring_step(score, fisher, search.free, 0.0, step):
         return np.inf
     gain = 0.0
     for i in range(5):
@@ -484,7 +468,7 @@ def _step(
             lower[i] <= trial[i] <= upper[i] and abs(step[i]) <= search.max_step[i]
         ):
             return np.inf
-        gain += 0.5 * sums[i] * step[i]
+        gain += 0.5 * score[i] * step[i]
     return gain
 
 

@@ -46,9 +46,6 @@ SERIES = 0.2
 FLOOR = 1e-300
 """Least expected count or intensity: keeps quotients finite where a dark fringe is exactly zero."""
 
-SLACK_NM = 1e-6
-"""Rounding of coordinates near the edge of the support."""
-
 
 @njit(inline="always")
 def _log1p(x: float) -> float:
@@ -171,6 +168,36 @@ def row_score(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def image_value(kind: int, data: FloatArray, level: float, rows: FloatArray) -> float:
+    """Log-likelihood of an image; `rows` (ny, 5 or more, nx) holds s and its gradient."""
+    total = 0.0
+    for row in range(rows.shape[0]):
+        total += row_value(kind, data, row, level, rows[row, 0])
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def image_score(
+    kind: int,
+    data: FloatArray,
+    level: float,
+    rows: FloatArray,
+    score: FloatArray,
+    fisher: FloatArray,
+) -> None:
+    """Fill score (5) and Fisher matrix (5, 5) of an image; `rows` as in `image_value`."""
+    sums = np.zeros(20)
+    for row in range(rows.shape[0]):
+        row_score(kind, data, row, level, rows[row], sums)
+    k = 5
+    for i in range(5):
+        score[i] = sums[i]
+        for j in range(i, 5):
+            fisher[i, j] = fisher[j, i] = sums[k]
+            k += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def score_pass(
     profile: FloatArray,
     lens: Lens,
@@ -185,18 +212,9 @@ def score_pass(
     level = np.exp(theta[4])
     g = np.empty((pixels.y.size, 5, pixels.x.size))
     signal_gradient(profile, lens, pixels, theta[0], theta[1], theta[3], g)
-    sums = np.zeros(20)
-    total = 0.0
-    for row in range(pixels.y.size):
-        total += row_value(kind, data, row, level, g[row, 0])
-        row_score(kind, data, row, level, g[row], sums)
-    k = 5
-    for i in range(5):
-        score[i] = sums[i]
-        for j in range(i, 5):
-            fisher[i, j] = fisher[j, i] = sums[k]
-            k += 1
-    return total
+    image_score(kind, data, level, g, score, fisher)
+    value: float = image_value(kind, data, level, g)
+    return value
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -261,61 +279,6 @@ def picture_at(
         return only
     profile_at(axial, z_nm, start, stop, work, profile)
     return profile
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def supported(
-    thetas: FloatArray,
-    x: FloatArray,
-    y: FloatArray,
-    half_pixel: float,
-    reach: float,
-    low: float,
-    high: float,
-    largest_level: float,
-) -> BoolArray:
-    """Tell at which θ (n, 5) every pixel is within reach, the height known and all finite."""
-    inside = np.empty(thetas.shape[0], dtype=np.bool_)
-    for k in range(thetas.shape[0]):
-        dx = max(abs(thetas[k, 0] - x[0]), abs(thetas[k, 0] - x[-1])) + half_pixel
-        dy = max(abs(thetas[k, 1] - y[0]), abs(thetas[k, 1] - y[-1])) + half_pixel
-        inside[k] = (
-            np.hypot(dx, dy) <= reach
-            and low - SLACK_NM <= thetas[k, 2] <= high + SLACK_NM
-            and np.isfinite(thetas[k, 3])
-            and abs(thetas[k, 4]) <= largest_level
-        )
-    return inside
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def box_supported(
-    start: FloatArray,
-    free: BoolArray,
-    lower: FloatArray,
-    upper: FloatArray,
-    x: FloatArray,
-    y: FloatArray,
-    half_pixel: float,
-    reach: float,
-    low: float,
-    high: float,
-    largest_level: float,
-) -> tuple[bool, bool]:
-    """Tell whether a box holds the start of what is free, and whether `supported` holds in it."""
-    inside = True
-    corners = np.empty((4, 5))
-    for i in range(5):
-        if free[i] and not lower[i] <= start[i] <= upper[i]:
-            inside = False
-        for k in range(4):
-            corners[k, i] = start[i]
-        if free[i] and i < 3:
-            corners[0, i], corners[1, i] = lower[i], upper[i]
-            corners[2, i] = lower[i] if i == 0 else upper[i]
-            corners[3, i] = upper[i] if i == 0 else lower[i]
-    known = supported(corners, x, y, half_pixel, reach, low, high, largest_level)
-    return inside, known[0] and known[1] and known[2] and known[3]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -68,13 +68,19 @@ def _copy(
     profile: FloatArray, row: int, step: int, first: int, last: int, line: int, a: float,
     signal: FloatArray, slope: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill lines of `signal` with P + a Q, of `slope` with P + 2a Q, from every `step`-th row."""
+    """Fill lines of `signal` with P + a Q, of `slope` with P + 2a Q, from every `step`-th row.
+
+    A slope without room is left out.
+    """
     for m in range(signal.size // line):
         p, q = profile[0, row + step * m, first:last], profile[1, row + step * m, first:last]
-        s, d = signal[m * line : (m + 1) * line], slope[m * line : (m + 1) * line]
+        s = signal[m * line : (m + 1) * line]
         for j in range(p.size):
             s[j] = p[j] + a * q[j]
-            d[j] = p[j] + 2.0 * a * q[j]
+        if slope.size:
+            d = slope[m * line : (m + 1) * line]
+            for j in range(p.size):
+                d[j] = p[j] + 2.0 * a * q[j]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -145,9 +151,10 @@ def _make_strip(
         for k in range(fine):
             start = k * block
             stop = start + (rows + (TAPS - 1 - k) // fine) * line
+            end = kept + stop if gradient else kept + start
             _copy(
                 profile, top + k, fine, phase * per_phase + first, phase * per_phase + last, line,
-                a, nodes[start:stop], nodes[kept + start : kept + stop],
+                a, nodes[start:stop], nodes[kept + start : end],
             )  # fmt: skip
         start = phase * made
         here = sums[start : start + used]

@@ -17,7 +17,6 @@ the level is a nuisance, and bounds count it as one.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 
@@ -295,9 +294,7 @@ def _optima(likelihood: Likelihood, start: Candidate, box: Box) -> list[Optimum]
     return sorted(optima, key=lambda o: (not o.converged, -o.log_likelihood))
 
 
-def _heights(
-    likelihood: Likelihood, theta: FloatArray, box: Box
-) -> Iterator[tuple[FloatArray, float]]:
+def _heights(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[tuple[FloatArray, float]]:
     """Start at the local maxima of the likelihood along z, best first.
 
     Each start is θ with a maximum's height and amplitude; beside it the log-likelihood there.
@@ -309,10 +306,12 @@ def _heights(
     values, amplitudes = likelihood.scan_heights(heights, theta, bounds)
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
     peaks = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]))
+    starts = []
     for i in peaks[np.argsort(-values[peaks], kind="stable")][:_STARTS]:
         begin = theta.copy()
         begin[2], begin[3] = heights[i], amplitudes[i]
-        yield begin, float(values[i])
+        starts.append((begin, float(values[i])))
+    return starts
 
 
 def _alternatives(optima: list[Optimum], fringe_nm: float) -> tuple[Alternative, ...]:

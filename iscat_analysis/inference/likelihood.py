@@ -27,12 +27,11 @@ from iscat_analysis._kernels.scoring import (
     CONDITIONAL,
     CONVERGED,
     POISSON,
-    box_supported,
     maximize,
     score_pass,
-    supported,
     value_batch,
 )
+from iscat_analysis._kernels.support import box_supported, supported
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import vector_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid

@@ -348,14 +348,9 @@ class MovingSearch:
         def search(threshold: float) -> pd.DataFrame:
             with threads(self._config.compute.workers) as pool:
                 found = search_frames(
-                    _with_threshold(scene, threshold),
-                    field,
-                    ground,
-                    rows,
-                    np.zeros(0),
-                    pool,
-                    (here, here + 1),
-                )
+                    _with_threshold(scene, threshold), field, ground, rows,
+                    snr=np.zeros(0), pool=pool, frames=(here, here + 1),
+                )  # fmt: skip
             mass = np.asarray(scene.model.scale.mass(found.strength))
             each = zip(found.x_px, found.y_px, found.snr, found.z_nm, mass, strict=True)
             return _listed(
