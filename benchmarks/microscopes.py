@@ -42,8 +42,9 @@ from instruments import Instrument, InstrumentMovie, Landings, draw_landings
 
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.pipeline.landing import LandingResult, analyse_landings
+from iscat_analysis.pipeline.landing import analyse_landings
 from iscat_analysis.pipeline.learning import learn_optics
+from iscat_analysis.pipeline.results import Found
 
 RESULTS = Path(__file__).resolve().parent / "results"
 SHAPE = (900, 160, 160)
@@ -138,7 +139,7 @@ def match(landings: Landings, table: pd.DataFrame) -> Matched:
     return Matched(rows, int(free.sum()))
 
 
-def analyse(movie: InstrumentMovie, config: Config, said: list[str]) -> LandingResult:
+def analyse(movie: InstrumentMovie, config: Config, said: list[str]) -> Found:
     """Analyse a movie and keep what the user is told."""
     return analyse_landings(
         movie,
@@ -149,7 +150,7 @@ def analyse(movie: InstrumentMovie, config: Config, said: list[str]) -> LandingR
     )
 
 
-def counted(result: LandingResult) -> pd.DataFrame:
+def counted(result: Found) -> pd.DataFrame:
     """Give the rows of a result that are not side lobes."""
     return result.table[result.table["status"] != "sidelobe"].reset_index(drop=True)
 

@@ -23,11 +23,11 @@ from instruments import Instrument, InstrumentMovie, draw_landings  # isort: ski
 from iscat_analysis.config import Config
 from iscat_analysis.movie.background import measure_windows
 from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.pipeline.chunks import FRAME_COLUMN
 from iscat_analysis.pipeline.diagnosis import misfit_warning
 from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.results import Row, table_of
+from iscat_analysis.pipeline.results import table_of
 from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.records import FRAME_COLUMN
 
 SHAPE = (200, 200, 200)
 BOUND = 100
@@ -52,7 +52,7 @@ def judge(name: str, seed: int) -> dict[str, Any]:
     windows = measure_windows(movie, camera, (0, BOUND), (BOUND, SHAPE[0]))
     with ThreadPoolExecutor(1) as pool:
         events, windows = fit_field(scene, windows, pool=pool)
-    table = table_of(scene, [Row(k, event, windows) for k, event in enumerate(events)])
+    table = table_of(scene, events)
     seconds = time.process_time() - start
     table = table[table["status"] != "sidelobe"].reset_index(drop=True)
     table = table.assign(frame=BOUND, **{FRAME_COLUMN: 0})

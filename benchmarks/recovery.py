@@ -27,8 +27,9 @@ from scipy.stats import poisson
 
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.pipeline.chunks import FRAME_COLUMN
-from iscat_analysis.pipeline.landing import LandingResult, analyse_landings
+from iscat_analysis.pipeline.landing import analyse_landings
+from iscat_analysis.pipeline.results import Found
+from iscat_analysis.records import FRAME_COLUMN
 from iscat_analysis.study.simulate import Movie
 
 ROOT = Path(__file__).resolve().parent
@@ -57,7 +58,7 @@ class Memory:
         return self.counts[start:stop]
 
 
-def analyse(config: Config, seed: int) -> tuple[pd.DataFrame, LandingResult]:
+def analyse(config: Config, seed: int) -> tuple[pd.DataFrame, Found]:
     """Simulate a movie and analyse it; its steps, and what was found."""
     movie = Movie(config, seed)
     simulation = config.simulation
@@ -75,7 +76,7 @@ def analyse(config: Config, seed: int) -> tuple[pd.DataFrame, LandingResult]:
     return pd.concat([landing, leaving], ignore_index=True), found
 
 
-def match(steps: pd.DataFrame, result: LandingResult, pixel_nm: float) -> pd.DataFrame:
+def match(steps: pd.DataFrame, result: Found, pixel_nm: float) -> pd.DataFrame:
     """Add to every step what was found of it; the nearest in space, each row once."""
     window, table = result.summary["window_frames"], result.table
     taken: set[int] = set()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, Protocol
 
@@ -56,6 +56,10 @@ EVENT_COLUMNS = (
     "n_scattered", "snr", "chi2_reduced", "p_value", "status", "flags",
 )  # fmt: skip
 """The columns of ``fits.csv``, in order."""
+
+FRAME_COLUMN = "frame_ci95"
+"""Column of ``fits.csv`` after `EVENT_COLUMNS`, of landing movies: half-width of the 95 % interval
+of ``frame`` [frames]."""
 
 REPEAT_COLUMNS = ("repeat_x_nm", "repeat_y_nm", "repeat_z_nm", "repeat_mass_kda")
 """Columns of ``fits.csv``: standard errors of an event as disjoint parts of its own frames show
@@ -293,6 +297,29 @@ class Windows:
     frames_after: tuple[int, int]
     power: FloatArray
 
+    def cut(self, region: tuple[slice, slice]) -> Windows:
+        """Give the sums of some pixels.
+
+        Parameters
+        ----------
+        region : (slice, slice)
+            Rows and columns.
+
+        Returns
+        -------
+        Windows
+            Views of these pixels, nothing is copied.
+        """
+        return replace(
+            self,
+            before_e=self.before_e[region],
+            after_e=self.after_e[region],
+            read_variance_before_e2=self.read_variance_before_e2[region],
+            read_variance_after_e2=self.read_variance_after_e2[region],
+            masked=self.masked[region],
+            saturated=self.saturated[region],
+        )
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -411,6 +438,21 @@ class FitResult:
     status: Status
     flags: tuple[Status, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
+
+    def shifted(self, x_nm: float, y_nm: float) -> FitResult:
+        """Give the same fit in coordinates with another origin.
+
+        Parameters
+        ----------
+        x_nm, y_nm : float
+            Added to the place [nm]; `theta` and `estimate` stay those of the likelihood.
+
+        Returns
+        -------
+        FitResult
+            In the other coordinates.
+        """
+        return replace(self, x_nm=self.x_nm + x_nm, y_nm=self.y_nm + y_nm)
 
 
 @dataclass(frozen=True)

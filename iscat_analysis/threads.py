@@ -7,9 +7,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,27 @@ class _Watched(ThreadPoolExecutor):
             return task(*args, **options)
 
         return super().submit(watched, *args, **options)
+
+
+def beside(work: Callable[..., T], *arguments: Any) -> Future[T]:
+    """Begin work in a thread of its own.
+
+    Parameters
+    ----------
+    work : callable
+        What to do.
+    *arguments : object
+        Given to it.
+
+    Returns
+    -------
+    Future
+        Its result.
+    """
+    pool = ThreadPoolExecutor(1)
+    begun = pool.submit(work, *arguments)
+    pool.shutdown(wait=False)
+    return begun
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -155,13 +155,17 @@ def fit_rois(
     return table_from(rows)
 
 
-def table_from(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
+def table_from(
+    rows: Sequence[dict[str, Any]], numbers: Sequence[int] | NDArray[np.int64] | None = None
+) -> pd.DataFrame:
     """Make a table of rows.
 
     Parameters
     ----------
     rows : sequence of dict
         With the keys `EVENT_COLUMNS`.
+    numbers : sequence of int, optional
+        Of the events, where they are not those of the rows.
 
     Returns
     -------
@@ -169,12 +173,14 @@ def table_from(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
         Columns `EVENT_COLUMNS`; a frame that is not known is empty.
     """
     table = pd.DataFrame(list(rows), columns=list(EVENT_COLUMNS))
+    if numbers is not None:
+        table["event"] = numbers
     known = bool(table["frame"].notna().all())
     kinds = dict.fromkeys(("event", "n_before", "n_after"), "int64")
     kinds["frame"] = "int64" if known else "Int64"
     texts = ("status", "flags")
-    numbers = [name for name in EVENT_COLUMNS if name not in kinds and name not in texts]
-    return table.astype({**kinds, **dict.fromkeys(numbers, "float64")})
+    values = [name for name in EVENT_COLUMNS if name not in kinds and name not in texts]
+    return table.astype({**kinds, **dict.fromkeys(values, "float64")})
 
 
 def row_of(
@@ -182,10 +188,12 @@ def row_of(
     fit: FitResult,
     collected: float,
     *,
+    flags: Iterable[Status],
     event: int,
     frame: int | None,
     n_before: int,
     n_after: int,
+    sign: int = 1,
 ) -> dict[str, Any]:
     """Put a fit and its bounds into a row of the table.
 
@@ -197,12 +205,16 @@ def row_of(
         Its estimate, in the full frame.
     collected : float
         Scattered photons that the pupil collected in the frames after.
+    flags : iterable of Status
+        What the fit and its surroundings are remarked for.
     event : int
         Number of the row.
     frame : int or None
         First frame of the new state, where it is known.
     n_before, n_after : int
         Frames.
+    sign : int
+        −1 for a particle that leaves, whose mass and contrast are told with the other sign.
 
     Returns
     -------
@@ -213,6 +225,7 @@ def row_of(
     bounds = event_bounds(
         likelihood, fit.estimate, fit.free, collected, level=bool(fit.box.free[LEVEL])
     )
+    status, noticed = verdict(flags)
     row: dict[str, Any] = {
         "event": event,
         "frame": frame,
@@ -223,14 +236,14 @@ def row_of(
         "x_nm": fit.x_nm,
         "y_nm": fit.y_nm,
         "z_nm": fit.z_nm,
-        "mass_kda": fit.mass_kda,
-        "contrast": fit.contrast if model.rho else np.nan,
+        "mass_kda": sign * fit.mass_kda,
+        "contrast": sign * fit.contrast if model.rho else np.nan,
         "n_scattered": collected,
         "snr": fit.snr,
         "chi2_reduced": fit.chi2_reduced,
         "p_value": fit.p_value,
-        "status": str(fit.status),
-        "flags": ";".join(str(flag) for flag in fit.flags),
+        "status": str(status),
+        "flags": ";".join(str(flag) for flag in noticed),
     }
     for k, name in enumerate(PARAMETERS):
         row[f"sigma_{name}"] = fit.sigma[k]
@@ -263,17 +276,46 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
     fit = fit_particle(
         likelihood, start, config.fit.mode, config.fit.z_range_nm, level=counts.level
     )
-    rows, columns = np.nonzero(saturated)
-    away = np.hypot(columns * pixel_nm - fit.x_nm, rows * pixel_nm - fit.y_nm)
-    if np.any(away < SATURATION_NM):
-        status, noticed = verdict([*fit.flags, Status.SATURATED])
-        fit = replace(fit, status=status, flags=noticed)
-    fit = replace(fit, x_nm=fit.x_nm + corner[1] * pixel_nm, y_nm=fit.y_nm + corner[0] * pixel_nm)
+    flags = list(fit.flags)
+    if saturated_near(saturated, fit.x_nm, fit.y_nm, pixel_nm):
+        flags.append(Status.SATURATED)
     collected = counts.collected(index, fit.z_nm, fit.mass_kda)
     return row_of(
-        likelihood, fit, collected,
-        event=index, frame=None, n_before=counts.n_before, n_after=counts.n_after,
+        likelihood, fit.shifted(corner[1] * pixel_nm, corner[0] * pixel_nm), collected,
+        flags=flags, event=index, frame=None, n_before=counts.n_before, n_after=counts.n_after,
     )  # fmt: skip
+
+
+def saturated_near(
+    saturated: NDArray[np.bool_],
+    x_nm: float,
+    y_nm: float,
+    pixel_nm: float,
+    *,
+    corner: tuple[int, int] = (0, 0),
+) -> bool:
+    """Tell whether saturated pixels spoil a fit.
+
+    Parameters
+    ----------
+    saturated : ndarray of bool, shape (rows, columns)
+        Those of the region.
+    x_nm, y_nm : float
+        Place of the particle [nm].
+    pixel_nm : float
+        Pixel side [nm].
+    corner : (int, int)
+        Row and column of the region's first pixel, where the place is that of the full frame.
+
+    Returns
+    -------
+    bool
+        Whether one lies within `SATURATION_NM` of the particle.
+    """
+    rows, columns = np.nonzero(saturated)
+    dx = (columns + corner[1]) * pixel_nm - x_nm
+    dy = (rows + corner[0]) * pixel_nm - y_nm
+    return bool(np.any(np.hypot(dx, dy) < SATURATION_NM))
 
 
 def _start(likelihood: Likelihood, templates: Templates) -> Candidate:

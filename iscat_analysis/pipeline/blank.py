@@ -15,8 +15,10 @@ from iscat_analysis.inference.likelihood import LEVEL
 from iscat_analysis.inference.repeats import LENGTHS
 from iscat_analysis.movie.background import smooth_background
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.field import Event, total_signal
-from iscat_analysis.pipeline.scene import Scene, photons_scale
+from iscat_analysis.pipeline.events import Event
+from iscat_analysis.pipeline.field import total_signal
+from iscat_analysis.pipeline.regions import photons_scale
+from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     BoolArray,
@@ -91,7 +93,7 @@ def taken_by(
     rows, columns = windows.after_e.shape
     taken = taken_places(
         scene, (rows, columns),
-        [(e.candidate.x_px, e.candidate.y_px, Status.POOR_FIT not in e.fit.flags) for e in events],
+        [(e.candidate.x_px, e.candidate.y_px, Status.POOR_FIT not in e.flags) for e in events],
     )  # fmt: skip
     if scene.additive:
         taken |= photons_scale(scene, windows) * signal > _OUTSHONE * windows.after_e.mean()

@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from iscat_analysis.config import Config
-from iscat_analysis.inference.posterior import sample_posterior
-from iscat_analysis.inference.prior import Prior
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.spectrum import NoiseSpectrum
-from iscat_analysis.optics.forward import forward_model
-from iscat_analysis.pipeline.chunks import (
-    CLIPS,
-    FRAME_COLUMN,
-    REPEATS_COLUMN,
-    VIEWS,
-    Done,
-    Reader,
-    counts_budget,
-)
+from iscat_analysis.pipeline.chunks import Reader, counts_budget
 from iscat_analysis.pipeline.diagnosis import misfit_warning
+from iscat_analysis.pipeline.events import posterior_of
+from iscat_analysis.pipeline.merging import CLIPS, VIEWS, Done
 from iscat_analysis.pipeline.pattern import follow
-from iscat_analysis.pipeline.results import Row, table_of, view_of
-from iscat_analysis.pipeline.scene import Scene, search_both, square_model, square_of
-from iscat_analysis.pipeline.steps import ChunkFitter, FittedStep
-from iscat_analysis.records import CountSource, EventView, FloatArray, Progress, silent
-from iscat_analysis.search.sliding import CORRELATION, STRIDES, Chunk, stride_of
-from iscat_analysis.search.templates import LARGEST_IMAGE, make_templates
+from iscat_analysis.pipeline.results import table_of, view_of
+from iscat_analysis.pipeline.scene import Scene, make_scene
+from iscat_analysis.pipeline.steps import ChunkFitter
+from iscat_analysis.records import CountSource, FloatArray, PosteriorResult, Progress, silent
+from iscat_analysis.search.sliding import STRIDES, Chunk, stride_of
 from iscat_analysis.threads import threads
 
 
@@ -101,72 +90,15 @@ def chunk_job(
     config, frames = setting.config, setting.frames
     reader = Reader(frames, setting.camera, *setting.span, counts_budget(config))
     with threads(config.compute.workers) as pool:
-        scene = make_landing_scene(
-            config,
-            reader.shape,
-            searches=setting.searches,
-            noise=setting.noise,
-            lines=setting.lines,
-        )
+        scene = make_scene(
+            config, reader.shape, searches=setting.searches, noise=setting.noise,
+            lines=setting.lines, sliding=True,
+        )  # fmt: skip
         chunk = reader.chunk(span, stride_of(setting.window), pool)
         progress("landing", 0, 1)
         return analyse_chunk(
             scene, chunk, core, setting.window, pool, posteriors, setting.excess_noise
         )
-
-
-def make_landing_scene(
-    config: Config,
-    field_px: tuple[int, int],
-    *,
-    searches: int,
-    noise: NoiseSpectrum | None = None,
-    lines: Lines | None = None,
-) -> Scene:
-    """Build the models and the matched filter, at the particles' nominal height.
-
-    Parameters
-    ----------
-    config : Config
-        With a pixel size.
-    field_px : (int, int)
-        Rows and columns.
-    searches : int
-        Boundaries that will be searched; they share the expected false alarms.
-    noise : NoiseSpectrum, optional
-        Of the movie; without it the noise is white and of the expected size.
-    lines : Lines, optional
-        What was divided out of the frames.
-
-    Returns
-    -------
-    Scene
-        Its `wide` model reaches as far as the rings of a strong particle matter.
-
-    Raises
-    ------
-    ConfigError
-        The region is larger than the field, or the calibration has the wrong sign.
-    """
-    pixel, roi_px = square_of(config, field_px)
-    model = square_model(config, pixel, roi_px)
-    return Scene(
-        config=config,
-        model=model,
-        wide=forward_model(config, math.sqrt(2) * (LARGEST_IMAGE * roi_px + 2) * pixel),
-        templates=make_templates(
-            model,
-            search_both(config.detection, searches=searches),
-            pixel_nm=pixel,
-            roi_nm=config.fit.roi_nm,
-            z_range_nm=None,
-            field_px=field_px,
-            noise=noise,
-            correlation=CORRELATION if searches > 1 else 0.0,
-        ),
-        mode=config.fit.mode,
-        lines=lines,
-    )
 
 
 def analyse_chunk(
@@ -207,49 +139,40 @@ def analyse_chunk(
     fitter = ChunkFitter(scene, chunk, window, pool, trajectory, excess_noise=excess_noise)
     seam = max(2, window // STRIDES)
     steps = fitter.run((core[0] - seam, core[1] + seam))
-    rows = list(pool.map(_row, range(len(steps)), steps))
-    sampled, stopped = 0, False
-    for i, row in enumerate(rows):
-        if sampled >= posteriors or not core[0] <= steps[i].step.at.frame < core[1]:
+    events = [step.event for step in steps]
+    chains: dict[int, PosteriorResult] = {}
+    stopped = False
+    for number, event in enumerate(events):
+        if len(chains) >= posteriors:
+            break
+        if not core[0] <= event.frame < core[1]:
             continue
-        settings = scene.config.posterior
         try:
-            chain = sample_posterior(
-                row.event.likelihood, row.event.fit,
-                walkers=settings.walkers, steps=settings.steps,
-                seed=scene.config.compute.seed + steps[i].step.at.frame,
-                prior=Prior(settings.priors),
-            )  # fmt: skip
+            chains[number] = posterior_of(scene, event, event.frame)
         except KeyboardInterrupt:  # the fits are done, and kept
             stopped = True
             break
-        rows[i] = replace(row, posterior=chain)
-        sampled += 1
-    table = table_of(scene, rows, mapper=pool.map)
-    table["frame"] = [s.step.at.frame for s in steps]
-    table["n_before"] = [s.n_before for s in steps]
-    table["n_after"] = [s.n_after for s in steps]
-    sign = np.array([s.step.sign for s in steps], dtype=float)
-    table["mass_kda"] *= sign
-    table["contrast"] *= sign
-    table[FRAME_COLUMN] = [s.step.at.half_width for s in steps]
-    table[REPEATS_COLUMN] = [s.repeats.ravel().tolist() for s in steps]
+    shown = fitter.shown(steps[:VIEWS], CLIPS)
     inside = slice(core[0] - chunk.first, core[1] - chunk.first)
     light = np.where(chunk.good, chunk.power, np.nan) * float(chunk.mean_e.mean())
     return Done(
         core=core,
-        table=table,
-        views=tuple(map(_view, rows, fitter.with_traces(steps[:VIEWS], CLIPS))),
+        table=table_of(scene, events, dated=True, mapper=pool.map),
+        repeats=np.array([step.repeats for step in steps]),
+        views=tuple(
+            view_of(n, events[n], posterior=chains.get(n), trace=trace, clip=clip)
+            for n, (trace, clip) in enumerate(shown)
+        ),
         good=chunk.good[inside].copy(),
         light=light[inside],
         masked=~chunk.usable,
         saturated=chunk.saturated,
         strongest=fitter.strongest,
         ends_e=_ends(chunk, inside),
-        sampled=sampled,
+        sampled=len(chains),
         stopped=stopped,
         trajectory=trajectory,
-        cause=misfit_warning(scene.config, [s.event for s in steps]),
+        cause=misfit_warning(scene.config, events),
         empty=fitter.empty,
     )
 
@@ -261,18 +184,3 @@ def _ends(chunk: Chunk, inside: slice) -> FloatArray:
     blocks = np.flatnonzero(held if held.any() else lit)
     few = max(1, blocks.size // 4)
     return np.stack([chunk.blocks_e[part].mean(axis=0) for part in (blocks[:few], blocks[-few:])])
-
-
-def _row(number: int, step: FittedStep) -> Row:
-    return Row(number, step.event, step.windows)
-
-
-def _view(row: Row, step: FittedStep) -> EventView:
-    view = view_of(row)
-    return replace(
-        view,
-        row_px=step.region.rows[0],
-        column_px=step.region.columns[0],
-        trace=step.trace,
-        clip=step.clip,
-    )

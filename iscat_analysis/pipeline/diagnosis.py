@@ -1,25 +1,21 @@
-"""What the background frames reveal about camera and stage."""
+"""What a movie reveals of lines, pixels, stage and model, in words."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
-from iscat_analysis.errors import DataError
 from iscat_analysis.inference.cause import likely_cause
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import follow_pattern
 from iscat_analysis.movie.lines import Lines, find_lines
-from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain
-from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
-from iscat_analysis.pipeline.field import Event
+from iscat_analysis.pipeline.events import Event
+from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, first_counts, is_lit
 from iscat_analysis.records import Status, Windows
 from iscat_analysis.search.sliding import measure_frames, measure_noise
 
@@ -28,48 +24,10 @@ DRIFT_PX = 0.02
 
 _BRIGHTEST = 8  # isolated particles on which the model is judged
 _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
-_GAIN_FRAMES = 64  # on which the gain is judged
-_SPECTRUM_FRAMES = 128  # on which the noise's spectrum is measured
 _NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
 _LONGEST = 100  # average of the noise curve
 _SMALLEST_PX = 32  # side of a field in which a pattern is followed
 _SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
-
-
-EXCESS_NOISE = 1.4
-"""Noise variance over the expected from which a thousand candidates are taken for noise."""
-
-
-def judge_background(
-    movie: Stack, camera: Camera, windows: Windows
-) -> tuple[GainDiagnosis | None, NoiseSpectrum | None]:
-    """Compare the noise of the background frames with the camera's.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    windows : Windows
-        The background.
-
-    Returns
-    -------
-    gain : GainDiagnosis or None
-        None where there is no shot noise to look at.
-    spectrum : NoiseSpectrum or None
-        None where the noise is white and of the expected size, or there is none to look at.
-    """
-    if windows.n_before < 2 or not _is_lit(windows):
-        return None, None
-    counts = _first(movie, windows, _SPECTRUM_FRAMES)
-    spectrum = measure_spectrum(counts, camera)
-    try:
-        gain = diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=windows.masked)
-    except DataError:  # too dark to tell
-        return None, spectrum
-    return allow_for_correlation(gain, spectrum), spectrum
 
 
 def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
@@ -102,43 +60,11 @@ def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
     ):
         return None
     first, last = background.frames or config.fit.frames or (0, movie.shape[0])
-    counts = movie.read(first, max(first, min(last, movie.shape[0], first + _SPECTRUM_FRAMES)))
+    counts = movie.read(first, max(first, min(last, movie.shape[0], first + SPECTRUM_FRAMES)))
     if not len(counts):
         return None
     light, repeats = measure_frames(counts, camera)
     return find_lines(counts[np.isfinite(light) & ~repeats], camera)
-
-
-def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:
-    """Judge the gain by the noise that neighbouring pixels have together.
-
-    Parameters
-    ----------
-    gain : GainDiagnosis
-        From the variance of single pixels.
-    spectrum : NoiseSpectrum or None
-        Of the same frames.
-
-    Returns
-    -------
-    GainDiagnosis
-        The same where pixels are independent.
-
-    Notes
-    -----
-    Light is Poisson before charge leaks to neighbours; leaking moves variance into covariances
-    (M. Downing et al., Proc. SPIE 6276, 627609, 2006).
-    """
-    if spectrum is None or not spectrum.correlated:
-        return gain
-    ratio, error = spectrum.summed
-    return replace(
-        gain,
-        noise_ratio=ratio,
-        noise_ratio_se=error,
-        gain_e_per_adu=gain.configured_gain / ratio,
-        gain_se=gain.configured_gain / ratio**2 * error,
-    )
 
 
 def pixel_warnings(windows: Windows) -> Iterator[str]:
@@ -185,9 +111,9 @@ def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[s
     """
     curve: tuple[tuple[int, ...], tuple[float, ...]] = ((), ())
     limit = drift = error = None
-    if windows.n_before >= 2 and _is_lit(windows):
+    if windows.n_before >= 2 and is_lit(windows):
         frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
-        some = _first(movie, windows, max(2, _NOISE_BYTES // frame_bytes))
+        some = first_counts(movie, windows, max(2, _NOISE_BYTES // frame_bytes))
         noise = measure_noise(some, camera, min(_LONGEST, len(some) // 2))
         curve, limit = (noise.frames, noise.variance_over_shot), noise.shot_limited
         if min(movie.shape[1:]) >= _SMALLEST_PX:
@@ -254,23 +180,10 @@ def misfit_warning(config: Config, events: Sequence[Event]) -> str:
     """
     if config.optics.psf == "measured":
         return ""
-    alone = [e for e in events if not _DISTURBED.intersection(e.fit.flags)]
+    alone = [e for e in events if not _DISTURBED.intersection(e.flags)]
     brightest = sorted(alone, key=lambda e: -e.snr)[:_BRIGHTEST]
-    missed = [e for e in brightest if Status.POOR_FIT in e.fit.flags]
+    missed = [e for e in brightest if Status.POOR_FIT in e.flags]
     if 2 * len(missed) <= len(brightest):
         return ""
     cause = likely_cause(config, [(e.likelihood, e.fit.theta, e.fit.box.free) for e in missed])
     return cause.message if cause else ""
-
-
-def _first(movie: Stack, windows: Windows, most: int) -> NDArray[Any]:
-    """Return the first background frames, shape (t, y, x) [counts]."""
-    start, stop = windows.frames_before
-    return movie.read(start, min(stop, start + most))
-
-
-def _is_lit(windows: Windows) -> bool:
-    """Whether there is light in the background, beyond the read noise."""
-    used = ~windows.masked
-    light, read = windows.before_e[used], windows.read_variance_before_e2[used]
-    return bool(light.sum() > read.sum())

@@ -10,36 +10,33 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.movie.background import refine_power
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.scene import (
-    SPREAD_NM,
+from iscat_analysis.pipeline.events import Event, Fitted, Place, remarks
+from iscat_analysis.pipeline.regions import (
     Region,
-    Scene,
-    judge,
     noise_cumulants,
     photons_scale,
+    region_around,
     region_likelihood,
-    search_both,
     search_likelihood,
 )
+from iscat_analysis.pipeline.scene import SPREAD_NM, Scene, search_both
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     Candidate,
-    FitResult,
     FloatArray,
     Progress,
     Status,
     Windows,
     silent,
 )
-from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, Described, is_hidden
+from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, is_hidden
 from iscat_analysis.search.templates import LARGEST_IMAGE, find_particles
 
 MAX_ROUNDS = 8
@@ -50,42 +47,6 @@ _MOST_SWEEPS = 16  # where two fits share one particle they part slowly
 _SETTLED = 0.1  # change of signal-to-noise ratios from one sweep to the next
 _AS_FOUND = 0.95  # of the threshold; what was found is dropped only where others explain it
 _DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
-
-
-Place = tuple[float, float, float, float]
-"""x, y, z [nm] and mass [kDa]."""
-
-
-@dataclass(frozen=True)
-class Event:
-    """One fitted particle: where it was searched, what was fitted, and the likelihood used."""
-
-    region: Region
-    fit: FitResult
-    likelihood: Likelihood
-
-    @property
-    def candidate(self) -> Candidate:
-        """The estimate, as the start of another fit."""
-        pixel = self.likelihood.grid.pixel_nm
-        return Candidate(
-            self.fit.x_nm / pixel, self.fit.y_nm / pixel, self.fit.z_nm, self.fit.mass_kda, self.snr
-        )
-
-    @property
-    def place(self) -> Place:
-        """Where it is, and its mass."""
-        return self.fit.x_nm, self.fit.y_nm, self.fit.z_nm, self.fit.mass_kda
-
-    @property
-    def snr(self) -> float:
-        """√(2 Δℓ) against no particle."""
-        return self.fit.snr
-
-    @property
-    def described(self) -> Described:
-        """What the fit explains, and what it leaves over."""
-        return Described.of(self.snr, self.fit.chi2_reduced, self.likelihood.n_pixels)
 
 
 def fit_field(
@@ -122,7 +83,7 @@ def fit_field(
     windows : Windows
         With the laser power estimated anew.
     """
-    events: list[Event] = []
+    events: list[Fitted] = []
     fresh, doubtful = list(starts), list[Candidate]()
     for number in range(MAX_ROUNDS):
         progress("detect", number, MAX_ROUNDS)
@@ -143,16 +104,16 @@ def fit_field(
     while 0 < len(kept) < len(events):  # what is dropped must leave its neighbours' background too
         events = _fit_all(scene, windows, [e.candidate for e in kept], kept, pool)
         kept = [e for e in events if e.snr > least and _wanted(scene, e)]
-    lobes: list[Event] = []
+    lobes: list[Fitted] = []
     if doubtful and not starts:
         lobes = _fit_all(scene, windows, doubtful, kept, pool, first=len(kept))
         lobes = [e for e in lobes if e.snr > least and _wanted(scene, e)]
-    events = _judged(scene, windows, kept, lobes)
+    judged = _judged(scene, windows, kept, lobes)
     progress("detect", MAX_ROUNDS, MAX_ROUNDS)
-    return tuple(sorted(events, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
+    return tuple(sorted(judged, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
 
 
-def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Event]) -> FloatArray:
+def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Fitted]) -> FloatArray:
     """Signal of all fitted particles over the field.
 
     Parameters
@@ -161,7 +122,7 @@ def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Event]) 
         Models.
     shape : (int, int)
         Rows and columns.
-    events : sequence of Event
+    events : sequence of Fitted
         The particles.
 
     Returns
@@ -206,7 +167,7 @@ def add_signal(scene: Scene, place: Place, region: Region, total: FloatArray) ->
 
 
 def search_field(
-    scene: Scene, windows: Windows, events: Sequence[Event] = (), excess_noise: str = ""
+    scene: Scene, windows: Windows, events: Sequence[Fitted] = (), excess_noise: str = ""
 ) -> tuple[list[Candidate], list[Candidate]]:
     """Find new particles, and what may be but the side lobe of a known one.
 
@@ -216,7 +177,7 @@ def search_field(
         Models and matched filter.
     windows : Windows
         Sums before and after.
-    events : sequence of Event
+    events : sequence of Fitted
         Particles that are known.
     excess_noise : str
         As for `fit_field`.
@@ -255,7 +216,7 @@ def search_field(
     return fresh, doubtful
 
 
-def _misfit(candidate: Candidate, event: Event, scene: Scene, near_px: float) -> float:
+def _misfit(candidate: Candidate, event: Fitted, scene: Scene, near_px: float) -> float:
     """Signal-to-noise ratio that a candidate must exceed not to be what a fit left over."""
     here = event.candidate
     distance = math.hypot(candidate.x_px - here.x_px, candidate.y_px - here.y_px)
@@ -272,11 +233,11 @@ def _fit_all(
     scene: Scene,
     windows: Windows,
     candidates: Sequence[Candidate],
-    events: Sequence[Event],
+    events: Sequence[Fitted],
     pool: ThreadPoolExecutor,
     *,
     first: int = 0,
-) -> list[Event]:
+) -> list[Fitted]:
     """Fit candidates with the current `events` but itself in its background.
 
     Candidate i is event ``first + i``, where there is one of that number.
@@ -289,13 +250,13 @@ def _fit_all(
         shape = (windows.after_e.shape[0], windows.after_e.shape[1])
         taken = scene.lines.taken(total_signal(scene, shape, events))
 
-    def one(index: int) -> Event | None:
+    def one(index: int) -> Fitted | None:
         start = candidates[index]
         if "mass_kda" not in free:
             start = replace(start, mass_kda=nominal)
         if "z_nm" not in free:
             start = replace(start, z_nm=height)
-        region = _region(scene, windows, start)
+        region = region_around(scene.roi_px, windows.after_e.shape, start)
         others = np.zeros(region.shape)
         for number, event in enumerate(events):
             if number != first + index:
@@ -306,21 +267,12 @@ def _fit_all(
         if likelihood.n_pixels < 0.5 * others.size:
             return None
         fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=False)
-        return Event(region, fit, likelihood)
+        return Fitted(region, fit, likelihood)
 
     return [event for event in pool.map(one, range(len(candidates))) if event is not None]
 
 
-def _region(scene: Scene, windows: Windows, start: Candidate) -> Region:
-    side = scene.roi_px
-    spans = []
-    for centre, size in zip((start.y_px, start.x_px), windows.after_e.shape, strict=True):
-        first = round(centre - (side - 1) / 2)
-        spans.append((max(first, 0), min(first + side, size)))
-    return Region(spans[0], spans[1])
-
-
-def _refined(scene: Scene, windows: Windows, events: Sequence[Event]) -> Windows:
+def _refined(scene: Scene, windows: Windows, events: Sequence[Fitted]) -> Windows:
     if not scene.config.background.power_normalization:
         return windows
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
@@ -330,13 +282,13 @@ def _refined(scene: Scene, windows: Windows, events: Sequence[Event]) -> Windows
     return refine_power(windows, signal, additive=scene.additive)
 
 
-def _wanted(scene: Scene, event: Event) -> bool:
+def _wanted(scene: Scene, event: Fitted) -> bool:
     """Whether the fitted contrast has the polarity that is reported."""
     sign = scene.config.detection.sign
     return sign == 0 or scene.additive or sign * event.fit.contrast > 0
 
 
-def _is_settled(before: Sequence[Event], after: Sequence[Event], near_px: float) -> bool:
+def _is_settled(before: Sequence[Fitted], after: Sequence[Fitted], near_px: float) -> bool:
     """Whether another sweep would change little of fits that are near each other."""
     if len(before) != len(after) or not after:
         return not after
@@ -346,9 +298,9 @@ def _is_settled(before: Sequence[Event], after: Sequence[Event], near_px: float)
     return bool(np.all((np.abs(moved) < _SETTLED) | (apart.min(axis=0) > near_px)))
 
 
-def _without_doubles(events: Sequence[Event], scene: Scene) -> list[Event]:
+def _without_doubles(events: Sequence[Fitted], scene: Scene) -> list[Fitted]:
     """Keep the better of two fits that fell onto one particle."""
-    kept: list[Event] = []
+    kept: list[Fitted] = []
     for event in sorted(events, key=lambda e: -e.snr):
         here = event.candidate
         if all(
@@ -361,31 +313,30 @@ def _without_doubles(events: Sequence[Event], scene: Scene) -> list[Event]:
 
 
 def _judged(
-    scene: Scene, windows: Windows, events: Sequence[Event], lobes: Sequence[Event]
+    scene: Scene, windows: Windows, fitted: Sequence[Fitted], lobes: Sequence[Fitted]
 ) -> list[Event]:
     """Add the verdicts that need the neighbourhood: saturation, crowding, side lobes."""
     judged = []
     limit = scene.config.detection.min_separation_nm
-    for number, event in enumerate((*events, *lobes)):
-        x, y = event.fit.x_nm, event.fit.y_nm
+    for number, one in enumerate((*fitted, *lobes)):
+        x, y = one.fit.x_nm, one.fit.y_nm
         crowded = any(
-            other is not event and math.hypot(other.fit.x_nm - x, other.fit.y_nm - y) < limit
-            for other in events
+            other is not one and math.hypot(other.fit.x_nm - x, other.fit.y_nm - y) < limit
+            for other in fitted
         )
         near = (
             other.described
-            for other in events
+            for other in fitted
             if math.hypot(other.fit.x_nm - x, other.fit.y_nm - y)
             < LARGEST_IMAGE * scene.roi_px * scene.pixel_nm
         )
-        lobe = number >= len(events) or event.described.is_dwarfed(near)
-        fit = judge(
-            scene,
-            event.fit,
-            event.region,
-            windows.saturated[event.region.slices],
-            sidelobe=lobe,
-            too_close=crowded,
-        )
-        judged.append(replace(event, fit=fit))
+        lobe = number >= len(fitted) or one.described.is_dwarfed(near)
+        own = windows.cut(one.region.slices)
+        flags = remarks(scene, one, own, sidelobe=lobe, too_close=crowded)
+        judged.append(
+            Event(
+                one.region, one.fit, one.likelihood, own, flags,
+                windows.frames_after[0], windows.n_before, windows.n_after,
+            )
+        )  # fmt: skip
     return judged

@@ -20,12 +20,17 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.bounds import power_searched
+from iscat_analysis.config import Config
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Mover, Trajectory
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.chunks import FRAME_COLUMN
-from iscat_analysis.pipeline.scene import Scene
-from iscat_analysis.records import CountSource, FloatArray, Status
+from iscat_analysis.pipeline.landing import analyse_landings
+from iscat_analysis.pipeline.prepare import Prepared
+from iscat_analysis.pipeline.results import Found
+from iscat_analysis.pipeline.run import Run
+from iscat_analysis.pipeline.scene import Scene, reported_steps
+from iscat_analysis.places import Place
+from iscat_analysis.records import FRAME_COLUMN, CountSource, FloatArray, Progress, Status
 from iscat_analysis.search.templates import LARGEST_IMAGE
 
 STAY = 3
@@ -156,6 +161,111 @@ def _with_particle(
     steps = np.floor(change / gain + rng.random(size.shape))
     changed: NDArray[Any] = np.clip(counts + steps, limits.min, limits.max)
     return changed.astype(counts.dtype)
+
+
+def injected(ready: Prepared, run: Run, found: Found) -> tuple[dict[str, Any], bool]:
+    """Tell how many known particles are found, and how well they are measured.
+
+    Parameters
+    ----------
+    ready : Prepared
+        The movie.
+    run : Run
+        `Run.inject` says how many.
+    found : Found
+        What was found without them.
+
+    Returns
+    -------
+    summary : dict
+        What ``summary.json`` adds.
+    interrupted : bool
+        Whether the user stopped it; what the movie itself gave is kept.
+    """
+    if not run.inject or found.interrupted:
+        return {}, False
+    try:
+        recovered = inject_and_recover(
+            ready.movie, found.scene.config, ready.camera, found, run.inject,
+            progress=run.progress, place=run.place,
+        )  # fmt: skip
+    except KeyboardInterrupt:
+        return {}, True
+    finally:
+        run.clock.lap("injection")
+    return {"injection": recovered}, False
+
+
+def inject_and_recover(
+    movie: CountSource,
+    config: Config,
+    camera: Camera,
+    result: Found,
+    count: int,
+    *,
+    progress: Progress,
+    place: Place | None = None,
+) -> dict[str, Any]:
+    """Add known particles to a movie, analyse it again and compare.
+
+    Parameters
+    ----------
+    movie : CountSource
+        The movie.
+    config : Config
+        As it was analysed.
+    camera : Camera
+        Counts → photoelectrons.
+    result : Found
+        What was found without them: their masses are drawn from it.
+    count : int
+        Particles.
+    progress : Progress
+        Told how far it is.
+    place : Place, optional
+        As in `analyse_landings`.
+
+    Returns
+    -------
+    dict
+        From `recovery`.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        The user stopped it: half of a search says nothing of what is found.
+    """
+    frames = config.fit.frames or (0, movie.shape[0])
+    window = int(result.summary["window_frames"])
+    fixed = config.background.model_copy(update={"window_frames": window})
+    seed = config.compute.seed
+    particles = draw_particles(
+        result.scene, (movie.shape[1], movie.shape[2]), frames, window, count, result.table, seed
+    )
+    again = analyse_landings(
+        InjectedMovie(movie, camera, particles, seed, result.trajectory),
+        config.model_copy(update={"background": fixed}),
+        camera,
+        tell=_unheard,
+        progress=progress,
+        lines=result.scene.lines,
+        place=place,
+    )
+    if again.interrupted:
+        raise KeyboardInterrupt
+    return recovery(
+        particles,
+        again.table[again.table["status"] != Status.SIDELOBE],
+        frames[1],
+        result.scene.roi_px / 2,
+        window,
+        sign=reported_steps(result.scene),
+        threshold=result.scene.templates.threshold,
+    )
+
+
+def _unheard(text: str) -> None:
+    """Say nothing: the user has been told already."""
 
 
 def draw_particles(

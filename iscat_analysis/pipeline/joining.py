@@ -9,7 +9,7 @@ variance of the mass.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -29,7 +29,7 @@ from iscat_analysis.pipeline.linking import (
     with_mass,
 )
 from iscat_analysis.pipeline.moving_table import tracks_seen
-from iscat_analysis.pipeline.results import Found
+from iscat_analysis.pipeline.results import Followed
 from iscat_analysis.records import EventView, FloatArray, Status, Windows, verdict
 from iscat_analysis.search.moving import link
 
@@ -38,9 +38,26 @@ IntArray = NDArray[np.int64]
 _MASS = ["mass_kda", "sigma_mass_kda", "crb_mass_kda"]
 
 
-def join_blocks(
-    config: Config, blocks: Sequence[Block], camera: Camera, *, interrupted: bool
-) -> Found:
+@dataclass(frozen=True)
+class Joined:
+    """What was followed through the blocks of a movie.
+
+    Attributes
+    ----------
+    table : pandas.DataFrame
+        One row per particle and frame.
+    views : tuple of EventView
+        One per track, of its clearest frame.
+    followed : Followed
+        Backgrounds, and the masses of tracks.
+    """
+
+    table: pd.DataFrame
+    views: tuple[EventView, ...]
+    followed: Followed
+
+
+def join_blocks(config: Config, blocks: Sequence[Block], camera: Camera) -> Joined:
     """Make one result of the blocks of a movie.
 
     Parameters
@@ -51,13 +68,11 @@ def join_blocks(
         At least one; of successive spans.
     camera : Camera
         Its read noise.
-    interrupted : bool
-        Whether there should have been more.
 
     Returns
     -------
-    Found
-        One row per particle and frame; one view per track, of its clearest frame.
+    Joined
+        Tracks numbered in the order of their first frames.
     """
     numbers = join_tracks(config, blocks)
     table = pd.concat([b.table for b in blocks], ignore_index=True)
@@ -68,14 +83,9 @@ def join_blocks(
     if len(blocks) > 1:
         table = _flagged(table)
     parts = tuple(block.windows(camera) for block in blocks)
-    return Found(
-        table=table,
-        views=_views(table, blocks, numbers),
-        windows=_together(blocks, parts),
-        interrupted=interrupted,
-        masses=combine_masses([b.masses for b in blocks], numbers, table),
-        parts=parts if len(parts) > 1 else (),
-    )
+    masses = combine_masses([b.masses for b in blocks], numbers, table)
+    followed = Followed(_together(blocks, parts), parts if len(parts) > 1 else (), masses)
+    return Joined(table, _views(table, blocks, numbers), followed)
 
 
 def join_tracks(config: Config, blocks: Sequence[Block]) -> list[IntArray]:

@@ -9,127 +9,85 @@ configuration alone, so a finished one can be kept on disk and a resumed run giv
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
-from numpy.typing import NDArray
 
 from iscat_analysis.config import Config, with_absolute_paths
-from iscat_analysis.errors import DataError
+from iscat_analysis.errors import DataError, FloodError
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.movie.lines import Lines, SteadyFrames
-from iscat_analysis.pipeline.chunk_work import (
-    ChunkSetting,
-    analyse_chunk,
-    chunk_job,
-    make_landing_scene,
-)
-from iscat_analysis.pipeline.chunks import (
-    REPEATS_COLUMN,
-    Done,
-    Merged,
-    Reader,
-    counts_budget,
-    judge_noise,
-    plan_chunks,
-)
-from iscat_analysis.pipeline.diagnosis import DRIFT_PX
-from iscat_analysis.pipeline.injection import InjectedMovie, draw_particles, recovery
+from iscat_analysis.pipeline.chunk_work import ChunkSetting, analyse_chunk, chunk_job
+from iscat_analysis.pipeline.chunks import Reader, counts_budget, plan_chunks
+from iscat_analysis.pipeline.frames import frame_warnings
+from iscat_analysis.pipeline.merging import Done, Merged
+from iscat_analysis.pipeline.noise import judge_opening
+from iscat_analysis.pipeline.prepare import Prepared
+from iscat_analysis.pipeline.results import Compared, Found
 from iscat_analysis.pipeline.resume import Store
-from iscat_analysis.pipeline.scene import Scene, reported_steps
+from iscat_analysis.pipeline.run import Run
+from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.places import Here, Place
-from iscat_analysis.records import (
-    FREE_PARAMETERS,
-    CountSource,
-    EventView,
-    FloatArray,
-    Progress,
-    Status,
-    Windows,
-)
-from iscat_analysis.search.empty import EmptySpread
+from iscat_analysis.records import CountSource, Progress, Status
 from iscat_analysis.search.sliding import boundaries, stride_of
 from iscat_analysis.threads import one_thread_algebra, threads
 
 POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""
 
-JUMP = 0.1
-"""Relative change of the light from one frame to the next that is reported."""
-
 Tell = Callable[[str], None]
+
+
+def find_landings(ready: Prepared, run: Run) -> Found:
+    """Find what lands or leaves between windows that slide over a movie.
+
+    Parameters
+    ----------
+    ready : Prepared
+        The movie.
+    run : Run
+        Is told what the user should know.
+
+    Returns
+    -------
+    Found
+        As `analyse_landings` gives it.
+
+    Raises
+    ------
+    FloodError
+        Noise passes the threshold everywhere; where the movie seems to be of another kind, it says
+        that instead.
+    DataError
+        As for `analyse_landings`.
+    """
+    for remark in run.place.remarks(ready.config.compute.memory_limit_mb):
+        run.notify(remark)
+    try:
+        found = analyse_landings(
+            ready.movie,
+            ready.config,
+            ready.camera,
+            tell=run.tell,
+            progress=run.progress,
+            prepare=run.warm_up,
+            partial=run.partial,
+            identity=ready.movie.identity if run.partial else "",
+            lines=ready.lines,
+            place=run.place,
+        )
+    except FloodError as error:  # what seems to be noise is then particles
+        raise FloodError(ready.other_kind) if ready.other_kind else error from None
+    run.clock.lap("landing")
+    return found
 
 
 def _nothing(scene: Scene) -> None:
     """Do nothing."""
-
-
-@dataclass(frozen=True)
-class LandingResult:
-    """What was found in a landing movie.
-
-    Attributes
-    ----------
-    table : pandas.DataFrame
-        One row per step, in order of frame: columns `EVENT_COLUMNS` and `FRAME_COLUMN`.
-    views : tuple of EventView
-        Images of the first `VIEWS` events.
-    windows : Windows
-        Masks and the power of every frame; its sums are empty.
-    image : ndarray, shape (y, x)
-        Contrast of the strongest step that each pixel saw, by the matched filter.
-    scene : Scene
-        Models and threshold.
-    repeats : tuple of ndarray
-        What parts of the frames of each event say; from `iscat_analysis.inference.repeats`.
-    empty : EmptySpread or None
-        The noise of whole windows where nothing lands or leaves.
-    summary : dict
-        What ``summary.json`` adds under ``"landing"``.
-    trajectory : Trajectory or None
-        Of the fixed pattern, where its motion was divided out.
-    interrupted : bool
-        Whether the user stopped it; the chunks that were finished are kept.
-    """
-
-    table: pd.DataFrame
-    views: tuple[EventView, ...]
-    windows: Windows
-    image: FloatArray
-    scene: Scene
-    repeats: tuple[FloatArray, ...]
-    empty: EmptySpread | None
-    summary: dict[str, Any]
-    trajectory: Trajectory | None
-    interrupted: bool
-
-
-def has_landings(config: Config) -> bool:
-    """Whether a configuration describes a movie in which the windows slide.
-
-    Parameters
-    ----------
-    config : Config
-        Without background frames, interferometric, not to be tracked.
-
-    Returns
-    -------
-    bool
-        Whether `analyse_landings` is the way to analyse it.
-    """
-    return (
-        config.background.method == "sliding"
-        and config.optics.scheme != "darkfield"
-        and config.fit.mode != "track"
-        and config.fit.likelihood != "poisson"
-    )
 
 
 def analyse_landings(
@@ -144,7 +102,7 @@ def analyse_landings(
     identity: str = "",
     lines: Lines | None = None,
     place: Place | None = None,
-) -> LandingResult:
+) -> Found:
     """Find and fit every particle that lands or leaves.
 
     Parameters
@@ -152,7 +110,7 @@ def analyse_landings(
     movie : CountSource
         The movie.
     config : Config
-        Resolved; `has_landings` holds.
+        Resolved, with ``background.method = "sliding"``.
     camera : Camera
         Counts → photoelectrons.
     tell : callable
@@ -172,8 +130,9 @@ def analyse_landings(
 
     Returns
     -------
-    LandingResult
-        Everything found.
+    Found
+        One row per step, in order of frame; views of the first `VIEWS` events; the light of every
+        frame.  An interrupt keeps the chunks that are finished.
 
     Raises
     ------
@@ -191,20 +150,17 @@ def analyse_landings(
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     reader = Reader(frames, camera, first, last, counts_budget(config))
     with threads(config.compute.workers) as pool:
-        noise = judge_noise(reader, config, pool.map)
-    curve, window = noise.curve, noise.window
-    if noise.spectrum is not None and noise.spectrum.message:
-        tell(f"{movie.name}: {noise.spectrum.message}")
-    if noise.gain_message:
-        tell(noise.gain_message)
+        noise, curve, window = judge_opening(reader, config, pool.map)
+    for text in noise.said(movie.name):
+        tell(text)
     stride = stride_of(window)
     count = boundaries(last - first, window)
     posterior = config.samples_posterior
     sampling = config.posterior.model_copy(update={"enabled": posterior})
     config = config.model_copy(update={"posterior": sampling})
     with one_thread_algebra():
-        scene = make_landing_scene(
-            config, reader.shape, searches=count, noise=noise.spectrum, lines=lines
+        scene = make_scene(
+            config, reader.shape, searches=count, noise=noise.spectrum, lines=lines, sliding=True
         )
     prepare(scene)
     plan = plan_chunks(reader, config, window, stride)
@@ -240,10 +196,8 @@ def analyse_landings(
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
             interrupted = True
-    table, views = merged.result(scene)
-    shape = (-1, len(FREE_PARAMETERS[scene.mode]) + 1)
-    repeats = tuple(np.reshape(flat, shape) for flat in table.pop(REPEATS_COLUMN))
-    windows, light = merged.windows(reader.shape, (first, last))
+    table, views, repeats = merged.result(scene)
+    light = merged.light()
     wanted = config.background.drift_correction
     for text in frame_warnings(movie.name, merged, light, first, window, corrected=wanted):
         tell(text)
@@ -265,23 +219,28 @@ def analyse_landings(
         "shot_noise_limited_frames": curve.shot_limited,
         "noise_frames": list(curve.frames),
         "noise_variance_over_shot": list(curve.variance_over_shot),
-        "noise_spectrum": noise.spectrum.summary if noise.spectrum else None,
+        "noise_spectrum": noise.summary,
         "frames_left_out": merged.left_out(),
         "drift_px": merged.drift(),
         **_way(merged.trajectory()),
         "chunks": len(plan),
     }
-    strongest = scene.model.peak_contrast(scene.model.height_nm, scene.model.material.mass_kda)
-    amplitude = scene.model.scale.amplitude(scene.model.material.mass_kda)
-    return LandingResult(
+    return Found(
+        scene=scene,
         table=table,
         views=views,
-        windows=windows,
-        image=merged.image * strongest / amplitude,
-        scene=scene,
+        image=scene.contrasts(merged.image),
+        compared=Compared(
+            frames_before=(0, 0),
+            frames_after=(first, first + light.size),
+            power_ratio=1.0,
+            power=light / np.nanmean(light) if np.isfinite(light).any() else light,
+            masked_pixels=merged.masked_pixels,
+        ),
+        heading="landing",
+        summary=summary,
         repeats=repeats,
         empty=merged.empty,
-        summary=summary,
         trajectory=merged.trajectory(),
         interrupted=interrupted,
     )
@@ -315,74 +274,6 @@ def _finished(
         yield frames, done.stopped
 
 
-def inject_and_recover(
-    movie: CountSource,
-    config: Config,
-    camera: Camera,
-    result: LandingResult,
-    count: int,
-    *,
-    progress: Progress,
-    place: Place | None = None,
-) -> dict[str, Any]:
-    """Add known particles to a movie, analyse it again and compare.
-
-    Parameters
-    ----------
-    movie : CountSource
-        The movie.
-    config : Config
-        As it was analysed.
-    camera : Camera
-        Counts → photoelectrons.
-    result : LandingResult
-        What was found without them: their masses are drawn from it.
-    count : int
-        Particles.
-    progress : Progress
-        Told how far it is.
-    place : Place, optional
-        As in `analyse_landings`.
-
-    Returns
-    -------
-    dict
-        From `iscat_analysis.pipeline.injection.recovery`.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        The user stopped it: half of a search says nothing of what is found.
-    """
-    frames = config.fit.frames or (0, movie.shape[0])
-    window = int(result.summary["window_frames"])
-    fixed = config.background.model_copy(update={"window_frames": window})
-    seed = config.compute.seed
-    particles = draw_particles(
-        result.scene, (movie.shape[1], movie.shape[2]), frames, window, count, result.table, seed
-    )
-    again = analyse_landings(
-        InjectedMovie(movie, camera, particles, seed, result.trajectory),
-        config.model_copy(update={"background": fixed}),
-        camera,
-        tell=_unheard,
-        progress=progress,
-        lines=result.scene.lines,
-        place=place,
-    )
-    if again.interrupted:
-        raise KeyboardInterrupt
-    return recovery(
-        particles,
-        again.table[again.table["status"] != Status.SIDELOBE],
-        frames[1],
-        result.scene.roi_px / 2,
-        window,
-        sign=reported_steps(result.scene),
-        threshold=result.scene.templates.threshold,
-    )
-
-
 def _way(trajectory: Trajectory | None) -> dict[str, Any]:
     """Give what the summary says of a trajectory."""
     if trajectory is None:
@@ -397,99 +288,3 @@ def _way(trajectory: Trajectory | None) -> dict[str, Any]:
         "drift_y_px": trajectory.shift_px[:, 0].tolist(),
         "drift_error_px": trajectory.typical_error_px,
     }
-
-
-def _unheard(text: str) -> None:
-    """Say nothing: the user has been told already."""
-
-
-def frame_warnings(
-    name: str,
-    merged: Merged,
-    light: FloatArray,
-    first: int,
-    window: int,
-    *,
-    corrected: bool = False,
-) -> Iterator[str]:
-    """Say what is odd about the frames.
-
-    Parameters
-    ----------
-    name : str
-        What the lines call the movie.
-    merged : Merged
-        The chunks.
-    light : ndarray, shape (t,)
-        Light of every frame; NaN where it was left out.
-    first : int
-        Number of the first frame.
-    window : int
-        Frames before and after a step.
-    corrected : bool
-        Whether the motion of the fixed pattern was to be divided out.
-
-    Yields
-    ------
-    str
-        One line each.
-    """
-    missing = merged.repeats() + first
-    if missing.size:
-        verb = "is" if missing.size == 1 else "are"
-        yield (
-            f"{name}: {_frames(missing)} {verb} zero throughout, not finite or the same as the "
-            "frame before (dropped or stuck in the camera); left out, the other frames are used"
-        )
-    known = np.flatnonzero(np.isfinite(light))
-    change = light[known][1:] / light[known][:-1] - 1
-    if change.size:
-        usual = 1.4826 * float(np.median(np.abs(change)))
-        jumps = known[1:][np.abs(change) > max(JUMP, 8 * usual)] + first
-        if jumps.size:
-            largest = 100 * float(change[np.argmax(np.abs(change))])
-            yield (
-                f"{name}: the brightness jumps at {_frames(jumps)} by up to {largest:+.0f} %; "
-                "it is divided out, but look at the laser and at events in these frames"
-            )
-    defects, burnt = merged.masks()
-    if defects:
-        yield f"{defects} dead or hot pixels are left out"
-    if burnt:
-        yield (
-            f"{burnt} pixels are saturated in some frame and left out; "
-            "lower the exposure or the laser power"
-        )
-    yield from _drift_warnings(name, merged, light.size / window, corrected)
-
-
-def _drift_warnings(name: str, merged: Merged, windows: float, corrected: bool) -> Iterator[str]:
-    """Say how the fixed pattern moved, and what was done about it."""
-    drift, way = merged.drift(), merged.trajectory()
-    if way is not None and drift is not None:
-        yield (
-            f"{name}: the fixed pattern moved by {drift[1]:+.3f} pixels in x and "
-            f"{drift[0]:+.3f} in y; corrected, to ±{way.typical_error_px:.1g} pixels"
-        )
-    unfollowed = merged.unfollowed() if corrected else []
-    if unfollowed:
-        spans = ", ".join(f"{a}:{b}" for a, b in unfollowed[:4])
-        yield (
-            f"{name}: no fixed pattern stands out of the noise in frames {spans}"
-            f"{' and more' if len(unfollowed) > 4 else ''}, so background.drift_correction has "
-            "nothing to correct there"
-        )
-    if corrected or drift is None:
-        return
-    if math.hypot(*drift) > DRIFT_PX * max(windows / 2, 1.0):
-        yield (
-            f"{name}: the fixed pattern moved by {drift[1]:+.2f} pixels in x and "
-            f"{drift[0]:+.2f} in y; it is not corrected: set background.drift_correction = true "
-            "(shorter windows, background.window_frames, suffer less too)"
-        )
-
-
-def _frames(frames: NDArray[np.int64]) -> str:
-    shown = ", ".join(str(f) for f in frames[:4])
-    more = f" and {frames.size - 4} more" if frames.size > 4 else ""
-    return f"frame{'' if frames.size == 1 else 's'} {shown}{more}"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -28,9 +27,8 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.forward import ForwardModel, forward_model
-from iscat_analysis.pipeline.landing import has_landings
 from iscat_analysis.pipeline.microscope import calibrate_sights, goodness, microscopes
-from iscat_analysis.pipeline.sights import bound_sights, landing_sights, reach_nm
+from iscat_analysis.pipeline.sights import bright_sights, reach_nm
 from iscat_analysis.threads import threads
 
 REJECTED_P = 1e-3
@@ -84,8 +82,7 @@ def learn_optics(
     tested: dict[str, Any] = {}
     try:
         with threads(config.compute.workers) as pool:
-            find = landing_sights if has_landings(config) else _bound
-            sights, others = find(movie, config, camera, pool)
+            sights, others = bright_sights(movie, config, camera, pool)
             if len(sights) < LEAST_TESTED:
                 raise DataError(
                     f"{movie.name}: shows {len(sights)} bright particles that stand alone, and "
@@ -115,12 +112,6 @@ def learn_optics(
     for note in found.notes:
         tell(note)
     return learned, summary | {"calibrated": True}
-
-
-def _bound(
-    movie: Stack, config: Config, camera: Camera, _pool: ThreadPoolExecutor
-) -> tuple[list[Sight], list[Sight]]:
-    return bound_sights(movie, config, camera)
 
 
 def _median_p(sights: list[Sight], config: Config) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache, partial
+from functools import cache, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -18,21 +18,16 @@ from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.background import measure_windows, start_power
-from iscat_analysis.movie.camera import Camera, check_counts
+from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.lines import Lines, SteadyFrames, steady
-from iscat_analysis.pipeline.chunk_work import make_landing_scene
-from iscat_analysis.pipeline.chunks import Reader, counts_budget, judge_noise
-from iscat_analysis.pipeline.diagnosis import judge_background
+from iscat_analysis.pipeline.chunks import Reader, counts_budget
 from iscat_analysis.pipeline.field import search_field
 from iscat_analysis.pipeline.moving import LEAST_FRAMES, load_field, search_frames, track_scene
+from iscat_analysis.pipeline.noise import judge_background, judge_opening
 from iscat_analysis.pipeline.pattern import SPAN, MovingPattern, follow
-from iscat_analysis.pipeline.ranges import frame_ranges
-from iscat_analysis.pipeline.scene import (
-    Scene,
-    field_likelihood,
-    make_scene,
-    reported_steps,
-)
+from iscat_analysis.pipeline.ranges import checked, frame_ranges, measured_windows
+from iscat_analysis.pipeline.regions import contrast_image
+from iscat_analysis.pipeline.scene import Scene, make_scene, reported_steps
 from iscat_analysis.pipeline.sidelobes import Sieve
 from iscat_analysis.records import FloatArray, silent
 from iscat_analysis.search.sliding import (
@@ -144,14 +139,13 @@ class LandingSearch:
         self._config = config
         self._reader = Reader(frames, camera, first, last, counts_budget(config))
         with threads(config.compute.workers) as pool:
-            noise = judge_noise(self._reader, config, pool.map)
-        self.window = noise.window
+            noise, _, self.window = judge_opening(self._reader, config, pool.map)
 
         @lru_cache(_WINDOWS_KEPT)
         def scene(window: int) -> Scene:
-            return make_landing_scene(
+            return make_scene(
                 config, self._reader.shape, searches=boundaries(last - first, window),
-                noise=noise.spectrum, lines=lines,
+                noise=noise.spectrum, lines=lines, sliding=True,
             )  # fmt: skip
 
         self.scene = scene
@@ -196,14 +190,10 @@ class LandingSearch:
             matched, snr, effective = map_of()
             peaks = find_steps(chunk, matched, snr, effective, threshold)
             sieve = Sieve(chunk.first, stride, window, scene.roi_px)
-            sign, model = reported_steps(scene), scene.model
-            nominal = model.material.mass_kda
-            per_amplitude = model.peak_contrast(model.height_nm, nominal) / model.scale.amplitude(
-                nominal
-            )
+            sign, scale = reported_steps(scene), scene.model.scale
             return _listed(
-                (p.x_px, p.y_px, p.snr, p.amplitude * per_amplitude,
-                 math.copysign(float(model.scale.mass(np.asarray(abs(p.amplitude)))), p.amplitude))
+                (p.x_px, p.y_px, p.snr, float(scene.contrasts(np.asarray(p.amplitude))),
+                 math.copysign(float(scale.mass(np.asarray(abs(p.amplitude)))), p.amplitude))
                 for p in sieve.sift(peaks, (), snr)[0]
                 if sign * p.amplitude >= 0
             )  # fmt: skip
@@ -232,21 +222,20 @@ class BoundSearch:
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self._movie = steady(movie, lines, camera)
         self._camera, self._config = camera, config
-        self._check = partial(check_counts, name=movie.name, camera=camera)
+        self._check = checked(movie, camera)
         before, after = frame_ranges(movie, config)
         self.frames, self.longest = after, after[1] - after[0]
         tracked = config.fit.mode == "track"
         self.window = 1 if tracked else self.longest
         shape = (movie.shape[1], movie.shape[2])
-        background = config.background
-        self._windows = measure_windows(
-            self._movie, camera, before, (after[0], after[0] + 1),
-            median=background.method == "median", level_e=background.level_e,
-            power_normalization=background.power_normalization, check=self._check,
-        )  # fmt: skip
-        _, spectrum = judge_background(self._movie, camera, self._windows)
+        self._windows = measured_windows(
+            self._movie, config, camera, before, (after[0], after[0] + 1)
+        )
+        noise = judge_background(self._movie, camera, self._windows)
         searches = self.longest if tracked else 1
-        self._scene = make_scene(config, shape, searches=searches, noise=spectrum, lines=lines)
+        self._scene = make_scene(
+            config, shape, searches=searches, noise=noise.spectrum, lines=lines
+        )
 
     def scene(self, window: int) -> Scene:  # noqa: ARG002
         """Give models and threshold, which are those of every window."""
@@ -272,9 +261,7 @@ class BoundSearch:
         )
         if self._config.background.power_normalization:
             windows = start_power(windows)
-        image = field_likelihood(scene, windows).measured_signal()
-        if scene.additive:
-            image = windows.after_e - windows.power_ratio * windows.before_e
+        image = contrast_image(scene, windows)
         wanted = self._config.detection.sign
 
         def search(threshold: float) -> pd.DataFrame:
@@ -309,7 +296,7 @@ class MovingSearch:
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self._movie = steady(movie, lines, camera)
         self._camera, self._config = camera, config
-        self._check = partial(check_counts, name=movie.name, camera=camera)
+        self._check = checked(movie, camera)
         self.frames = first, last = config.fit.frames or (0, movie.shape[0])
         self.longest = last - first
         self.window = min(AROUND, self.longest)

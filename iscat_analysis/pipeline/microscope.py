@@ -33,11 +33,10 @@ from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.kept import kept
-from iscat_analysis.pipeline.landing import has_landings
 from iscat_analysis.pipeline.sights import (
     RINGS_NM,
-    bound_sights,
-    landing_sights,
+    bright_sights,
+    kind_of,
     reach_nm,
     scan_sights,
 )
@@ -101,16 +100,13 @@ def calibrate_movie(
         if focus_step_nm is not None:
             others: list[Sight] = []
             sights = scan_sights(movie, config, camera)
-        elif has_landings(config):
-            sights, others = landing_sights(movie, config, camera, pool)
         else:
-            sights, others = bound_sights(movie, config, camera)
+            sights, others = bright_sights(movie, config, camera, pool)
         progress("particles", 1, 1)
         source = {
             "movie": movie.path.name,
             "sha256": movie.sha256(),
-            "kind": "scan of the focus" if focus_step_nm is not None
-            else "landing movie" if has_landings(config) else "frames before and after",
+            "kind": kind_of(config) if focus_step_nm is None else "scan of the focus",
             "version": version("iscat-analysis"),
         }  # fmt: skip
         return calibrate_sights(

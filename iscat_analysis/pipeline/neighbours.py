@@ -14,14 +14,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from iscat_analysis.movie.drift import derivatives
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.pattern import MovingPattern
-from iscat_analysis.pipeline.scene import Region, Scene
+from iscat_analysis.pipeline.regions import Region
+from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.search.sliding import Chunk, StepFrame
 from iscat_analysis.search.templates import LARGEST_IMAGE
@@ -49,8 +50,8 @@ class Step:
         Row and column of the first pixel of `image`.
     image : ndarray, shape (y, x)
         Its contrast around it.
-    slopes : ndarray, shape (5, y, x)
-        Derivatives of `image` by y, x, yy, yx and xx [1/pixel]; empty where nothing moves.
+    slopes : ndarray, shape (5, y, x), or None
+        Derivatives of `image` by y, x, yy, yx and xx [1/pixel]; None where nothing moves.
     theta : ndarray, shape (5,), or None
         Latest estimate.
     snr : float
@@ -64,7 +65,7 @@ class Step:
     start: Candidate
     corner: tuple[int, int]
     image: FloatArray
-    slopes: FloatArray = field(default_factory=lambda: np.empty((5, 0, 0)))
+    slopes: FloatArray | None = None
     theta: FloatArray | None = None
     snr: float = math.inf
     excess: float = 0.0
@@ -99,10 +100,37 @@ class Neighbours:
         )
         self._power = np.concatenate([[0.0], np.cumsum(chunk.power)])
 
-    def drawn(self, step: Step) -> Step:
-        """Draw the step's contrast anew."""
-        scene, start = self._scene, step.start
-        half = self._half(step)
+    def draw(
+        self,
+        sign: int,
+        at: StepFrame,
+        start: Candidate,
+        *,
+        theta: FloatArray | None = None,
+        snr: float = math.inf,
+        excess: float = 0.0,
+    ) -> Step:
+        """Make a step, with its contrast drawn where it is.
+
+        Parameters
+        ----------
+        sign : int
+            1 where it lands, −1 where it leaves.
+        at : StepFrame
+            When.
+        start : Candidate
+            Where, and its mass (positive).
+        theta : ndarray, shape (5,), optional
+            Latest estimate.
+        snr, excess : float
+            Of that estimate; not known before the first.
+
+        Returns
+        -------
+        Step
+            As its neighbours see it.
+        """
+        scene, half = self._scene, self._half(start)
         sides = []
         for centre, size in zip((start.y_px, start.x_px), self._chunk.shape, strict=True):
             middle = round(centre)
@@ -112,12 +140,13 @@ class Neighbours:
         image = scene.wide.image(
             grid, start.x_px * pixel, start.y_px * pixel, start.z_nm, start.mass_kda
         )
-        slopes = step.slopes if self._pattern is None else derivatives(image)
-        return replace(step, corner=(sides[0][0], sides[1][0]), image=image, slopes=slopes)
+        corner = sides[0][0], sides[1][0]
+        slopes = None if self._pattern is None else derivatives(image)
+        return Step(sign, at, start, corner, image, slopes, theta, snr, excess)
 
-    def _half(self, step: Step) -> int:
+    def _half(self, start: Candidate) -> int:
         """From the centre to the edge of a step's image [pixels]; strong rings reach far."""
-        return round(self._roi_px * min(max(step.start.snr / _FAINT_SNR, 1.0), LARGEST_IMAGE))
+        return round(self._roi_px * min(max(start.snr / _FAINT_SNR, 1.0), LARGEST_IMAGE))
 
     def overlaps(self, step: Step, start: int, stop: int) -> bool:
         """Whether a step lies inside frames relative to the chunk."""
@@ -186,7 +215,7 @@ class Neighbours:
     ) -> FloatArray:
         """Mean of a moving particle's contrast over frames, or its contrast at the mean place."""
         image = step.image[inside]
-        if self._pattern is None:
+        if self._pattern is None or step.slopes is None:
             return image
         (y, x), (yy, yx, xx) = self._pattern.moments(frames, step.at.frame)
         if not smeared:
@@ -204,7 +233,7 @@ class Neighbours:
                 *((s.start.x_px, s.start.y_px, s.at.frame) for s in steps), strict=True
             )
         )
-        reach = np.array([self._half(s) for s in steps]) + self._roi_px / 2 + 2
+        reach = np.array([self._half(s.start) for s in steps]) + self._roi_px / 2 + 2
         seen, bound = [], []
         for i in range(len(steps)):
             dt = np.abs(frame - frame[i])
@@ -239,30 +268,6 @@ class Neighbours:
             for y, x in ((region.rows[0], region.columns[0]), (rows[0], columns[0]))
         )
         return here, inside
-
-
-def region_around(side: int, shape: tuple[int, int], start: Candidate) -> Region:
-    """Place the square that is fitted.
-
-    Parameters
-    ----------
-    side : int
-        Its side [pixels].
-    shape : (int, int)
-        Rows and columns of the field.
-    start : Candidate
-        Its centre.
-
-    Returns
-    -------
-    Region
-        Cut at the edges of the field.
-    """
-    sides = []
-    for centre, size in zip((start.y_px, start.x_px), shape, strict=True):
-        first = round(centre - (side - 1) / 2)
-        sides.append((max(first, 0), min(first + side, size)))
-    return Region(sides[0], sides[1])
 
 
 def spans(

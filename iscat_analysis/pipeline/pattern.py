@@ -24,7 +24,7 @@ from iscat_analysis.movie.drift import (
     follow_pattern,
     trusted,
 )
-from iscat_analysis.pipeline.scene import Region
+from iscat_analysis.pipeline.regions import Region
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.search.sliding import STRIDES, Chunk
 

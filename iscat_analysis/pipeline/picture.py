@@ -23,9 +23,9 @@ from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.forward import ForwardModel, forward_model, with_template
 from iscat_analysis.optics.measured import Template, lattice_step_nm
-from iscat_analysis.pipeline.landing import has_landings
 from iscat_analysis.pipeline.microscope import goodness, refuse_uncalibratable
-from iscat_analysis.pipeline.sights import bound_sights, landing_sights, reach_nm
+from iscat_analysis.pipeline.sights import bright_sights, kind_of, reach_nm
+from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import Mapper, Progress, silent
 from iscat_analysis.threads import threads
 
@@ -193,18 +193,12 @@ def measure_template(
     roi_nm = config.fit.roi_px(pixel) * pixel
     physics = config.optics.model_copy(update={"psf": "model", "template": None})
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
-    landing = has_landings(config)
     with threads(config.compute.workers) as pool:
         for number, margin in enumerate(MARGINS_PX):
             progress("particles", number, len(MARGINS_PX))
             larger = config.fit.model_copy(update={"roi_nm": roi_nm + 2 * margin * pixel})
             cut = config.model_copy(update={"fit": larger, "optics": physics, "calibration": None})
-            found = (
-                landing_sights(movie, cut, camera, pool)
-                if landing
-                else bound_sights(movie, cut, camera)
-            )
-            alone = _alone(*found)
+            alone = _alone(*bright_sights(movie, cut, camera, pool))
             if len(alone) >= _PLENTY:
                 break
         progress("particles", len(MARGINS_PX), len(MARGINS_PX))
@@ -218,11 +212,15 @@ def measure_template(
         source = {
             "movie": movie.path.name,
             "sha256": movie.sha256(),
-            "kind": "landing movie" if landing else "frames before and after",
+            "kind": kind_of(config),
             "version": version("iscat-analysis"),
         }
         step = lattice_step_nm(config.optics.wavelength_nm, config.optics.n_glass)
-        settings = {"roi_nm": max(roi_nm, config.fit.roi_nm), "step_nm": step, "level": landing}
+        settings = {
+            "roi_nm": max(roi_nm, config.fit.roi_nm),
+            "step_nm": step,
+            "level": way_of(config) == "sliding",
+        }
         return _judged(place_sights(alone, nominal), nominal, config, settings, source, pool.map)
 
 

@@ -7,7 +7,7 @@ fitted.  The optics are the configured ones: learning them takes the whole movie
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
@@ -16,7 +16,6 @@ from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_ratio
 from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pipeline.diagnosis import judge_lines
-from iscat_analysis.pipeline.landing import has_landings
 from iscat_analysis.pipeline.looks import (
     BoundSearch,
     LandingSearch,
@@ -25,7 +24,13 @@ from iscat_analysis.pipeline.looks import (
     Search,
     positive,
 )
-from iscat_analysis.pipeline.tracking import learns_background
+from iscat_analysis.pipeline.ways import Way, way_of
+
+_SEARCHES: Mapping[Way, Callable[[Stack, Config, Camera, Lines | None], Search]] = {
+    "fixed": BoundSearch,
+    "sliding": LandingSearch,
+    "tracks": MovingSearch,
+}
 
 
 class Preview:
@@ -72,17 +77,12 @@ class Preview:
         camera = camera_from_config(config.camera, shape, movie.dtype)
         refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
         lines = judge_lines(movie, config, camera)
-        kind: Callable[[Stack, Config, Camera, Lines | None], Search] = BoundSearch
-        if has_landings(config):
-            kind = LandingSearch
-        elif learns_background(config):
-            kind = MovingSearch
         if config.fit.frames and config.fit.frames[1] > movie.shape[0]:
             raise DataError(
                 f"{movie.name}: has {movie.shape[0]} frames, but fit.frames asks for "
                 f"{config.fit.frames[0]}:{config.fit.frames[1]}; change fit.frames"
             )
-        self._search = kind(movie, config, camera, lines)
+        self._search = _SEARCHES[way_of(config)](movie, config, camera, lines)
         self._lock = threading.Lock()  # a viewer may ask from several threads
 
     @property

@@ -1,10 +1,15 @@
-"""Which frames are background and which are fitted."""
+"""Which frames are background and which are fitted, and their sums."""
 
 from __future__ import annotations
+
+from functools import partial
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import Stack
+from iscat_analysis.movie.background import Check, measure_windows
+from iscat_analysis.movie.camera import Camera, check_counts
+from iscat_analysis.records import FrameSource, Progress, Windows, silent
 
 
 def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, tuple[int, int]]:
@@ -86,3 +91,66 @@ def tracked_frames(movie: Stack, config: Config) -> int:
     """
     first, last = fitted_frames(movie, config, config.background.frames)
     return max(min(last, movie.shape[0]) - first, 0)
+
+
+def checked(movie: FrameSource, camera: Camera) -> Check:
+    """Give what refuses the impossible counts of a movie.
+
+    Parameters
+    ----------
+    movie : FrameSource
+        Named in messages.
+    camera : Camera
+        Counts → photoelectrons.
+
+    Returns
+    -------
+    callable
+        Given counts and the number of their first frame.
+    """
+    return partial(check_counts, name=movie.name, camera=camera)
+
+
+def measured_windows(
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    before: tuple[int, int] | None,
+    after: tuple[int, int],
+    *,
+    progress: Progress = silent,
+) -> Windows:
+    """Sum the background and the frames after it, as configured.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        Its ``[background]``.
+    camera : Camera
+        Counts → photoelectrons.
+    before : (int, int) or None
+        Frames of the background; None where it is known.
+    after : (int, int)
+        Frames that stand against it.
+    progress : Progress
+        Told the frames.
+
+    Returns
+    -------
+    Windows
+        Of the whole field.
+
+    Raises
+    ------
+    DataError
+        A frame is impossible.
+    """
+    background = config.background
+    return measure_windows(
+        movie, camera, before, after,
+        median=background.method == "median", level_e=background.level_e,
+        power_normalization=background.power_normalization,
+        check=checked(movie, camera), progress=progress,
+    )  # fmt: skip

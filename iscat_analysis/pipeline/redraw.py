@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -22,22 +22,28 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.movie import Stack
-from iscat_analysis.movie.background import measure_windows, refine_power
-from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts
+from iscat_analysis.movie.background import refine_power
+from iscat_analysis.movie.camera import Camera, camera_from_config
 from iscat_analysis.movie.lines import Lines, SteadyFrames, steady
 from iscat_analysis.pipeline.block_store import row_view
-from iscat_analysis.pipeline.chunk_work import make_landing_scene
 from iscat_analysis.pipeline.chunks import HALO, Reader, counts_budget
 from iscat_analysis.pipeline.diagnosis import judge_lines
-from iscat_analysis.pipeline.field import Event, Place, add_signal
+from iscat_analysis.pipeline.events import Fitted, Place
+from iscat_analysis.pipeline.field import add_signal
 from iscat_analysis.pipeline.moving import blurred_rows, exposure_of, load_field, track_scene
-from iscat_analysis.pipeline.neighbours import Neighbours, Step, region_around
+from iscat_analysis.pipeline.neighbours import Neighbours, Step
 from iscat_analysis.pipeline.pattern import MovingPattern, follow
-from iscat_analysis.pipeline.ranges import frame_ranges
-from iscat_analysis.pipeline.results import Row, view_of
-from iscat_analysis.pipeline.scene import Region, make_scene, photons_scale, region_likelihood
+from iscat_analysis.pipeline.ranges import checked, frame_ranges, measured_windows
+from iscat_analysis.pipeline.regions import (
+    Region,
+    photons_scale,
+    region_around,
+    region_likelihood,
+)
+from iscat_analysis.pipeline.results import view_of
+from iscat_analysis.pipeline.scene import make_scene
 from iscat_analysis.pipeline.tasks import TaskBuilder
-from iscat_analysis.pipeline.tracking import learns_background
+from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import Candidate, EventView, FloatArray, Windows, silent
 from iscat_analysis.search.sliding import StepFrame, stride_of
 from iscat_analysis.threads import threads
@@ -77,11 +83,12 @@ def redraw(
     """
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     lines = judge_lines(movie, config, camera)
-    if "landing" in summary:
+    way = way_of(config)
+    if way == "sliding":
         window = int(summary["landing"]["window_frames"])
         return _landings(movie, config, camera, lines, table, window)
     seen = steady(movie, lines, camera)
-    if learns_background(config):
+    if way == "tracks":
         blocks = int(summary["blocks"]["number"])
         return _moving(seen, config, camera, table, tracks, blocks)
     return _bound(seen, config, camera, lines, table)
@@ -99,7 +106,7 @@ def _landings(
     first, last = config.fit.frames or (0, movie.shape[0])
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     reader = Reader(frames, camera, first, last, counts_budget(config))
-    scene = make_landing_scene(config, reader.shape, searches=1, lines=lines)
+    scene = make_scene(config, reader.shape, lines=lines, sliding=True)
     stride = stride_of(window)
 
     def draw(row: int) -> EventView:
@@ -114,7 +121,7 @@ def _landings(
         near = (table["frame"] - frame).abs() < 3 * window
         known = near & table["mass_kda"].notna() & (table["status"] != "sidelobe")
         numbers = [row, *(int(i) for i in np.flatnonzero(known) if i != row)]
-        steps = [neighbours.drawn(_step(table.iloc[i])) for i in numbers]
+        steps = [_step(neighbours, table.iloc[i]) for i in numbers]
         task = TaskBuilder(scene, chunk, window, neighbours, pattern).build(
             0, steps, neighbours.of(steps)[0]
         )
@@ -126,12 +133,12 @@ def _landings(
         )
         fit = fit_particle(task.likelihood, start, scene.mode, config.fit.z_range_nm, level=True)
         number = int(table["event"].iloc[row])
-        return view_of(Row(number, Event(task.region, fit, task.likelihood), task.windows))
+        return view_of(number, Fitted(task.region, fit, task.likelihood))
 
     return draw
 
 
-def _step(row: pd.Series[Any]) -> Step:
+def _step(neighbours: Neighbours, row: pd.Series[Any]) -> Step:
     """Make a step of a row of the table."""
     frames = row["n_before"] * row["n_after"] / (row["n_before"] + row["n_after"])
     at = StepFrame(
@@ -142,7 +149,7 @@ def _step(row: pd.Series[Any]) -> Step:
     start = Candidate(
         float(row["x_px"]), float(row["y_px"]), float(row["z_nm"]), abs(mass), float(row["snr"])
     )
-    return Step(-1 if mass < 0 else 1, at, start, (0, 0), np.empty((0, 0)))
+    return neighbours.draw(-1 if mass < 0 else 1, at, start)
 
 
 def _bound(
@@ -153,9 +160,7 @@ def _bound(
     tracked = config.fit.mode == "track"
     shape = (movie.shape[1], movie.shape[2])
     scene = make_scene(config, shape, lines=lines)
-    background, whole = config.background, Region((0, shape[0]), (0, shape[1]))
-
-    check = partial(check_counts, name=movie.name, camera=camera)
+    whole = Region((0, shape[0]), (0, shape[1]))
 
     def drawn(region: Region, rows: Sequence[int]) -> FloatArray:
         """Draw the signal of some rows in a region."""
@@ -167,14 +172,10 @@ def _bound(
     @lru_cache(1)
     def seen(span: tuple[int, int]) -> tuple[Windows, list[int]]:
         """Give the sums, with the light that the particles leave, and the rows in them."""
-        windows = measure_windows(
-            movie, camera, before, span,
-            median=background.method == "median", level_e=background.level_e,
-            power_normalization=background.power_normalization, check=check,
-        )  # fmt: skip
+        windows = measured_windows(movie, config, camera, before, span)
         rows = table.index[table["mass_kda"].notna() & (table["status"] != "sidelobe")]
         here = [int(i) for i in rows if not tracked or int(table["frame"].iloc[i]) == span[0]]
-        if background.power_normalization:
+        if config.background.power_normalization:
             signal = scene.left(drawn(whole, here))
             if scene.additive:
                 signal = signal * photons_scale(scene, windows)
@@ -194,7 +195,7 @@ def _bound(
         likelihood = region_likelihood(scene, windows, region, others)
         fit = fit_particle(likelihood, start, scene.mode, config.fit.z_range_nm, level=False)
         number = int(table["event"].iloc[row])
-        return view_of(Row(number, Event(region, fit, likelihood), windows))
+        return view_of(number, Fitted(region, fit, likelihood))
 
     return draw
 
@@ -223,7 +224,7 @@ def _moving(
         pairs = zip(tracks["track"], np.nan_to_num(tracks["d_um2_s"].to_numpy(float)), strict=True)
         diffusion = {int(track): float(d) for track, d in pairs}
 
-    check = partial(check_counts, name=movie.name, camera=camera)
+    check = checked(movie, camera)
 
     @lru_cache(1)
     def block(start: int, stop: int) -> tuple[MovingField, Ground, Rows, NDArray[np.int64]]:

@@ -22,11 +22,13 @@ from iscat_analysis.inference.repeats import (
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.blank import background_field, empty_field, taken_by, taken_places
-from iscat_analysis.pipeline.field import Event, total_signal
+from iscat_analysis.pipeline.events import Event
+from iscat_analysis.pipeline.field import total_signal
 from iscat_analysis.pipeline.neighbours import Neighbours, Step
 from iscat_analysis.pipeline.pattern import LocalPattern, MovingPattern
-from iscat_analysis.pipeline.scene import Region, Scene, photons_scale
-from iscat_analysis.records import FREE_PARAMETERS, FitResult, FloatArray, Windows
+from iscat_analysis.pipeline.regions import Region, photons_scale
+from iscat_analysis.pipeline.scene import Scene
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Windows
 from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.sliding import Chunk
 
@@ -63,8 +65,6 @@ def nothing_repeated(mode: str) -> FloatArray:
 def step_repeats(
     chunk: Chunk,
     event: Event,
-    region: Region,
-    windows: Windows,
     step: Step,
     others: Sequence[Step],
     neighbours: Neighbours,
@@ -77,11 +77,7 @@ def step_repeats(
     chunk : Chunk
         The frames.
     event : Event
-        The fit.
-    region : Region
-        Its pixels, in the full frame.
-    windows : Windows
-        Its sums, those with the particle as "after".
+        The particle.
     step : Step
         When and where.
     others : sequence of Step
@@ -96,10 +92,10 @@ def step_repeats(
     ndarray
         From `repeats_of`.
     """
-    fit = event.fit
-    response = _response(event, windows)
+    region, windows = event.region, event.windows
+    response = _response(event)
     if response is None:
-        return nothing_repeated("mass")[:, : len(fit.free) + 1]
+        return nothing_repeated("mass")[:, : len(event.fit.free) + 1]
     local = pattern.local(region, step.at.frame) if pattern else None
     series = []
     for span, weights in (
@@ -162,7 +158,7 @@ def step_controls(
     scene: Scene,
     chunk: Chunk,
     window: int,
-    fits: Sequence[tuple[Step, FitResult]],
+    events: Sequence[Event],
     steps: Sequence[Step],
     neighbours: Neighbours,
 ) -> EmptySpread | None:
@@ -176,8 +172,8 @@ def step_controls(
         The frames.
     window : int
         Frames before and after a step.
-    fits : sequence of (Step, FitResult)
-        Events at whose times, heights and masses the noise is looked at.
+    events : sequence of Event
+        At whose times, heights and masses the noise is looked at.
     steps : sequence of Step
         All that are known.
     neighbours : Neighbours
@@ -188,13 +184,13 @@ def step_controls(
     EmptySpread or None
         None without events whose windows lie in the chunk.
     """
-    times = sorted({s.at.frame for s, _ in fits})
+    times = sorted({event.frame for event in events})
     times = [t for t in times if chunk.first <= t - window and t + window <= chunk.stop]
     if not times:
         return None
     field = empty_field(
         scene, chunk.mean_e, chunk.camera.read_variance_e2(chunk.shape), chunk.usable,
-        [fit for _, fit in fits], level=True,
+        [event.fit for event in events], level=True,
     )  # fmt: skip
     most = int(np.clip(PLACES // max(field.places, 1), FEWEST_WINDOWS, MOST_WINDOWS))
     apart: list[int] = []
@@ -293,7 +289,7 @@ def field_repeats(
     read = camera.read_variance_e2(shape)
     owns: list[_Own | None] = []
     for event in events:
-        response = _response(event, windows)
+        response = _response(event)
         owns.append(None if response is None else _Own(event, response, ([], [])))
     spans = (windows.frames_before, windows.frames_after)
     n_before = windows.n_before
@@ -392,9 +388,8 @@ def _pieces(shape: tuple[int, int], start: int, stop: int) -> Iterator[tuple[int
 # ---- both ------------------------------------------------------------------------------------
 
 
-def _response(event: Event, windows: Windows) -> Response | None:
-    fit = event.fit
-    before = windows.before_e
-    if before.shape != event.likelihood.grid.shape:
-        before = before[event.region.slices]
-    return response_of(event.likelihood, fit.theta, fit.box.free, before, windows.power_ratio)
+def _response(event: Event) -> Response | None:
+    fit, windows = event.fit, event.windows
+    return response_of(
+        event.likelihood, fit.theta, fit.box.free, windows.before_e, windows.power_ratio
+    )

@@ -1,113 +1,202 @@
-"""From fitted events to the table, the views and the summary."""
+"""What is found in a movie: from judged events to the table and the views."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.bounds import holevo_over_quantum
-from iscat_analysis.inference.achieved import Achieved
+from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pieces.regions import row_of, table_from
-from iscat_analysis.pipeline.field import Event
-from iscat_analysis.pipeline.scene import Scene, photons_scale
+from iscat_analysis.pipeline.events import Event, Fitted
+from iscat_analysis.pipeline.regions import photons_scale
+from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import (
-    FREE_PARAMETERS,
+    FRAME_COLUMN,
+    Clip,
     EventView,
     FloatArray,
     PosteriorResult,
-    Status,
+    Trace,
     Windows,
-    free_parameters,
 )
-from iscat_analysis.report.spread import rejection
 from iscat_analysis.search.empty import EmptySpread
-from iscat_analysis.species import describe
-from iscat_analysis.species.tables import filter_efficiency, shared_error
-
-_HEIGHTS = 65
-"""Heights at which the Holevo bound is computed for a table; linear in between."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """One line of the table and what its view shows."""
+class Compared:
+    """Which frames of a movie stand against which.
 
-    number: int
-    event: Event
+    Attributes
+    ----------
+    frames_before, frames_after : (int, int)
+        Half-open ranges; nothing before where the background is known or the windows slide.
+    power_ratio : float
+        Light after over light before; 1 where each frame is weighed by its own.
+    power : ndarray, shape (t,)
+        Relative light of every frame of both ranges, before first; NaN where one was left out.
+    masked_pixels : int
+        Pixels that are not used.
+    """
+
+    frames_before: tuple[int, int]
+    frames_after: tuple[int, int]
+    power_ratio: float
+    power: FloatArray
+    masked_pixels: int
+
+    @classmethod
+    def of(cls, windows: Windows) -> Compared:
+        """Describe the sums of two ranges of frames.
+
+        Parameters
+        ----------
+        windows : Windows
+            The sums.
+
+        Returns
+        -------
+        Compared
+            Without their images.
+        """
+        return cls(
+            windows.frames_before, windows.frames_after, windows.power_ratio, windows.power,
+            int(windows.masked.sum()),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What the tracks of a movie are described with, beside their rows.
+
+    Attributes
+    ----------
+    windows : Windows
+        The background, and all frames in which particles were followed.
+    parts : tuple of Windows
+        The backgrounds of blocks of frames, where there are several.
+    masses : pandas.DataFrame or None
+        Over a background that was learnt with the tracks: ``mass_kda``, ``sigma_mass_kda`` and
+        ``crb_mass_kda`` by the exact likelihood of all frames, indexed by track.
+    """
+
     windows: Windows
-    posterior: PosteriorResult | None = None
+    parts: tuple[Windows, ...] = ()
+    masses: pd.DataFrame | None = None
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a strategy found in a movie.
+    """What was found in a movie, whichever frames stand against which.
 
     Attributes
     ----------
+    scene : Scene
+        Models, threshold and the configuration as it was used.
     table : pandas.DataFrame
-        Columns `EVENT_COLUMNS`.
+        Columns `EVENT_COLUMNS`; of a landing movie also `FRAME_COLUMN`.
     views : tuple of EventView
-        Images, in the order of the table, or one per track.
-    windows : Windows
-        The sums, with the final laser power.
-    interrupted : bool
-        Whether the user stopped it; what was finished is kept.
+        Images, in the order of the table, or one per track; of the first events only, where there
+        are many.
+    image : ndarray, shape (y, x)
+        Contrast of the field; of a landing movie that of the strongest step at each pixel.
+    compared : Compared
+        Frames and their light.
+    heading : str
+        Under which ``summary.json`` has `summary`.
+    summary : mapping
+        What was learnt of the background; empty where there is nothing to say.
     repeats : tuple of ndarray
         What parts of the frames of each row say, from `iscat_analysis.inference.repeats`; of
         single frames, what they say where there is no particle.
     empty : EmptySpread or None
         The noise of whole windows, or of single frames, where there is no particle.
-    masses : pandas.DataFrame or None
-        Of tracks over a background that was learnt with them: ``mass_kda``, ``sigma_mass_kda`` and
-        ``crb_mass_kda`` by the exact likelihood of all frames, indexed by track.
-    parts : tuple of Windows
-        The backgrounds of blocks of frames, where there are several.
+    followed : Followed or None
+        Mode ``track``.
+    trajectory : Trajectory or None
+        Of the fixed pattern, where its motion was divided out.
+    interrupted : bool
+        Whether the user stopped it; what was finished is kept.
     """
 
+    scene: Scene
     table: pd.DataFrame
     views: tuple[EventView, ...]
-    windows: Windows
-    interrupted: bool = False
+    image: FloatArray
+    compared: Compared
+    heading: str
+    summary: Mapping[str, Any]
     repeats: tuple[FloatArray, ...] = ()
     empty: EmptySpread | None = None
-    masses: pd.DataFrame | None = None
-    parts: tuple[Windows, ...] = ()
+    followed: Followed | None = None
+    trajectory: Trajectory | None = None
+    interrupted: bool = False
 
 
-def collected_photons(scene: Scene, windows: Windows, event: Event) -> float:
+def collected_photons(scene: Scene, event: Event) -> float:
     """Scattered photons that the pupil collected from one particle in the frames after.
 
     Parameters
     ----------
     scene : Scene
         Models.
-    windows : Windows
-        Give the background light.
     event : Event
-        The particle.
+        The particle, and the sums that give the background light.
 
     Returns
     -------
     float
         Photoelectrons (the quantum efficiency counts as part of the collection).
     """
+    windows = event.windows
     area = scene.model.collected_area_nm2(event.fit.z_nm, event.fit.mass_kda)
     if scene.additive:
         per_pixel = photons_scale(scene, windows)
     else:
-        used = ~windows.masked[event.region.slices]
-        per_pixel = windows.power_ratio * float(windows.before_e[event.region.slices][used].mean())
+        per_pixel = windows.power_ratio * float(windows.before_e[~windows.masked].mean())
     return per_pixel * area / scene.pixel_nm**2
 
 
+def rows_of(
+    scene: Scene, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
+) -> list[dict[str, Any]]:
+    """Make the lines of ``fits.csv``.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models.
+    events : sequence of Event
+        The events.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    list of dict
+        With the keys `EVENT_COLUMNS`, numbered from 0; and `FRAME_COLUMN`, where steps were dated.
+    """
+    return list(mapper(lambda n, event: _row(scene, n, event), range(len(events)), events))
+
+
+def _row(scene: Scene, number: int, event: Event) -> dict[str, Any]:
+    row = row_of(
+        event.likelihood, event.fit, collected_photons(scene, event), flags=event.flags,
+        event=number, frame=event.frame, n_before=event.n_before, n_after=event.n_after,
+        sign=event.sign,
+    )  # fmt: skip
+    return row if event.half_width is None else row | {FRAME_COLUMN: event.half_width}
+
+
 def table_of(
-    scene: Scene, rows: Sequence[Row], *, mapper: Callable[..., Iterable[Any]] = map
+    scene: Scene,
+    events: Sequence[Event],
+    *,
+    dated: bool = False,
+    mapper: Callable[..., Iterable[Any]] = map,
 ) -> pd.DataFrame:
     """Make the table of ``fits.csv``.
 
@@ -115,203 +204,61 @@ def table_of(
     ----------
     scene : Scene
         Models.
-    rows : sequence of Row
+    events : sequence of Event
         The events.
+    dated : bool
+        Whether they are steps of a landing movie, whose frames have errors.
     mapper : callable
         `map`, or the one of a pool.
 
     Returns
     -------
     pandas.DataFrame
-        Columns `EVENT_COLUMNS`.
+        Columns `EVENT_COLUMNS`, and `FRAME_COLUMN` where `dated`.
     """
-    return table_from(list(mapper(lambda row: _record(scene, row), rows)))
+    rows = rows_of(scene, events, mapper=mapper)
+    table = table_from(rows)
+    if dated:
+        table[FRAME_COLUMN] = np.array([row[FRAME_COLUMN] for row in rows], dtype=np.int64)
+    return table
 
 
-def _record(scene: Scene, row: Row) -> dict[str, Any]:
-    event, windows = row.event, row.windows
-    return row_of(
-        event.likelihood, event.fit, collected_photons(scene, windows, event),
-        event=row.number, frame=windows.frames_after[0],
-        n_before=windows.n_before, n_after=windows.n_after,
-    )  # fmt: skip
-
-
-def view_of(row: Row) -> EventView:
+def view_of(
+    number: int,
+    fitted: Fitted,
+    *,
+    posterior: PosteriorResult | None = None,
+    trace: Trace | None = None,
+    clip: Clip | None = None,
+) -> EventView:
     """Images of one event for the report.
 
     Parameters
     ----------
-    row : Row
+    number : int
+        Of the event.
+    fitted : Fitted
         The event.
+    posterior : PosteriorResult, optional
+        Its chain, where sampled.
+    trace, clip : Trace, Clip, optional
+        Of landing movies.
 
     Returns
     -------
     EventView
         Measured signal, model and residuals.
     """
-    likelihood, theta = row.event.likelihood, row.event.fit.theta
+    likelihood, theta = fitted.likelihood, fitted.fit.theta
     unit = likelihood.data[2] if not likelihood.model.rho else 1.0
     return EventView(
-        event=row.number,
-        row_px=row.event.region.rows[0],
-        column_px=row.event.region.columns[0],
+        event=number,
+        row_px=fitted.region.rows[0],
+        column_px=fitted.region.columns[0],
         contrast=likelihood.measured_signal() * unit,
         model=likelihood.signal(theta) * unit,
         residual=likelihood.residuals(theta),
-        posterior=row.posterior,
+        posterior=posterior,
+        trace=trace,
+        clip=clip,
     )
-
-
-def summary_of(
-    scene: Scene,
-    table: pd.DataFrame,
-    windows: Windows,
-    timings: Mapping[str, float],
-    achieved: Mapping[str, Achieved] = MappingProxyType({}),
-) -> dict[str, Any]:
-    """Gather counts, medians and efficiency, for ``summary.json``.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models and configuration.
-    table : pandas.DataFrame
-        The events.
-    windows : Windows
-        Frame ranges and power.
-    timings : mapping of str to float
-        Seconds per stage.
-    achieved : mapping of str to Achieved
-        Measured spread of each free parameter over its bound, where it was measured.
-
-    Returns
-    -------
-    dict
-        Nested plain values.
-    """
-    good = table[table["status"] == Status.OK]
-    free = free_parameters(scene.mode, table)
-    conflict = {"z_nm", "mass_kda"} <= set(free) and len(good) > 0
-    cost = _holevo_over_quantum(scene, good["z_nm"].to_numpy(float)) if conflict else {}
-    distribution = _distribution(scene, good)
-    precision = {}
-    for name in free:
-        sigma, crb, qcrb = (good[f"{kind}_{name}"] for kind in ("sigma", "crb", "qcrb"))
-        reachable = qcrb * cost.get(name, 1.0)
-        precision[name] = {
-            "sigma_median": _median(sigma),
-            "crb_median": _median(crb),
-            **({"holevo_median": _median(reachable)} if conflict else {}),
-            "qcrb_median": _median(qcrb),
-            "sigma_over_crb_median": _median(sigma / crb),
-            "information_fraction_median": _median((reachable / crb) ** 2),
-        }
-        if name in achieved:
-            precision[name] |= _repeats(achieved[name])
-        if f"systematic_{name}" in good:
-            precision[name]["systematic_median"] = _median(good[f"systematic_{name}"])
-    return {
-        "mode": scene.mode,
-        "scheme": scene.model.optics.scheme,
-        "emission": scene.model.optics.emission,
-        "convention": scene.model.optics.convention,
-        "mass_scale": "calibration" if scene.config.calibration else "absolute model",
-        "events": int((table["status"] != Status.SIDELOBE).sum()),
-        "status": dict(sorted(Counter(table["status"]).items())),
-        "frames_before": list(windows.frames_before),
-        "frames_after": list(windows.frames_after),
-        "power_ratio": windows.power_ratio,
-        "power_spread": float(np.std(windows.power)) if windows.power.size else 0.0,
-        "masked_pixels": int(windows.masked.sum()),
-        "detection_threshold_snr": scene.templates.threshold,
-        "medians": {
-            "mass_kda": _median(good["mass_kda"]),
-            "contrast": _median(good["contrast"]),
-            "n_scattered": _median(good["n_scattered"]),
-        },
-        "precision": precision,
-        "distribution": distribution,
-        "across_particles": _across(scene, table, distribution),
-        "seconds": {name: round(value, 3) for name, value in timings.items()},
-    }
-
-
-def _repeats(found: Achieved) -> dict[str, Any]:
-    """Give what the summary says of a measured spread."""
-    return {
-        "repeat_over_crb": found.over_crb,
-        "repeat_over_crb_ci95": list(found.ci95),
-        "repeat_significance": found.significance,
-        "repeat_events": found.events,
-        "repeat_whole": found.whole,
-        "repeat_frames": list(found.frames),
-        "repeat_over_crb_by_frames": list(found.by_frames),
-        "repeat_over_crb_by_frames_se": list(found.by_frames_se),
-        "empty_over_crb": list(found.empty),
-    }
-
-
-def _holevo_over_quantum(scene: Scene, z_nm: FloatArray) -> dict[str, FloatArray]:
-    """Cost of fitting height and mass at once, of each particle, by parameter.
-
-    It depends on the height through the evanescent waves alone, and smoothly.
-    """
-    free = FREE_PARAMETERS[scene.mode]
-    heights = np.linspace(max(z_nm.min(), 0.0), max(z_nm.max(), 1.0), _HEIGHTS)
-    costs = [holevo_over_quantum(scene.model, float(z), free) for z in heights]
-    return {name: np.interp(z_nm, heights, [cost[name] for cost in costs]) for name in free}
-
-
-def _distribution(scene: Scene, good: pd.DataFrame) -> dict[str, Any] | None:
-    """Describe the species where masses were fitted, each event once.
-
-    The matched filter's standard deviation is what its snr makes of each mass.
-    """
-    if "mass_kda" not in FREE_PARAMETERS[scene.mode] or scene.mode == "track":
-        return None
-    mass, sigma = (good[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
-    found = describe(
-        mass,
-        sigma,
-        efficiency=filter_efficiency(good, scene.templates.threshold),
-        seed=scene.config.compute.seed,
-        scale_error=shared_error(good),
-        window_frames=int(good["n_after"].max()) if len(good) else None,
-    )
-    return found.to_dict()
-
-
-def _across(
-    scene: Scene, table: pd.DataFrame, distribution: Mapping[str, Any] | None
-) -> list[dict[str, Any]]:
-    """Say how much wider than σ each species is; of a rejected model, poor fits are judged too."""
-    if distribution is None:
-        return []
-    species, status = distribution["species"], table["status"]
-    used = table[status == Status.OK]
-    if rejection(table):
-        used = table[status.isin([Status.OK, Status.POOR_FIT])]
-        mass, sigma = (used[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
-        found = describe(mass, sigma, seed=scene.config.compute.seed)
-        species = found.to_dict()["species"]
-    if not species:
-        return []
-    means = np.array([one["mass_kda"] for one in species])
-    sizes = used["mass_kda"].abs().to_numpy(float)
-    nearest = np.argmin(np.abs(sizes[:, None] - means), axis=1)
-    across = []
-    for k, one in enumerate(species):
-        sigma_median = _median(used["sigma_mass_kda"].to_numpy(float)[nearest == k])
-        if one["outlier"] or not sigma_median:
-            continue
-        keys = ("mass_kda", "width_kda", "width_low", "width_high", "count")
-        over = np.hypot(1.0, one["width_kda"] / sigma_median)
-        across.append({**{key: one[key] for key in keys}, "spread_over_sigma": float(over)})
-    return across
-
-
-def _median(values: pd.Series[float] | FloatArray) -> float | None:
-    finite = np.asarray(values, dtype=float)
-    finite = finite[np.isfinite(finite)]
-    return float(np.median(finite)) if finite.size else None

@@ -17,7 +17,7 @@ import pandas as pd
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
-from iscat_analysis.pipeline.chunks import Done
+from iscat_analysis.pipeline.merging import Done
 from iscat_analysis.records import Clip, EventView, FloatArray, Trace
 from iscat_analysis.search.empty import EmptySpread
 
@@ -132,6 +132,7 @@ class Store(Shelf):
             return Done(
                 core=(low, high),
                 table=table,
+                repeats=data["repeats"],
                 views=unpacked_views(data),
                 good=data["good"],
                 light=data["light"],
@@ -150,6 +151,7 @@ class Store(Shelf):
         """Keep a finished chunk."""
         arrays = {
             "core": np.array(done.core),
+            "repeats": done.repeats,
             **packed_views(done.views),
             "good": done.good,
             "light": done.light,

@@ -1,62 +1,30 @@
-"""What a configuration makes of a movie: models, matched filter, likelihoods of its pixels."""
+"""What a configuration makes of a movie: models, matched filter, threshold."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-
-import numpy as np
+from dataclasses import dataclass
 
 from iscat_analysis.config import Config, Detection
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference.counts import KNOWN, MEAN, MEDIAN, counts_likelihood
+from iscat_analysis.inference.counts import KNOWN, MEAN, MEDIAN
 from iscat_analysis.inference.fit import window_nm
-from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.movie.background import smooth_background
 from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.spectrum import NoiseSpectrum
-from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.stamp import margin_nm
-from iscat_analysis.records import (
-    FREE_PARAMETERS,
-    BoolArray,
-    FitResult,
-    FloatArray,
-    Status,
-    Windows,
-    verdict,
-)
-from iscat_analysis.search.templates import Templates, make_templates
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray
+from iscat_analysis.search.sliding import CORRELATION
+from iscat_analysis.search.templates import LARGEST_IMAGE, Templates, make_templates
 
 SPREAD_NM = 10_000.0
 """Farther than this from a particle its rings are left out; they are 1e-4 of its peak."""
 
 
-SATURATION_NM = 500.0
-"""Saturated pixels nearer than this spoil a fit."""
-
 _VARIANCE_OF_BACKGROUND = {
     "fixed": MEAN, "sliding": MEAN, "tracks": MEAN, "median": MEDIAN, "known": KNOWN,
 }  # fmt: skip
 """Variance of a measured background over that of the mean of its frames."""
-
-
-@dataclass(frozen=True)
-class Region:
-    """Half-open ranges of full-frame pixels."""
-
-    rows: tuple[int, int]
-    columns: tuple[int, int]
-
-    @property
-    def slices(self) -> tuple[slice, slice]:
-        """Index of the region in a full frame."""
-        return slice(*self.rows), slice(*self.columns)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns it has."""
-        return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
 
 
 @dataclass(frozen=True)
@@ -111,10 +79,27 @@ class Scene:
         """
         return signal if self.lines is None else self.lines.left(signal)
 
+    def contrasts(self, amplitude: FloatArray) -> FloatArray:
+        """Give the peak contrast of particles at the nominal height.
+
+        Parameters
+        ----------
+        amplitude : ndarray
+            As the matched filter measures it.
+
+        Returns
+        -------
+        ndarray
+            In proportion to that of the nominal particle.
+        """
+        nominal = self.model.material.mass_kda
+        peak = self.model.peak_contrast(self.model.height_nm, nominal)
+        return amplitude * peak / self.model.scale.amplitude(nominal)
+
     @property
     def background_variance(self) -> float:
         """Variance of the background over that of the mean of its frames."""
-        return _VARIANCE_OF_BACKGROUND[self.config.background.method or "fixed"]
+        return _VARIANCE_OF_BACKGROUND[str(self.config.background.method)]
 
     @property
     def additive(self) -> bool:
@@ -129,6 +114,7 @@ def make_scene(
     searches: int = 1,
     noise: NoiseSpectrum | None = None,
     lines: Lines | None = None,
+    sliding: bool = False,
 ) -> Scene:
     """Build the models and the matched filter for a field.
 
@@ -139,37 +125,47 @@ def make_scene(
     field_px : (int, int)
         Rows and columns.
     searches : int
-        Images that will be searched; they share the expected false alarms.
+        Images, or boundaries between windows, that will be searched; they share the expected false
+        alarms.
     noise : NoiseSpectrum, optional
         Of the movie; without it the noise is white and of the expected size.
     lines : Lines, optional
         What was divided out of the frames.
+    sliding : bool
+        Whether windows slide over the movie: particles are then sought at their nominal height,
+        neighbouring boundaries have frames in common, and the rings reach as far as those of a
+        strong particle matter.
 
     Returns
     -------
     Scene
-        Ready for `fit_field`.
+        Ready for `fit_field`, or for chunks of a landing movie.
 
     Raises
     ------
     ConfigError
-        The region is too small or too large, or the likelihood does not suit the scheme.
+        The region is too small or too large, the likelihood does not suit the scheme, or the
+        calibration has the wrong sign.
     """
     pixel, roi_px = square_of(config, field_px)
     darkfield = config.optics.scheme == "darkfield"
-    if config.fit.likelihood == "conditional" and (darkfield or not _is_counted(config)):
+    if config.fit.likelihood == "conditional" and (darkfield or not is_counted(config)):
         raise ConfigError(
             'fit.likelihood = "conditional" needs an interferometric scheme and '
             'background.method = "fixed" or "sliding": use "auto"'
         )
     model = square_model(config, pixel, roi_px)
+    if sliding:
+        reach_nm = math.sqrt(2) * (LARGEST_IMAGE * roi_px + 2) * pixel
+    else:
+        field_nm = math.hypot(field_px[0] + 1, field_px[1] + 1) * pixel
+        reach_nm = min(field_nm, math.sqrt(2) * (SPREAD_NM + 2 * pixel))
     mode = config.fit.mode
-    free_z = "z_nm" in FREE_PARAMETERS[mode]
-    field_nm = math.hypot(field_px[0] + 1, field_px[1] + 1) * pixel
+    free_z = "z_nm" in FREE_PARAMETERS[mode] and not sliding
     return Scene(
         config=config,
         model=model,
-        wide=forward_model(config, min(field_nm, math.sqrt(2) * (SPREAD_NM + 2 * pixel))),
+        wide=forward_model(config, reach_nm),
         templates=make_templates(
             model,
             search_both(config.detection, searches=searches),
@@ -178,7 +174,8 @@ def make_scene(
             z_range_nm=config.fit.z_range_nm if free_z else None,
             field_px=field_px,
             noise=noise,
-            in_turn=True,
+            in_turn=not sliding,
+            correlation=CORRELATION if sliding and searches > 1 else 0.0,
         ),
         mode=mode,
         lines=lines,
@@ -240,229 +237,6 @@ def square_model(config: Config, pixel_nm: float, roi_px: int) -> ForwardModel:
     )
 
 
-def field_likelihood(scene: Scene, windows: Windows) -> Likelihood:
-    """Likelihood of the whole field.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    windows : Windows
-        Sums before and after.
-
-    Returns
-    -------
-    Likelihood
-        For the matched filter.
-    """
-    rows, columns = windows.after_e.shape
-    return region_likelihood(scene, windows, Region((0, rows), (0, columns)), None)
-
-
-def search_likelihood(scene: Scene, windows: Windows, explained: FloatArray) -> Likelihood:
-    """Likelihood of the whole field with weights that no particle may have made.
-
-    Where the counts are few, weights made of those before alone are large where these are low by
-    chance, and there the particles seem to have landed.  Counts before and after together say as
-    much of the noise and nothing of the change.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    windows : Windows
-        Sums before and after.
-    explained : ndarray, shape (y, x)
-        Signal of the particles that are known.
-
-    Returns
-    -------
-    Likelihood
-        For the matched filter.
-    """
-    whole = field_likelihood(scene, windows)
-    if not scene.additive or not windows.n_before:
-        return whole
-    counts, level, scale, extra = whole.data
-    ratio = windows.power_ratio
-    read = windows.read_variance_after_e2, windows.read_variance_before_e2
-    both = windows.before_e + (counts - extra) - scale * explained
-    noise = (read[0] + read[1]) / (1 + ratio) ** 2
-    steady = smooth_background(both / (1 + ratio), noise, windows.masked)
-    factor = scene.background_variance
-    variance = steady * ratio * (1 + ratio * factor) + read[0] + ratio**2 * read[1]
-    other = np.where(whole.used, variance - level, 0.0)
-    return replace(whole, data=np.stack([counts - extra + other, level, scale, other]))
-
-
-def region_likelihood(
-    scene: Scene, windows: Windows, region: Region, others: FloatArray | None
-) -> Likelihood:
-    """Likelihood of a region, with the signal of other particles as part of its background.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    windows : Windows
-        Sums before and after.
-    region : Region
-        Which pixels.
-    others : ndarray, shape (rows, columns), optional
-        Signal of the other particles there.
-
-    Returns
-    -------
-    Likelihood
-        Conditional where a measured background is divided out, Poisson otherwise.
-    """
-    cut = region.slices
-    config = scene.config
-    grid = PixelGrid.region(region.rows, region.columns, scene.pixel_nm)
-    model = scene.model if grid.diagonal_nm <= scene.model.reach_nm else scene.wide
-    before, after, masked = windows.before_e[cut], windows.after_e[cut], windows.masked[cut]
-    return counts_likelihood(
-        model, grid, before, after, windows.power_ratio,
-        background=scene.background_variance,
-        use_conditional=_uses_conditional(config),
-        scale_e=photons_scale(scene, windows) if scene.additive else None,
-        others=others,
-        read_variance_before_e2=windows.read_variance_before_e2[cut],
-        read_variance_after_e2=windows.read_variance_after_e2[cut],
-        masked=masked,
-    )  # fmt: skip
-
-
-def noise_cumulants(
-    scene: Scene, windows: Windows, likelihood: Likelihood
-) -> tuple[FloatArray, FloatArray] | None:
-    """Third and fourth cumulants of the counts against their background.
-
-    Parameters
-    ----------
-    scene : Scene
-        Its background says which counts are compared.
-    windows : Windows
-        Sums before and after.
-    likelihood : Likelihood
-        From `search_likelihood`, whose noise it is.
-
-    Returns
-    -------
-    (ndarray, ndarray) or None
-        Of each pixel [e³, e⁴]; None in interferometric schemes, where the counts are many.
-
-    Notes
-    -----
-    Of a Poisson count μ every cumulant is μ; of a − ρ b the k-th is μ_a + (−ρ)ᵏ μ_b.  Read noise
-    has none, and a median of frames has hardly any.
-    """
-    if not scene.additive:
-        return None
-    _, level, _, extra = likelihood.data
-    factor = scene.background_variance
-    ratio = windows.power_ratio
-    read = windows.read_variance_after_e2 + ratio**2 * windows.read_variance_before_e2
-    light = np.maximum(level + extra - read, 0.0) / (1 + ratio * factor)
-    counted = ratio if factor == MEAN else 0.0
-    return light * (1 - counted**2), light * (1 + counted**3)
-
-
-def photons_scale(scene: Scene, windows: Windows) -> float:
-    """Scale of the signal in dark field.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    windows : Windows
-        Frames and laser power.
-
-    Returns
-    -------
-    float
-        Photoelectrons per pixel for unit |E_sca|², summed over the frames after.
-    """
-    photons = scene.config.particle.photons_per_frame
-    if photons is None:
-        raise ConfigError(
-            "particle.photons_per_frame is needed in dark field, where it is the scale of masses: "
-            "give the scattered photons that are collected per frame from a particle of "
-            "particle.mass_kda"
-        )
-    per_frame = scene.model.photons_per_intensity(photons, scene.pixel_nm)
-    return per_frame * windows.power_ratio * max(windows.n_before, 1)
-
-
-def is_saturated(scene: Scene, saturated: BoolArray, region: Region, fit: FitResult) -> bool:
-    """Whether pixels that were saturated spoil a fit.
-
-    Parameters
-    ----------
-    scene : Scene
-        Its pixel size.
-    saturated : ndarray of bool, shape (rows, columns)
-        Those of the region.
-    region : Region
-        Where it lies in the full frame.
-    fit : FitResult
-        In the full frame.
-
-    Returns
-    -------
-    bool
-        Whether one lies within `SATURATION_NM` of the particle.
-    """
-    rows, columns = np.nonzero(saturated)
-    dx = (columns + region.columns[0]) * scene.pixel_nm - fit.x_nm
-    dy = (rows + region.rows[0]) * scene.pixel_nm - fit.y_nm
-    return bool(np.any(np.hypot(dx, dy) < SATURATION_NM))
-
-
-def judge(
-    scene: Scene,
-    fit: FitResult,
-    region: Region,
-    saturated: BoolArray,
-    *,
-    sidelobe: bool,
-    too_close: bool,
-    poor_fit: bool = False,
-) -> FitResult:
-    """Add what the surroundings of a particle say of its fit.
-
-    Parameters
-    ----------
-    scene : Scene
-        Its pixel size.
-    fit : FitResult
-        With the flags that it raised itself, in the full frame.
-    region : Region
-        Of the fit, in the full frame.
-    saturated : ndarray of bool, shape (rows, columns)
-        Pixels of the region that were saturated.
-    sidelobe : bool
-        Whether the particle may be no more than what the model leaves over of a brighter one.
-    too_close : bool
-        Whether another one is too near to be kept out of the fit.
-    poor_fit : bool
-        Whether its light changes otherwise than by one step.
-
-    Returns
-    -------
-    FitResult
-        With the verdict on all of them.
-    """
-    status, flags = verdict([
-        *fit.flags,
-        *([Status.SIDELOBE] if sidelobe else []),
-        *([Status.SATURATED] if is_saturated(scene, saturated, region, fit) else []),
-        *([Status.TOO_CLOSE] if too_close else []),
-        *([Status.POOR_FIT] if poor_fit else []),
-    ])  # fmt: skip
-    return replace(fit, status=status, flags=flags)
-
-
 def search_both(detection: Detection, *, searches: int = 1) -> Detection:
     """Search both polarities, for one that is not wanted has side lobes that are.
 
@@ -499,15 +273,19 @@ def reported_steps(scene: Scene) -> int:
     return scene.config.detection.sign * int(scene.templates.signs[0])
 
 
-def _uses_conditional(config: Config) -> bool:
-    """Whether the fits condition on the sum of counts before and after."""
-    if config.fit.likelihood == "auto":
-        return config.optics.scheme != "darkfield" and _is_counted(config)
-    return config.fit.likelihood == "conditional"
+def is_counted(config: Config) -> bool:
+    """Tell whether the background is a sum of counts, which is what the conditional law is about.
 
+    Parameters
+    ----------
+    config : Config
+        Method of its background.
 
-def _is_counted(config: Config) -> bool:
-    """Whether the background is a sum of counts, which is what the conditional law is about."""
+    Returns
+    -------
+    bool
+        True for the methods ``"fixed"`` and ``"sliding"``.
+    """
     return config.background.method in ("fixed", "sliding")
 
 

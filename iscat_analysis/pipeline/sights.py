@@ -9,10 +9,8 @@ import math
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis.calibration.optics import (
     FAINTEST,
@@ -24,13 +22,13 @@ from iscat_analysis.calibration.optics import (
 from iscat_analysis.config import Config
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional, poisson
-from iscat_analysis.movie.background import measure_windows
 from iscat_analysis.movie.camera import Camera, check_counts
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.pipeline.chunks import Reader, counts_budget, judge_window, plan_chunks
-from iscat_analysis.pipeline.ranges import frame_ranges
-from iscat_analysis.records import Windows
+from iscat_analysis.pipeline.chunks import Reader, counts_budget, plan_chunks
+from iscat_analysis.pipeline.noise import judge_window
+from iscat_analysis.pipeline.ranges import frame_ranges, measured_windows
+from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.search.bright import (
     ALONE_NM,
     BrightStep,
@@ -54,6 +52,50 @@ SAME_NM = 800.0
 """Nearer than this, and at the same time, two steps are one."""
 
 _SHIFT_NM = 450.0  # how far a particle may lie from the centre of its picture
+
+
+def bright_sights(
+    movie: Stack, config: Config, camera: Camera, pool: ThreadPoolExecutor
+) -> tuple[list[Sight], list[Sight]]:
+    """Find the bright particles of a movie, in the way in which it is analysed.
+
+    Parameters
+    ----------
+    movie : Stack
+        A landing movie, or one with background frames or a known level.
+    config : Config
+        Resolved.
+    camera : Camera
+        Counts → photoelectrons.
+    pool : ThreadPoolExecutor
+        Runs the search.
+
+    Returns
+    -------
+    sights : list of Sight
+        At most `MOST_SIGHTS`, the brightest first.
+    others : list of Sight
+        Every bright particle, on small regions.
+    """
+    if way_of(config) == "sliding":
+        return landing_sights(movie, config, camera, pool)
+    return bound_sights(movie, config, camera)
+
+
+def kind_of(config: Config) -> str:
+    """Say what such a movie shows, for the record of a calibration.
+
+    Parameters
+    ----------
+    config : Config
+        Resolved.
+
+    Returns
+    -------
+    str
+        A few words.
+    """
+    return "landing movie" if way_of(config) == "sliding" else "frames before and after"
 
 
 def landing_sights(
@@ -165,7 +207,7 @@ def bound_sights(movie: Stack, config: Config, camera: Camera) -> tuple[list[Sig
         Every bright particle, on small regions.
     """
     before, after = frame_ranges(movie, config)
-    windows = _windows(movie, config, camera, before, after)
+    windows = measured_windows(movie, config, camera, before, after)
     ratio = windows.power_ratio
     # the noise of a known background is none
     noise_before = windows.before_e + windows.read_variance_before_e2 if windows.n_before else 0.0
@@ -288,23 +330,6 @@ def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
         )
         sights += [replace(sight, x_nm=x_nm, y_nm=y_nm) for sight in seen]
     return _bright(sights)
-
-
-def _windows(
-    movie: Stack,
-    config: Config,
-    camera: Camera,
-    before: tuple[int, int] | None,
-    after: tuple[int, int],
-) -> Windows:
-    def check(counts: NDArray[Any], first: int) -> None:
-        check_counts(counts, first, movie.name, camera=camera)
-
-    return measure_windows(
-        movie, camera, before, after, median=config.background.method == "median",
-        level_e=config.background.level_e,
-        power_normalization=config.background.power_normalization, check=check,
-    )  # fmt: skip
 
 
 def _centred(likelihood: Likelihood, config: Config, *, frame: int) -> Sight:

@@ -23,27 +23,15 @@ from iscat_analysis.inference.fit import (
     start_theta,
 )
 from iscat_analysis.movie.drift import Trajectory
-from iscat_analysis.pipeline.field import Event
-from iscat_analysis.pipeline.neighbours import (
-    Neighbours,
-    Step,
-    distance_px,
-)
+from iscat_analysis.pipeline.events import Event, Fitted, remarks, standing_out
+from iscat_analysis.pipeline.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.pipeline.pattern import MovingPattern
 from iscat_analysis.pipeline.repeats import step_controls, step_repeats
-from iscat_analysis.pipeline.scene import Region, Scene, judge, reported_steps
+from iscat_analysis.pipeline.scene import Scene, reported_steps
 from iscat_analysis.pipeline.sidelobes import Sieve
 from iscat_analysis.pipeline.tasks import Task, TaskBuilder
 from iscat_analysis.pipeline.traces import clip_of, patch_of, trace_of
-from iscat_analysis.records import (
-    FREE_PARAMETERS,
-    Candidate,
-    Clip,
-    FloatArray,
-    Status,
-    Trace,
-    Windows,
-)
+from iscat_analysis.records import FREE_PARAMETERS, Candidate, Clip, FloatArray, Trace
 from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.residue import chi2_excess
 from iscat_analysis.search.sliding import (
@@ -68,41 +56,36 @@ _SAME_PX = 1.5
 
 
 @dataclass(frozen=True)
-class FittedStep:
-    """A step with its final fit.
+class StepEvent:
+    """A step that was fitted for good, and what its frames say beside it.
 
     Attributes
     ----------
-    step : Step
-        When and where.
     event : Event
-        The fit; its region counts from its own first pixel, as `windows` does.
-    region : Region
-        In the full frame.
-    windows : Windows
-        The sums of the region, those with the particle as "after".
-    n_before, n_after : int
-        Frames before and after the step that were used.
-    repeats : ndarray
-        From `iscat_analysis.pipeline.repeats.step_repeats`.
+        The particle that lands or leaves.
+    step : Step
+        When and where, as its neighbours see it.
     others : tuple of Step
         Those that the fit knew of.
-    trace : Trace or None
-        From `iscat_analysis.pipeline.traces.trace_of`.
-    clip : Clip or None
-        From `iscat_analysis.pipeline.traces.clip_of`.
+    repeats : ndarray
+        From `iscat_analysis.pipeline.repeats.step_repeats`.
     """
 
-    step: Step
     event: Event
-    region: Region
-    windows: Windows
-    n_before: int
-    n_after: int
+    step: Step
+    others: tuple[Step, ...]
     repeats: FloatArray
-    others: tuple[Step, ...] = ()
-    trace: Trace | None = None
-    clip: Clip | None = None
+
+
+@dataclass(frozen=True)
+class _Finished:
+    """A step after its last fit, before it is judged."""
+
+    fitted: Fitted
+    step: Step
+    others: tuple[Step, ...]
+    task: Task
+    lobe: bool  # found where a known step may have left it over
 
 
 class ChunkFitter:
@@ -164,7 +147,7 @@ class ChunkFitter:
         self.rounds = 0
         self.empty: EmptySpread | None = None  # noise where nothing lands or leaves
 
-    def run(self, keep: tuple[int, int]) -> list[FittedStep]:
+    def run(self, keep: tuple[int, int]) -> list[StepEvent]:
         """Find and fit every step.
 
         Parameters
@@ -174,7 +157,7 @@ class ChunkFitter:
 
         Returns
         -------
-        list of FittedStep
+        list of StepEvent
             In order of frame.
         """
         templates = self._scene.templates
@@ -220,43 +203,45 @@ class ChunkFitter:
             for i, s in enumerate(everything)
             if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
         ]
-        found = self._pool.map(lambda i: self._finish(i, everything, seen), own)
-        finished = [(i >= len(steps), *f) for i, f in zip(own, found, strict=True) if f is not None]
-        fitted = self._judged(finished)
+        found = self._pool.map(
+            lambda i: self._finish(i, everything, seen, lobe=i >= len(steps)), own
+        )
+        fitted = self._judged([one for one in found if one is not None])
         if fitted and not self._pattern:
-            described = [f for f in fitted if f.event.fit.status == Status.OK] or fitted
+            events = standing_out([f.event for f in fitted])
             self.empty = step_controls(
                 scene=self._scene, chunk=self._chunk, window=self._window,
-                fits=[(f.step, f.event.fit) for f in described],
-                steps=everything, neighbours=self._neighbours,
+                events=events, steps=everything, neighbours=self._neighbours,
             )  # fmt: skip
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
 
-    def with_traces(self, fitted: Sequence[FittedStep], clips: int) -> list[FittedStep]:
-        """Add what the report shows of steps beside their images.
+    def shown(
+        self, fitted: Sequence[StepEvent], clips: int
+    ) -> list[tuple[Trace | None, Clip | None]]:
+        """Give what the report shows of steps beside their images.
 
         Parameters
         ----------
-        fitted : sequence of FittedStep
+        fitted : sequence of StepEvent
             From `run`.
         clips : int
             How many, the first, have a clip.
 
         Returns
         -------
-        list of FittedStep
-            With trace and clip, where the frames allow.
+        list of (Trace or None, Clip or None)
+            Where the frames allow.
         """
         chunk, window = self._chunk, self._window
 
-        def one(number: int) -> FittedStep:
+        def one(number: int) -> tuple[Trace | None, Clip | None]:
             step = fitted[number]
             patch = patch_of(step, chunk, window)
             trace = trace_of(step, patch, chunk, self._neighbours, self._tasks)
             clip = None
             if number < clips:
                 clip = clip_of(step, patch, self._scene, chunk, window, self._pattern)
-            return replace(step, trace=trace, clip=clip)
+            return trace, clip
 
         return list(self._pool.map(one, range(len(fitted))))
 
@@ -313,8 +298,7 @@ class ChunkFitter:
         start = Candidate(
             peak.x_px, peak.y_px, scene.config.particle.height_nm, mass, abs(peak.snr)
         )
-        at = StepFrame(peak.frame, self._stride, 1.0, 1.0, 1.0)
-        return self._neighbours.drawn(Step(sign, at, start, (0, 0), np.empty((0, 0))))
+        return self._neighbours.draw(sign, StepFrame.undated(peak.frame, self._stride), start)
 
     # ---- one step --------------------------------------------------------------------------
 
@@ -379,9 +363,7 @@ class ChunkFitter:
             mass_kda=float(likelihood.model.scale.mass(theta[3])),
         )
         excess = chi2_excess(likelihood.residuals(theta))
-        return self._neighbours.drawn(
-            replace(step, at=task.at, start=start, theta=theta, snr=snr, excess=excess)
-        )
+        return self._neighbours.draw(step.sign, task.at, start, theta=theta, snr=snr, excess=excess)
 
     @property
     def _quick_mode(self) -> str:
@@ -389,8 +371,8 @@ class ChunkFitter:
         return "mass" if "mass_kda" in FREE_PARAMETERS[self._scene.mode] else "localize"
 
     def _finish(
-        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]]
-    ) -> tuple[FittedStep, Task] | None:
+        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]], *, lobe: bool
+    ) -> _Finished | None:
         """Fit a step for good."""
         scene, step = self._scene, steps[index]
         task = self._tasks.build(index, steps, near)
@@ -405,45 +387,40 @@ class ChunkFitter:
         if fit.mass_kda <= 0 and "mass_kda" in fit.free:
             return None
         pixel = scene.pixel_nm
-        fit = replace(fit, x_nm=fit.x_nm - x_px * pixel, y_nm=fit.y_nm - y_px * pixel)
-        local = Region(
-            (0, task.region.rows[1] - task.region.rows[0]),
-            (0, task.region.columns[1] - task.region.columns[0]),
-        )
-        event = Event(local, fit, likelihood)
-        if event.snr < _EXPLAINED * scene.templates.threshold:
+        fitted = Fitted(task.region, fit.shifted(-x_px * pixel, -y_px * pixel), likelihood)
+        if fitted.snr < _EXPLAINED * scene.templates.threshold:
             return None
-        step = replace(step, at=task.at)
         seen = near[index] if scene.lines is None else [i for i in range(len(steps)) if i != index]
         others = tuple(steps[i] for i in seen)
-        repeats = step_repeats(
-            self._chunk, event, task.region, task.windows, step,
-            others, self._neighbours, self._pattern,
-        )  # fmt: skip
-        fitted = FittedStep(
-            step, event, task.region, task.windows, task.n_before, task.n_after, repeats, others
-        )
-        return fitted, task
+        return _Finished(fitted, replace(step, at=task.at), others, task, lobe)
 
-    def _judged(self, finished: Sequence[tuple[bool, FittedStep, Task]]) -> list[FittedStep]:
+    def _judged(self, finished: Sequence[_Finished]) -> list[StepEvent]:
         """Judge all steps, those that may be side lobes, or explain less than they leave, too."""
-        judged = []
-        for lobe, one, task in finished:
-            event = one.event
+
+        def one(own: _Finished) -> StepEvent:
+            fitted, task, step = own.fitted, own.task, own.step
             near = (
-                other.event.described
-                for _, other, _ in finished
-                if _apart(other.step, one.step) < self._window
-                and distance_px(other.step, one.step) < LARGEST_IMAGE * self._roi_px
+                other.fitted.described
+                for other in finished
+                if _apart(other.step, step) < self._window
+                and distance_px(other.step, step) < LARGEST_IMAGE * self._roi_px
             )
-            fit = judge(
-                self._scene, event.fit, task.region, task.windows.saturated,
-                sidelobe=lobe or event.described.is_dwarfed(near),
+            flags = remarks(
+                self._scene, fitted, task.windows,
+                sidelobe=own.lobe or fitted.described.is_dwarfed(near),
                 too_close=task.crowded,
                 poor_fit=task.at.p_constant < POOR_FIT_P,
             )  # fmt: skip
-            judged.append(replace(one, event=replace(event, fit=fit)))
-        return judged
+            event = Event(
+                fitted.region, fitted.fit, fitted.likelihood, task.windows, flags, task.at.frame,
+                task.n_before, task.n_after, step.sign, task.at.half_width,
+            )  # fmt: skip
+            repeats = step_repeats(
+                self._chunk, event, step, own.others, self._neighbours, self._pattern
+            )
+            return StepEvent(event, step, own.others, repeats)
+
+        return list(self._pool.map(one, finished))
 
     def _credible(self, steps: Sequence[Step]) -> list[Step]:
         """Leave out what the others explain, and the weaker of two steps that describe one."""

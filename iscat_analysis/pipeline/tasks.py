@@ -14,9 +14,10 @@ import numpy as np
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.neighbours import Neighbours, Step, distance_px, region_around
+from iscat_analysis.pipeline.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.pipeline.pattern import LocalPattern, MovingPattern
-from iscat_analysis.pipeline.scene import Region, Scene
+from iscat_analysis.pipeline.regions import Region, region_around
+from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.sliding import Chunk, Patch, StepFrame, crosstalk, locate_step
 

@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from iscat_analysis.pipeline.neighbours import Neighbours, region_around
+from iscat_analysis.pipeline.neighbours import Neighbours
 from iscat_analysis.pipeline.pattern import MovingPattern
-from iscat_analysis.pipeline.scene import Region, Scene
+from iscat_analysis.pipeline.regions import Region, region_around
+from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.pipeline.tasks import TaskBuilder
 from iscat_analysis.records import BoolArray, Clip, FloatArray, Trace
 from iscat_analysis.search.sliding import Chunk, Patch, frame_heights
 
 if TYPE_CHECKING:
-    from iscat_analysis.pipeline.steps import FittedStep
+    from iscat_analysis.pipeline.steps import StepEvent
 
 TRACE_WINDOWS = 2
 """Windows on either side of a step that its trace covers; a chunk holds as many around its core."""
@@ -32,12 +33,12 @@ CLIP_STEPS = 6
 """Images of a clip from the first that reaches the step to the one at the step."""
 
 
-def patch_of(fitted: FittedStep, chunk: Chunk, window: int) -> Patch:
+def patch_of(fitted: StepEvent, chunk: Chunk, window: int) -> Patch:
     """Copy the frames around a step, for `trace_of` and `clip_of`.
 
     Parameters
     ----------
-    fitted : FittedStep
+    fitted : StepEvent
         The step.
     chunk : Chunk
         The frames.
@@ -49,18 +50,19 @@ def patch_of(fitted: FittedStep, chunk: Chunk, window: int) -> Patch:
     Patch
         `TRACE_WINDOWS` on either side, of the pixels that were fitted.
     """
+    region = fitted.event.region
     turn, reach = fitted.step.at.frame, TRACE_WINDOWS * window
-    return chunk.patch(turn - reach, turn + reach, fitted.region.rows, fitted.region.columns)
+    return chunk.patch(turn - reach, turn + reach, region.rows, region.columns)
 
 
 def trace_of(
-    fitted: FittedStep, patch: Patch, chunk: Chunk, neighbours: Neighbours, tasks: TaskBuilder
+    fitted: StepEvent, patch: Patch, chunk: Chunk, neighbours: Neighbours, tasks: TaskBuilder
 ) -> Trace | None:
     """Measure the contrast of a step's particle in every frame around the step.
 
     Parameters
     ----------
-    fitted : FittedStep
+    fitted : StepEvent
         The step; what its neighbours make is taken off.
     patch : Patch
         From `patch_of`.
@@ -76,7 +78,8 @@ def trace_of(
     Trace or None
         None where the region holds too little of the picture.
     """
-    fit, windows, region = fitted.event.fit, fitted.windows, fitted.region
+    event = fitted.event
+    fit, windows, region = event.fit, event.windows, event.region
     step, turn = fitted.step, fitted.step.at.frame
     shown = neighbours.shown(step, region)  # its image of the last sweep, near that of the fit
     if shown is None or shown[1].shape != region.shape:
@@ -106,7 +109,7 @@ def trace_of(
 
 
 def clip_of(
-    fitted: FittedStep,
+    fitted: StepEvent,
     patch: Patch,
     scene: Scene,
     chunk: Chunk,
@@ -117,7 +120,7 @@ def clip_of(
 
     Parameters
     ----------
-    fitted : FittedStep
+    fitted : StepEvent
         The step.
     patch : Patch
         From `patch_of`.
@@ -138,7 +141,7 @@ def clip_of(
     turn, start = fitted.step.at.frame, fitted.event.candidate
     side = min(scene.roi_px, 2 * math.ceil(CLIP_NM / scene.pixel_nm / 2) - 1)
     fold = math.ceil(side / CLIP_PIXELS)
-    square, whole = region_around(side, chunk.shape, start), fitted.region
+    square, whole = region_around(side, chunk.shape, start), fitted.event.region
     sides = []
     for (low, high), (first, last) in (
         (square.rows, whole.rows), (square.columns, whole.columns)

@@ -1,49 +1,91 @@
 """Mode ``track``: every frame is fitted, and the positions are linked into tracks.
 
-`track_movie` learns the background from the frames in which the particles move, block by block;
-`track_particles` takes one that was recorded or is known.
+`find_moving` learns the background from the frames in which the particles move, block by block;
+`track_frames` takes one that was recorded or is known.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-import pandas as pd
 
-from iscat_analysis.config import Config
 from iscat_analysis.movie.background import Check, add_frames, start_power
 from iscat_analysis.movie.camera import Camera
+from iscat_analysis.pieces.regions import table_from
 from iscat_analysis.pipeline.blank import FrameNoise
 from iscat_analysis.pipeline.block_store import Block, BlockStore, analyse_block
-from iscat_analysis.pipeline.blocks import Plan
-from iscat_analysis.pipeline.field import Event, fit_field
+from iscat_analysis.pipeline.blocks import Plan, plan_blocks
+from iscat_analysis.pipeline.events import Event
+from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.joining import join_blocks
-from iscat_analysis.pipeline.results import Found, Row, table_of, view_of
+from iscat_analysis.pipeline.moving import track_scene
+from iscat_analysis.pipeline.prepare import Prepared
+from iscat_analysis.pipeline.ranges import checked
+from iscat_analysis.pipeline.regions import contrast_image
+from iscat_analysis.pipeline.results import Compared, Followed, Found, rows_of, view_of
+from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import EventView, FloatArray, FrameSource, Progress, Windows
 from iscat_analysis.search.moving import link
+from iscat_analysis.threads import threads
 
 _STEPS = 100  # of the progress of a block
 
 
-def learns_background(config: Config) -> bool:
-    """Whether the background is that of the very frames in which particles are tracked.
+def find_moving(ready: Prepared, run: Run) -> Found:
+    """Track particles over backgrounds that are learnt with them.
 
     Parameters
     ----------
-    config : Config
-        Method and frames of its background.
+    ready : Prepared
+        The movie.
+    run : Run
+        Is told what the user should know.
 
     Returns
     -------
-    bool
-        True for method ``"tracks"``, and in mode track for a median without frames of its own.
+    Found
+        As `track_movie` gives it.
+
+    Raises
+    ------
+    DataError
+        There are too few frames.
+    KeyboardInterrupt
+        The user stopped it before the first block was finished.
     """
-    method, frames = config.background.method, config.background.frames
-    return method == "tracks" or (
-        config.fit.mode == "track" and method == "median" and frames is None
+    movie, config, camera = ready.steady, ready.config, ready.camera
+    first, last = config.fit.frames or (0, movie.shape[0])
+    scene = track_scene(config, ready.shape, max(last - first, 1))
+    run.clock.lap("model")
+    check = checked(movie, camera)
+    plan = plan_blocks(movie, config, camera, check=check)
+    if message := plan.message(movie.name):
+        run.tell(message)
+    run.clock.lap("background")
+    identity = movie.identity if run.partial else ""
+    store = BlockStore(run.partial, config, identity, ready.shape, (first, last), camera)
+    with threads(config.compute.workers) as pool:
+        blocks, interrupted = track_movie(
+            scene, movie, camera, plan, store, check=check, pool=pool, progress=run.progress
+        )
+    joined = join_blocks(config, blocks, camera)
+    windows = joined.followed.windows
+    run.clock.lap("track")
+    return Found(
+        scene=replace(scene, mode="track", config=config),
+        table=joined.table,
+        views=joined.views,
+        image=windows.after_e / windows.before_e - 1,
+        compared=Compared.of(windows),
+        heading="blocks",
+        summary=plan.summary,
+        followed=joined.followed,
+        interrupted=interrupted,
     )
 
 
@@ -57,7 +99,7 @@ def track_movie(
     check: Check,
     pool: ThreadPoolExecutor,
     progress: Progress,
-) -> Found:
+) -> tuple[list[Block], bool]:
     """Track particles that are there in all frames, over backgrounds learnt with them.
 
     Parameters
@@ -81,9 +123,10 @@ def track_movie(
 
     Returns
     -------
-    Found
-        One row per particle and frame; one view per track, of its clearest frame.  An interrupt
-        keeps the blocks that are finished.
+    blocks : list of Block
+        Those that are finished.
+    interrupted : bool
+        Whether there should have been more.
 
     Raises
     ------
@@ -115,7 +158,7 @@ def track_movie(
         progress("report", 0, 1)  # what was finished is now gathered and kept, which takes a moment
         pool.shutdown(wait=False, cancel_futures=True)
         interrupted = True
-    return join_blocks(scene.config, blocks, camera, interrupted=interrupted)
+    return blocks, interrupted
 
 
 def _part_of(progress: Progress, number: int, count: int) -> Progress:
@@ -128,11 +171,12 @@ def _part_of(progress: Progress, number: int, count: int) -> Progress:
     return told
 
 
-def track_particles(
+def track_frames(
     scene: Scene,
     movie: FrameSource,
     camera: Camera,
     windows: Windows,
+    summary: Mapping[str, Any],
     *,
     check: Check,
     pool: ThreadPoolExecutor,
@@ -150,6 +194,8 @@ def track_particles(
         Counts → photoelectrons.
     windows : Windows
         The background, and all frames after it summed.
+    summary : mapping
+        What was learnt of the background.
     check : callable
         Refuses impossible counts.
     pool : ThreadPoolExecutor
@@ -164,7 +210,7 @@ def track_particles(
         the frames that are done.
     """
     first, last = windows.frames_after
-    tables: list[pd.DataFrame] = []
+    rows: list[dict[str, Any]] = []
     views: list[EventView] = []
     repeats: list[FloatArray] = []
     noise: FrameNoise | None = None
@@ -175,36 +221,38 @@ def track_particles(
             here = _one_frame(movie, camera, windows, frame, check, scene)
             starts = [event.candidate for event in events]
             events, here = fit_field(scene, here, starts=starts, pool=pool)
-            rows = [Row(number, event, here) for number, event in enumerate(events)]
             if events and noise is None:
                 read = camera.read_variance_e2((here.after_e.shape[0], here.after_e.shape[1]))
                 noise = FrameNoise(scene, windows, read, [event.fit for event in events])
             if events and noise is not None:
                 repeats += [noise.look(here, events)] * len(events)
-            views += [view_of(row) for row in rows]
-            tables.append(table_of(scene, rows))  # last: of what an interrupt cuts off, no row is
+            views += [view_of(number, event) for number, event in enumerate(events)]
+            rows += rows_of(scene, events)  # last: of what an interrupt cuts off, no row is
             progress("track", frame + 1 - first, last - first)
     except KeyboardInterrupt:
         interrupted = True
-    table = pd.concat(tables, ignore_index=True) if tables else table_of(scene, [])
-    views, repeats = views[: len(table)], repeats[: len(table)]
     track = scene.config.track
-    table["event"] = link(
-        table["frame"].to_numpy(), table[["x_nm", "y_nm"]].to_numpy(),
-        reach_nm=track.max_step_nm, memory=track.memory_frames,
-    )  # fmt: skip
-    table["track"] = table["event"]
+    places = np.array([(row["x_nm"], row["y_nm"]) for row in rows]).reshape(-1, 2)
+    frames = np.array([row["frame"] for row in rows], dtype=np.int64)
+    numbers = link(frames, places, reach_nm=track.max_step_nm, memory=track.memory_frames)
+    order = np.lexsort((frames, numbers))
+    table = table_from([rows[k] for k in order], numbers[order])
     seen: dict[int, EventView] = {}
-    for track, view in zip(table["event"], views, strict=True):
-        seen.setdefault(int(track), replace(view, event=int(track)))
-    order = np.lexsort((table["frame"], table["event"]))
+    for number, view in zip(numbers.tolist(), views[: len(rows)], strict=True):
+        if number not in seen:
+            seen[number] = replace(view, event=number)
     return Found(
-        table=table.iloc[order].reset_index(drop=True),
-        views=tuple(seen[track] for track in sorted(seen)),
-        windows=windows,
-        interrupted=interrupted,
+        scene=scene,
+        table=table.assign(track=table["event"]),
+        views=tuple(seen[number] for number in sorted(seen)),
+        image=contrast_image(scene, windows),
+        compared=Compared.of(windows),
+        heading="background",
+        summary=summary,
         repeats=tuple(repeats[row] for row in order),
         empty=noise.spread if noise else None,
+        followed=Followed(windows),
+        interrupted=interrupted,
     )
 
 

@@ -19,8 +19,9 @@ from iscat_analysis.optics.blur import blurred, path_variance_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.materials import material
 from iscat_analysis.pipeline.moving import exposure_of
-from iscat_analysis.pipeline.scene import Region, Scene, region_likelihood
-from iscat_analysis.pipeline.tracking import learns_background
+from iscat_analysis.pipeline.regions import Region, region_likelihood
+from iscat_analysis.pipeline.scene import Scene
+from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import (
     Film,
     FloatArray,
@@ -86,7 +87,7 @@ def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
             f"camera.exposure_ms = {exposure:g} is longer than the {1e3 / rate:.4g} ms from frame "
             f"to frame at camera.frame_rate_hz = {rate:g}: correct one of them"
         )
-    if frames < SHORT_MOVIE and not learns_background(config):  # which refuses it altogether
+    if frames < SHORT_MOVIE and way_of(config) != "tracks":  # which refuses it altogether
         best = 100 / np.sqrt(max(frames - 1, 1))
         text = f"{name}: {frames} frames tell no diffusion coefficient better than to {best:.0f} %"
         if frames < config.track.min_frames:
@@ -202,7 +203,7 @@ def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
     """
     config = scene.config
     before = fits["n_before"].median() if len(fits) else 0
-    known = config.background.method == "known" or scene.additive or learns_background(config)
+    known = config.background.method == "known" or scene.additive or way_of(config) == "tracks"
     if known or not before > 0:
         return None
     share = scene.background_variance / (scene.background_variance + before)
@@ -345,7 +346,7 @@ def make_films(
 def _models(scene: Scene, tracks: pd.DataFrame) -> dict[int, ForwardModel]:
     """Give each track the model that it was fitted with: blurred by its own motion, or sharp."""
     known = np.nan_to_num(tracks["d_um2_s"].to_numpy(float))
-    if not learns_background(scene.config):
+    if way_of(scene.config) != "tracks":
         known[:] = 0.0
     _, exposure_s = exposure_of(scene.config)
     upwards = scene.config.track.free == "joint"

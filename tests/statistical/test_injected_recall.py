@@ -11,7 +11,7 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.bounds import power_searched
-from iscat_analysis.pipeline import analyse, injection, landing
+from iscat_analysis.pipeline import analyse, injection
 
 ADDED = 20
 SIGMAS = 4.0
@@ -37,7 +37,7 @@ def test_recall_near_the_threshold_is_the_predicted_one(
         mass = 0.95 * sigma * threshold[0]
         return real(scene, *before, pd.DataFrame({"mass_kda": [mass], "status": ["ok"]}), seed)
 
-    monkeypatch.setattr(landing, "draw_particles", faint)
+    monkeypatch.setattr(injection, "draw_particles", faint)
     with ia.open_stack(tmp_path / "movie.tif") as movie:
         found = analyse(movie, config, inject=ADDED).summary["injection"]
     expected = found["predicted"]

@@ -16,9 +16,9 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.chunks import FRAME_COLUMN
-from iscat_analysis.pipeline.landing import analyse_landings, make_landing_scene
-from iscat_analysis.records import Candidate
+from iscat_analysis.pipeline.landing import analyse_landings
+from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.records import FRAME_COLUMN, Candidate
 from iscat_analysis.study.simulate import Movie
 
 pytestmark = pytest.mark.large
@@ -168,7 +168,7 @@ def test_a_search_that_does_not_measure_the_noise_has_more(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Control: of the noise, and of the test above."""
-    monkeypatch.setattr("iscat_analysis.pipeline.chunks.measure_spectrum", lambda *_, **__: None)
+    monkeypatch.setattr("iscat_analysis.pipeline.noise.measure_spectrum", lambda *_, **__: None)
     with pytest.raises(AssertionError):
         _assert_expected(_alarms_in(kind, 6), 6)
 
@@ -277,7 +277,7 @@ def test_frames_lie_in_their_intervals(events: pd.DataFrame) -> None:
 def biases() -> tuple[np.ndarray, np.ndarray]:
     """Relative errors of a faint particle's mass, with and without the correction."""
     config = _config(64, 200)
-    scene = make_landing_scene(config, (64, 64), searches=1)
+    scene = make_scene(config, (64, 64), sliding=True)
     grid = PixelGrid.region((0, scene.roi_px), (0, scene.roi_px), PIXEL_NM)
     x, y, mass = 15.3, 15.8, 66.0
     signal = scene.model.image(grid, x * PIXEL_NM, y * PIXEL_NM, 5.0, mass)

@@ -128,7 +128,7 @@ def test_pulls_are_standard_and_masses_unbiased(kind: str, lines: str) -> None:
 @pytest.mark.parametrize("kind", ["landing", "fixed"])
 def test_without_the_correction_they_are_not(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Control: the movies above; across the rows and in the mass, and not along them."""
-    monkeypatch.setattr("iscat_analysis.pipeline.judge_lines", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.pipeline.prepare.judge_lines", lambda *_: None)
     table = _fitted(kind, "rows", 8)
     _assert_standard(table["x"])
     for name in ("y", "mass"):
@@ -170,7 +170,7 @@ def test_lines_that_are_divided_out_of_a_moving_pattern_make_particles(
         background = config.background.model_copy(update={"drift_correction": False})
         return judge_lines(movie, config.model_copy(update={"background": background}), camera)
 
-    monkeypatch.setattr("iscat_analysis.pipeline.judge_lines", divided)
+    monkeypatch.setattr("iscat_analysis.pipeline.prepare.judge_lines", divided)
     config = _config("drifting", "simulation.count=0", "detection.false_alarms_per_movie=1e-3")
     with pytest.raises(DataError, match="places in frames 0:140 pass the detection threshold"):
         ia.fit_movie(_recorded(config, 0, "both", FLICKER), config=config)
@@ -194,6 +194,6 @@ def test_clean_movies_are_not_touched(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = [_recorded(config, seed, "rows", 0.0) for seed in range(6)]
     found = [ia.fit_movie(c, config=config) for c in counts]
     assert not any("lines" in result.summary for result in found)
-    monkeypatch.setattr("iscat_analysis.pipeline.judge_lines", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.pipeline.prepare.judge_lines", lambda *_: None)
     for c, result in zip(counts, found, strict=True):
         pd.testing.assert_frame_equal(ia.fit_movie(c, config=config).table, result.table)

@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from iscat_analysis.config import Config
 from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.results import Row, table_of
+from iscat_analysis.pipeline.results import table_of
 from iscat_analysis.pipeline.scene import make_scene
 from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.study.simulate import Movie
@@ -69,9 +69,8 @@ def _fields(mode: str, gain: float, places: int) -> tuple[pd.DataFrame, int, int
             light = Light.of(movie, 200)
             for draw in range(DRAWS):
                 rng = np.random.default_rng([place, draw, 77])
-                events, windows = fit_field(scene, light.draw(rng, gain=gain), pool=pool)
-                rows = [Row(k, event, windows) for k, event in enumerate(events)]
-                found = table_of(scene, rows)
+                events, _ = fit_field(scene, light.draw(rng, gain=gain), pool=pool)
+                found = table_of(scene, events)
                 apart = np.hypot(
                     *(found[c].to_numpy()[:, None] - movie.truth[c].to_numpy() for c in
                       ("x_px", "y_px"))

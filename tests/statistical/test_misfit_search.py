@@ -14,7 +14,8 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.background import measure_windows
 from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.landing import LandingResult, analyse_landings
+from iscat_analysis.pipeline.landing import analyse_landings
+from iscat_analysis.pipeline.results import Found
 from iscat_analysis.pipeline.scene import make_scene
 from iscat_analysis.search.residue import EXCEEDS, Described, chi2_excess, size_on_ring
 
@@ -48,7 +49,7 @@ def _configured(*settings: str, gain: float = 4.0) -> Config:
     )
 
 
-def _analysed(instrument: Instrument, gain: float = 4.0) -> tuple[LandingResult, list[str]]:
+def _analysed(instrument: Instrument, gain: float = 4.0) -> tuple[Found, list[str]]:
     movie = InstrumentMovie(instrument, SHAPE, LANDINGS, seed=SEED)
     config = _configured("background.method=sliding", gain=gain)
     said: list[str] = []
@@ -96,7 +97,7 @@ def test_rings_as_high_as_their_particle_are_none(instrument: Instrument) -> Non
     windows = measure_windows(movie, camera, (0, bound), (bound, shape[0]))
     with ThreadPoolExecutor(1) as pool:
         events, _ = fit_field(scene, windows, pool=pool)
-    kept = [e.candidate for e in events if "sidelobe" not in e.fit.flags]
+    kept = [e.candidate for e in events if "sidelobe" not in e.flags]
     for x, y in zip(landings.x_px, landings.y_px, strict=True):
         assert sum(np.hypot(k.x_px - x, k.y_px - y) < 3 for k in kept) == 1, (x, y)
     assert len(kept) == count
@@ -125,7 +126,7 @@ def test_noise_that_passes_the_threshold_everywhere_stops_the_search(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The same where the noise between neighbouring frames does not tell it."""
-    monkeypatch.setattr("iscat_analysis.pipeline.chunks.measure_spectrum", lambda *_, **__: None)
+    monkeypatch.setattr("iscat_analysis.pipeline.noise.measure_spectrum", lambda *_, **__: None)
     with pytest.raises(DataError, match=r"set camera\.gain_e_per_adu = [34]\."):
         _analysed(Instrument(), gain=28.0)
 

@@ -10,7 +10,7 @@ from microscopes import setting
 
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.pipeline.scene import Region
+from iscat_analysis.pipeline.regions import Region
 from iscat_analysis.records import PARAMETERS, Candidate, FitResult, FloatArray, Status
 from iscat_analysis.study import Setting, run_trials, trial_generator
 

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 import iscat_analysis as ia
 from iscat_analysis.config import Config, config_to_toml, configure, load_config, read_optics_file
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.pipeline.landing import has_landings
-from iscat_analysis.pipeline.scene import make_scene, photons_scale
+from iscat_analysis.pipeline.regions import photons_scale
+from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.pipeline.ways import way_of
 
 SETTINGS: list[tuple[str, Any]] = [
     ("optics.na", 1.3),
@@ -147,7 +148,7 @@ def test_the_method_is_explicit_after_resolution(settings: list[str], method: st
     config = configure(settings=settings)
     assert config.background.method == method
     assert f'method = "{method}"' in config_to_toml(config, comments=False)
-    assert has_landings(config) is (method == "sliding")
+    assert (way_of(config) == "sliding") is (method == "sliding")
 
 
 def test_the_method_follows_frames_that_are_added_or_taken_away() -> None:
@@ -283,7 +284,7 @@ def test_only_the_simulator_and_one_announced_fallback_read_the_simulation() -> 
         if re.search(r"\.simulation\b(?! import)", path.read_text("utf-8"))
         and path.parent.name != "config"
     }
-    assert readers <= {"study/simulate.py", "study/movers.py", "pipeline/__init__.py"}
+    assert readers <= {"study/simulate.py", "study/movers.py", "pipeline/prepare.py"}
 
 
 def test_a_blank_is_a_movie_without_particles(tmp_path: Path) -> None:

@@ -14,13 +14,12 @@ from scenes import Light, blank, make_config
 from iscat_analysis.config import Config
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.scene import (
-    Scene,
+from iscat_analysis.pipeline.regions import (
     field_likelihood,
-    make_scene,
     noise_cumulants,
     search_likelihood,
 )
+from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.records import Candidate, Windows
 from iscat_analysis.search.templates import find_particles, signal_to_noise
 from iscat_analysis.study.simulate import Movie

@@ -10,7 +10,7 @@ from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Mover, Trajectory, derivatives, measure_drift, trusted
 from iscat_analysis.pipeline.pattern import MovingPattern, follow
-from iscat_analysis.pipeline.scene import Region
+from iscat_analysis.pipeline.regions import Region
 from iscat_analysis.search.sliding import Chunk, make_chunk, measure_frames
 from iscat_analysis.study.simulate import Movie
 

@@ -19,19 +19,19 @@ from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.pipeline import analyse, chunk_work, fit_stack
+from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.pipeline import chunks as chunks_module
+from iscat_analysis.pipeline import events as events_module
 from iscat_analysis.pipeline import landing as landing_module
-from iscat_analysis.pipeline.chunks import FRAME_COLUMN, Done, Merged
-from iscat_analysis.pipeline.landing import (
-    analyse_landings,
-    frame_warnings,
-    has_landings,
-    inject_and_recover,
-)
+from iscat_analysis.pipeline.frames import frame_warnings
+from iscat_analysis.pipeline.injection import inject_and_recover
+from iscat_analysis.pipeline.landing import analyse_landings
+from iscat_analysis.pipeline.merging import Done, Merged
 from iscat_analysis.pipeline.resume import partial_folder
+from iscat_analysis.pipeline.summary import summary_of
 from iscat_analysis.pipeline.tasks import TaskBuilder
-from iscat_analysis.records import EVENT_COLUMNS, EventView
+from iscat_analysis.pipeline.ways import way_of
+from iscat_analysis.records import EVENT_COLUMNS, FRAME_COLUMN, EventView
 from iscat_analysis.study.simulate import Movie
 
 PIXEL_NM = 84.0
@@ -318,6 +318,8 @@ def test_stuck_and_dropped_frames_are_left_out(counts: np.ndarray) -> None:
     assert "100, 210" in line
     assert "left out" in line
     assert result.summary["frames_left_out"] == 2
+    spread = summary_of(result.scene, result.table, result.compared, {})["power_spread"]
+    assert 0.005 < spread < 0.02, "of the other frames, whose light has 1 % of noise"
 
 
 @pytest.mark.parametrize(("polarity", "sign"), [("dark", 1), ("bright", -1)])
@@ -381,6 +383,7 @@ def test_a_moving_pattern_is_named(shift: int, named: bool) -> None:
         Done(
             core=(0, 400),
             table=pd.DataFrame(),
+            repeats=np.empty(0),
             views=(),
             good=np.ones(400, dtype=bool),
             light=np.ones(400),
@@ -457,18 +460,28 @@ def test_rings_of_neighbours_are_those_of_their_height(mode: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "sliding"),
+    ("settings", "way"),
     [
-        ("fit.mode=mass", True),
-        ("fit.mode=joint", True),
-        ("fit.mode=track", False),
-        ("background.frames=[0, 100]", False),
-        ("background.method=median", False),
-        ("optics.scheme=darkfield", False),
+        (["fit.mode=mass"], "sliding"),
+        (["fit.mode=joint"], "sliding"),
+        (["fit.mode=track"], "tracks"),
+        (["fit.mode=track", "background.method=median"], "tracks"),
+        (["fit.mode=track", "background.method=median", "background.frames=[0, 100]"], "fixed"),
+        (["fit.mode=track", "background.frames=[0, 100]"], "fixed"),
+        (["background.frames=[0, 100]"], "fixed"),
+        (["background.method=median"], "fixed"),
+        (["background.method=known", "background.level_e=2"], "fixed"),
+        (["optics.scheme=darkfield"], "fixed"),
     ],
 )
-def test_which_movies_slide(setting: str, sliding: bool) -> None:
-    assert has_landings(load_config(None, [setting])) is sliding
+def test_the_method_says_which_frames_stand_against_which(settings: list[str], way: str) -> None:
+    assert way_of(load_config(None, settings)) == way
+
+
+def test_windows_that_slide_measure_a_background_that_poisson_takes_for_known() -> None:
+    config = load_config(None, ["fit.likelihood=poisson"])
+    with pytest.raises(ConfigError, match=r'fit.likelihood = "poisson".*"sliding" measures it'):
+        way_of(config)
 
 
 # ---- on disk ---------------------------------------------------------------------------------
@@ -643,7 +656,7 @@ def test_an_interrupt_of_the_chains_keeps_the_fits(
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(chunk_work, "sample_posterior", interrupt)
+    monkeypatch.setattr(events_module, "sample_posterior", interrupt)
     result, _ = _run(counts, _config("posterior.enabled=true"))
     assert result.interrupted
     pd.testing.assert_frame_equal(result.table, plain[0].table)

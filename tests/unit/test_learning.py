@@ -23,7 +23,7 @@ def _learn(
     """Whether the configuration stayed, the summary, and what the user was told."""
     config = _config(calibrate)
     sights, _, _ = make_sights(changes, count, seed=3)
-    monkeypatch.setattr(learning, "landing_sights", lambda *_: (sights, []))
+    monkeypatch.setattr(learning, "bright_sights", lambda *_: (sights, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
     learned, summary = learn_optics(MOVIE, config, camera, tell=said.append)

@@ -27,7 +27,7 @@ from iscat_analysis.inference.repeats import (
 )
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline.achieved import likely_noise, spread_verdict, with_measured_sigma
-from iscat_analysis.pipeline.results import _across
+from iscat_analysis.pipeline.summary import _across
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
 from iscat_analysis.report import render_report
 from iscat_analysis.report.headline import headline

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -55,7 +55,29 @@ class StepFrame:
         They stay out of the fit: where the frame was chosen by their noise, that noise would
         count as signal.
         """
-        return round(_STEEP / max(self.per_frame_snr, 0.5) ** 2)
+        return _gap(self.per_frame_snr)
+
+    @classmethod
+    def undated(cls, frame: int, half_width: int) -> StepFrame:
+        """Date a step as the search did, before its own frames are looked at.
+
+        Parameters
+        ----------
+        frame : int
+            At which a boundary between windows lies.
+        half_width : int
+            Frames from one boundary to the next.
+
+        Returns
+        -------
+        StepFrame
+            As high as the noise of one frame, and with no sign of another change.
+        """
+        return cls(frame, half_width, height=1.0, per_frame_snr=1.0, p_constant=1.0)
+
+
+def _gap(per_frame_snr: float) -> int:
+    return round(_STEEP / max(per_frame_snr, 0.5) ** 2)
 
 
 def locate_step(
@@ -107,11 +129,11 @@ def locate_step(
     held = np.cumsum(posterior[order])
     half_width = int(distance[order][np.searchsorted(held, CREDIBLE * (1 - 1e-12))])
     height = float(jump[best])
-    found = StepFrame(int(frames[best]), half_width, height, abs(height) * math.sqrt(scale), 1.0)
-    turn = best + 1
-    sides = (slice(0, max(turn - found.gap, 0)), slice(turn + found.gap, None))
+    snr = abs(height) * math.sqrt(scale)
+    turn, gap = best + 1, _gap(snr)
+    sides = (slice(0, max(turn - gap, 0)), slice(turn + gap, None))
     p = min(_p_constant(heights[side], weight[side]) for side in sides)
-    return replace(found, p_constant=1 - (1 - p) ** 2)
+    return StepFrame(int(frames[best]), half_width, height, snr, 1 - (1 - p) ** 2)
 
 
 def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArray, float]:

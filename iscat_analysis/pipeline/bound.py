@@ -1,0 +1,133 @@
+"""Particles that stand against a background recorded before them, or against a known level."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from iscat_analysis.pipeline.diagnosis import (
+    drift_warning,
+    examine_background,
+    misfit_warning,
+    pixel_warnings,
+)
+from iscat_analysis.pipeline.events import Event, posterior_of
+from iscat_analysis.pipeline.field import fit_field
+from iscat_analysis.pipeline.noise import judge_background
+from iscat_analysis.pipeline.prepare import Prepared
+from iscat_analysis.pipeline.ranges import checked, frame_ranges, measured_windows
+from iscat_analysis.pipeline.regions import contrast_image
+from iscat_analysis.pipeline.repeats import field_repeats
+from iscat_analysis.pipeline.results import Compared, Found, table_of, view_of
+from iscat_analysis.pipeline.run import Run
+from iscat_analysis.pipeline.scene import Scene, make_scene
+from iscat_analysis.pipeline.tracking import track_frames
+from iscat_analysis.records import PosteriorResult, Progress
+from iscat_analysis.threads import threads
+
+
+def find_bound(ready: Prepared, run: Run) -> Found:
+    """Find particles in the frames after a background, together or, in mode track, one by one.
+
+    Parameters
+    ----------
+    ready : Prepared
+        The movie.
+    run : Run
+        Is told what the user should know.
+
+    Returns
+    -------
+    Found
+        Everything found.
+
+    Raises
+    ------
+    ConfigError
+        The background frames are not given.
+    DataError
+        The background leaves no frame to fit, or a frame is impossible.
+    """
+    movie, config, camera = ready.steady, ready.config, ready.camera
+    before, after = frame_ranges(movie, config)
+    searches = after[1] - after[0] if config.fit.mode == "track" else 1
+    scene = make_scene(config, ready.shape, searches=searches, lines=ready.lines)
+    run.warm_up(scene)
+    run.clock.lap("model")
+    windows = measured_windows(movie, config, camera, before, after, progress=run.progress)
+    noise = judge_background(movie, camera, windows)
+    if noise.spectrum is not None:
+        scene = make_scene(
+            config, ready.shape, searches=searches, noise=noise.spectrum, lines=ready.lines
+        )
+    for text in (*noise.said(movie.name), *pixel_warnings(windows)):
+        run.tell(text)
+    summary: dict[str, Any] = {}
+    if not scene.additive:
+        summary = examine_background(movie, camera, windows)
+        summary["noise_spectrum"] = noise.summary
+        moved = drift_warning(movie.name, summary)
+        if moved:
+            run.tell(moved)
+    run.clock.lap("background")
+    interrupted = False
+    with threads(config.compute.workers) as pool:
+        if scene.mode == "track":
+            found = track_frames(
+                scene, movie, camera, windows, summary,
+                check=checked(movie, camera), pool=pool, progress=run.progress,
+            )  # fmt: skip
+            run.clock.lap("results")
+            return found
+        events, windows = fit_field(
+            scene, windows, excess_noise=noise.excess, pool=pool, progress=run.progress
+        )
+        run.clock.lap("fit")
+        cause = misfit_warning(config, events)
+        if cause:
+            run.tell(cause)
+        repeats, empty = field_repeats(scene, movie, camera, windows, events)
+        run.clock.lap("repeats")
+        chains: list[PosteriorResult] = []
+        if config.samples_posterior:
+            chains, interrupted = _sampled(scene, events, pool, run.progress)
+            run.clock.lap("posterior")
+    unsampled = [None] * (len(events) - len(chains))
+    found = Found(
+        scene=scene,
+        table=table_of(scene, events),
+        views=tuple(
+            view_of(number, event, posterior=chain)
+            for number, (event, chain) in enumerate(zip(events, [*chains, *unsampled], strict=True))
+        ),
+        image=contrast_image(scene, windows),
+        compared=Compared.of(windows),
+        heading="background",
+        summary=summary,
+        repeats=tuple(repeats),
+        empty=empty,
+        interrupted=interrupted,
+    )
+    run.clock.lap("results")
+    return found
+
+
+def _sampled(
+    scene: Scene, events: Sequence[Event], pool: ThreadPoolExecutor, progress: Progress
+) -> tuple[list[PosteriorResult], bool]:
+    """Sample the posteriors, in order; an interrupt keeps those that are done."""
+    stop = threading.Event()
+    done: list[PosteriorResult] = []
+    try:
+        for chain in pool.map(
+            lambda n: posterior_of(scene, events[n], n, stopped=stop.is_set), range(len(events))
+        ):
+            done.append(chain)
+            progress("posterior", len(done), len(events))
+    except KeyboardInterrupt:
+        stop.set()
+        pool.shutdown(cancel_futures=True)
+        return done, True
+    return done, False

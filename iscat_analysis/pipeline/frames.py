@@ -1,0 +1,108 @@
+"""What is odd about the frames of a landing movie, in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.pipeline.diagnosis import DRIFT_PX
+from iscat_analysis.pipeline.merging import Merged
+from iscat_analysis.records import FloatArray
+
+JUMP = 0.1
+"""Relative change of the light from one frame to the next that is reported."""
+
+
+def frame_warnings(
+    name: str,
+    merged: Merged,
+    light: FloatArray,
+    first: int,
+    window: int,
+    *,
+    corrected: bool = False,
+) -> Iterator[str]:
+    """Say what is odd about the frames.
+
+    Parameters
+    ----------
+    name : str
+        What the lines call the movie.
+    merged : Merged
+        The chunks.
+    light : ndarray, shape (t,)
+        Light of every frame; NaN where it was left out.
+    first : int
+        Number of the first frame.
+    window : int
+        Frames before and after a step.
+    corrected : bool
+        Whether the motion of the fixed pattern was to be divided out.
+
+    Yields
+    ------
+    str
+        One line each.
+    """
+    missing = merged.repeats() + first
+    if missing.size:
+        verb = "is" if missing.size == 1 else "are"
+        yield (
+            f"{name}: {_frames(missing)} {verb} zero throughout, not finite or the same as the "
+            "frame before (dropped or stuck in the camera); left out, the other frames are used"
+        )
+    known = np.flatnonzero(np.isfinite(light))
+    change = light[known][1:] / light[known][:-1] - 1
+    if change.size:
+        usual = 1.4826 * float(np.median(np.abs(change)))
+        jumps = known[1:][np.abs(change) > max(JUMP, 8 * usual)] + first
+        if jumps.size:
+            largest = 100 * float(change[np.argmax(np.abs(change))])
+            yield (
+                f"{name}: the brightness jumps at {_frames(jumps)} by up to {largest:+.0f} %; "
+                "it is divided out, but look at the laser and at events in these frames"
+            )
+    defects, burnt = merged.masks()
+    if defects:
+        yield f"{defects} dead or hot pixels are left out"
+    if burnt:
+        yield (
+            f"{burnt} pixels are saturated in some frame and left out; "
+            "lower the exposure or the laser power"
+        )
+    yield from _drift_warnings(name, merged, light.size / window, corrected)
+
+
+def _drift_warnings(name: str, merged: Merged, windows: float, corrected: bool) -> Iterator[str]:
+    """Say how the fixed pattern moved, and what was done about it."""
+    drift, way = merged.drift(), merged.trajectory()
+    if way is not None and drift is not None:
+        yield (
+            f"{name}: the fixed pattern moved by {drift[1]:+.3f} pixels in x and "
+            f"{drift[0]:+.3f} in y; corrected, to ±{way.typical_error_px:.1g} pixels"
+        )
+    unfollowed = merged.unfollowed() if corrected else []
+    if unfollowed:
+        spans = ", ".join(f"{a}:{b}" for a, b in unfollowed[:4])
+        yield (
+            f"{name}: no fixed pattern stands out of the noise in frames {spans}"
+            f"{' and more' if len(unfollowed) > 4 else ''}, so background.drift_correction has "
+            "nothing to correct there"
+        )
+    if corrected or drift is None:
+        return
+    if math.hypot(*drift) > DRIFT_PX * max(windows / 2, 1.0):
+        yield (
+            f"{name}: the fixed pattern moved by {drift[1]:+.2f} pixels in x and "
+            f"{drift[0]:+.2f} in y; it is not corrected: set background.drift_correction = true "
+            "(shorter windows, background.window_frames, suffer less too)"
+        )
+
+
+def _frames(frames: NDArray[np.int64]) -> str:
+    shown = ", ".join(str(f) for f in frames[:4])
+    more = f" and {frames.size - 4} more" if frames.size > 4 else ""
+    return f"frame{'' if frames.size == 1 else 's'} {shown}{more}"

@@ -1,0 +1,292 @@
+"""The noise before anything is searched: gain, correlation of pixels, length of the windows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from numpy.typing import NDArray
+
+from iscat_analysis.config import Config
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie import Stack
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain
+from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
+from iscat_analysis.pipeline.chunks import NOISE_FRAMES, Reader
+from iscat_analysis.records import BoolArray, Mapper, Windows
+from iscat_analysis.search.sliding import (
+    SHORTEST_MOVIE,
+    NoiseCurve,
+    choose_window,
+    longest_window,
+    measure_noise,
+)
+
+EXCESS_NOISE = 1.4
+"""Noise variance over the expected from which a thousand candidates are taken for noise."""
+
+SPECTRUM_FRAMES = 128
+"""Background frames on which the spectrum of the noise is measured."""
+
+_GAIN_FRAMES = 64  # on which the gain is judged
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What some frames without particles, or nearly so, say of the noise.
+
+    Attributes
+    ----------
+    gain_message : str
+        One line where the noise does not agree with the configured gain, else empty.
+    excess : str
+        What is known of noise beyond the expected, else empty.
+    spectrum : NoiseSpectrum or None
+        Of the noise between neighbouring frames, where it is not white and of the expected size.
+    """
+
+    gain_message: str = ""
+    excess: str = ""
+    spectrum: NoiseSpectrum | None = None
+
+    def said(self, name: str) -> Iterator[str]:
+        """Give what the user should know.
+
+        Parameters
+        ----------
+        name : str
+            What messages call the movie.
+
+        Yields
+        ------
+        str
+            One line each.
+        """
+        if self.spectrum is not None and self.spectrum.message:
+            yield f"{name}: {self.spectrum.message}"
+        if self.gain_message:
+            yield self.gain_message
+
+    @property
+    def summary(self) -> dict[str, Any] | None:
+        """What ``summary.json`` says of the spectrum."""
+        return None if self.spectrum is None else self.spectrum.summary
+
+
+def judge_counts(
+    counts: NDArray[Any],
+    camera: Camera,
+    *,
+    masked: BoolArray | None = None,
+    mapper: Mapper = map,
+) -> Noise:
+    """Compare the noise between neighbouring frames with the camera's.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Successive frames; the gain is judged on the first of them.
+    camera : Camera
+        Counts → photoelectrons.
+    masked : ndarray of bool, shape (y, x), optional
+        Pixels to leave out.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    Noise
+        Silent of the gain where it is too dark to tell.
+    """
+    spectrum = measure_spectrum(counts, camera, mapper=mapper)
+    try:
+        gain = diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=masked)
+    except DataError:  # too dark to tell
+        return Noise(spectrum=spectrum)
+    gain = allow_for_correlation(gain, spectrum)
+    message = gain.message or ""
+    return Noise(message, message if gain.noise_ratio > EXCESS_NOISE else "", spectrum)
+
+
+def judge_background(movie: Stack, camera: Camera, windows: Windows) -> Noise:
+    """Judge the noise of the background frames.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    camera : Camera
+        Counts → photoelectrons.
+    windows : Windows
+        The background.
+
+    Returns
+    -------
+    Noise
+        Silent where there is no shot noise to look at.
+    """
+    if windows.n_before < 2 or not is_lit(windows):
+        return Noise()
+    counts = first_counts(movie, windows, SPECTRUM_FRAMES)
+    return judge_counts(counts, camera, masked=windows.masked)
+
+
+def judge_opening(
+    reader: Reader, config: Config, mapper: Mapper = map
+) -> tuple[Noise, NoiseCurve, int]:
+    """Judge the noise of a landing movie, and choose how many frames around a step are summed.
+
+    Parameters
+    ----------
+    reader : Reader
+        The frames.
+    config : Config
+        ``background.window_frames`` wins where it is given.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    noise : Noise
+        Of the first good frames, in which little has landed.
+    curve : NoiseCurve
+        Noise against averaging, of these.
+    window : int
+        Frames before, and as many after, each step.
+
+    Raises
+    ------
+    DataError
+        The movie is shorter than two windows, or holds no two frames that differ.
+    """
+    opening, curve, window = judge_window(reader, config, mapper)
+    noise = judge_counts(opening, reader.camera, mapper=mapper)
+    excess = noise.excess
+    if not excess and curve.at(window) > EXCESS_NOISE:
+        excess = (
+            f"between averages of {window} frames the noise variance is {curve.at(window):.2g} "
+            "times that of the light; look at the laser, set background.drift_correction = true, "
+            "or lower background.window_frames"
+        )
+    return replace(noise, excess=excess), curve, window
+
+
+def judge_window(
+    reader: Reader, config: Config, mapper: Mapper = map
+) -> tuple[NDArray[Any], NoiseCurve, int]:
+    """Choose how many frames around a step are summed.
+
+    Parameters
+    ----------
+    reader : Reader
+        The frames.
+    config : Config
+        ``background.window_frames`` wins where it is given.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    opening : ndarray, shape (t, y, x)
+        Good frames among the first.
+    curve : NoiseCurve
+        Noise against averaging, of these.
+    window : int
+        Frames before, and as many after, each step.
+
+    Raises
+    ------
+    DataError
+        The movie is shorter than two windows, or holds no two frames that differ.
+    """
+    frames = reader.last - reader.first
+    given = config.background.window_frames
+    needed = 2 * given if given else SHORTEST_MOVIE
+    if frames < needed:
+        windows = (
+            f"two windows of background.window_frames = {given}" if given else "sliding windows"
+        )
+        raise DataError(
+            f"{reader.name}: has {frames} frames, but {windows} before and after each landing take "
+            f"{needed}: record longer"
+            + (", or lower background.window_frames" if given else "")
+            + "; or give the frames before the particles bind as background.frames = [0, N]"
+        )
+    opening = reader.opening(mapper)
+    longest = min(given or longest_window(frames), NOISE_FRAMES // 4)
+    curve = measure_noise(opening, reader.camera, longest, mapper=mapper)
+    window = given or choose_window(curve, frames)
+    return opening, curve, window
+
+
+def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:
+    """Judge the gain by the noise that neighbouring pixels have together.
+
+    Parameters
+    ----------
+    gain : GainDiagnosis
+        From the variance of single pixels.
+    spectrum : NoiseSpectrum or None
+        Of the same frames.
+
+    Returns
+    -------
+    GainDiagnosis
+        The same where pixels are independent.
+
+    Notes
+    -----
+    Light is Poisson before charge leaks to neighbours; leaking moves variance into covariances
+    (M. Downing et al., Proc. SPIE 6276, 627609, 2006).
+    """
+    if spectrum is None or not spectrum.correlated:
+        return gain
+    ratio, error = spectrum.summed
+    return replace(
+        gain,
+        noise_ratio=ratio,
+        noise_ratio_se=error,
+        gain_e_per_adu=gain.configured_gain / ratio,
+        gain_se=gain.configured_gain / ratio**2 * error,
+    )
+
+
+def first_counts(movie: Stack, windows: Windows, most: int) -> NDArray[Any]:
+    """Read the first background frames.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    windows : Windows
+        The background.
+    most : int
+        Frames, at most.
+
+    Returns
+    -------
+    ndarray, shape (t, y, x)
+        Counts.
+    """
+    start, stop = windows.frames_before
+    return movie.read(start, min(stop, start + most))
+
+
+def is_lit(windows: Windows) -> bool:
+    """Tell whether there is light in the background, beyond the read noise.
+
+    Parameters
+    ----------
+    windows : Windows
+        The background.
+
+    Returns
+    -------
+    bool
+        Of the pixels in use together.
+    """
+    used = ~windows.masked
+    light, read = windows.before_e[used], windows.read_variance_before_e2[used]
+    return bool(light.sum() > read.sum())

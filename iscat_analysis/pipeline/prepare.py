@@ -1,0 +1,168 @@
+"""From an open movie to one whose camera, optics and kind are known: load and calibrate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
+
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.movie import Stack
+from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_ratio
+from iscat_analysis.movie.lines import Lines, SteadyFrames
+from iscat_analysis.movie.metadata import resolve_metadata
+from iscat_analysis.pipeline.diagnosis import judge_lines
+from iscat_analysis.pipeline.learning import learn_optics
+from iscat_analysis.pipeline.ranges import fitted_frames, tracked_frames
+from iscat_analysis.pipeline.recognise import (
+    as_landing,
+    as_moving,
+    changes_summary,
+    look_at_changes,
+)
+from iscat_analysis.pipeline.run import Run
+from iscat_analysis.pipeline.tracks import judge_times
+from iscat_analysis.pipeline.ways import Way, way_of
+from iscat_analysis.search.changes import Changes
+from iscat_analysis.threads import beside
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A movie that can be searched.
+
+    Attributes
+    ----------
+    movie : Stack
+        As it was opened.
+    steady : Stack
+        The same without the flicker of lines.
+    config : Config
+        Resolved: with what the metadata say, and with the optics that were learned.
+    camera : Camera
+        Counts → photoelectrons.
+    way : {"fixed", "sliding", "tracks"}
+        Which frames stand against which.
+    lines : Lines or None
+        Rows and columns that flicker.
+    other_kind : str
+        Says that the movie seems to be of another kind than configured; else empty.
+    digest : Future of str
+        SHA-256 of the movie's bytes, which takes a while.
+    summary : mapping
+        What ``summary.json`` says of ``lines``, ``optics`` and ``changes``.
+    """
+
+    movie: Stack
+    steady: Stack
+    config: Config
+    camera: Camera
+    way: Way
+    lines: Lines | None
+    other_kind: str
+    digest: Future[str]
+    summary: Mapping[str, Any]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.movie.shape[1], self.movie.shape[2]
+
+
+def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
+    """Load and calibrate a movie.
+
+    Parameters
+    ----------
+    movie : Stack
+        From `iscat_analysis.movie.open_stack`.
+    config : Config
+        What to do.
+    run : Run
+        Is told what the user should know.
+
+    Returns
+    -------
+    Prepared
+        Ready to be searched.
+
+    Raises
+    ------
+    ConfigError
+        The configuration does not suit the movie.
+    DataError
+        The frames are impossible.
+    """
+    config, notes = resolve_metadata(config, movie.metadata)
+    for note in (*movie.notes, *notes):
+        run.tell(note)
+    way = way_of(config)
+    tracked = config.fit.mode == "track"
+    if tracked:
+        for note in judge_times(config, tracked_frames(movie, config), movie.name):
+            run.tell(note)
+    config = _with_photons(config, run)
+    if config.optics.psf == "measured":
+        run.tell(
+            'optics.psf = "measured": bounds are those of the template, and there is no quantum '
+            "bound, because a picture does not say what light made it"
+        )
+    camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
+    refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
+    digest = beside(movie.sha256)
+    summary: dict[str, Any] = {}
+    lines = judge_lines(movie, config, camera)
+    steady = movie
+    if lines is not None:
+        run.tell(f"{movie.name}: {lines.message}")
+        summary["lines"] = lines.summary
+        steady = movie.seen_as(SteadyFrames(movie, lines, camera))
+    looking: Future[Changes] | None = None
+    if way == "sliding" or tracked:
+        span = fitted_frames(movie, config, config.background.frames)
+        looking = beside(look_at_changes, steady, config, camera, span)
+    configured = config
+    config, learned = learn_optics(steady, config, camera, tell=run.tell)
+    if learned:
+        summary["optics"] = learned
+    run.clock.lap("optics")
+    other_kind = ""
+    if looking is not None:
+        changes = looking.result()
+        if config.optics.na != configured.optics.na:
+            changes = look_at_changes(steady, config, camera, span)
+        summary["changes"] = changes_summary(changes)
+        other_kind = (as_landing if tracked else as_moving)(changes, movie.name)
+        if other_kind:
+            run.tell(other_kind)
+    if way != "sliding":
+        _refuse_what_only_slides(run, movie.name)
+    return Prepared(movie, steady, config, camera, way, lines, other_kind, digest, summary)
+
+
+def _with_photons(config: Config, run: Run) -> Config:
+    """Take the scale of masses in dark field from the simulation, for one more release."""
+    if config.optics.scheme != "darkfield" or config.particle.photons_per_frame is not None:
+        return config
+    photons = config.simulation.photons_per_pixel
+    run.tell(
+        f"particle.photons_per_frame is not given, so that masses rest on "
+        f"simulation.photons_per_pixel = {photons:g}, which says nothing of this movie; give "
+        "the scattered photons collected per frame from a particle of particle.mass_kda: the "
+        "next release asks for it"
+    )
+    particle = config.particle.model_copy(update={"photons_per_frame": photons})
+    return config.model_copy(update={"particle": particle})
+
+
+def _refuse_what_only_slides(run: Run, name: str) -> None:
+    """Say that workers are left idle, and refuse to inject particles."""
+    if run.place.distant:
+        run.notify(f"{name}: is analysed in this process: only landing movies have chunks")
+    if run.inject:
+        raise ConfigError(
+            f"`inject` = {run.inject}: particles are added to landing movies only, which have an "
+            'interferometric scheme and background.method = "sliding"; leave it out'
+        )

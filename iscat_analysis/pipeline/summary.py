@@ -1,0 +1,183 @@
+"""What ``summary.json`` says of all events together: counts, medians, precision, species."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.bounds import holevo_over_quantum
+from iscat_analysis.inference.achieved import Achieved
+from iscat_analysis.pipeline.results import Compared
+from iscat_analysis.pipeline.scene import Scene
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status, free_parameters
+from iscat_analysis.report.spread import rejection
+from iscat_analysis.species import describe
+from iscat_analysis.species.tables import filter_efficiency, shared_error
+
+_HEIGHTS = 65
+"""Heights at which the Holevo bound is computed for a table; linear in between."""
+
+
+def summary_of(
+    scene: Scene,
+    table: pd.DataFrame,
+    compared: Compared,
+    timings: Mapping[str, float],
+    achieved: Mapping[str, Achieved] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """Gather counts, medians and efficiency, for ``summary.json``.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models and configuration.
+    table : pandas.DataFrame
+        The events.
+    compared : Compared
+        Frames and their light.
+    timings : mapping of str to float
+        Seconds per stage.
+    achieved : mapping of str to Achieved
+        Measured spread of each free parameter over its bound, where it was measured.
+
+    Returns
+    -------
+    dict
+        Nested plain values.
+    """
+    good = table[table["status"] == Status.OK]
+    free = free_parameters(scene.mode, table)
+    conflict = {"z_nm", "mass_kda"} <= set(free) and len(good) > 0
+    cost = _holevo_over_quantum(scene, good["z_nm"].to_numpy(float)) if conflict else {}
+    distribution = _distribution(scene, good)
+    precision = {}
+    for name in free:
+        sigma, crb, qcrb = (good[f"{kind}_{name}"] for kind in ("sigma", "crb", "qcrb"))
+        reachable = qcrb * cost.get(name, 1.0)
+        precision[name] = {
+            "sigma_median": _median(sigma),
+            "crb_median": _median(crb),
+            **({"holevo_median": _median(reachable)} if conflict else {}),
+            "qcrb_median": _median(qcrb),
+            "sigma_over_crb_median": _median(sigma / crb),
+            "information_fraction_median": _median((reachable / crb) ** 2),
+        }
+        if name in achieved:
+            precision[name] |= _repeats(achieved[name])
+        if f"systematic_{name}" in good:
+            precision[name]["systematic_median"] = _median(good[f"systematic_{name}"])
+    return {
+        "mode": scene.mode,
+        "scheme": scene.model.optics.scheme,
+        "emission": scene.model.optics.emission,
+        "convention": scene.model.optics.convention,
+        "mass_scale": "calibration" if scene.config.calibration else "absolute model",
+        "events": int((table["status"] != Status.SIDELOBE).sum()),
+        "status": dict(sorted(Counter(table["status"]).items())),
+        "frames_before": list(compared.frames_before),
+        "frames_after": list(compared.frames_after),
+        "power_ratio": compared.power_ratio,
+        "power_spread": _spread(compared.power),
+        "masked_pixels": compared.masked_pixels,
+        "detection_threshold_snr": scene.templates.threshold,
+        "medians": {
+            "mass_kda": _median(good["mass_kda"]),
+            "contrast": _median(good["contrast"]),
+            "n_scattered": _median(good["n_scattered"]),
+        },
+        "precision": precision,
+        "distribution": distribution,
+        "across_particles": _across(scene, table, distribution),
+        "seconds": {name: round(value, 3) for name, value in timings.items()},
+    }
+
+
+def _repeats(found: Achieved) -> dict[str, Any]:
+    """Give what the summary says of a measured spread."""
+    return {
+        "repeat_over_crb": found.over_crb,
+        "repeat_over_crb_ci95": list(found.ci95),
+        "repeat_significance": found.significance,
+        "repeat_events": found.events,
+        "repeat_whole": found.whole,
+        "repeat_frames": list(found.frames),
+        "repeat_over_crb_by_frames": list(found.by_frames),
+        "repeat_over_crb_by_frames_se": list(found.by_frames_se),
+        "empty_over_crb": list(found.empty),
+    }
+
+
+def _holevo_over_quantum(scene: Scene, z_nm: FloatArray) -> dict[str, FloatArray]:
+    """Cost of fitting height and mass at once, of each particle, by parameter.
+
+    It depends on the height through the evanescent waves alone, and smoothly.
+    """
+    free = FREE_PARAMETERS[scene.mode]
+    heights = np.linspace(max(z_nm.min(), 0.0), max(z_nm.max(), 1.0), _HEIGHTS)
+    costs = [holevo_over_quantum(scene.model, float(z), free) for z in heights]
+    return {name: np.interp(z_nm, heights, [cost[name] for cost in costs]) for name in free}
+
+
+def _distribution(scene: Scene, good: pd.DataFrame) -> dict[str, Any] | None:
+    """Describe the species where masses were fitted, each event once.
+
+    The matched filter's standard deviation is what its snr makes of each mass.
+    """
+    if "mass_kda" not in FREE_PARAMETERS[scene.mode] or scene.mode == "track":
+        return None
+    mass, sigma = (good[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
+    found = describe(
+        mass,
+        sigma,
+        efficiency=filter_efficiency(good, scene.templates.threshold),
+        seed=scene.config.compute.seed,
+        scale_error=shared_error(good),
+        window_frames=int(good["n_after"].max()) if len(good) else None,
+    )
+    return found.to_dict()
+
+
+def _across(
+    scene: Scene, table: pd.DataFrame, distribution: Mapping[str, Any] | None
+) -> list[dict[str, Any]]:
+    """Say how much wider than σ each species is; of a rejected model, poor fits are judged too."""
+    if distribution is None:
+        return []
+    species, status = distribution["species"], table["status"]
+    used = table[status == Status.OK]
+    if rejection(table):
+        used = table[status.isin([Status.OK, Status.POOR_FIT])]
+        mass, sigma = (used[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
+        found = describe(mass, sigma, seed=scene.config.compute.seed)
+        species = found.to_dict()["species"]
+    if not species:
+        return []
+    means = np.array([one["mass_kda"] for one in species])
+    sizes = used["mass_kda"].abs().to_numpy(float)
+    nearest = np.argmin(np.abs(sizes[:, None] - means), axis=1)
+    across = []
+    for k, one in enumerate(species):
+        sigma_median = _median(used["sigma_mass_kda"].to_numpy(float)[nearest == k])
+        if one["outlier"] or not sigma_median:
+            continue
+        keys = ("mass_kda", "width_kda", "width_low", "width_high", "count")
+        over = np.hypot(1.0, one["width_kda"] / sigma_median)
+        across.append({**{key: one[key] for key in keys}, "spread_over_sigma": float(over)})
+    return across
+
+
+def _median(values: pd.Series[float] | FloatArray) -> float | None:
+    finite = np.asarray(values, dtype=float)
+    finite = finite[np.isfinite(finite)]
+    return float(np.median(finite)) if finite.size else None
+
+
+def _spread(power: FloatArray) -> float:
+    """Give the standard deviation of the light of the frames in which it is known."""
+    known = power[np.isfinite(power)]
+    return float(np.std(known)) if known.size else 0.0
