@@ -1,47 +1,47 @@
 """The configuration: what the keys are, how files are read, and how single keys are changed.
 
-`schema` lists the sections and keys.  `configure` is the one way to a `Config`: files, mappings,
-keyword arguments and ``--set`` all go through it, so that the same keys give the same
+The sections and their keys stand in `instrument`, `analysis` and `synthetic`, `values` says what
+these may be, and `schema` has the whole.  `configure` is the one way to a `Config`: files,
+mappings, keyword arguments and ``--set`` all go through it, so that the same keys give the same
 configuration and a later value wins over an earlier one in the same way.  `files` reads and writes
 TOML, and `renamed` keeps old names working for one release.
 """
 
 from __future__ import annotations
 
+from iscat_analysis.config.analysis import (
+    BackgroundConfig,
+    Compute,
+    Detection,
+    Fit,
+    PosteriorConfig,
+    TrackConfig,
+)
 from iscat_analysis.config.files import (
     OpticsFile,
     config_to_toml,
     read_optics_file,
     with_absolute_paths,
 )
-from iscat_analysis.config.overrides import configure, load_config, parse_config
-from iscat_analysis.config.schema import (
+from iscat_analysis.config.instrument import (
     ABERRATIONS,
     MEASURABLE,
-    PIXEL_NM,
-    SIMULATED,
-    BackgroundConfig,
-    BoundsConfig,
     Calibration,
     CameraConfig,
-    Compute,
-    Config,
-    Detection,
-    Fit,
-    Method,
-    Mode,
     Optics,
     OpticsCovariance,
     Particle,
-    PosteriorConfig,
-    Scheme,
-    Section,
+)
+from iscat_analysis.config.overrides import configure, load_config, parse_config
+from iscat_analysis.config.schema import Config
+from iscat_analysis.config.synthetic import (
+    SIMULATED,
+    BoundsConfig,
     SimulatedEvent,
     SimulatedMover,
     Simulation,
-    TrackConfig,
-    plausible_pixel,
 )
+from iscat_analysis.config.values import PIXEL_NM, Method, Mode, Scheme, Section, plausible_pixel
 
 __all__ = [
     "ABERRATIONS",

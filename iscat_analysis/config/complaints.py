@@ -7,7 +7,9 @@ import re
 from collections.abc import Mapping
 from typing import Any, get_args
 
-from iscat_analysis.config.schema import SIMULATED, Config, Section
+from iscat_analysis.config.schema import Config
+from iscat_analysis.config.synthetic import SIMULATED
+from iscat_analysis.config.values import Section
 
 _DECIMAL_COMMA = re.compile(r"\s*([-+]?\d+),(\d+)\s*")
 

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from iscat_analysis.config.complaints import model_of
-from iscat_analysis.config.schema import SIMULATED, Config, Section
+from iscat_analysis.config.schema import Config
+from iscat_analysis.config.synthetic import SIMULATED
+from iscat_analysis.config.values import Section
 from iscat_analysis.errors import ConfigError
 
 

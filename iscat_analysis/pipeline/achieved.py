@@ -116,6 +116,7 @@ def spread_verdict(
     *,
     scaled: bool,
     rejected: bool = False,
+    sliding: bool = True,
 ) -> dict[str, Any]:
     """Say whether σ is too small, by what factor, and what the noise suggests.
 
@@ -129,6 +130,8 @@ def spread_verdict(
         Whether σ was scaled by the measured spread.
     rejected : bool
         Whether the model of the image is rejected.
+    sliding : bool
+        Whether windows slide; else frames stand against a background recorded before them.
 
     Returns
     -------
@@ -148,7 +151,7 @@ def spread_verdict(
             )
         return {"understated": False, "message": message, "cause": ""}
     worst = max(high.values(), key=lambda a: a.significance)
-    cause = likely_noise(worst, noise, rejected=rejected)
+    cause = likely_noise(worst, noise, rejected=rejected, sliding=sliding)
     if scaled:
         message = (
             f"σ is scaled by the measured spread, {_ratios(high)} times the Cramér–Rao bound; "
@@ -162,7 +165,13 @@ def spread_verdict(
     return {"understated": not scaled, "message": message, "cause": cause}
 
 
-def likely_noise(found: Achieved, noise: Mapping[str, Any], *, rejected: bool = False) -> str:
+def likely_noise(
+    found: Achieved,
+    noise: Mapping[str, Any],
+    *,
+    rejected: bool = False,
+    sliding: bool = True,
+) -> str:
     """Name what an excess of noise looks like.
 
     Parameters
@@ -174,6 +183,8 @@ def likely_noise(found: Achieved, noise: Mapping[str, Any], *, rejected: bool = 
     rejected : bool
         Whether the model of the image is rejected: what it leaves over of other particles then
         looks like slow noise.
+    sliding : bool
+        As in `spread_verdict`.
 
     Returns
     -------
@@ -203,7 +214,7 @@ def likely_noise(found: Achieved, noise: Mapping[str, Any], *, rejected: bool = 
             )
     if found.empty:
         if found.slow2 > _SHARE * excess:
-            said.append(_slow(found))
+            said.append(_slow(found, sliding))
             if rejected:
                 doubt = (
                     "it may be what a wrong model of the image leaves over of other particles: "
@@ -217,19 +228,21 @@ def likely_noise(found: Achieved, noise: Mapping[str, Any], *, rejected: bool = 
     return doubt + ("; ".join(said) or "its kind is not clear")
 
 
-def _slow(found: Achieved) -> str:
+def _slow(found: Achieved, sliding: bool) -> str:
+    name = "a drift of the fixed pattern (speckle)" if found.drifts else "flicker (1/f noise)"
     if found.single:
-        name = "a drift of the fixed pattern (speckle)" if found.drifts else "flicker (1/f noise)"
         return (
             f"it grows with the time since the background, as {name}: take background frames "
             "nearer to the others (background.frames), or fewer of these (fit.frames)"
         )
-    name = (
-        "a drift of the fixed pattern (speckle): set background.drift_correction = true"
-        if found.drifts
-        else "flicker (1/f noise)"
-    )
-    return f"it grows with the frames that are averaged, as {name}, or average fewer"
+    remedy = ", or average fewer"
+    if found.drifts and sliding:
+        remedy = ": set background.drift_correction = true, or average fewer"
+    elif found.drifts:  # the correction is for windows that slide
+        remedy = (
+            ": take background frames nearer to the others (background.frames), or average fewer"
+        )
+    return f"it grows with the frames that are averaged, as {name}{remedy}"
 
 
 def _ratios(found: Mapping[str, Achieved]) -> str:

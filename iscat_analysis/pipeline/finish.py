@@ -23,6 +23,7 @@ from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.summary import summary_of
 from iscat_analysis.pipeline.systematic import with_systematic
 from iscat_analysis.pipeline.tracks import make_films, tracks_of
+from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.places import versions
 from iscat_analysis.records import Analysis, Film, Provenance, silent
 from iscat_analysis.report.spread import rejection
@@ -56,7 +57,10 @@ def with_errors(found: Found) -> tuple[pd.DataFrame, dict[str, Achieved], dict[s
     scaled = config.fit.sigma == "measured"
     if scaled:
         table = with_measured_sigma(table, achieved)
-    verdict = spread_verdict(achieved, found.summary, scaled=scaled, rejected=rejected)
+    verdict = spread_verdict(
+        achieved, found.summary,
+        scaled=scaled, rejected=rejected, sliding=way_of(config) == "sliding",
+    )  # fmt: skip
     return table, achieved, verdict
 
 

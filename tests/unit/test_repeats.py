@@ -295,6 +295,14 @@ def test_slow_noise_of_a_rejected_model_may_be_its_rings() -> None:
     assert "wrong model" not in likely_noise(white, {}, rejected=True)
 
 
+def test_what_helps_against_a_drift_depends_on_what_frames_stand_against() -> None:
+    drifting = _achieved(1.80, 1.0, (1.03, 1.0, 1.02, 1.14, 1.80))
+    assert "drift_correction" in likely_noise(drifting, {}, sliding=True)
+    fixed = likely_noise(drifting, {}, sliding=False)
+    assert "drift_correction" not in fixed
+    assert "nearer to the others (background.frames)" in fixed
+
+
 def test_a_clean_movie_is_told_nothing() -> None:
     assert spread_verdict({"mass_kda": _achieved(1.01)}, {}, scaled=False)["message"] == ""
     less = spread_verdict({"mass_kda": _achieved(0.85)}, {}, scaled=False)

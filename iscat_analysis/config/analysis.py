@@ -1,0 +1,179 @@
+"""Sections of the analysis: background, detection, fit, tracks, posterior, resources."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from iscat_analysis.config.values import (
+    LARGEST_NM,
+    FrameRange,
+    Method,
+    Mode,
+    NonNegative,
+    Positive,
+    Section,
+    length,
+)
+
+
+class BackgroundConfig(Section):
+    """The image without particles."""
+
+    method: Method | None = Field(
+        None,
+        description='"fixed": the mean of frames | "median": their median, in mode track without '
+        'frames that of all | "sliding": landing movies | "tracks": moving particles, together '
+        'with their tracks | "known": level_e',
+    )
+    frames: FrameRange | None = Field(
+        None, description="pre-binding frames [start, stop); absent in landing movies"
+    )
+    window_frames: Annotated[int, Field(ge=4)] | None = Field(
+        None,
+        description="landing movies: frames before and after each step; absent: from the noise",
+    )
+    level_e: Positive | None = Field(
+        None, description="known level per pixel and frame, for method known"
+    )
+    power_normalization: bool = Field(
+        True,
+        description="divide out the laser power, estimated with the particles excluded, and its "
+        "flicker along rows or columns where they show one",
+    )
+    drift_correction: bool = Field(
+        False, description="landing movies: divide out the motion of the fixed pattern"
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> BackgroundConfig:
+        if self.method == "known" and self.level_e is None:
+            raise ValueError('method = "known" needs level_e, the known background level')
+        if self.method == "sliding" and self.frames is not None:
+            raise ValueError(
+                'method = "sliding" takes every frame against its neighbours: leave frames out, '
+                'or set method = "fixed"'
+            )
+        if self.method == "tracks" and self.frames is not None:
+            raise ValueError(
+                'method = "tracks" learns the background from the frames in which the particles '
+                'are: leave frames out, or set method = "fixed"'
+            )
+        return self
+
+
+class Detection(Section):
+    """What counts as a particle."""
+
+    false_alarms_per_movie: Positive = Field(
+        0.1, description="expected number of detections in a movie of pure noise"
+    )
+    polarity: Literal["both", "dark", "bright"] = Field(
+        "both", description='"both" | "dark" | "bright"'
+    )
+    min_separation_nm: Positive = Field(500.0, description="closer particles are flagged too_close")
+
+    @property
+    def sign(self) -> int:
+        """Sign of the contrast that is reported; 0 where both are."""
+        return {"both": 0, "bright": 1, "dark": -1}[self.polarity]
+
+
+class Fit(Section):
+    """The maximum-likelihood fit."""
+
+    mode: Mode = Field("mass", description='"mass" | "localize" | "joint" | "track"')
+    frames: FrameRange | None = Field(
+        None, description="[start, stop); absent: all after the background"
+    )
+    roi_nm: Annotated[Positive, length(50.0, LARGEST_NM)] = Field(
+        2700.0, description="side of the square that is fitted"
+    )
+    likelihood: Literal["auto", "poisson", "conditional"] = Field(
+        "auto", description='"auto" | "poisson" | "conditional"'
+    )
+    sigma: Literal["curvature", "measured"] = Field(
+        "curvature",
+        description='"curvature" (of the likelihood) | "measured": scaled by the measured spread',
+    )
+    z_range_nm: tuple[
+        Annotated[NonNegative, length(0.0, LARGEST_NM)],
+        Annotated[NonNegative, length(0.0, LARGEST_NM)],
+    ] = Field((0.0, 1000.0), description="bounds of z where it is free")
+
+    @model_validator(mode="after")
+    def _range(self) -> Fit:
+        if not self.z_range_nm[0] < self.z_range_nm[1]:
+            raise ValueError(f"z_range_nm = {list(self.z_range_nm)} is empty")
+        return self
+
+    def roi_px(self, pixel_nm: float) -> int:
+        """Side of the square that is fitted, in pixels of a given side [nm]."""
+        return max(5, round(self.roi_nm / pixel_nm))
+
+
+class TrackConfig(Section):
+    """Mode track: particles that move."""
+
+    free: Literal["mass", "joint"] = Field(
+        "joint",
+        description='fitted per frame: "mass" (x, y, mass: a membrane) | "joint" (x, y, z, mass)',
+    )
+    max_step_nm: Annotated[Positive, length(1.0, LARGEST_NM)] = Field(
+        600.0, description="farthest that a particle goes from one frame to the next"
+    )
+    memory_frames: Annotated[int, Field(ge=0, le=1000)] = Field(
+        3, description="frames in which a particle may be missed without losing its track"
+    )
+    min_frames: Annotated[int, Field(ge=1)] = Field(10, description="shorter tracks are left out")
+    block_frames: Literal["auto"] | Annotated[int, Field(ge=20)] = Field(
+        "auto",
+        description="frames with a background of their own, at most, tracks going on from block to "
+        'block | "auto": as many as fit into the memory and drift of the stage allows',
+    )
+    viscosity_mpa_s: Positive = Field(
+        0.89, description="of the medium, for hydrodynamic diameters; water at 25 °C: 0.89"
+    )
+    temperature_c: Annotated[float, Field(gt=-273.15, lt=1000.0)] = Field(
+        25.0, description="of the medium, for hydrodynamic diameters"
+    )
+
+
+class PosteriorConfig(Section):
+    """Sampling of the posterior with emcee."""
+
+    enabled: Literal["auto"] | bool = Field(
+        "auto", description='true | false | "auto": where events are few, not in landing movies'
+    )
+    walkers: Annotated[int, Field(ge=10, le=10_000, multiple_of=2)] = Field(
+        32, description="even number"
+    )
+    steps: Annotated[int, Field(ge=100, le=1_000_000)] = Field(
+        2000, description="per walker, burn-in included"
+    )
+    prior_mass_kda: tuple[Positive, Positive] | None = Field(
+        None, description="[mean, standard deviation] of a normal prior, as of a species"
+    )
+    prior_z_nm: tuple[NonNegative, Positive] | None = Field(
+        None, description="[mean, standard deviation] of a normal prior, as above a membrane"
+    )
+
+    @property
+    def priors(self) -> dict[str, tuple[float, float]]:
+        """Normal priors by parameter, mean and standard deviation [nm, kDa]."""
+        both = {"z_nm": self.prior_z_nm, "mass_kda": self.prior_mass_kda}
+        return {name: prior for name, prior in both.items() if prior is not None}
+
+
+class Compute(Section):
+    """Resources, and the seed of what the analysis draws."""
+
+    workers: Annotated[int, Field(ge=1, le=1024)] = Field(2, description="threads")
+    memory_limit_mb: Annotated[int, Field(ge=64)] = Field(
+        1000, description="for the pixel data held at once"
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(
+        1,
+        description="of what the analysis draws: posteriors, injected particles, resampled species",
+    )

@@ -1,0 +1,272 @@
+"""Sections of the instrument and of what it looks at: optics, camera, particle, mass scale."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from iscat_analysis.config.values import (
+    LARGEST_NM,
+    WAVELENGTH_NM,
+    Finite,
+    NonNegative,
+    Positive,
+    Scheme,
+    Section,
+    length,
+    plausible_pixel,
+)
+
+MOST_WAVES = 0.5
+"""Largest Zernike term over the wavelength; ten times that of a poor objective."""
+
+ABERRATIONS = tuple(f"z{j}" for j in range(5, 38))
+"""Zernike terms on offer, by Noll's index."""
+
+MEASURABLE = (
+    "focus_nm",
+    "na",
+    "reference_phase_deg",
+    "mask_na",
+    "attenuation",
+    "polarization_deg",
+    *ABERRATIONS,
+)
+"""Parameters of the optics that pictures can tell, and that have a derivative."""
+
+
+def _noll_names(terms: dict[str, float]) -> dict[str, float]:
+    for name in terms:
+        if name not in ABERRATIONS:
+            known = {"z1": "piston", "z2": "tilt", "z3": "tilt", "z4": "defocus"}
+            reason = f" ({known[name]} is not an aberration here)" if name in known else ""
+            raise ValueError(
+                f"{name} is not on offer{reason}: name Zernike terms z5 to z37 by Noll's index; "
+                "defocus is optics.focus_nm"
+            )
+    return terms
+
+
+class OpticsCovariance(Section):
+    """Errors of measured optics, as ``[covariance]`` of ``optics.toml`` has them."""
+
+    names: tuple[str, ...] = Field(description="keys of [optics], each aberration by its own name")
+    matrix: tuple[tuple[Finite, ...], ...] = Field(description="covariance, in the order of names")
+
+    @model_validator(mode="after")
+    def _symmetric(self) -> OpticsCovariance:
+        size = len(self.names)
+        unknown = [name for name in self.names if name not in MEASURABLE]
+        if unknown:
+            raise ValueError(f"names has {unknown[0]}, which is none of {', '.join(MEASURABLE)}")
+        if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
+            raise ValueError(f"matrix needs {size} rows of {size} numbers, one for each of names")
+        for i, row in enumerate(self.matrix):
+            for j in range(i):
+                room = 1e-6 * math.sqrt(abs(row[i] * self.matrix[j][j]))
+                if abs(row[j] - self.matrix[j][i]) > room:
+                    raise ValueError(f"matrix is not symmetric in {self.names[i]}, {self.names[j]}")
+            if row[i] < 0:
+                raise ValueError(f"matrix gives {self.names[i]} a negative variance")
+        return self
+
+
+class Optics(Section):
+    """The microscope (physics.md, section 1)."""
+
+    file: str | None = Field(
+        None, description="of `iscat calibrate optics`; its values win over this section's"
+    )
+    wavelength_nm: Annotated[Positive, length(*WAVELENGTH_NM)] = Field(
+        525.0, description="vacuum wavelength"
+    )
+    na: Positive = Field(1.42, description="numerical aperture")
+    n_immersion: Positive = Field(1.515, description="refractive index of the immersion oil")
+    n_glass: Positive = Field(1.515, description="refractive index of the coverslip")
+    n_sample: Positive = Field(1.33, description="refractive index of the sample")
+    scheme: Scheme = Field("iscat", description='"iscat" | "cobri" | "darkfield"')
+    attenuation: NonNegative = Field(
+        1.0, description="amplitude of the reference that passes; ignored in dark field"
+    )
+    polarization: Literal["linear", "circular"] = Field(
+        "linear", description='of the illumination: "linear" | "circular"'
+    )
+    polarization_deg: Finite = Field(
+        0.0, description="of linear light, from the image's x axis towards y"
+    )
+    analyzer: bool = Field(
+        False, description="only light polarised as the reference reaches the camera"
+    )
+    mask_na: NonNegative = Field(
+        0.0, description="a disc in the pupil attenuates below this NA; 0: the reference alone"
+    )
+    reference_phase_deg: Finite = Field(
+        0.0, description="delay of the reference against the scattered light"
+    )
+    aberrations_nm: Annotated[dict[str, Finite], AfterValidator(_noll_names)] = Field(
+        default_factory=dict,
+        description="Zernike terms, Noll z5 to z37, rms path over the pupil: { z11 = 8.0 }",
+    )
+    focus_nm: Annotated[Finite, length(0.0, LARGEST_NM)] = Field(
+        -300.0,
+        description="focus height z_f; sets the oil thickness for a particle at particle.height_nm",
+    )
+    convention: Literal["exact", "dong2021"] = Field(
+        "exact", description='"exact" | "dong2021" (the paper\'s numbers, errors included)'
+    )
+    axial: Literal["stage", "refocus"] = Field(
+        "stage", description='what a moving particle holds fixed: "stage" | "refocus"'
+    )
+    emission: Literal["reciprocal", "dong2021"] = Field(
+        "reciprocal",
+        description='"reciprocal" (energy-conserving) | "dong2021" (the paper\'s own)',
+    )
+    psf: Literal["model", "measured"] = Field(
+        "model", description='"model" | "measured" (the picture in template; mode mass only)'
+    )
+    template: str | None = Field(
+        None, description="of `iscat calibrate optics --measured`, whose optics.toml names it"
+    )
+    calibrate: Literal["auto", "always", "never"] = Field(
+        "auto", description='"auto" | "always" | "never": learn the optics from the movie'
+    )
+
+    covariance: OpticsCovariance | None = Field(
+        None, description="of the measured keys, { names, matrix }; taken from the file"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _emission_of_the_convention(cls, values: Any) -> Any:
+        if isinstance(values, dict) and values.get("convention") == "dong2021":
+            return {"emission": "dong2021", **values}
+        return values
+
+    @model_validator(mode="after")
+    def _possible(self) -> Optics:
+        if self.mask_na >= self.na:
+            raise ValueError(
+                f"mask_na = {self.mask_na} must be below na = {self.na}: a mask that covers the "
+                "whole pupil is attenuation without mask_na"
+            )
+        for name, size in self.aberrations_nm.items():
+            if abs(size) > MOST_WAVES * self.wavelength_nm:
+                raise ValueError(
+                    f"aberrations_nm.{name} = {size:g} exceeds {MOST_WAVES:g} wavelengths rms: "
+                    "give nanometres of path, rms over the pupil"
+                )
+        if self.na >= self.n_immersion:
+            raise ValueError(
+                f"na = {self.na} must be below n_immersion = {self.n_immersion}: "
+                "lower na, or give the index of the oil that was used"
+            )
+        if self.na >= self.n_glass:
+            raise ValueError(
+                f"na = {self.na} must be below n_glass = {self.n_glass}: such light cannot "
+                "cross the coverslip"
+            )
+        if self.psf == "measured" and self.template is None:
+            raise ValueError(
+                'psf = "measured" needs a template: run `iscat calibrate optics MOVIE --measured` '
+                "and give its optics.toml as optics.file"
+            )
+        if self.psf == "measured" and self.scheme == "darkfield":
+            raise ValueError(
+                'psf = "measured" needs an interferometric scheme: in dark field the picture is a '
+                "square of what the template holds"
+            )
+        if self.scheme == "iscat" and self.n_glass == self.n_sample:
+            raise ValueError(
+                "n_glass equals n_sample: nothing is reflected, so there is no iSCAT reference"
+            )
+        if self.scheme != "darkfield" and self.attenuation == 0:
+            raise ValueError('attenuation = 0 leaves no reference: use scheme = "darkfield"')
+        return self
+
+
+class CameraConfig(Section):
+    """The detector, in the sample plane."""
+
+    pixel_size_nm: Annotated[Positive, AfterValidator(plausible_pixel)] | None = Field(
+        None, description="in the sample plane; taken from the TIFF metadata where absent"
+    )
+    gain_e_per_adu: Positive | str = Field(
+        1.0, description="photoelectrons per count: a number or the path of a TIFF map"
+    )
+    offset_adu: Finite | str = Field(0.0, description="counts in the dark: a number or a map")
+    read_noise_e: NonNegative | str = Field(
+        0.0, description="read noise, standard deviation per frame: a number or a map"
+    )
+    well_depth_e: Positive | None = Field(
+        None, description="full well: counts at or above it are flagged as saturated"
+    )
+    exposure_ms: Positive | None = Field(None, description="taken from the metadata where absent")
+    frame_rate_hz: Positive | None = Field(None, description="taken from the metadata where absent")
+    samples_per_pixel: Annotated[int, Field(ge=1, le=9)] = Field(
+        1, description="per axis, to integrate over pixels; 1 = point sampling at pixel centres"
+    )
+
+
+class Particle(Section):
+    """What scatters."""
+
+    kind: Literal["gold", "silica", "polystyrene", "protein", "custom"] = Field(
+        "protein", description='"gold" | "silica" | "polystyrene" | "protein" | "custom"'
+    )
+    permittivity: tuple[float, float] | None = Field(
+        None, description="relative, [re, im]; overrides the kind's own"
+    )
+    index: Positive | None = Field(None, description="refractive index, in place of permittivity")
+    density_kg_m3: Positive | None = Field(None, description="overrides the kind's own")
+    mass_kda: Positive | None = Field(
+        None, description="start value, and the truth of a simulation"
+    )
+    diameter_nm: Annotated[Positive, length(0.1, 1e4)] | None = Field(
+        None, description="in place of mass_kda"
+    )
+    height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
+        5.0, description="z where it is fixed; start value elsewhere"
+    )
+    photons_per_frame: Positive | None = Field(
+        None,
+        description="dark field: scattered photons collected per frame from a particle of this "
+        "mass, which is the scale of masses there",
+    )
+
+    @model_validator(mode="after")
+    def _one_of(self) -> Particle:
+        if self.permittivity is not None and self.index is not None:
+            raise ValueError("give permittivity or index, not both")
+        if self.mass_kda is not None and self.diameter_nm is not None:
+            raise ValueError("give mass_kda or diameter_nm, not both")
+        if self.kind == "custom":
+            if self.permittivity is None and self.index is None:
+                raise ValueError('kind = "custom" needs permittivity or index')
+            if self.density_kg_m3 is None:
+                raise ValueError('kind = "custom" needs density_kg_m3')
+        return self
+
+
+class Calibration(Section):
+    """Contrast against mass; present, it replaces the model's absolute scale.
+
+    Signed peak contrast = gradient·mass + sign(mass)·offset.
+    """
+
+    gradient_per_kda: Finite = Field(description="signed peak contrast per kDa")
+    offset: Finite = Field(0.0, description="peak contrast at zero mass (odd-symmetric)")
+    gradient_se_per_kda: NonNegative = Field(
+        0.0, description="standard error of gradient_per_kda; 0: not known"
+    )
+    offset_se: NonNegative = Field(0.0, description="standard error of offset")
+    correlation: Annotated[float, Field(ge=-1, le=1)] = Field(
+        0.0, description="of the errors of gradient_per_kda and offset"
+    )
+
+    @model_validator(mode="after")
+    def _usable(self) -> Calibration:
+        if self.gradient_per_kda == 0:
+            raise ValueError("gradient_per_kda = 0 says nothing about mass")
+        return self

@@ -1,0 +1,186 @@
+"""Sections of what is not measured: a simulated movie, and the set-up of bounds."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from iscat_analysis.config.values import (
+    LARGEST_NM,
+    Finite,
+    NonNegative,
+    Positive,
+    Section,
+    length,
+)
+
+
+class SimulatedEvent(Section):
+    """One particle that appears, and may leave."""
+
+    frame: Annotated[int, Field(ge=0)] = Field(description="first frame with the particle")
+    leave: Annotated[int, Field(ge=1)] | None = Field(
+        None, description="first frame without it again"
+    )
+    x_px: Finite = Field(
+        description="column; integer = pixel centre; with drift, that of its first frame"
+    )
+    y_px: Finite = Field(description="row, downwards")
+    z_nm: NonNegative | None = Field(None, description="default particle.height_nm")
+    mass_kda: Positive | None = Field(None, description="default particle.mass_kda")
+
+    @model_validator(mode="after")
+    def _leaves_later(self) -> SimulatedEvent:
+        if self.leave is not None and self.leave <= self.frame:
+            raise ValueError(f"leave = {self.leave} must come after frame = {self.frame}")
+        return self
+
+
+class SimulatedMover(Section):
+    """Particles of one kind that diffuse."""
+
+    count: Annotated[int, Field(ge=1, le=100_000)] = Field(
+        1, description="in the field in their first frame; as many enter as leave"
+    )
+    d_um2_s: NonNegative = Field(description="diffusion coefficient along each axis, µm²/s")
+    mass_kda: Positive | None = Field(None, description="default particle.mass_kda")
+    diameter_nm: Annotated[Positive, length(0.1, 1e4)] | None = Field(
+        None, description="in place of mass_kda, of the material of [particle]"
+    )
+    space: Literal["membrane", "volume"] = Field(
+        "membrane", description='"membrane": z is fixed | "volume": above z = 0, which reflects'
+    )
+    z_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = Field(
+        None, description="at first; default particle.height_nm, below a ceiling anywhere"
+    )
+    ceiling_nm: Annotated[Positive, length(0.0, LARGEST_NM)] | None = Field(
+        None, description="volume: a height that reflects too"
+    )
+    drift_um_s: tuple[Finite, Finite] = Field(
+        (0.0, 0.0), description="velocity along x and y, µm/s"
+    )
+    confinement_nm: Annotated[Positive, length(1.0, LARGEST_NM)] | None = Field(
+        None, description="side of a square whose walls reflect, one for each particle"
+    )
+    frame: Annotated[int, Field(ge=0)] = Field(0, description="first frame with them")
+    leave: Annotated[int, Field(ge=1)] | None = Field(
+        None, description="first frame without them again"
+    )
+    x_px: Finite | None = Field(
+        None, description="column at first, of a single particle; absent: anywhere"
+    )
+    y_px: Finite | None = Field(None, description="row at first, downwards")
+
+    @model_validator(mode="after")
+    def _possible(self) -> SimulatedMover:
+        if self.mass_kda is not None and self.diameter_nm is not None:
+            raise ValueError("give mass_kda or diameter_nm, not both")
+        if self.leave is not None and self.leave <= self.frame:
+            raise ValueError(f"leave = {self.leave} must come after frame = {self.frame}")
+        if (self.x_px is None) != (self.y_px is None):
+            raise ValueError("give x_px and y_px, or neither")
+        if self.x_px is not None and self.count != 1:
+            raise ValueError(
+                f"count = {self.count} particles cannot all begin at x_px, y_px: leave the place "
+                "out, or give each a block of its own"
+            )
+        if self.ceiling_nm is not None:
+            if self.space == "membrane":
+                raise ValueError('ceiling_nm needs space = "volume"')
+            if self.z_nm is not None and self.z_nm > self.ceiling_nm:
+                raise ValueError(
+                    f"z_nm = {self.z_nm:g} lies above ceiling_nm = {self.ceiling_nm:g}"
+                )
+        return self
+
+
+SIMULATED: dict[str, type[Section]] = {"events": SimulatedEvent, "movers": SimulatedMover}
+"""Tables of [simulation] that may be there many times, each describing particles."""
+
+
+class Simulation(Section):
+    """A synthetic movie with known truth."""
+
+    shape: tuple[Annotated[int, Field(ge=8, le=16_384)], Annotated[int, Field(ge=8, le=16_384)]] = (
+        Field((128, 128), description="rows, columns")
+    )
+    frames: Annotated[int, Field(ge=2)] = Field(400, description="frames in the movie")
+    photons_per_pixel: Positive = Field(
+        1e4,
+        description="background photoelectrons per pixel and frame; dark field: scattered photons "
+        "collected per frame from a particle of particle.mass_kda",
+    )
+    background: str = Field("flat", description='"flat" | "speckle" | path of a TIFF')
+    speckle_contrast: NonNegative = Field(0.1, description="standard deviation over mean")
+    power_noise: NonNegative = Field(0.0, description="relative laser-power noise, frame to frame")
+    drift_px_per_frame: tuple[Finite, Finite] = Field(
+        (0.0, 0.0), description="of background and particles together, along x and y"
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(1, description="same seed, same bytes")
+    events: tuple[SimulatedEvent, ...] = Field((), description="each particle, placed by hand")
+    movers: tuple[SimulatedMover, ...] = Field((), description="particles that diffuse, by kind")
+    count: Annotated[int, Field(ge=0, le=1_000_000)] | None = Field(
+        None, description="landings at random places and times, in place of events; 0: a blank"
+    )
+    leavings: Annotated[int, Field(ge=0)] = Field(
+        0, description="how many of the count leave before the movie ends"
+    )
+    species: tuple[Positive, ...] | None = Field(
+        None, description="masses [kDa] of the random particles, in equal shares"
+    )
+
+    @model_validator(mode="after")
+    def _either(self) -> Simulation:
+        if self.events and self.count is not None:
+            raise ValueError("give events or count, not both")
+        if self.leavings and (self.count is None or self.leavings > self.count):
+            raise ValueError(f"leavings = {self.leavings} needs a count at least as large")
+        for number, event in enumerate(self.events):
+            inside = (
+                -0.5 <= event.y_px < self.shape[0] - 0.5
+                and -0.5 <= event.x_px < self.shape[1] - 0.5
+            )
+            if not inside:
+                raise ValueError(
+                    f"events[{number}] at x_px = {event.x_px}, y_px = {event.y_px} lies outside "
+                    f"the field of {self.shape[1]} x {self.shape[0]} pixels"
+                )
+            if event.frame >= self.frames:
+                raise ValueError(
+                    f"events[{number}] appears at frame {event.frame}, after the "
+                    f"{self.frames} frames of the movie"
+                )
+        for number, mover in enumerate(self.movers):
+            if mover.frame >= self.frames:
+                raise ValueError(
+                    f"movers[{number}] appear at frame {mover.frame}, after the {self.frames} "
+                    "frames of the movie"
+                )
+            x, y = mover.x_px or 0.0, mover.y_px or 0.0
+            if not (-0.5 <= y < self.shape[0] - 0.5 and -0.5 <= x < self.shape[1] - 0.5):
+                raise ValueError(
+                    f"movers[{number}] at x_px = {x}, y_px = {y} begins outside the field of "
+                    f"{self.shape[1]} x {self.shape[0]} pixels"
+                )
+        return self
+
+
+class BoundsConfig(Section):
+    """`iscat bounds`: one particle on a square field of pixel centres (i − (n−1)/2)·pixel size."""
+
+    pixels: Annotated[int, Field(ge=2, le=4096)] = Field(151, description="side of the field")
+    x_nm: Finite = Field(0.0, description="particle, from the centre of the field")
+    y_nm: Finite = Field(0.0, description="particle, from the centre of the field")
+    z_nm: NonNegative | None = Field(None, description="default particle.height_nm")
+    photons_per_pixel: Positive = Field(
+        1e4, description="background per frame; dark field: as in [simulation]"
+    )
+    n_before: Annotated[int, Field(ge=0)] = Field(200, description="0: the background is known")
+    n_after: Annotated[int, Field(ge=1)] = Field(200, description="frames with the particle")
+    false_alarm_probability: Annotated[float, Field(gt=0, lt=0.5)] = Field(
+        1e-3, description="of the smallest mass that is detected: that noise is taken for it"
+    )
+    miss_probability: Annotated[float, Field(gt=0, lt=0.5)] = Field(
+        0.05, description="of the smallest mass that is detected: that it is not found"
+    )

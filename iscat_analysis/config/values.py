@@ -1,0 +1,157 @@
+"""What values the keys of a configuration may have: modes, lengths, ranges of frames; `Section`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+)
+
+from iscat_analysis.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
+
+Mode = Literal["mass", "localize", "joint", "track"]
+
+
+def _lower(value: Any) -> Any:
+    return value.lower() if isinstance(value, str) else value
+
+
+Scheme = Annotated[Literal["iscat", "cobri", "darkfield"], BeforeValidator(_lower)]
+Method = Literal["fixed", "sliding", "tracks", "median", "known"]
+
+
+def _two(frames: Any) -> Any:
+    if isinstance(frames, (list, tuple)) and len(frames) == 2:
+        return frames
+    raise ValueError(
+        "[start, stop) takes two numbers, the first frame and the one after the last, as in "
+        "[0, 200]"
+    )
+
+
+def _ordered(frames: tuple[int, int]) -> tuple[int, int]:
+    if not 0 <= frames[0] < frames[1]:
+        raise ValueError(f"[start, stop) needs 0 <= start < stop, got {list(frames)}")
+    return frames
+
+
+WAVELENGTH_NM = (200.0, 3000.0)
+"""Vacuum wavelengths that a light microscope uses [nm]."""
+
+LARGEST_NM = 1e5
+"""No height, focus or fitted square is larger [nm]."""
+
+PIXEL_NM = (1.0, 2000.0)
+"""Pixel sizes in the sample plane that a microscope can have [nm]; outside, the unit is wrong."""
+
+_UNITS_NM = {"micrometres": 1e3, "millimetres": 1e6, "metres": 1e9, "ångström": 0.1}
+
+
+def unit_guess(value: float, low_nm: float, high_nm: float) -> str:
+    """Say which unit an impossible length was probably written in.
+
+    Parameters
+    ----------
+    value : float
+        As it was given.
+    low_nm, high_nm : float
+        Smallest and largest length that is possible [nm].
+
+    Returns
+    -------
+    str
+        A clause that names the unit and the length in nanometres; empty where no unit fits.
+    """
+    for unit, nanometres in _UNITS_NM.items():
+        converted = value * nanometres
+        if low_nm <= abs(converted) <= high_nm:
+            return f"; if {value:g} is in {unit}, write {converted:g}"
+    return ""
+
+
+def plausible_pixel(size_nm: float) -> float:
+    """Return a pixel size, unless no microscope has it.
+
+    Parameters
+    ----------
+    size_nm : float
+        In the sample plane [nm].
+
+    Returns
+    -------
+    float
+        The same.
+
+    Raises
+    ------
+    ValueError
+        It lies outside `PIXEL_NM`.
+    """
+    low, high = PIXEL_NM
+    if not low <= size_nm <= high:
+        raise ValueError(
+            f"a pixel of {size_nm:g} nm is not between {low:g} and {high:g} nm: give its size in "
+            f"the sample plane (not on the sensor), in nanometres{unit_guess(size_nm, low, high)}"
+        )
+    return size_nm
+
+
+def length(low_nm: float, high_nm: float) -> AfterValidator:
+    """Accept lengths whose magnitude lies in a range, and guess the unit of the others.
+
+    Parameters
+    ----------
+    low_nm, high_nm : float
+        The range [nm].
+
+    Returns
+    -------
+    pydantic.AfterValidator
+        For an `Annotated` type.
+    """
+
+    def check(value: float) -> float:
+        if low_nm <= abs(value) <= high_nm:
+            return value
+        guess = unit_guess(value, max(low_nm, 1e-3 * high_nm), high_nm)
+        raise ValueError(f"{value:g} nm is not between {low_nm:g} and {high_nm:g} nm{guess}")
+
+    return AfterValidator(check)
+
+
+FrameRange = Annotated[tuple[int, int], BeforeValidator(_two), AfterValidator(_ordered)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Called(ModelMetaclass):
+    """What makes a section from keyword arguments: what is wrong is said in the program's words."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return super().__call__(*args, **kwargs)
+        except ValidationError as error:
+            from iscat_analysis.config.complaints import complaint, section_name
+
+            name = section_name(self)
+            items = ({**item, "loc": (*name, *item["loc"])} for item in error.errors())
+            complaints = dict.fromkeys(complaint(item, {}) for item in items)
+            raise ConfigError("; ".join(complaints)) from None
+
+
+class Section(BaseModel, metaclass=_Called):
+    """A section of the file: immutable, and an unknown key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
