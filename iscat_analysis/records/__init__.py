@@ -1,0 +1,73 @@
+"""What the stages hand to one another: frozen dataclasses, axes (t, y, x), units in the names."""
+
+from __future__ import annotations
+
+from iscat_analysis.records.analysis import (
+    Analysis,
+    Clip,
+    EventView,
+    Film,
+    Provenance,
+    Trace,
+)
+from iscat_analysis.records.arrays import (
+    BoolArray,
+    FloatArray,
+    Mapper,
+    Progress,
+    silent,
+)
+from iscat_analysis.records.columns import (
+    EVENT_COLUMNS,
+    FRAME_COLUMN,
+    FREE_PARAMETERS,
+    PARAMETERS,
+    REPEAT_COLUMNS,
+    TRACK_COLUMNS,
+    free_parameters,
+    track_numbers,
+)
+from iscat_analysis.records.fits import (
+    Alternative,
+    Box,
+    Candidate,
+    FitResult,
+    PosteriorResult,
+)
+from iscat_analysis.records.frames import CountSource, FrameSource, StackMetadata, Windows
+from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus, verdict
+
+__all__ = [
+    "EVENT_COLUMNS",
+    "FRAME_COLUMN",
+    "FREE_PARAMETERS",
+    "PARAMETERS",
+    "REPEAT_COLUMNS",
+    "SEVERITY",
+    "TRACK_COLUMNS",
+    "Alternative",
+    "Analysis",
+    "BoolArray",
+    "Box",
+    "Candidate",
+    "Clip",
+    "CountSource",
+    "EventView",
+    "Film",
+    "FitResult",
+    "FloatArray",
+    "FrameSource",
+    "Mapper",
+    "PosteriorResult",
+    "Progress",
+    "Provenance",
+    "StackMetadata",
+    "Status",
+    "Trace",
+    "TrackStatus",
+    "Windows",
+    "free_parameters",
+    "silent",
+    "track_numbers",
+    "verdict",
+]

@@ -1,0 +1,33 @@
+"""Kinds of arrays, and what is told how far a job has come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Mapper = Callable[..., Iterable[Any]]
+"""`map`, or the one of a pool."""
+
+
+class Progress(Protocol):
+    """Told how far a stage has come; the command line turns it into a bar on stderr."""
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Report that `done` of `total` steps of `stage` are finished."""
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Ignore progress.
+
+    Parameters
+    ----------
+    stage : str
+        Name of the stage.
+    done, total : int
+        Steps finished, and steps there are.
+    """

@@ -1,0 +1,121 @@
+"""What a movie is to those who read it, and sums of its frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.records.arrays import BoolArray, FloatArray
+
+
+@dataclass(frozen=True)
+class StackMetadata:
+    """What a movie file says of itself; None where it is silent.
+
+    Attributes
+    ----------
+    pixel_size_nm : float or None
+        In the sample plane [nm].
+    exposure_ms : float or None
+        Exposure of one frame [ms].
+    frame_rate_hz : float or None
+        Frames per second [Hz].
+    source : str
+        Which metadata spoke: ``"ome"``, ``"imagej"``, ``"micromanager"``, ``"tiff"``, ``"none"``…
+    """
+
+    pixel_size_nm: float | None = None
+    exposure_ms: float | None = None
+    frame_rate_hz: float | None = None
+    source: str = "none"
+
+
+class FrameSource(Protocol):
+    """A movie that is read a few frames at a time."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Frames ``[start, stop)`` as stored, shape (stop − start, y, x) [counts]."""
+
+
+class CountSource(FrameSource, Protocol):
+    """A movie and the type of its numbers."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored counts."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Photoelectrons summed before and after the particles bound.
+
+    The raw counts are summed, never rescaled frames, so that both sums stay Poisson; laser power
+    enters through `power_ratio` alone (physics.md, section 4).
+
+    Attributes
+    ----------
+    before_e, after_e : ndarray, shape (y, x)
+        Summed photoelectrons [e].  With a known background `before_e` is its expectation for
+        `n_before` = 1 frame.
+    n_before, n_after : int
+        Frames in each sum; `n_before` = 0 where the background is known.
+    power_ratio : float
+        ρ, total power after over total power before.
+    read_variance_before_e2, read_variance_after_e2 : ndarray, shape (y, x)
+        Read-noise variance of each sum [e²].
+    masked : ndarray of bool, shape (y, x)
+        Pixels that must not be used: dead, hot or saturated.
+    saturated : ndarray of bool, shape (y, x)
+        The saturated ones among them.
+    frames_before, frames_after : (int, int)
+        The half-open frame ranges.
+    power : ndarray, shape (t,)
+        Power of every frame in both ranges over the mean power before; before first.
+    """
+
+    before_e: FloatArray
+    after_e: FloatArray
+    n_before: int
+    n_after: int
+    power_ratio: float
+    read_variance_before_e2: FloatArray
+    read_variance_after_e2: FloatArray
+    masked: BoolArray
+    saturated: BoolArray
+    frames_before: tuple[int, int]
+    frames_after: tuple[int, int]
+    power: FloatArray
+
+    def cut(self, region: tuple[slice, slice]) -> Windows:
+        """Give the sums of some pixels.
+
+        Parameters
+        ----------
+        region : (slice, slice)
+            Rows and columns.
+
+        Returns
+        -------
+        Windows
+            Views of these pixels, nothing is copied.
+        """
+        return replace(
+            self,
+            before_e=self.before_e[region],
+            after_e=self.after_e[region],
+            read_variance_before_e2=self.read_variance_before_e2[region],
+            read_variance_after_e2=self.read_variance_after_e2[region],
+            masked=self.masked[region],
+            saturated=self.saturated[region],
+        )

@@ -1,0 +1,106 @@
+"""Verdicts on fits and tracks, and what each asks of the user."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import StrEnum
+
+
+class Status(StrEnum):
+    """The verdict on one fit; `advice` says what each asks of the user."""
+
+    OK = "ok"
+    NOT_CONVERGED = "not_converged"
+    AT_BOUND = "at_bound"
+    AMBIGUOUS_Z = "ambiguous_z"
+    POOR_FIT = "poor_fit"
+    TOO_CLOSE = "too_close"
+    SATURATED = "saturated"
+    SIDELOBE = "sidelobe"
+
+    @property
+    def advice(self) -> str:
+        """What the status means and what to try."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Status.OK: "The fit converged, inside its bounds, and agrees with the data.",
+    Status.NOT_CONVERGED: "The fit did not settle: check the optics, or enlarge fit.roi_nm.",
+    Status.AT_BOUND: "The data pull a parameter beyond its bound: widen fit.z_range_nm; where that "
+    "begins at 0, the coverslip, check optics.focus_nm and the indices; or leave the event out.",
+    Status.AMBIGUOUS_Z: "Another height explains the data almost as well: use more frames, "
+    "another focus, or a narrower fit.z_range_nm.",
+    Status.POOR_FIT: "The model does not describe the data: check focus, NA, gain and neighbours.",
+    Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
+    "treat the mass as shared between them.",
+    Status.SIDELOBE: "Not larger than what the model leaves over of a brighter particle beside it, "
+    "and not counted: check focus, NA and aberrations to tell whether it is a particle.",
+    Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
+}
+
+
+SEVERITY = (
+    Status.SIDELOBE,
+    Status.NOT_CONVERGED,
+    Status.AT_BOUND,
+    Status.POOR_FIT,
+    Status.AMBIGUOUS_Z,
+    Status.TOO_CLOSE,
+    Status.SATURATED,
+)
+"""What is remarked on a fit, worst first: perhaps no particle; no estimate; none inside the bounds;
+a model that does not describe the data; one of several heights; a mass shared with a neighbour;
+pixels left out."""
+
+
+def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
+    """Put the remarks on a fit in order.
+
+    Parameters
+    ----------
+    flags : iterable of Status
+        Every condition that was noticed, in any order.
+
+    Returns
+    -------
+    status : Status
+        The worst of them, or ok.
+    flags : tuple of Status
+        All of them, worst first, each once.
+    """
+    ordered = tuple(sorted(set(flags) - {Status.OK}, key=SEVERITY.index))
+    return (ordered[0] if ordered else Status.OK), ordered
+
+
+class TrackStatus(StrEnum):
+    """The verdict on one track; worst first."""
+
+    FEW_FRAMES = "few_frames"
+    POOR_FITS = "poor_fits"
+    MASS_VARIES = "mass_varies"
+    NOT_FREE = "not_free"
+    STANDS_STILL = "stands_still"
+    NEAR_WALL = "near_wall"
+    OK = "ok"
+
+    @property
+    def advice(self) -> str:
+        """What the status means and what to try."""
+        return _TRACK_ADVICE[self]
+
+
+_TRACK_ADVICE = {
+    TrackStatus.OK: "The frames agree on one mass, and the particle diffuses freely.",
+    TrackStatus.FEW_FRAMES: "Fewer positions than track.min_frames: no diffusion coefficient.",
+    TrackStatus.POOR_FITS: "Fewer than half of its frames are ok, so that its mass is that of a "
+    "selection: see the status of its rows in fits.csv.",
+    TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors: motion blurs "
+    "the picture, particles met, or the particle changed.",
+    TrackStatus.NOT_FREE: "It does not diffuse freely: p_confinement, p_anomalous and p_steady "
+    "say which way, and D is that of free diffusion.",
+    TrackStatus.STANDS_STILL: "Its D is not above zero within its error: take d_high_um2_s as an "
+    "upper limit, or record for longer.",
+    TrackStatus.NEAR_WALL: "The coverslip, so near, slows it by more than 5 %: its diameter "
+    "is too large, its index too small.",
+}
