@@ -48,7 +48,8 @@ from iscat_analysis.bounds.planning import (
     parse_names,
     parse_target,
 )
-from iscat_analysis.bounds.pupil import KNOBS, PupilOptimum, optimize_pupil
+from iscat_analysis.bounds.pupil import PupilOptimum, optimize_pupil
+from iscat_analysis.bounds.pupil_search import KNOBS
 from iscat_analysis.bounds.quantum import (
     incompatible_pairs,
     quantum_bounds,

@@ -15,7 +15,7 @@ import mmap
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,47 +38,35 @@ from iscat_analysis.movie.descriptions import (
 from iscat_analysis.movie.file_set import FileSet, open_set
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, map_file, refuse_changed, release
 from iscat_analysis.movie.ome import is_ome, read_ome, read_ome_set
+from iscat_analysis.movie.tiff_checks import (
+    BOMB_RATIO,
+    FRAME_BOMB_RATIO,
+    STRIP_OFFSETS,
+    STRIP_SIZES,
+    TILE_OFFSETS,
+    TILE_SIZES,
+    Image,
+    damaged,
+    pixel_type,
+    refuse_differences,
+    refuse_growth,
+    refuse_overlap,
+    refuse_unread_pixels,
+)
 from iscat_analysis.movie.tiff_headers import Repetition, repetition_of
 from iscat_analysis.records import StackMetadata
 
 _DESCRIPTION, _MICRO_MANAGER = 270, 51123
-_STRIP_OFFSETS, _TILE_OFFSETS, _STRIP_SIZES, _TILE_SIZES = 273, 324, 279, 325
 _ESSENTIAL = {
-    256, 257, 258, 259, 266, _DESCRIPTION, _STRIP_OFFSETS, 277, 278, _STRIP_SIZES, 317, 322, 323,
-    _TILE_OFFSETS, _TILE_SIZES, 339, 32997,
+    256, 257, 258, 259, 266, _DESCRIPTION, STRIP_OFFSETS, 277, 278, STRIP_SIZES, 317, 322, 323,
+    TILE_OFFSETS, TILE_SIZES, 339, 32997,
 }  # fmt: skip
 """Tags without which an image would be taken for another: size, type, encoding, place, text."""
 
-_LOSSLESS = {1, 5, 8, 32773, 32946, 34925, 50000}
-"""No compression, LZW, Deflate, PackBits, old Deflate, LZMA, Zstandard."""
-
-_LARGEST_FRAME_BYTES = 2**31  # 32 768 × 32 768 pixels of 16 bits, beyond any camera
-_BOMB_RATIO = 2000  # Deflate reaches 1032, on constant images only
-_FRAME_BOMB_RATIO = 100  # of one frame, which is held in memory whole
-_BOMB_BYTES = 64_000_000  # smaller than this, anything is harmless whatever its ratio
-_OVERLAP = 2  # values of tags over the size of the file; each lies in it once
-_OVERLAP_BYTES = 1_000_000
 _INLINE = 8  # elements that may stand in the list of tags itself
 
 _PLAIN = dict.fromkeys(("is_lsm", "is_ndpi", "is_ome", "is_scanimage", "is_stk"), False)
 """Dialects whose images tifffile would guess rather than read."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Image:
-    """One image of the file: how it is stored, and where its strips or tiles lie."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any] | None
-    encoding: int  # equal where one decoder serves both
-    reduced: bool
-    texts: tuple[str, ...]
-    offsets: tuple[int, ...]
-    sizes: tuple[int, ...]
-    start: int | None  # first byte of the pixels where they lie in one piece as they are
-
-    def __str__(self) -> str:
-        return f"{' x '.join(map(str, self.shape))} pixels of {self.dtype}"
 
 
 class TiffFrames:
@@ -110,7 +98,7 @@ class TiffFrames:
         path: Path,
         *,
         dtype: np.dtype[Any],
-        images: Sequence[_Image],
+        images: Sequence[Image],
         n_frames: int,
         metadata: StackMetadata,
         notes: tuple[str, ...],
@@ -181,7 +169,7 @@ class TiffFrames:
             return starts[0] + size * np.arange(n_frames, dtype=np.int64)
         return np.array(starts, dtype=np.int64)
 
-    def _decode_into(self, frame: NDArray[Any], image: _Image, number: int) -> None:
+    def _decode_into(self, frame: NDArray[Any], image: Image, number: int) -> None:
         rows, columns = frame.shape
         for segment, (offset, size) in enumerate(zip(image.offsets, image.sizes, strict=True)):
             try:
@@ -274,8 +262,8 @@ def _open(
         notes = (TIME_FROM_HEIGHTS,) if heights else ()
     frames = [images[k] for k in order]
     first = file.pages[order[0]]
-    dtype = _dtype(first, path).newbyteorder(file.byteorder)
-    _refuse_differences(frames, path)
+    dtype = pixel_type(first, path).newbyteorder(file.byteorder)
+    refuse_differences(frames, path)
     if n_frames < 2 and not member:
         raise DataError(
             f"{path}: holds a single frame; a movie needs frames before and after a particle binds"
@@ -283,9 +271,9 @@ def _open(
     size = math.prod(frames[0].shape) * dtype.itemsize
     for number, image in enumerate(frames):
         if image.start is None:
-            _refuse_growth(size, sum(image.sizes), _FRAME_BOMB_RATIO, f"image {number}", path)
+            refuse_growth(size, sum(image.sizes), FRAME_BOMB_RATIO, f"image {number}", path)
     if frames[0].start is None:
-        _refuse_growth(n_frames * size, len(data), _BOMB_RATIO, "it", path)
+        refuse_growth(n_frames * size, len(data), BOMB_RATIO, "it", path)
 
     stamps = [file.pages[k].tags.valueof(_MICRO_MANAGER) for k in (order[0], order[-1])]
     if stamps[0] is not None or _MICRO_MANAGER in first.tags:
@@ -308,11 +296,11 @@ def _open(
     )
 
 
-def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[_Image]:
+def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[Image]:
     """Read the images one by one, and refuse the file where tifffile would repair it."""
     seen: set[int] = set()
     following = values = long_values = 0
-    image: _Image | None = None
+    image: Image | None = None
     pattern: Repetition | None = None
     for number in itertools.count():
         again = None
@@ -322,7 +310,7 @@ def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[_I
             seen.add(following)
             start, following = again
             values += long_values
-            _refuse_overlap(values, data, path)
+            refuse_overlap(values, data, path)
             yield replace(image, offsets=(start,), start=None if image.start is None else start)
             continue
         if number and not following:
@@ -332,16 +320,16 @@ def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[_I
         except IndexError:
             break
         if page.offset in seen:
-            raise _damaged(path, f"its list of frames runs in a circle after {number}")
+            raise damaged(path, f"its list of frames runs in a circle after {number}")
         seen.add(page.offset)
         tags, following = _declared_tags(file.tiff, data, page.offset)
         if len(tags) != len(page.tags) and set(tags) & _ESSENTIAL - set(page.tags.keys()):
-            raise _damaged(path, f"the header of image {number} is truncated or cannot be read")
+            raise damaged(path, f"the header of image {number} is truncated or cannot be read")
         long_values = sum(tag.valuebytecount for tag in page.tags if tag.count > _INLINE)
         values += long_values
-        _refuse_overlap(values, data, path)
-        _refuse_unread_pixels(page, len(data), path)
-        image = _Image(
+        refuse_overlap(values, data, path)
+        refuse_unread_pixels(page, len(data), path)
+        image = Image(
             page.shape,
             page.dtype,
             page.hash,
@@ -364,12 +352,6 @@ def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[_I
         )
 
 
-def _refuse_overlap(values: int, data: mmap.mmap, path: Path) -> None:
-    """Images that share one long value would cost its length each time."""
-    if values > _OVERLAP * len(data) + _OVERLAP_BYTES:
-        raise _damaged(path, "the headers of its images overlap")
-
-
 def _declared_tags(
     tiff: tifffile.TiffFormat, data: mmap.mmap, offset: int
 ) -> tuple[list[int], int]:
@@ -381,46 +363,13 @@ def _declared_tags(
     return codes, int(struct.unpack_from(tiff.offsetformat, data, end)[0])
 
 
-def _refuse_unread_pixels(page: tifffile.TiffPage, file_size: int, path: Path) -> None:
-    """Every strip or tile must be listed and lie in the file, with as many bytes as it needs."""
-    number, rows, columns = page.index, page.imagelength, page.imagewidth
-    frame_bytes = rows * columns * (page.dtype.itemsize if page.dtype else 8) * page.samplesperpixel
-    if not 0 < frame_bytes <= _LARGEST_FRAME_BYTES:
-        raise _damaged(path, f"image {number} declares {rows} x {columns} pixels")
-    needed = math.prod(page.chunked)
-    tag = page.tags.get(_TILE_OFFSETS) or page.tags.get(_STRIP_OFFSETS)
-    listed = tag.count if tag is not None else 0
-    if page.compression != 1 and not {_STRIP_SIZES, _TILE_SIZES} & set(page.tags.keys()):
-        raise _damaged(path, f"image {number} does not say how long its pixel data are")
-    if not listed == len(page.dataoffsets) == len(page.databytecounts) == needed:
-        raise _damaged(path, f"image {number} lists {listed} strips or tiles but needs {needed}")
-    if min(page.dataoffsets) <= 0 or min(page.databytecounts) <= 0:
-        raise DataError(
-            f"{path}: image {number} has no pixel data for part of its area; "
-            "the recording or the copy was interrupted, export it again"
-        )
-    end = max(map(sum, zip(page.dataoffsets, page.databytecounts, strict=True)))
-    if end > file_size:
-        raise DataError(
-            f"{path}: is truncated (the pixels of image {number} should reach byte {end} of "
-            f"{file_size}); copy it again or export it again"
-        )
-    if page.compression == 1:
-        stored = sum(page.databytecounts)
-        tile_rows, tile_columns = page.chunks[-2:] if page.samplesperpixel == 1 else (1, 1)
-        if page.is_tiled and page.samplesperpixel == 1:
-            rows, columns = needed * tile_rows, tile_columns
-        if stored < rows * -(-columns * page.bitspersample // 8):
-            raise _damaged(path, f"image {number} needs more than the {stored} bytes it stores")
-
-
 def _text(value: str | bytes) -> str:
     """Text of a description, which tifffile gives as bytes where it is not UTF-8."""
     text = value if isinstance(value, str) else value.decode("latin-1")
     return text.partition("\0")[0].strip()
 
 
-def _count_frames(images: Sequence[_Image], path: Path) -> tuple[int, bool]:
+def _count_frames(images: Sequence[Image], path: Path) -> tuple[int, bool]:
     """Set what the file holds against every description in it; the larger number must be true.
 
     Returns the number of frames, and whether they lie along an axis of heights.
@@ -443,53 +392,6 @@ def _count_frames(images: Sequence[_Image], path: Path) -> tuple[int, bool]:
         f"{path}: describes {announced} frames but holds {len(images)}; "
         "the recording or the copy was interrupted: export it again"
     )
-
-
-def _dtype(page: tifffile.TiffPage, path: Path) -> np.dtype[Any]:
-    """Type of the pixels of the first frame, if the movie is of a kind that can be analysed."""
-    if page.samplesperpixel > 1:
-        raise DataError(
-            f"{path}: holds colour images ({page.samplesperpixel} samples per pixel); "
-            "export the camera's grey values"
-        )
-    if page.imagedepth > 1:
-        raise DataError(
-            f"{path}: holds volumes ({page.imagedepth} planes per image); "
-            "export one plane per frame"
-        )
-    if page.compression not in _LOSSLESS:
-        name = getattr(page.compression, "name", "unknown")
-        raise DataError(
-            f"{path}: its compression ({name}, number {int(page.compression)}) is not supported; "
-            "save it uncompressed or with Deflate"
-        )
-    if page.dtype is None or page.dtype.kind not in "uif":
-        raise DataError(
-            f"{path}: its pixels are {page.bitspersample}-bit numbers of sample format "
-            f"{int(page.sampleformat)}; export it as 8-, 16- or 32-bit integers or as floats"
-        )
-    dtype: np.dtype[Any] = page.dtype
-    return dtype
-
-
-def _refuse_differences(frames: Sequence[_Image], path: Path) -> None:
-    first = frames[0]
-    for number, image in enumerate(frames):
-        if image.encoding != first.encoding:
-            differs = str(image) != str(first)
-            what = f"{image} but the first is {first}" if differs else "stored in another way"
-            raise DataError(
-                f"{path}: its frames differ: image {number} is {what}; "
-                "export the frames of one movie to a file of their own"
-            )
-
-
-def _refuse_growth(size: int, stored: int, ratio: int, what: str, path: Path) -> None:
-    if size > max(_BOMB_BYTES, ratio * stored):
-        raise DataError(
-            f"{path}: {what} would grow from {stored} to {size} bytes, which no recording does; "
-            "the file is damaged, export it again"
-        )
 
 
 def _micro_manager_summary(path: Path) -> dict[str, Any]:
@@ -525,7 +427,3 @@ def _unheard() -> Iterator[None]:
 
 def _first_line(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), "") or type(error).__name__
-
-
-def _damaged(path: Path, how: str) -> DataError:
-    return DataError(f"{path}: is damaged ({how}); export it again")

@@ -10,23 +10,30 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from iscat_analysis.report.batch_cells import (
+    link,
+    percent,
+    plain,
+    probability,
+    share,
+    unbroken,
+    whole,
+    with_interval,
+)
 from iscat_analysis.report.batch_figures import Curve, batch_figures
 from iscat_analysis.report.binding import binding_figure
-from iscat_analysis.report.numbers import count, decimals_for, fixed, number
+from iscat_analysis.report.numbers import count, fixed, number
 from iscat_analysis.report.page import render_page
 from iscat_analysis.report.style import publish
 from iscat_analysis.schemas import jsonable
 
 LONG = 30
 """Rows above which a table scrolls, and can be narrowed."""
-
-_SHORT_NAME = 28  # characters
 
 _SHARE = "of the particles that came, corrected for those that were missed; without outliers"
 
@@ -135,7 +142,7 @@ def _overview(
     if failed:
         columns: list[Any] = ["not analysed", "why"]
         tables.append({"columns": columns, "rows": [list(each) for each in failed]})
-    rows = [[_link(page, what), source] for what, source, page in calibrations]
+    rows = [[link(page, what), source] for what, source, page in calibrations]
     tables.append({"columns": ["calibration", "from"], "rows": rows})
     return {
         "id": "day",
@@ -224,19 +231,17 @@ def _shift_table(shifts: pd.DataFrame, mass_label: str) -> dict[str, Any]:
         rows.append(
             [
                 f"{row['kind_mass_kda']:.3g}",
-                _name(row["sample"]),
-                _name(row["condition"] or "—"),
+                unbroken(row["sample"]),
+                unbroken(row["condition"] or "—"),
                 int(row["movies"]),
-                *_with_interval(row["value"], row["low"], row["high"]),
-                *_with_interval(row["shift"], row["shift_low"], row["shift_high"]),
-                _probability(row["p_holm"]),
-                *_with_interval(
-                    *(100 * part[name] for name in ("value", "low", "high")), unit=" %"
-                ),
-                *_with_interval(
+                *with_interval(row["value"], row["low"], row["high"]),
+                *with_interval(row["shift"], row["shift_low"], row["shift_high"]),
+                probability(row["p_holm"]),
+                *with_interval(*(100 * part[name] for name in ("value", "low", "high")), unit=" %"),
+                *with_interval(
                     *(100 * part[name] for name in ("shift", "shift_low", "shift_high")), unit=" %"
                 ),
-                _probability(part["p_holm"]),
+                probability(part["p_holm"]),
             ]
         )
     columns = [
@@ -268,13 +273,13 @@ def _species_table(
             [
                 "apart" if row["outlier"] else str(row["kind"]),
                 links.get(row["movie"], row["movie"]),
-                _name(row["sample"]),
-                _name(row["condition"] or "—"),
+                unbroken(row["sample"]),
+                unbroken(row["condition"] or "—"),
                 row["concentration_nm"],
-                *_with_interval(row["mass_kda"], row["mass_low"], row["mass_high"]),
-                *_with_interval(row["width_kda"], row["width_low"], row["width_high"]),
+                *with_interval(row["mass_kda"], row["mass_low"], row["mass_high"]),
+                *with_interval(row["width_kda"], row["width_low"], row["width_high"]),
                 f"{row['count']:.0f}",
-                *_with_interval(
+                *with_interval(
                     *(100 * row[name] for name in ("share", "share_low", "share_high")),
                     unit=" %",
                 ),
@@ -329,7 +334,7 @@ def _equilibria(
                 len(found["samples"]),
                 number(kd),
                 f"{number(low)} to {number(high) if math.isfinite(high) else '∞'}",
-                _probability(found["p_value"]),
+                probability(found["p_value"]),
                 "; ".join(remarks) or "none",
             ]
         )
@@ -354,12 +359,12 @@ def _landing(movies: pd.DataFrame, drawn: Mapping[str, Markup]) -> dict[str, Any
     rows = [
         [
             links[row["movie"]],
-            _name(row["sample"]),
-            _name(row["condition"] or "—"),
+            unbroken(row["sample"]),
+            unbroken(row["condition"] or "—"),
             row["concentration_nm"],
             int(row["landings"]),
             int(row["leavings"]),
-            *_with_interval(row["rate"], row["rate_from"], row["rate_to"]),
+            *with_interval(row["rate"], row["rate_from"], row["rate_to"]),
         ]
         for row in known.to_dict("records")
     ]
@@ -390,21 +395,21 @@ def _quality(movies: pd.DataFrame) -> dict[str, Any]:
             [
                 links[row["movie"]],
                 row["role"],
-                _name(row["sample"]),
-                *(_plain(row[name]) for name in further),
+                unbroken(row["sample"]),
+                *(plain(row[name]) for name in further),
                 {"done": "done", "failed": "failed", "missing": "not yet"}[row["state"]],
                 said or "none",
-                _whole(row["events"]),
-                _share(row["ok"], row["events"]),
+                whole(row["events"]),
+                share(row["ok"], row["events"]),
                 fixed(row["noise_over_shot"], 2),
                 fixed(row["drift_px"], 2),
                 fixed(row["focus_shift_nm"], 0),
-                _percent(row["small_p_values"]),
+                percent(row["small_p_values"]),
                 fixed(row["repeat_over_crb"], 2),
                 row["standards_seen"] or "—",
-                _name(row["optics"] or "—", 80),
-                _name(row["mass_scale"] or "—", 80),
-                _percent(row["outside_standards"]),
+                unbroken(row["optics"] or "—", 80),
+                unbroken(row["mass_scale"] or "—", 80),
+                percent(row["outside_standards"]),
             ]
         )
     columns = [
@@ -433,59 +438,7 @@ def _quality(movies: pd.DataFrame) -> dict[str, Any]:
 def _links(movies: pd.DataFrame) -> list[tuple[str, Any]]:
     """Give every movie's name, as a link to its report where there is one."""
     pages = zip(movies["movie"], movies["report"], strict=True)
-    return [(name, _link(report, name)) for name, report in pages]
-
-
-def _link(page: Any, name: str) -> str:
-    """Make a name a link, where there is a page."""
-    if not isinstance(page, str) or not page:
-        return name
-    return Markup('<a href="{}">{}</a>').format(quote(page), name)
-
-
-def _with_interval(
-    value: float | None, low: float | None, high: float | None, *, unit: str = ""
-) -> tuple[str, str]:
-    """Write a number, and its interval, with as many decimals as the interval supports."""
-    if value is None or not math.isfinite(value):
-        return "—", "—"
-    known = low is not None and high is not None and math.isfinite(low) and math.isfinite(high)
-    if not known or low is None or high is None:
-        return f"{number(value)}{unit}", "—"
-    decimals = decimals_for([(high - low) / 2])
-    return (
-        f"{fixed(value, decimals)}{unit}",
-        f"{fixed(low, decimals)} to {fixed(high, decimals)}{unit}",
-    )
-
-
-def _probability(p: float) -> str:
-    if not math.isfinite(p):
-        return "—"
-    return number(p, 2) if p >= 1e-6 else "0.000001 or less"
-
-
-def _percent(value: float | None) -> str:
-    return "—" if value is None or not math.isfinite(value) else f"{100 * value:.1f} %"
-
-
-def _share(part: float, whole: float) -> str:
-    return _percent(part / whole) if whole and math.isfinite(whole) else "—"
-
-
-def _name(text: Any, longest: int = _SHORT_NAME) -> Any:
-    """Keep a short text in one line."""
-    if not isinstance(text, str) or len(text) > longest:
-        return text
-    return text.replace(" ", "\N{NO-BREAK SPACE}")
-
-
-def _whole(value: float) -> Any:
-    return int(value) if value is not None and math.isfinite(value) else None
-
-
-def _plain(value: Any) -> Any:
-    return "—" if value is None or value != value or value == "" else value
+    return [(name, link(report, name)) for name, report in pages]
 
 
 def summary_line(movies: pd.DataFrame) -> str:

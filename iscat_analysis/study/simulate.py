@@ -31,9 +31,9 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.camera import camera_from_config, read_map
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.optics.materials import material
 from iscat_analysis.records import FloatArray, Progress, silent
 from iscat_analysis.study.movers import MovingParticle, place_movers, track_rows
+from iscat_analysis.study.particles import SimulatedParticle, place_particles
 from iscat_analysis.threads import threads
 
 ComplexArray = NDArray[np.complex128]
@@ -70,18 +70,6 @@ class _Still:
     field: ComplexArray
     expected: FloatArray
     spectrum: ComplexArray | None
-
-
-@dataclass(frozen=True)
-class SimulatedParticle:
-    """One simulated particle: where, when, how heavy; its place is that in the frame it lands."""
-
-    frame: int
-    leave: int | None
-    x_px: float
-    y_px: float
-    z_nm: float
-    mass_kda: float
 
 
 def write_stack(
@@ -193,7 +181,7 @@ class Movie:
             for (low, high), size in zip(self._margins, simulation.shape, strict=True)
         )
         self._grid = PixelGrid.region(rows, columns, self._pixel_nm)
-        self.particles = self._place()
+        self.particles = place_particles(config, self._generator("events"))
         self._near_px = config.fit.roi_nm / 2 / self._pixel_nm
         self.movers = place_movers(config, self._near_px, lambda i: self._generator("movers", i))
         heights = [p.z_nm for p in self.particles]
@@ -476,45 +464,6 @@ class Movie:
                 f"the brightest pixel would hold {top:.0f} counts, more than 16 bits: raise "
                 "camera.gain_e_per_adu or lower simulation.photons_per_pixel"
             )
-
-    def _place(self) -> tuple[SimulatedParticle, ...]:
-        simulation, particle = self._config.simulation, self._config.particle
-        nominal = material(particle, self._config.optics.wavelength_nm).mass_kda
-        if simulation.count is None:
-            return tuple(
-                SimulatedParticle(
-                    e.frame, e.leave, e.x_px, e.y_px,
-                    particle.height_nm if e.z_nm is None else e.z_nm,
-                    nominal if e.mass_kda is None else e.mass_kda,
-                )
-                for e in sorted(simulation.events, key=lambda e: e.frame)
-            )  # fmt: skip
-        rng = self._generator("events")
-        margin = min(self._config.fit.roi_nm / 2 / self._pixel_nm, (min(simulation.shape) - 1) / 2)
-        rows, columns = simulation.shape
-        count = simulation.count
-        x = rng.uniform(margin, columns - 1 - margin, count)
-        y = rng.uniform(margin, rows - 1 - margin, count)
-        first = self._config.background.frames
-        start = first[1] if first is not None else simulation.frames // 20
-        landing = np.sort(
-            rng.integers(start, max(simulation.frames - start // 2, start + 1), count)
-        )
-        species = np.array(simulation.species or (nominal,))
-        mass = rng.permutation(species[np.arange(count) % species.size])
-        leavers = set(rng.choice(count, simulation.leavings, replace=False).tolist())
-        particles = []
-        for i in range(count):
-            latest = simulation.frames - 1
-            leaves = i in leavers and landing[i] + 1 <= latest
-            leave = int(rng.integers(landing[i] + 1, latest + 1)) if leaves else None
-            particles.append(
-                SimulatedParticle(
-                    int(landing[i]), leave, float(x[i]), float(y[i]), particle.height_nm,
-                    float(mass[i]),
-                )
-            )  # fmt: skip
-        return tuple(particles)
 
 
 def _counted(

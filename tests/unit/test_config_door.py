@@ -284,7 +284,12 @@ def test_only_the_simulator_and_one_announced_fallback_read_the_simulation() -> 
         if re.search(r"\.simulation\b(?! import)", path.read_text("utf-8"))
         and path.parent.name != "config"
     }
-    assert readers <= {"study/simulate.py", "study/movers.py", "pipeline/prepare.py"}
+    assert readers <= {
+        "study/simulate.py",
+        "study/movers.py",
+        "study/particles.py",
+        "pipeline/prepare.py",
+    }
 
 
 def test_a_blank_is_a_movie_without_particles(tmp_path: Path) -> None:

@@ -8,14 +8,7 @@ before a movie is recorded what it would tell.
 
 from __future__ import annotations
 
-from iscat_analysis.calibration.optics.estimate import (
-    FOCUS_STEP,
-    Estimate,
-    Settings,
-    Sight,
-    maximise,
-    optics_limits,
-)
+from iscat_analysis.calibration.optics.estimate import Estimate, maximise, optics_limits
 from iscat_analysis.calibration.optics.forecast import OpticsForecast, forecast_optics
 from iscat_analysis.calibration.optics.measure import (
     FAINTEST,
@@ -38,6 +31,7 @@ from iscat_analysis.calibration.optics.settings import (
     settings_of,
     with_settings,
 )
+from iscat_analysis.calibration.optics.sights import FOCUS_STEP, Settings, Sight
 
 __all__ = [
     "FAINTEST",

@@ -14,13 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.calibration.optics.estimate import (
-    Build,
-    Estimate,
-    Settings,
-    Sight,
-    maximise,
-)
+from iscat_analysis.calibration.optics.estimate import Estimate, maximise
 from iscat_analysis.calibration.optics.hidden import find_hidden
 from iscat_analysis.calibration.optics.settings import (
     FREE,
@@ -30,6 +24,7 @@ from iscat_analysis.calibration.optics.settings import (
     free_names,
     is_term,
 )
+from iscat_analysis.calibration.optics.sights import Build, Settings, Sight
 from iscat_analysis.calibration.optics.starts import average_sights, with_masses
 from iscat_analysis.calibration.optics.states import StateSearch, same_state
 from iscat_analysis.records import FloatArray, Mapper

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from iscat_analysis.calibration.optics.estimate import Sight
+from iscat_analysis.calibration.optics.sights import Sight
 from iscat_analysis.calibration.optics.starts import average_sights
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.optics.forward import ForwardModel, peak_per_amplitude, with_template

@@ -9,8 +9,8 @@ import numpy as np
 from scipy import ndimage
 
 from iscat_analysis._kernels.zernike import zernike
-from iscat_analysis.calibration.optics.estimate import Build, Settings, Sight
 from iscat_analysis.calibration.optics.settings import is_term
+from iscat_analysis.calibration.optics.sights import Build, Settings, Sight
 from iscat_analysis.calibration.optics.starts import contrast_of
 from iscat_analysis.records import FloatArray
 

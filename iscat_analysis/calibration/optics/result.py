@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.calibration.optics.estimate import FOCUS_STEP
 from iscat_analysis.calibration.optics.measure import Judgement, Measured
 from iscat_analysis.calibration.optics.pictures import Pictures
 from iscat_analysis.calibration.optics.settings import exists, is_term, with_settings
+from iscat_analysis.calibration.optics.sights import FOCUS_STEP
 from iscat_analysis.config import Config, OpticsCovariance
 from iscat_analysis.records import FloatArray
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from iscat_analysis.calibration.optics.estimate import FOCUS_STEP, Settings
+from iscat_analysis.calibration.optics.sights import FOCUS_STEP, Settings
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import ForwardModel, forward_model

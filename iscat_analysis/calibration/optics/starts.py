@@ -19,7 +19,7 @@ import numpy as np
 from scipy import fft, ndimage
 
 from iscat_analysis._kernels.scoring import CONDITIONAL
-from iscat_analysis.calibration.optics.estimate import Build, Sight
+from iscat_analysis.calibration.optics.sights import Build, Sight
 from iscat_analysis.inference.pixels import pixel_terms
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import FloatArray

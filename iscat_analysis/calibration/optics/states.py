@@ -12,8 +12,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from iscat_analysis.calibration.optics.estimate import Build, Estimate, Settings, Sight, maximise
+from iscat_analysis.calibration.optics.estimate import Estimate, maximise
 from iscat_analysis.calibration.optics.settings import PRIMARY, SECONDARY, free_names
+from iscat_analysis.calibration.optics.sights import Build, Settings, Sight
 from iscat_analysis.calibration.optics.starts import (
     FOCUS_RANGE_NM,
     FOCUS_STEP_NM,

@@ -1,0 +1,151 @@
+"""The picture of one particle, and what makes such pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from iscat_analysis._kernels.scoring import CONDITIONAL
+from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.records import FloatArray
+
+FOCUS_STEP = "focus_step_nm"
+"""Rise of the focus from picture to picture of a scan [nm]; the one parameter that is not a key of
+``[optics]``."""
+
+PRIVATE = 4
+"""Unknowns of one sight: x, y [nm], mass [kDa] and the logarithm of the background level."""
+
+ROAM_NM = 300.0
+"""Farthest from the centre of a picture that its particle may be, along x and y."""
+
+
+class Microscope(Protocol):
+    """What the estimator asks of a forward model."""
+
+    def image(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
+    ) -> FloatArray:
+        """Signal of one particle."""
+
+    def gradient(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Signal, and its derivatives with respect to x, y, z and mass."""
+
+    def joint_gradient(
+        self,
+        grid: PixelGrid,
+        x_nm: float,
+        y_nm: float,
+        z_nm: float,
+        mass_kda: float,
+        names: Sequence[str],
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Signal, and its derivatives with respect to the particle and the named optics."""
+
+
+Settings = Mapping[str, Any]
+"""Values of ``[optics]`` by key, each aberration under its own name (``z5``…)."""
+
+Build = Callable[[Settings], Microscope]
+"""Makes the microscope of some settings."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The picture of one particle: counts of a region, and where the search begins.
+
+    Attributes
+    ----------
+    grid : PixelGrid
+        The region's pixels.
+    kind : int
+        Noise model of `data`: CONDITIONAL or POISSON of `iscat_analysis.likelihood`.
+    data : ndarray, shape (4, ny, nx)
+        As in `Likelihood.data`.
+    x_nm, y_nm : float
+        Place from which the search starts [nm].
+    z_nm : float
+        Height of the particle [nm].
+    mass_kda : float
+        Signed mass from which the search starts, 0 where unknown [kDa].
+    level : float
+        Logarithm of the background level from which the search starts.
+    focus_steps : float
+        Steps of the focus since the first picture of a scan; ``focus_step_nm`` of the settings is
+        their size.
+    frame : int
+        First frame of the new state.
+    snr : float
+        Signal-to-noise ratio with which it was found.
+    neighbours : tuple of (int, float)
+        Other particles whose rings reach into the picture: their number, and the share of their
+        contrast that is new after the step.
+    rings : ndarray, shape (ny, nx), or float
+        Factor of the expected light that was put into `data` for them.
+    baseline : float
+        What they add to the log-likelihood where there is no particle.
+    """
+
+    grid: PixelGrid
+    kind: int
+    data: FloatArray
+    x_nm: float
+    y_nm: float
+    z_nm: float
+    mass_kda: float = 0.0
+    level: float = 0.0
+    focus_steps: float = 0.0
+    frame: int = 0
+    snr: float = 0.0
+    neighbours: tuple[tuple[int, float], ...] = ()
+    rings: FloatArray | float = 1.0
+    baseline: float = 0.0
+
+    @property
+    def private(self) -> FloatArray:
+        """Start of the sight's own unknowns, shape (4,)."""
+        return np.array([self.x_nm, self.y_nm, self.mass_kda, self.level])
+
+    def among(self, contrast: FloatArray) -> Sight:
+        """Return the sight with the contrast of its neighbours in its expectation."""
+        rings = 1 + contrast
+        data = self.data.copy()
+        # a factor of the odds, or of the expected counts with and without the particle
+        columns = [2] if self.kind == CONDITIONAL else [1, 2]
+        data[columns] *= rings / self.rings
+        bare = data.copy()
+        bare[columns] /= rings
+        if self.kind == CONDITIONAL:
+            terms = data[0] * np.log(rings) - data[1] * (np.log1p(data[2]) - np.log1p(bare[2]))
+            baseline = float(np.sum(data[3] * terms))
+        else:
+            now, then = data[1] + data[3], bare[1] + bare[3]
+            used = (data[2] > 0) & (then > 0)
+            ratio = np.where(used, now / np.where(used, then, 1.0), 1.0)
+            baseline = float(np.sum(np.where(used, data[0] * np.log(ratio) - now + then, 0.0)))
+        return replace(self, data=data, rings=rings, baseline=baseline)
+
+    def seen_with(self, settings: Settings) -> dict[str, Any]:
+        """Return the settings with the focus of this picture, as keys of ``[optics]``."""
+        own = {key: value for key, value in settings.items() if key != FOCUS_STEP}
+        own["focus_nm"] += self.focus_steps * settings.get(FOCUS_STEP, 0.0)
+        return own
+
+    def moved(self, private: FloatArray) -> Sight:
+        """Return the same pictures with another start."""
+        x, y, mass, level = (float(v) for v in private)
+        return replace(self, x_nm=x, y_nm=y, mass_kda=mass, level=level)
+
+    def placed(self, x_nm: float, y_nm: float) -> Sight:
+        """Return the same picture with another place, or the nearest where it may be."""
+        (low, high), (left, right) = (
+            (float(np.mean(axis)) - ROAM_NM, float(np.mean(axis)) + ROAM_NM)
+            for axis in (self.grid.y_nm, self.grid.x_nm)
+        )
+        x, y = min(max(x_nm, left), right), min(max(y_nm, low), high)
+        return replace(self, x_nm=x, y_nm=y)
