@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import re
-import signal
 import sys
 import threading
 import time
@@ -14,13 +13,13 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 from rich.console import Console, RenderableType
 
 from iscat_cli import INTERRUPTED
+from iscat_cli.ending import ending_in_time, termination_interrupts
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bars
@@ -33,12 +32,6 @@ UNEXPECTED = 1
 SECONDS_TO_FIRST_LINE = 2.0
 SECONDS_BETWEEN_LINES = 10.0
 PLAIN_WIDTH = 200
-
-GRACE_S = 1.5
-"""After a signal to end, the time that is left for tidying up."""
-
-WRITING_GRACE_S = 30.0
-"""The same while results are being written, which a second signal cuts short."""
 
 
 class Messages:
@@ -233,7 +226,7 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
         where = f" ({category.__name__}, {Path(filename).name}:{lineno})" if debug else ""
         messages.notify(f"warning: {message}{where}")
 
-    with warnings.catch_warnings(), _ending_in_time(messages), _termination_interrupts():
+    with warnings.catch_warnings(), ending_in_time(messages), termination_interrupts():
         warnings.showwarning = show
         try:
             yield
@@ -249,80 +242,6 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
             line, status = _verdict(error, debug=debug)
             messages.error(with_options(line))
             raise typer.Exit(status) from error
-
-
-@contextmanager
-def _ending_in_time(messages: Messages) -> Iterator[None]:
-    """End the process where the answer to a signal takes too long.
-
-    Python raises `KeyboardInterrupt` between two of its own instructions, so a long call into
-    compiled code delays it, and so do threads that must finish first.  The operating system's
-    handler writes each signal's number into a pipe at once; a thread reads it and keeps the time.
-    """
-    if threading.current_thread() is not threading.main_thread() or os.name == "nt":
-        yield
-        return
-    reader, writer = os.pipe()
-    os.set_blocking(writer, False)
-    ended = threading.Event()
-
-    def watch() -> None:
-        with open(reader, "rb", buffering=0) as signals:  # noqa: PTH123  (a descriptor)
-            while (number := signals.read(1)) and number[0] not in _ENDING:
-                pass
-            if not number:
-                return
-            if ended.wait(GRACE_S):
-                return
-            if messages.writing:
-                os.set_blocking(reader, False)
-                due = time.monotonic() + WRITING_GRACE_S
-                while messages.writing and time.monotonic() < due:
-                    if ended.wait(0.1):
-                        return
-                    again = signals.read(1)
-                    if again and again[0] in _ENDING:
-                        break
-        messages.error(f"interrupted by {signal.Signals(number[0]).name}")
-        os._exit(INTERRUPTED)
-
-    earlier = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    threading.Thread(target=watch, daemon=True, name="signals").start()
-    try:
-        yield
-    finally:
-        signal.set_wakeup_fd(earlier)
-        ended.set()
-        os.close(writer)
-
-
-_ENDING = {
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-}
-
-
-@contextmanager
-def _termination_interrupts() -> Iterator[None]:
-    """Let a request to end (SIGTERM, SIGHUP) end the command as Ctrl-C does: tidied up."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        del frame
-        raise KeyboardInterrupt(f"by {signal.Signals(number).name}")
-
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    ours = [
-        number
-        for number in numbers
-        if threading.current_thread() is threading.main_thread()
-        and signal.getsignal(number) is signal.SIG_DFL  # SIGHUP is ignored under nohup
-    ]
-    for number in ours:
-        signal.signal(number, interrupt)
-    try:
-        yield
-    finally:
-        for number in ours:
-            signal.signal(number, signal.SIG_DFL)
 
 
 _OPTIONS = {

@@ -25,12 +25,11 @@ from iscat_analysis.pipeline.linking import (
     bridge,
     numbered,
     typical,
-    unlike,
     with_mass,
 )
-from iscat_analysis.pipeline.moving_table import tracks_seen
+from iscat_analysis.pipeline.moving_table import table_of_tracks
 from iscat_analysis.pipeline.results import Followed
-from iscat_analysis.records import EventView, FloatArray, Status, Windows, verdict
+from iscat_analysis.records import EventView, FloatArray, Windows
 from iscat_analysis.search.moving import link
 
 IntArray = NDArray[np.int64]
@@ -75,13 +74,13 @@ def join_blocks(config: Config, blocks: Sequence[Block], camera: Camera) -> Join
         Tracks numbered in the order of their first frames.
     """
     numbers = join_tracks(config, blocks)
-    table = pd.concat([b.table for b in blocks], ignore_index=True)
-    inside = np.concatenate([b.inside for b in blocks])
-    table["track"] = np.concatenate([n[b.rows.track] for n, b in zip(numbers, blocks, strict=True)])
-    table["event"] = table["track"]
-    table = tracks_seen(table, inside, config.track.min_frames)
-    if len(blocks) > 1:
-        table = _flagged(table)
+    table = table_of_tracks(
+        pd.concat([b.table for b in blocks], ignore_index=True),
+        np.concatenate([n[b.rows.track] for n, b in zip(numbers, blocks, strict=True)]),
+        np.concatenate([b.inside for b in blocks]),
+        config.track.min_frames,
+        parted=len(blocks) > 1,
+    )
     parts = tuple(block.windows(camera) for block in blocks)
     masses = combine_masses([b.masses for b in blocks], numbers, table)
     followed = Followed(_together(blocks, parts), parts if len(parts) > 1 else (), masses)
@@ -193,16 +192,6 @@ def combine_masses(
     out["mass_kda"] = (weight * used["mass_kda"]).groupby(used["track"]).sum() / total
     out["sigma_mass_kda"] = out["crb_mass_kda"] = 1 / np.sqrt(total)
     return out
-
-
-def _flagged(table: pd.DataFrame) -> pd.DataFrame:
-    """Flag rows whose mass is not that of their whole track, as each block did with its part."""
-    off = unlike(*(table[name].to_numpy() for name in ("track", "mass_kda", "crb_mass_kda")))
-    for i in np.flatnonzero(off):
-        flags = {Status(flag) for flag in str(table.at[i, "flags"]).split(";") if flag}
-        worst, all_ = verdict([*flags, Status.TOO_CLOSE])
-        table.loc[i, ["status", "flags"]] = str(worst), ";".join(str(flag) for flag in all_)
-    return table
 
 
 def _views(

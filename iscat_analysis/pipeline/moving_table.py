@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy.special import gammainc, gammaincc, ndtr
 
 from iscat_analysis.bounds.quantum import quantum_information
@@ -11,6 +12,7 @@ from iscat_analysis.inference.common import variances_left
 from iscat_analysis.inference.fit import POOR_FIT_P
 from iscat_analysis.optics.blur import PATH_SPREAD, blurred
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+from iscat_analysis.pipeline.linking import unlike
 from iscat_analysis.pipeline.moving import Moving
 from iscat_analysis.pipeline.paths import path_covariances
 from iscat_analysis.pipeline.scene import Scene
@@ -28,7 +30,7 @@ _APART = 0.05  # relative step of a blur
 
 
 def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame:
-    """Make a line of ``fits.csv`` for every row.
+    """Make a line of ``fits.csv`` for every row, without its number and its verdict.
 
     Parameters
     ----------
@@ -42,8 +44,9 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     Returns
     -------
     pandas.DataFrame
-        Columns `EVENT_COLUMNS`, and ``track``; ``event`` is the track too.  In the order of the
-        rows, those outside the field too.
+        In the order of the rows, those outside the field too; ``track`` is the number in these
+        frames, and ``flags`` what is remarked on the row itself.  `table_of_tracks` makes the
+        columns `EVENT_COLUMNS` of it.
 
     Notes
     -----
@@ -71,46 +74,70 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     freedom = np.maximum(judged.pixels - index.size, 1)
     p_value = _p_values(judged.chi2, freedom, judged.worst, judged.pixels)
     collected = judged.level / pixel**2 * _areas(model, estimate[:, 2], mass)
-    statuses = [verdict(flags) for flags in _flags(moving, sigma, p_value, losses)]
     columns: dict[str, object] = {
-        "event": rows.track, "frame": rows.frame + first_frame,
+        "track": rows.track, "frame": rows.frame + first_frame,
         "n_before": np.full(n, field.frames), "n_after": np.ones(n, dtype=int),
         "x_px": estimate[:, 0] / pixel, "y_px": estimate[:, 1] / pixel,
         "x_nm": estimate[:, 0], "y_nm": estimate[:, 1], "z_nm": estimate[:, 2], "mass_kda": mass,
         "contrast": _contrasts(model, estimate[:, 2], estimate[:, 3]),
         "n_scattered": collected, "snr": np.sqrt(2 * np.maximum(judged.gain, 0.0)),
         "chi2_reduced": judged.chi2 / freedom, "p_value": p_value,
-        "status": [str(status) for status, _ in statuses],
-        "flags": [";".join(str(flag) for flag in flags) for _, flags in statuses],
+        "flags": [";".join(flags) for flags in _flags(moving, sigma, p_value, losses)],
     }  # fmt: skip
     quantum = _quantum(model, estimate[:, 2], mass, collected, free)
     for k, name in enumerate(PARAMETERS):
         columns[f"sigma_{name}"], columns[f"crb_{name}"] = sigma[:, k], crb[:, k]
         columns[f"qcrb_{name}"] = quantum[:, k]
-    return pd.DataFrame(columns)[list(EVENT_COLUMNS)].assign(track=rows.track)
+    return pd.DataFrame(columns)
 
 
-def tracks_seen(table: pd.DataFrame, inside: BoolArray, min_frames: int) -> pd.DataFrame:
-    """Keep the lines of tracks that were seen long enough.
+def table_of_tracks(
+    lines: pd.DataFrame,
+    track: NDArray[np.int64],
+    inside: BoolArray,
+    min_frames: int,
+    *,
+    parted: bool,
+) -> pd.DataFrame:
+    """Judge the lines of a movie, number them, and keep those of tracks seen long enough.
 
     Parameters
     ----------
-    table : pandas.DataFrame
-        From `moving_table`.
+    lines : pandas.DataFrame
+        From `moving_table`, of all blocks.
+    track : ndarray of int, shape (n,)
+        Number in the movie of the track of each line.
     inside : ndarray of bool, shape (n,)
         Which particles are in the field: the others were fitted for the sake of these.
     min_frames : int
         Lines of a track in the field, at least.
+    parted : bool
+        Whether there are several blocks: each has compared the masses of its part of a track, and
+        here they are compared with those of the whole.
 
     Returns
     -------
     pandas.DataFrame
-        Track by track, in the order of the frames.
+        Columns `EVENT_COLUMNS`, and ``track``, which is the number of the event too; track by
+        track, in the order of the frames.
     """
-    table = table[inside]
+    table = lines.assign(event=track, track=track)[inside]
     seen = table.groupby("track")["frame"].transform("size")
     table = table[seen >= min_frames]
-    return table.sort_values(["track", "frame"], kind="stable").reset_index(drop=True)
+    table = table.sort_values(["track", "frame"], kind="stable").reset_index(drop=True)
+    off = np.zeros(len(table), dtype=np.bool_)
+    if parted:
+        names = ("track", "mass_kda", "crb_mass_kda")
+        off = unlike(*(table[name].to_numpy() for name in names))
+    judged = []
+    for text, shared in zip(table["flags"], off, strict=True):
+        own = [Status(flag) for flag in text.split(";") if flag]
+        judged.append(verdict([*own, Status.TOO_CLOSE] if shared else own))
+    table = table.assign(
+        status=[str(status) for status, _ in judged],
+        flags=[";".join(str(flag) for flag in flags) for _, flags in judged],
+    )
+    return table[[*EVENT_COLUMNS, "track"]]
 
 
 def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:

@@ -36,7 +36,7 @@ from iscat_analysis.pipeline.blocks import (
 from iscat_analysis.pipeline.joining import combine_masses, join_tracks
 from iscat_analysis.pipeline.linking import unlike
 from iscat_analysis.pipeline.moving import follow, track_scene
-from iscat_analysis.pipeline.moving_table import common_masses, moving_table, tracks_seen
+from iscat_analysis.pipeline.moving_table import common_masses, moving_table, table_of_tracks
 from iscat_analysis.pipeline.resume import partial_folder
 from iscat_analysis.threads import threads
 
@@ -298,7 +298,10 @@ def _whole(counts: np.ndarray, config: Config) -> tuple[pd.DataFrame, pd.DataFra
             check=_unchecked, pool=pool, progress=lambda *_: None,
         )  # fmt: skip
     inside = moving.field.holds(moving.rows.theta)
-    table = tracks_seen(moving_table(scene, moving, 0), inside, config.track.min_frames)
+    table = table_of_tracks(
+        moving_table(scene, moving, 0), moving.rows.track, inside, config.track.min_frames,
+        parted=False,
+    )  # fmt: skip
     return table, common_masses(scene, moving)
 
 
