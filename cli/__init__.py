@@ -16,6 +16,10 @@ __all__ = ["main", "main_fit"]
 
 INTERRUPTED = 130
 
+_OBJECTS = 50_000
+"""New containers after which cycles among them are looked for: loading the libraries makes some
+ten times as many, which stay, and looking through them every 700 took a quarter of a short run."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `iscat`.
@@ -50,6 +54,8 @@ def main_fit(arguments: Sequence[str] | None = None) -> int:
 
 
 def _start(program: str, arguments: Sequence[str] | None) -> int:
+    if arguments is None:  # the process is ours
+        gc.set_threshold(_OBJECTS, *gc.get_threshold()[1:])
     try:
         import signal
         import threading

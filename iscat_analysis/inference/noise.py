@@ -14,6 +14,8 @@ What to use when
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -26,6 +28,9 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 
 FloatArray = NDArray[np.float64]
+
+PARTS = ("heights", "posteriors")
+"""Kernels that not every run needs: of a height that is fitted, and of posteriors."""
 
 
 def conditional(
@@ -258,24 +263,28 @@ def compile_maximisation(model: ForwardModel) -> None:
     likelihood.score_fisher(theta)
 
 
-def compile_values(model: ForwardModel) -> None:
+def compile_values(model: ForwardModel, parts: Collection[str] = PARTS) -> None:
     """Run the kernels of values and curvatures once: the other half of `compile_kernels`.
 
     Parameters
     ----------
     model : ForwardModel
         Any.
+    parts : collection of str
+        Which of `PARTS` will be needed.
     """
     likelihood, theta = _small(model)
-    likelihood.values(theta[None])
     likelihood.signal(theta)
+    if "posteriors" in parts:
+        likelihood.values(theta[None])
+    if "heights" in parts:
+        likelihood.derivatives(theta, np.ones(5, dtype=np.bool_))
+        likelihood.scan_heights(theta[2:3], theta, (0.0, 2.0))
     free = np.array([True, True, False, True, False])
-    likelihood.derivatives(theta, ~free)
     derivatives = likelihood.derivatives(theta, free)
     likelihood.observed_information(theta, derivatives)
     first_order_bias(likelihood, theta, free, derivatives)
     goodness_of_fit(likelihood, theta, free, derivatives)
-    likelihood.scan_heights(theta[2:3], theta, (0.0, 2.0))
 
 
 def _small(model: ForwardModel) -> tuple[Likelihood, FloatArray]:

@@ -20,7 +20,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.movie import Stack, beside, open_stack
 from iscat_analysis.pipeline.bound import find_bound
-from iscat_analysis.pipeline.compilation import compiling
+from iscat_analysis.pipeline.compilation import compiling, needed_parts
 from iscat_analysis.pipeline.finish import gather
 from iscat_analysis.pipeline.injection import injected
 from iscat_analysis.pipeline.landing import find_landings
@@ -165,7 +165,7 @@ def analyse(
     started = datetime.now(UTC).isoformat(timespec="seconds")
     # particles that move are fitted by kernels of their own, which call those of others
     workers = 1 if way_of(config) == "tracks" else config.compute.workers
-    with compiling(notify, workers) as compilation:
+    with compiling(notify, workers, needed_parts(config)) as compilation:
         run = Run(notify, progress, compilation, partial, place or Here(), inject)
         ready = prepare(movie, config, run)  # load, calibrate
         found = FIND[ready.way](ready, run)  # background, detect, fit, posterior, bounds

@@ -6,12 +6,15 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from numba.core import event
 
 from iscat_analysis import _kernels
+from iscat_analysis.config import Config
+from iscat_analysis.inference.noise import PARTS
+from iscat_analysis.records import FREE_PARAMETERS
 
 _PATIENCE_S = 1.0  # of compilation, before it is announced
 _BETWEEN_S = 4.0  # from one line to the next
@@ -43,9 +46,19 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
         Told one line at a time.
     together : bool
         Whether a second process may be started.
+    parts : sequence of str
+        As in `compiling`.
+
+    Attributes
+    ----------
+    parts : sequence of str
+        As given.
     """
 
-    def __init__(self, notify: Callable[[str], None], *, together: bool) -> None:
+    def __init__(
+        self, notify: Callable[[str], None], *, together: bool, parts: Sequence[str]
+    ) -> None:
+        self.parts = parts
         self._notify = notify
         self._together = together
         self._other: subprocess.Popen[bytes] | None = None
@@ -70,7 +83,7 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
         kind = module.removeprefix(_ROOM)
         self._about = _ABOUT.get(kind, _PICTURES)
         if self._together and self._other is None and kind in _SHARED:
-            self._other = _started()
+            self._other = _started(self.parts)
         if self._timer is None:
             self._timer = threading.Timer(_PATIENCE_S, self._announce)
             self._timer.daemon = True
@@ -114,12 +127,32 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
             self._other.wait()
 
 
-def _started() -> subprocess.Popen[bytes] | None:
+def needed_parts(config: Config) -> tuple[str, ...]:
+    """Name the kernels of `iscat_analysis.inference.noise.PARTS` that an analysis needs.
+
+    Parameters
+    ----------
+    config : Config
+        Of the analysis.
+
+    Returns
+    -------
+    tuple of str
+        Some of them, or none.
+    """
+    needed = {
+        "heights": "z_nm" in FREE_PARAMETERS[config.fit.mode],
+        "posteriors": config.samples_posterior,
+    }
+    return tuple(part for part in PARTS if needed[part])
+
+
+def _started(parts: Sequence[str]) -> subprocess.Popen[bytes] | None:
     """Start the other process; what it does not compile is compiled in this one."""
     if not sys.executable or getattr(sys, "frozen", False):  # inside another program
         return None
     nowhere = subprocess.DEVNULL
-    command = [sys.executable, "-P", "-m", "iscat_analysis.inference.ahead"]
+    command = [sys.executable, "-P", "-m", "iscat_analysis.inference.ahead", *parts]
     try:
         return subprocess.Popen(
             command, stdin=nowhere, stdout=nowhere, stderr=nowhere, env=_kernels.environment()
@@ -129,7 +162,9 @@ def _started() -> subprocess.Popen[bytes] | None:
 
 
 @contextmanager
-def compiling(notify: Callable[[str], None], workers: int) -> Iterator[Compilation]:
+def compiling(
+    notify: Callable[[str], None], workers: int, parts: Sequence[str] = PARTS
+) -> Iterator[Compilation]:
     """Say what is compiled until the block ends.
 
     Parameters
@@ -138,6 +173,8 @@ def compiling(notify: Callable[[str], None], workers: int) -> Iterator[Compilati
         Told one line at a time, after a second of compilation.
     workers : int
         From two on, a second process compiles half of what fits need.
+    parts : sequence of str
+        Which of `iscat_analysis.inference.noise.PARTS` it compiles as well.
 
     Yields
     ------
@@ -150,7 +187,7 @@ def compiling(notify: Callable[[str], None], workers: int) -> Iterator[Compilati
             "folder can be written: every run compiles them anew; set NUMBA_CACHE_DIR to a folder "
             "that can be written"
         )
-    listener = Compilation(notify, together=workers > 1)
+    listener = Compilation(notify, together=workers > 1, parts=parts)
     try:
         with event.install_listener("numba:compile", listener):
             yield listener

@@ -72,4 +72,4 @@ class Run:
         """Load the compiled kernels of fits, or compile them."""
         compile_maximisation(scene.model)
         self.compilation.wait()
-        compile_values(scene.model)
+        compile_values(scene.model, self.compilation.parts)

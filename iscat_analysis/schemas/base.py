@@ -57,10 +57,10 @@ def maybe(description: str) -> Any:
 class Document(BaseModel):
     """A document, or a part of one, that may hold further keys."""
 
-    model_config = ConfigDict(extra="allow")
+    model_config = ConfigDict(extra="allow", defer_build=True)  # a command needs one of them
 
 
 class Closed(BaseModel):
     """A part that holds the keys named here and no other."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", defer_build=True)

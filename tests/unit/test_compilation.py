@@ -22,10 +22,11 @@ from iscat_analysis._kernels.score_test import score_statistic
 from iscat_analysis._kernels.scoring import maximize, value_batch
 from iscat_analysis.config import load_config
 from iscat_analysis.inference import ahead
-from iscat_analysis.inference.noise import compile_kernels
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise import PARTS, compile_kernels, compile_values
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.pipeline import compilation as module
-from iscat_analysis.pipeline.compilation import compiling
+from iscat_analysis.pipeline.compilation import compiling, needed_parts
 
 ROOM = "iscat_analysis._kernels"
 
@@ -40,8 +41,8 @@ def started(monkeypatch):
     """Start processes that do nothing, and list them."""
     begun = []
 
-    def start():
-        begun.append(subprocess.Popen([sys.executable, "-c", ""]))
+    def start(parts):
+        begun.append(subprocess.Popen([sys.executable, "-c", "", *parts]))
         return begun[-1]
 
     monkeypatch.setattr(module, "_started", start)
@@ -99,7 +100,7 @@ def test_the_second_process_runs_nothing_of_the_folder_it_is_in(monkeypatch, tmp
     for name in ("numba.py", "iscat_analysis.py"):
         (tmp_path / name).write_text("open('ran', 'w').close()\n", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    other = module._started()
+    other = module._started(())
     with suppress(subprocess.TimeoutExpired):
         other.wait(timeout=5)  # long after its imports begin
     other.kill()
@@ -116,7 +117,7 @@ def test_the_second_process_runs_nothing_of_the_folder_it_is_in(monkeypatch, tmp
 def test_the_second_process_ends_with_the_first(monkeypatch):
     command = [sys.executable, "-c", "import time; time.sleep(600)"]
     other = subprocess.Popen(command)
-    monkeypatch.setattr(module, "_started", lambda: other)
+    monkeypatch.setattr(module, "_started", lambda _: other)
     with (
         pytest.raises(KeyboardInterrupt),
         compiling(print, 2),
@@ -129,13 +130,33 @@ def test_the_second_process_ends_with_the_first(monkeypatch):
 def test_the_second_process_compiles_what_the_first_needs():
     shared = (value_batch, signal_hessian, scan_heights, score_statistic)
     others = set(maximize.signatures)  # of other tests
-    ahead.main()
+    ahead.main(PARTS)
     made = [set(kernel.signatures) for kernel in shared]
     assert all(made)
     config = load_config(Path("sample_configs/joint.toml"), [])
     compile_kernels(forward_model(config, 2000.0))
     assert [set(kernel.signatures) for kernel in shared] == made
     assert len(set(maximize.signatures) - others) <= 1
+
+
+@pytest.mark.parametrize(
+    ("sample", "changes", "parts"),
+    [
+        ("mass", [], ("posteriors",)),
+        ("mass", ["posterior.enabled=false"], ()),
+        ("landing", [], ()),
+        ("joint", [], ("heights",)),
+        ("joint", ["posterior.enabled=true"], ("heights", "posteriors")),
+    ],
+)
+def test_an_analysis_compiles_what_it_needs(monkeypatch, sample, changes, parts):
+    config = load_config(Path(f"sample_configs/{sample}.toml"), changes)
+    assert needed_parts(config) == parts
+    run = set()
+    for name, part in (("scan_heights", "heights"), ("values", "posteriors")):
+        monkeypatch.setattr(Likelihood, name, lambda *_, part=part: run.add(part))
+    compile_values(forward_model(config, 2000.0), parts)
+    assert run == set(parts)
 
 
 def test_kernels_are_kept_where_nothing_can_be_written(tmp_path):
