@@ -280,7 +280,7 @@ class Explorer(QWidget):
     def _settings(self, preview: ia.Preview, threshold: float, window: int) -> str:
         """Say with which options the command would search so."""
         said = []
-        if "sliding" in str(preview.config.background.method) and window != preview.window:
+        if preview.config.background.method == "sliding" and window != preview.window:
             said.append(f"--set background.window_frames={window}")
         if abs(threshold - preview.threshold(window)) > 10.0 ** -self.threshold.decimals():
             alarms = preview.false_alarms(threshold, window)

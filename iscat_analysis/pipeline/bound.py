@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
+
 from iscat_analysis.pipeline.diagnosis import (
     drift_warning,
     examine_background,
@@ -62,7 +64,9 @@ def find_bound(ready: Prepared, run: Run) -> Found:
         scene = make_scene(
             config, ready.shape, searches=searches, noise=noise.spectrum, lines=ready.lines
         )
-    for text in (*noise.said(movie.name), *pixel_warnings(windows)):
+    saturated = int(windows.saturated.sum())
+    defects = int(np.sum(windows.masked & ~windows.saturated))
+    for text in (*noise.said(movie.name), *pixel_warnings(defects, saturated)):
         run.tell(text)
     summary: dict[str, Any] = {}
     if not scene.additive:

@@ -15,7 +15,7 @@ from iscat_analysis.pipeline.chunks import Reader, counts_budget
 from iscat_analysis.pipeline.diagnosis import misfit_warning
 from iscat_analysis.pipeline.events import posterior_of
 from iscat_analysis.pipeline.merging import CLIPS, VIEWS, Done
-from iscat_analysis.pipeline.pattern import follow
+from iscat_analysis.pipeline.pattern import corrected
 from iscat_analysis.pipeline.results import table_of, view_of
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.pipeline.steps import ChunkFitter
@@ -135,8 +135,8 @@ def analyse_chunk(
         Everything found.
     """
     wanted = scene.config.background.drift_correction
-    trajectory = follow(chunk, pool.map) if wanted else None
-    fitter = ChunkFitter(scene, chunk, window, pool, trajectory, excess_noise=excess_noise)
+    still, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
+    fitter = ChunkFitter(scene, still, window, pool, pattern, excess_noise=excess_noise)
     seam = max(2, window // STRIDES)
     steps = fitter.run((core[0] - seam, core[1] + seam))
     events = [step.event for step in steps]
@@ -171,7 +171,7 @@ def analyse_chunk(
         ends_e=_ends(chunk, inside),
         sampled=len(chains),
         stopped=stopped,
-        trajectory=trajectory,
+        trajectory=pattern.trajectory if pattern else None,
         cause=misfit_warning(scene.config, events),
         empty=fitter.empty,
     )

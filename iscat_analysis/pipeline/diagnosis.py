@@ -16,7 +16,9 @@ from iscat_analysis.movie.drift import follow_pattern
 from iscat_analysis.movie.lines import Lines, find_lines
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, first_counts, is_lit
+from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import Status, Windows
+from iscat_analysis.report.numbers import count
 from iscat_analysis.search.sliding import measure_frames, measure_noise
 
 DRIFT_PX = 0.02
@@ -56,7 +58,7 @@ def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
         or background.method == "known"
         or (background.method == "sliding" and background.drift_correction)
         or config.optics.scheme == "darkfield"
-        or (config.fit.mode == "track" and config.track.free == "joint" and not background.frames)
+        or (way_of(config) == "tracks" and config.track.free == "joint")
     ):
         return None
     first, last = background.frames or config.fit.frames or (0, movie.shape[0])
@@ -67,28 +69,32 @@ def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
     return find_lines(counts[np.isfinite(light) & ~repeats], camera)
 
 
-def pixel_warnings(windows: Windows) -> Iterator[str]:
-    """Say which pixels are left out.
+def pixel_warnings(defects: int, saturated: int) -> Iterator[str]:
+    """Say how many pixels are left out, and why.
 
     Parameters
     ----------
-    windows : Windows
-        The background.
+    defects : int
+        Dead and hot pixels.
+    saturated : int
+        Those that are saturated in some frame.
 
     Yields
     ------
     str
         One line each.
     """
-    defects = int(np.sum(windows.masked & ~windows.saturated))
     if defects:
-        yield f"{defects} dead or hot pixels are left out"
-    saturated = int(windows.saturated.sum())
+        yield f"{count(defects, 'dead or hot pixel')} {_be(defects)} left out"
     if saturated:
         yield (
-            f"{saturated} pixels are saturated in some frame and left out; "
+            f"{count(saturated, 'pixel')} {_be(saturated)} saturated in some frame and left out; "
             "lower the exposure or the laser power"
         )
+
+
+def _be(number: int) -> str:
+    return "is" if number == 1 else "are"
 
 
 def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[str, Any]:

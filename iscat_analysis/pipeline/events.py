@@ -19,7 +19,7 @@ from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import Candidate, FitResult, PosteriorResult, Status, Windows, verdict
 from iscat_analysis.search.residue import Described
 
-Place = tuple[float, float, float, float]
+PlaceAndMass = tuple[float, float, float, float]
 """x, y, z [nm] and mass [kDa]."""
 
 
@@ -50,7 +50,7 @@ class Fitted:
         )
 
     @property
-    def place(self) -> Place:
+    def place(self) -> PlaceAndMass:
         """Where it is, and its mass."""
         return self.fit.x_nm, self.fit.y_nm, self.fit.z_nm, self.fit.mass_kda
 

@@ -17,7 +17,7 @@ import numpy as np
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.movie.background import refine_power
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.events import Event, Fitted, Place, remarks
+from iscat_analysis.pipeline.events import Event, Fitted, PlaceAndMass, remarks
 from iscat_analysis.pipeline.regions import (
     Region,
     noise_cumulants,
@@ -136,7 +136,7 @@ def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Fitted])
     return total
 
 
-def add_signal(scene: Scene, place: Place, region: Region, total: FloatArray) -> None:
+def add_signal(scene: Scene, place: PlaceAndMass, region: Region, total: FloatArray) -> None:
     """Add a particle's signal to the pixels of a region that it reaches.
 
     Parameters

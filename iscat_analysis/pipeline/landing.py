@@ -23,9 +23,9 @@ from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.pipeline.chunk_work import ChunkSetting, analyse_chunk, chunk_job
 from iscat_analysis.pipeline.chunks import Reader, counts_budget, plan_chunks
-from iscat_analysis.pipeline.frames import frame_warnings
 from iscat_analysis.pipeline.merging import Done, Merged
 from iscat_analysis.pipeline.noise import judge_opening
+from iscat_analysis.pipeline.odd_frames import frame_warnings
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.results import Compared, Found
 from iscat_analysis.pipeline.resume import Store

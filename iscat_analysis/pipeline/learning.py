@@ -70,7 +70,7 @@ def learn_optics(
     optics = config.optics
     suited = optics.scheme != "darkfield" and optics.convention == "exact"
     suited = suited and optics.psf == "model"
-    measured = config.background.method in ("sliding", "fixed", "median")
+    measured = config.background.method != "known"
     if (
         optics.calibrate == "never"
         or (optics.calibrate == "auto" and optics.file is not None)

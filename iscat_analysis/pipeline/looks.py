@@ -24,7 +24,7 @@ from iscat_analysis.pipeline.chunks import Reader, counts_budget
 from iscat_analysis.pipeline.field import search_field
 from iscat_analysis.pipeline.moving import LEAST_FRAMES, load_field, search_frames, track_scene
 from iscat_analysis.pipeline.noise import judge_background, judge_opening
-from iscat_analysis.pipeline.pattern import SPAN, MovingPattern, follow
+from iscat_analysis.pipeline.pattern import SPAN, corrected
 from iscat_analysis.pipeline.ranges import checked, frame_ranges, measured_windows
 from iscat_analysis.pipeline.regions import contrast_image
 from iscat_analysis.pipeline.scene import Scene, make_scene, reported_steps
@@ -162,9 +162,7 @@ class LandingSearch:
         scene = self.scene(window)
         with threads(self._config.compute.workers) as pool:
             chunk = self._reader.chunk(span, stride, pool)
-            way = follow(chunk, pool.map) if reach > STRIDES else None
-            pattern = MovingPattern(chunk, way, pool.map) if way else None
-        chunk = pattern.chunk if pattern else chunk
+            chunk, pattern = corrected(chunk, wanted=reach > STRIDES, mapper=pool.map)
         at = blocks_before - 1  # the boundary between blocks at which `frame` begins
         known = pattern.contrast[at] if pattern else None
         earlier, later = slice(max(at + 1 - STRIDES, 0), at + 1), slice(at + 1, at + 1 + STRIDES)

@@ -57,6 +57,34 @@ def follow(chunk: Chunk, mapper: Mapper = map) -> Trajectory | None:
     return follow_pattern(chunk.blocks_e, light, frames, chunk.usable, read, mapper=mapper)
 
 
+def corrected(
+    chunk: Chunk, *, wanted: bool, mapper: Mapper = map
+) -> tuple[Chunk, MovingPattern | None]:
+    """Follow the fixed pattern of a chunk where its motion is to be divided out.
+
+    Parameters
+    ----------
+    chunk : Chunk
+        The sums.
+    wanted : bool
+        Whether it is.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    chunk : Chunk
+        Without the pixels at which a moved pattern is not known.
+    pattern : MovingPattern or None
+        None where it is not wanted, or there is no pattern to follow.
+    """
+    trajectory = follow(chunk, mapper) if wanted else None
+    if trajectory is None:
+        return chunk, None
+    pattern = MovingPattern(chunk, trajectory, mapper)
+    return pattern.chunk, pattern
+
+
 @dataclass(frozen=True)
 class LocalPattern:
     """The pattern of a region, made of the blocks around a step.
@@ -90,6 +118,8 @@ class MovingPattern:
 
     Attributes
     ----------
+    trajectory : Trajectory
+        The same.
     chunk : Chunk
         The same, without the pixels at which a moved pattern is not known.
     contrast : ndarray of float32, shape (k − 1, y, x)
@@ -97,6 +127,7 @@ class MovingPattern:
     """
 
     def __init__(self, chunk: Chunk, trajectory: Trajectory, mapper: Mapper = map) -> None:
+        self.trajectory = trajectory
         self._shift = trajectory.at(chunk.first + np.arange(len(chunk.counts), dtype=float))
         y, x = self._shift.T
         powers = np.stack([np.ones_like(y), y, x, y * y, y * x, x * x])

@@ -28,11 +28,11 @@ from iscat_analysis.movie.lines import Lines, SteadyFrames, steady
 from iscat_analysis.pipeline.block_store import row_view
 from iscat_analysis.pipeline.chunks import HALO, Reader, counts_budget
 from iscat_analysis.pipeline.diagnosis import judge_lines
-from iscat_analysis.pipeline.events import Fitted, Place
+from iscat_analysis.pipeline.events import Fitted, PlaceAndMass
 from iscat_analysis.pipeline.field import add_signal
 from iscat_analysis.pipeline.moving import blurred_rows, exposure_of, load_field, track_scene
 from iscat_analysis.pipeline.neighbours import Neighbours, Step
-from iscat_analysis.pipeline.pattern import MovingPattern, follow
+from iscat_analysis.pipeline.pattern import corrected
 from iscat_analysis.pipeline.ranges import checked, frame_ranges, measured_windows
 from iscat_analysis.pipeline.regions import (
     Region,
@@ -114,9 +114,8 @@ def _landings(
         span = max(frame - HALO * window, first), min(frame + HALO * window, last)
         with threads(config.compute.workers) as pool:
             chunk = reader.chunk(span, stride, pool)
-            way = follow(chunk, pool.map) if config.background.drift_correction else None
-            pattern = MovingPattern(chunk, way, pool.map) if way else None
-        chunk = pattern.chunk if pattern else chunk
+            wanted = config.background.drift_correction
+            chunk, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
         neighbours = Neighbours(scene, chunk, window, pattern)
         near = (table["frame"] - frame).abs() < 3 * window
         known = near & table["mass_kda"].notna() & (table["status"] != "sidelobe")
@@ -200,7 +199,7 @@ def _bound(
     return draw
 
 
-def _place(row: pd.Series[Any]) -> Place:
+def _place(row: pd.Series[Any]) -> PlaceAndMass:
     x, y, z, mass = (float(row[name]) for name in ("x_nm", "y_nm", "z_nm", "mass_kda"))
     return x, y, z, mass
 

@@ -22,7 +22,6 @@ from iscat_analysis.inference.fit import (
     search_box,
     start_theta,
 )
-from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pipeline.events import Event, Fitted, remarks, standing_out
 from iscat_analysis.pipeline.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.pipeline.pattern import MovingPattern
@@ -101,8 +100,8 @@ class ChunkFitter:
         Frames before and after a step.
     pool : ThreadPoolExecutor
         Runs the fits; the result does not depend on its size.
-    trajectory : Trajectory, optional
-        Of the fixed pattern, whose motion is then divided out.
+    pattern : MovingPattern, optional
+        Of the same chunk, where its motion is divided out.
     excess_noise : str
         What is known of noise beyond the expected; with it a search that a thousand places pass is
         given up.
@@ -122,13 +121,11 @@ class ChunkFitter:
         chunk: Chunk,
         window: int,
         pool: ThreadPoolExecutor,
-        trajectory: Trajectory | None = None,
+        pattern: MovingPattern | None = None,
         *,
         excess_noise: str = "",
     ) -> None:
         self._excess_noise = excess_noise
-        pattern = MovingPattern(chunk, trajectory, pool.map) if trajectory else None
-        chunk = pattern.chunk if pattern else chunk
         self._scene = scene
         self._chunk = chunk
         self._pattern = pattern

@@ -30,6 +30,7 @@ from iscat_analysis.pipeline.results import Compared, Followed, Found, rows_of, 
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import EventView, FloatArray, FrameSource, Progress, Windows
+from iscat_analysis.report.numbers import count
 from iscat_analysis.search.moving import link
 from iscat_analysis.threads import threads
 
@@ -75,6 +76,9 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         )
     joined = join_blocks(config, blocks, camera)
     windows = joined.followed.windows
+    masked = int(windows.masked.sum())
+    if masked:
+        run.tell(f"{count(masked, 'pixel')} left out: dead, hot, or saturated in some frame")
     run.clock.lap("track")
     return Found(
         scene=replace(scene, mode="track", config=config),

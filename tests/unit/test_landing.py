@@ -23,10 +23,10 @@ from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.pipeline import chunks as chunks_module
 from iscat_analysis.pipeline import events as events_module
 from iscat_analysis.pipeline import landing as landing_module
-from iscat_analysis.pipeline.frames import frame_warnings
 from iscat_analysis.pipeline.injection import inject_and_recover
 from iscat_analysis.pipeline.landing import analyse_landings
 from iscat_analysis.pipeline.merging import Done, Merged
+from iscat_analysis.pipeline.odd_frames import frame_warnings
 from iscat_analysis.pipeline.resume import partial_folder
 from iscat_analysis.pipeline.summary import summary_of
 from iscat_analysis.pipeline.tasks import TaskBuilder

@@ -352,6 +352,8 @@ def test_an_empty_movie_has_no_tracks(tmp_path: Path) -> None:
     """The frame rate is not needed for that, nor for the blur of a whole frame."""
     movie = tmp_path / "movie.tif"
     counts = np.random.default_rng(1).poisson(1e4, (25, *SHAPE)).astype(np.uint16)
+    counts[:, 11, 17] = 0  # a dead pixel is no particle, and is said
     tifffile.imwrite(movie, counts, photometric="minisblack")
     found = fit_stack(movie, _config(camera={"frame_rate_hz": None}))
     assert len(found.table) == 0
+    assert "1 pixel left out: dead, hot, or saturated in some frame" in found.warnings

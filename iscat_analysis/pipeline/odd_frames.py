@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.pipeline.diagnosis import DRIFT_PX
+from iscat_analysis.pipeline.diagnosis import DRIFT_PX, pixel_warnings
 from iscat_analysis.pipeline.merging import Merged
 from iscat_analysis.records import FloatArray
 
@@ -65,14 +65,7 @@ def frame_warnings(
                 f"{name}: the brightness jumps at {_frames(jumps)} by up to {largest:+.0f} %; "
                 "it is divided out, but look at the laser and at events in these frames"
             )
-    defects, burnt = merged.masks()
-    if defects:
-        yield f"{defects} dead or hot pixels are left out"
-    if burnt:
-        yield (
-            f"{burnt} pixels are saturated in some frame and left out; "
-            "lower the exposure or the laser power"
-        )
+    yield from pixel_warnings(*merged.masks())
     yield from _drift_warnings(name, merged, light.size / window, corrected)
 
 
