@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from iscat_analysis.pipeline.diagnosis import (
 )
 from iscat_analysis.pipeline.events import Event, posterior_of
 from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.noise import judge_background
+from iscat_analysis.pipeline.noise import Noise, judge_background
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.ranges import checked, frame_ranges, measured_windows
 from iscat_analysis.pipeline.regions import contrast_image
@@ -26,7 +27,7 @@ from iscat_analysis.pipeline.results import Compared, Found, table_of, view_of
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.pipeline.tracking import track_frames
-from iscat_analysis.records import PosteriorResult, Progress
+from iscat_analysis.records import PosteriorResult, Progress, Windows
 from iscat_analysis.threads import threads
 
 
@@ -52,6 +53,22 @@ def find_bound(ready: Prepared, run: Run) -> Found:
     DataError
         The background leaves no frame to fit, or a frame is impossible.
     """
+    scene, windows, noise, summary = _background(ready, run)
+    movie, camera = ready.steady, ready.camera
+    with threads(scene.config.compute.workers) as pool:
+        if scene.mode == "track":
+            found = track_frames(
+                scene, movie, camera, windows, summary,
+                check=checked(movie, camera), pool=pool, progress=run.progress,
+            )  # fmt: skip
+        else:
+            found = _together(ready, run, scene, windows, noise, summary, pool)
+    run.clock.lap("results")
+    return found
+
+
+def _background(ready: Prepared, run: Run) -> tuple[Scene, Windows, Noise, dict[str, Any]]:
+    """Sum the background and the frames after it, and judge its noise, pixels and drift."""
     movie, config, camera = ready.steady, ready.config, ready.camera
     before, after = frame_ranges(movie, config)
     searches = after[1] - after[0] if config.fit.mode == "track" else 1
@@ -76,35 +93,39 @@ def find_bound(ready: Prepared, run: Run) -> Found:
         if moved:
             run.tell(moved)
     run.clock.lap("background")
+    return scene, windows, noise, summary
+
+
+def _together(
+    ready: Prepared,
+    run: Run,
+    scene: Scene,
+    windows: Windows,
+    noise: Noise,
+    summary: dict[str, Any],
+    pool: ThreadPoolExecutor,
+) -> Found:
+    """Find, fit and sample the particles that are there in all frames after the background."""
+    events, windows = fit_field(
+        scene, windows, excess_noise=noise.excess, pool=pool, progress=run.progress
+    )
+    run.clock.lap("fit")
+    cause = misfit_warning(scene.config, events)
+    if cause:
+        run.tell(cause)
+    repeats, empty = field_repeats(scene, ready.steady, ready.camera, windows, events)
+    run.clock.lap("repeats")
+    chains: list[PosteriorResult] = []
     interrupted = False
-    with threads(config.compute.workers) as pool:
-        if scene.mode == "track":
-            found = track_frames(
-                scene, movie, camera, windows, summary,
-                check=checked(movie, camera), pool=pool, progress=run.progress,
-            )  # fmt: skip
-            run.clock.lap("results")
-            return found
-        events, windows = fit_field(
-            scene, windows, excess_noise=noise.excess, pool=pool, progress=run.progress
-        )
-        run.clock.lap("fit")
-        cause = misfit_warning(config, events)
-        if cause:
-            run.tell(cause)
-        repeats, empty = field_repeats(scene, movie, camera, windows, events)
-        run.clock.lap("repeats")
-        chains: list[PosteriorResult] = []
-        if config.samples_posterior:
-            chains, interrupted = _sampled(scene, events, pool, run.progress)
-            run.clock.lap("posterior")
-    unsampled = [None] * (len(events) - len(chains))
-    found = Found(
+    if scene.config.samples_posterior:
+        chains, interrupted = _sampled(scene, events, pool, run.progress)
+        run.clock.lap("posterior")
+    return Found(
         scene=scene,
         table=table_of(scene, events),
         views=tuple(
             view_of(number, event, posterior=chain)
-            for number, (event, chain) in enumerate(zip(events, [*chains, *unsampled], strict=True))
+            for number, (event, chain) in enumerate(zip_longest(events, chains))
         ),
         image=contrast_image(scene, windows),
         compared=Compared.of(windows),
@@ -114,8 +135,6 @@ def find_bound(ready: Prepared, run: Run) -> Found:
         empty=empty,
         interrupted=interrupted,
     )
-    run.clock.lap("results")
-    return found
 
 
 def _sampled(

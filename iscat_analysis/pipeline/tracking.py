@@ -50,7 +50,8 @@ def find_moving(ready: Prepared, run: Run) -> Found:
     Returns
     -------
     Found
-        As `track_movie` gives it.
+        One row per particle and frame; one view per track, of its clearest frame.  An interrupt
+        keeps the blocks that are finished.
 
     Raises
     ------

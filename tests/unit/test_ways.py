@@ -1,0 +1,152 @@
+"""Three ways to say which frames stand against which, and one record of what is found."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from scenes import PIXEL_NM
+
+from iscat_analysis.config import Config, configure
+from iscat_analysis.movie import open_stack
+from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.pipeline import FIND, analyse
+from iscat_analysis.pipeline.events import Event, remarks, standing_out
+from iscat_analysis.pipeline.field import fit_field
+from iscat_analysis.pipeline.scene import Scene, make_scene
+from iscat_analysis.pipeline.ways import Way, way_of
+from iscat_analysis.records import EVENT_COLUMNS, SEVERITY, Analysis, Status, Windows
+from iscat_analysis.study.simulate import Movie
+
+SIDE = 48
+PLACES = ((14.3, 15.7), (33.2, 31.6))
+BASE = [
+    f"camera.pixel_size_nm={PIXEL_NM}", "camera.gain_e_per_adu=8", "camera.frame_rate_hz=200",
+    "camera.exposure_ms=5", "particle.mass_kda=480", "calibration.gradient_per_kda=-3.1e-5",
+    f"simulation.shape=[{SIDE}, {SIDE}]", "simulation.photons_per_pixel=2e5",
+    "simulation.background=speckle", "posterior.enabled=false", "optics.calibrate=never",
+    "fit.roi_nm=2000",
+]  # fmt: skip
+
+
+def _bound(frame: int) -> dict[str, object]:
+    return {"events": [{"frame": frame, "x_px": x, "y_px": y} for x, y in PLACES]}
+
+
+MOVIES: dict[Way, tuple[list[str], dict[str, object]]] = {
+    "fixed": (["background.frames=[0, 40]", "simulation.frames=80"], _bound(40)),
+    "sliding": (["background.window_frames=30", "simulation.frames=120"], _bound(60)),
+    "tracks": (
+        ["fit.mode=track", "track.free=mass", "simulation.frames=30"],
+        {"movers": [{"d_um2_s": 0.1, "x_px": x, "y_px": y} for x, y in PLACES]},
+    ),
+}
+
+
+def _config(way: Way) -> Config:
+    settings, simulated = MOVIES[way]
+    return configure({"simulation": simulated}, settings=[*BASE, *settings])
+
+
+@pytest.fixture(scope="module")
+def analyses(tmp_path_factory: pytest.TempPathFactory) -> dict[Way, Analysis]:
+    """Analyse a movie in each way."""
+    folder, found = tmp_path_factory.mktemp("ways"), {}
+    for way in MOVIES:
+        config, path = _config(way), Path(folder / f"{way}.npy")
+        np.save(path, np.array(list(Movie(config, 1).frames())))
+        with open_stack(path) as movie:
+            found[way] = analyse(movie, config)
+    return found
+
+
+def test_every_way_is_found() -> None:
+    assert set(FIND) == set(get_args(Way)) == set(MOVIES)
+    assert [way_of(_config(way)) for way in MOVIES] == list(MOVIES)
+
+
+@pytest.mark.parametrize("way", list(MOVIES))
+def test_every_way_gives_the_same_record(analyses: dict[Way, Analysis], way: Way) -> None:
+    found = analyses[way]
+    table = found.table
+    assert tuple(table.columns[: len(EVENT_COLUMNS)]) == EVENT_COLUMNS
+    numbers = table["event"].unique().tolist()
+    assert numbers == list(range(len(PLACES)))
+    assert [view.event for view in found.views] == numbers
+    assert f'method = "{way}"' in found.config_toml
+    assert found.ratio_image.shape == (SIDE, SIDE)
+    assert found.power.shape == found.power_frames.shape
+    for flags, status in zip(table["flags"], table["status"], strict=True):
+        own = [Status(flag) for flag in flags.split(";") if flag]
+        assert own == sorted(own, key=SEVERITY.index)
+        assert status == (own[0] if own else "ok")
+    for view in found.views:
+        rows = table[table["event"] == view.event]
+        inside = rows["x_px"] - view.column_px
+        assert ((inside > 0) & (inside < view.contrast.shape[1])).any()
+
+
+@pytest.mark.parametrize("way", list(MOVIES))
+def test_every_way_weighs_the_particles_alike(analyses: dict[Way, Analysis], way: Way) -> None:
+    """Each particle once: the rows of a track share the error of their background."""
+    found = analyses[way]
+    table = found.table if found.tracks is None else found.tracks
+    pulls = (table["mass_kda"] - 480) / table["sigma_mass_kda"]
+    assert len(pulls) == len(PLACES)
+    assert pulls.abs().max() < 4.5
+
+
+def _event() -> tuple[Scene, Event]:
+    """Fit a particle at the first of `PLACES` to counts without noise."""
+    config = _config("fixed")
+    scene = make_scene(config, (SIDE, SIDE))
+    grid = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM)
+    place = (PIXEL_NM * axis for axis in PLACES[0])
+    before, none = np.full((SIDE, SIDE), 8e6), np.zeros((SIDE, SIDE))
+    windows = Windows(
+        before_e=before,
+        after_e=before * (1 + scene.wide.image(grid, *place, scene.model.height_nm, 480.0)),
+        n_before=40, n_after=40, power_ratio=1.0,
+        read_variance_before_e2=none, read_variance_after_e2=none,
+        masked=none > 0, saturated=none > 0,
+        frames_before=(0, 40), frames_after=(40, 80), power=np.ones(80),
+    )  # fmt: skip
+    with ThreadPoolExecutor(1) as pool:
+        (event,) = fit_field(scene, windows, pool=pool)[0]
+    return scene, event
+
+
+def test_remarks_on_surroundings_are_put_in_order() -> None:
+    """A saturated pixel beside the particle, and one too far away to matter."""
+    scene, event = _event()
+    assert Status.SATURATED not in event.flags
+    top, left = event.region.rows[0], event.region.columns[0]
+    column, row = (round(axis) for axis in PLACES[0])
+    for away, spoiled in ((2, True), (9, False)):
+        saturated = np.zeros(event.region.shape, dtype=bool)
+        saturated[row + away - top, column - left] = True
+        windows = replace(event.windows, saturated=saturated)
+        said = remarks(scene, event, windows, sidelobe=True, too_close=True)
+        assert said[0] == Status.SIDELOBE
+        assert Status.TOO_CLOSE in said
+        assert (Status.SATURATED in said) is spoiled
+        assert list(said) == sorted(said, key=SEVERITY.index)
+
+
+def test_events_that_stand_out_are_judged_first() -> None:
+    _, event = _event()
+    clean, flagged = replace(event, flags=()), replace(event, flags=(Status.TOO_CLOSE,))
+    assert standing_out([flagged, clean]) == [clean]
+    assert standing_out([flagged]) == [flagged]
+
+
+def test_the_sums_of_a_region_are_views() -> None:
+    _, event = _event()
+    part = event.windows.cut((slice(1, 4), slice(2, 7)))
+    assert part.before_e.shape == part.masked.shape == part.saturated.shape == (3, 5)
+    assert np.shares_memory(part.after_e, event.windows.after_e)
+    assert part.power_ratio == event.windows.power_ratio
