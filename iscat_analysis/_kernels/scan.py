@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.image import Lens, Pixels, signal_parts, workspace
+from iscat_analysis._kernels.image import Lens, Pixels, signal_parts
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.radial import AxialTable, profile_at
 from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, row_value, scratch, span
@@ -37,7 +37,7 @@ def scan_heights(
     empty amplitude range holds the amplitude fixed.
     """
     work, profile = scratch(axial, lens, 1)
-    here, f = theta.copy(), workspace(lens, pixels)
+    here = theta.copy()
     parts, s = np.empty((pixels.y.size, 2, pixels.x.size)), np.empty(pixels.x.size)
     low, high = amplitude_range
     unit, level = theta[3] if theta[3] != 0.0 else 1.0, np.exp(theta[4])
@@ -45,7 +45,7 @@ def scan_heights(
         here[2] = heights[k]
         start, stop = span(lens, pixels, here, axial.heights.shape[3])
         profile_at(axial, here[2], start, stop, work, profile)
-        signal_parts(profile, lens, pixels, theta[0], theta[1], unit, f, parts)
+        signal_parts(profile, lens, pixels, theta[0], theta[1], unit, parts)
         a = theta[3]
         for _ in range(2 if low < high else 0):
             pull = known = 0.0

@@ -28,6 +28,7 @@ from iscat_analysis._kernels.image import (
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lattice_rows import lattice_span
 from iscat_analysis._kernels.radial import AxialTable, profile_at
+from iscat_analysis._kernels.radial_rows import intervals_needed
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -241,14 +242,10 @@ def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int
     """Range of the flattened profile, `width` long, that an image needs."""
     if lens.fine:
         return 0, width
-    x, y = pixels.x, pixels.y
-    margin = abs(pixels.offsets[-1])
     if lens.half:
-        first, last = lattice_span(lens, x, margin, theta[0])
+        first, last = lattice_span(lens, pixels.x, abs(pixels.offsets[-1]), theta[0])
         return first, last
-    dx = max(abs(x[0] - theta[0]), abs(x[-1] - theta[0])) + margin
-    dy = max(abs(y[0] - theta[1]), abs(y[-1] - theta[1])) + margin
-    return 0, min(6 * (int(np.sqrt(dx * dx + dy * dy) * lens.inv_step) + 1), width)
+    return 0, 6 * intervals_needed(lens, pixels, theta[0], theta[1], width // 6)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
