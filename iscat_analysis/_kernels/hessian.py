@@ -48,7 +48,7 @@ def signal_hessian(
     Parameters
     ----------
     profile : ndarray
-        Three orders; of a radial one, shape (4·orders, intervals, 6), the first is enough where
+        Three orders; of a radial one, shape (intervals, 6, 4·orders), the first is enough where
         `with_z` is False.
     lens, pixels, x_p, y_p, amplitude
         As in `iscat_analysis._kernels.image.signal_gradient`.
@@ -99,38 +99,38 @@ def _quintics(
         t -= n
         i = np.uintp(n)
         for k in range(4):
-            b = d = profile[k, i, 5]
-            v = d * t + profile[k, i, 4]
+            b = d = profile[i, 5, k]
+            v = d * t + profile[i, 4, k]
             d = d * t + v
-            v = v * t + profile[k, i, 3]
+            v = v * t + profile[i, 3, k]
             b = b * t + d
             d = d * t + v
-            v = v * t + profile[k, i, 2]
+            v = v * t + profile[i, 2, k]
             b = b * t + d
             d = d * t + v
-            v = v * t + profile[k, i, 1]
+            v = v * t + profile[i, 1, k]
             f[8 + k, j] = 2 * (b * t + d)
             f[4 + k, j] = d * t + v
-            f[k, j] = v * t + profile[k, i, 0]
+            f[k, j] = v * t + profile[i, 0, k]
         if with_z:
             for k in range(4, 8):
-                d = profile[k, i, 5]
-                v = d * t + profile[k, i, 4]
+                d = profile[i, 5, k]
+                v = d * t + profile[i, 4, k]
                 d = d * t + v
-                v = v * t + profile[k, i, 3]
+                v = v * t + profile[i, 3, k]
                 d = d * t + v
-                v = v * t + profile[k, i, 2]
+                v = v * t + profile[i, 2, k]
                 d = d * t + v
-                v = v * t + profile[k, i, 1]
+                v = v * t + profile[i, 1, k]
                 f[12 + k, j] = d * t + v
-                f[8 + k, j] = v * t + profile[k, i, 0]
+                f[8 + k, j] = v * t + profile[i, 0, k]
             for k in range(8, 12):
-                v = profile[k, i, 5]
-                v = v * t + profile[k, i, 4]
-                v = v * t + profile[k, i, 3]
-                v = v * t + profile[k, i, 2]
-                v = v * t + profile[k, i, 1]
-                f[12 + k, j] = v * t + profile[k, i, 0]
+                v = profile[i, 5, k]
+                v = v * t + profile[i, 4, k]
+                v = v * t + profile[i, 3, k]
+                v = v * t + profile[i, 2, k]
+                v = v * t + profile[i, 1, k]
+                f[12 + k, j] = v * t + profile[i, 0, k]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")

@@ -159,7 +159,7 @@ def signal_gradient(
     Parameters
     ----------
     profile : ndarray
-        Radial, shape (8 or more, intervals, 6), or on a lattice, shape (channels, nodes, nodes).
+        Radial, shape (intervals, 6, 8 or more), or on a lattice, shape (channels, nodes, nodes).
     lens : Lens
         Step, reference, polarisation.
     pixels : Pixels

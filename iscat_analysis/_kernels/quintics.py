@@ -1,10 +1,10 @@
 """The quintics of a radial profile at eight pixels at once, in vector registers.
 
 Every pixel lies in another interval of the profile, so that a loop over pixels reads its six powers
-one by one, and a compiler leaves it scalar.  Here the channels of a profile follow one another
-(`turned`), a pixel evaluates all of them in one register, and eight pixels are then exchanged for
-their channels.  Numba makes no such code of loops: it is written as the instructions of LLVM, of
-registers of eight numbers that every processor has or puts together from smaller ones.
+one by one, and a compiler leaves it scalar.  Here a pixel evaluates all channels, which follow one
+another in a profile, in one register, and eight pixels are then exchanged for their channels.
+Numba makes no such code of loops: it is written as the instructions of LLVM, for registers of eight
+numbers, which a processor has or puts together from smaller ones.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from iscat_analysis._kernels.radial import POWERS
 
 FloatArray = NDArray[np.float64]
 
@@ -39,25 +41,13 @@ def padded(pixels: int) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def turned(profile: FloatArray, channels: int, intervals: int) -> FloatArray:
-    """Put the first channels and intervals of a profile into an array (intervals, 6, channels)."""
-    out = np.empty((intervals, 6, channels))
-    flat = out.reshape(6 * intervals, channels)
-    for k in range(channels):
-        one = profile[k].ravel()
-        for i in range(6 * intervals):
-            flat[i, k] = one[i]
-    return out
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def evaluate(profile: FloatArray, f: FloatArray) -> None:
-    """Evaluate a profile of four channels.
+    """Evaluate the first four channels of a profile.
 
     Parameters
     ----------
-    profile : ndarray, shape (intervals, 6, 4)
-        From `turned`.
+    profile : ndarray, shape (intervals, 6, 4 or more)
+        See `iscat_analysis._kernels.radial`.
     f : ndarray, shape (rows, padded)
         Row `DISTANCE` has the distances of the pixels, in intervals and below their number; the
         first four rows are filled with the channels.
@@ -101,6 +91,7 @@ class _Emitter:
             context.make_array(kind)(context, builder, value)
             for kind, value in zip(signature.args[:2], arguments[:2], strict=True)
         )
+        self.channels = cgutils.unpack_tuple(builder, self.profile.shape)[2]
         self.stride = cgutils.unpack_tuple(builder, rows.strides)[0]
         self.rows = builder.bitcast(rows.data, _BYTE.as_pointer())
         self.first = arguments[2]
@@ -119,11 +110,13 @@ class _Emitter:
         nothing = ir.Constant(kind, ir.Undefined)
         one = self.b.insert_element(nothing, place, ir.Constant(_LANE, 0))
         spread = self.b.shuffle_vector(one, nothing, _lanes(*[0] * channels))
-        start = self.b.mul(interval, ir.Constant(_INDEX, 6 * channels))
-        begin = self.b.gep(self.profile.data, [start])
-        powers = self.b.bitcast(begin, kind.as_pointer())
-        loads = (self.b.gep(powers, [ir.Constant(_INDEX, k)]) for k in range(6))
-        return [self.b.load(power, align=8) for power in loads], spread
+        first = self.b.mul(interval, ir.Constant(_INDEX, POWERS))
+        powers = []
+        for k in range(POWERS):
+            row = self.b.mul(self.b.add(first, ir.Constant(_INDEX, k)), self.channels)
+            at = self.b.gep(self.profile.data, [row])
+            powers.append(self.b.load(self.b.bitcast(at, kind.as_pointer()), align=8))
+        return powers, spread
 
     def multiply_add(self, x: Any, y: Any, z: Any) -> Any:
         return self.b.fadd(self.b.fmul(x, y, flags=_FLAGS), z, flags=_FLAGS)

@@ -14,7 +14,7 @@ A fit asks for hundreds of heights in one range.  There the mean phase exp(iκz)
 profile and its first two derivatives along z are tabulated, and `profile_at` interpolates them by
 the same quintic, at a tenth of the cost and with the same error.
 
-A *profile* has shape (channels, intervals, 6), the last axis the powers of t ∈ [0, 1) in each
+A *profile* has shape (intervals, 6, channels), the middle axis the powers of t ∈ [0, 1) in each
 interval; the channels are Re F0, Im F0, Re F2, Im F2, followed by the same four for ∂/∂z, and for
 ∂²/∂z² where asked.
 """
@@ -32,6 +32,10 @@ FloatArray = NDArray[np.float64]
 
 STEP = 0.3
 """Step times bandwidth, along r and z: 1.6e-8 of the peak in the field, 3e-7 in its gradient."""
+
+
+POWERS = 6
+"""Of a quintic."""
 
 
 class AxialTable(NamedTuple):
@@ -165,7 +169,7 @@ def radial_profile(
         1: fields only; 2: with ∂/∂z; 3: with ∂²/∂z².
     nodes : ndarray, shape (4·orders, 3·(intervals + 1))
         Scratch.
-    profile : ndarray, shape (4·orders, intervals, 6)
+    profile : ndarray, shape (intervals, 6, 4·orders)
         Filled.
     """
     n = axial.size
@@ -196,14 +200,14 @@ def radial_profile(
         s = nodes[channel, 2 * points :]
         for k in range(points - 1):
             rise = f[k + 1] - f[k]
-            profile[channel, k, 0] = f[k]
-            profile[channel, k, 1] = d[k]
-            profile[channel, k, 2] = 0.5 * s[k]
-            profile[channel, k, 3] = (
+            profile[k, 0, channel] = f[k]
+            profile[k, 1, channel] = d[k]
+            profile[k, 2, channel] = 0.5 * s[k]
+            profile[k, 3, channel] = (
                 10 * rise - 6 * d[k] - 4 * d[k + 1] - 1.5 * s[k] + 0.5 * s[k + 1]
             )
-            profile[channel, k, 4] = -15 * rise + 8 * d[k] + 7 * d[k + 1] + 1.5 * s[k] - s[k + 1]
-            profile[channel, k, 5] = (
+            profile[k, 4, channel] = -15 * rise + 8 * d[k] + 7 * d[k + 1] + 1.5 * s[k] - s[k + 1]
+            profile[k, 5, channel] = (
                 6 * rise - 3 * d[k] - 3 * d[k + 1] - 0.5 * s[k] + 0.5 * s[k + 1]
             )
 
@@ -235,14 +239,16 @@ def _turn(
     im: FloatArray,
     cos: float,
     sin: float,
-    out_re: FloatArray,
-    out_im: FloatArray,
+    out: FloatArray,
+    first_re: int,
+    first_im: int,
+    stride: int,
 ) -> None:
-    """Multiply re + i·im by cos + i·sin."""
+    """Multiply re + i·im by cos + i·sin, into the numbers of `out` from two first ones on."""
     for j in range(re.size):
         a, b = re[j], im[j]
-        out_re[j] = a * cos - b * sin
-        out_im[j] = a * sin + b * cos
+        out[first_re + j * stride] = a * cos - b * sin
+        out[first_im + j * stride] = a * sin + b * cos
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -282,8 +288,10 @@ def profile_at(
         Range of the flattened profile.
     work : ndarray, shape (channels, orders, width)
         Scratch.
-    profile : ndarray, shape (orders·channels, …, …)
+    profile : ndarray
         Filled; with twice the channels of the table ∂/∂z too, with three times ∂²/∂z² as well.
+        The channels of a radial profile are its last axis, those of a lattice its first; a lattice
+        has an odd number of nodes and a quintic six powers, which tells them apart.
     """
     heights, first_nm, step_nm, kappa = axial
     place = (z_nm - first_nm) / step_nm
@@ -312,10 +320,12 @@ def profile_at(
     b[5] = 3 * t - 12 * t2 + 10 * t3
     b /= step_nm * step_nm
     channels, width = heights.shape[2:]
-    with_slope = profile.shape[0] > channels
-    with_bend = profile.shape[0] > 2 * channels
+    every = profile.size // width
+    with_slope, with_bend = every > channels, every > 2 * channels
     cos, sin = np.cos(kappa * z_nm), np.sin(kappa * z_nm)
-    flat = profile.reshape(profile.shape[0], width)
+    flat = profile.reshape(profile.size)
+    apart, stride = (1, every) if profile.shape[1] == POWERS else (width, 1)
+    begin = start * stride
     for channel in range(channels):
         _mix(heights, i, channel, start, v, work[channel, 0, start:stop])
         if with_slope:
@@ -329,38 +339,36 @@ def profile_at(
             for j in range(re.size):
                 slope_re[j] -= kappa * im[j]
                 slope_im[j] += kappa * re[j]
-            _turn(
-                slope_re, slope_im, cos, sin,
-                flat[c + channels, start:stop], flat[c + channels + 1, start:stop],
-            )  # fmt: skip
+            there = begin + (c + channels) * apart
+            _turn(slope_re, slope_im, cos, sin, flat, there, there + apart, stride)
         if with_bend:
             _add_carrier(kappa, re, im, work[c, 1, start:stop], work[c + 1, 1, start:stop],
                          work[c, 2, start:stop], work[c + 1, 2, start:stop])  # fmt: skip
-            there = c + 2 * channels
+            there = begin + (c + 2 * channels) * apart
             _turn(
                 work[c, 2, start:stop], work[c + 1, 2, start:stop], cos, sin,
-                flat[there, start:stop], flat[there + 1, start:stop],
+                flat, there, there + apart, stride,
             )  # fmt: skip
-        _turn(re, im, cos, sin, flat[c, start:stop], flat[c + 1, start:stop])
+        _turn(re, im, cos, sin, flat, begin + c * apart, begin + (c + 1) * apart, stride)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def profile_between(axial: AxialTable, z_nm: float, profile: FloatArray) -> None:
     """Fill a whole profile of one order or more by interpolation along z."""
     channels, width = axial.heights.shape[2:]
-    work = np.empty((channels, profile.shape[0] // channels, width))
+    work = np.empty((channels, profile.size // (width * channels), width))
     profile_at(axial, z_nm, 0, width, work, profile)
 
 
 @njit(inline="always")
 def _quintic(profile: FloatArray, channel: int, i: int, t: float) -> float:
     """Evaluate one channel in an interval."""
-    v = profile[channel, i, 5]
-    v = v * t + profile[channel, i, 4]
-    v = v * t + profile[channel, i, 3]
-    v = v * t + profile[channel, i, 2]
-    v = v * t + profile[channel, i, 1]
-    value: float = v * t + profile[channel, i, 0]
+    v = profile[i, 5, channel]
+    v = v * t + profile[i, 4, channel]
+    v = v * t + profile[i, 3, channel]
+    v = v * t + profile[i, 2, channel]
+    v = v * t + profile[i, 1, channel]
+    value: float = v * t + profile[i, 0, channel]
     return value
 
 
@@ -380,7 +388,7 @@ def _extremes(
     At fixed r the signal is a function of cos 2φ, with its extremes at ±1 or where its slope
     vanishes.  `place` is r in steps; the number of directions is returned.
     """
-    i = min(int(place), profile.shape[1] - 1)
+    i = min(int(place), profile.shape[0] - 1)
     t, a = place - i, amplitude
     square = (place / inv_step) ** 2
     f0r, f0i = _quintic(profile, 0, i, t), _quintic(profile, 1, i, t)
@@ -419,7 +427,7 @@ def largest_signal(
     The largest on a radial grid of `per_step` points in each interval of the profile, then that of
     a parabola through its neighbours.
     """
-    count = per_step * profile.shape[1]
+    count = per_step * profile.shape[0]
     sums, parts = np.empty((3, count)), np.empty((3, 2))
     way = best = 0
     top = -1.0

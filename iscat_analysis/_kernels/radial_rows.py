@@ -19,7 +19,6 @@ from iscat_analysis._kernels.quintics import (
     evaluate,
     evaluate_slopes,
     padded,
-    turned,
 )
 
 if TYPE_CHECKING:
@@ -147,14 +146,13 @@ def radial_gradient(
     """As `iscat_analysis._kernels.image.signal_gradient`."""
     x, y, offsets, weights = pixels.x, pixels.y, pixels.offsets, pixels.weights
     together, f = _strip(y.size, x.size)
-    ready = turned(profile, 8, intervals_needed(lens, pixels, x_p, y_p, profile.shape[1]))
     for first in range(0, y.size, together):
         rows = y[first : first + together]
         _begin(f, 5)
         for i in range(offsets.size):
             for j in range(offsets.size):
                 _place(lens.inv_step, x, rows, x_p - offsets[j], y_p - offsets[i], f)
-                evaluate_slopes(ready, f)
+                evaluate_slopes(profile, f)
                 _add_gradient(
                     lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross,
                     lens.ring, amplitude, weights[i] * weights[j], f,
@@ -169,14 +167,13 @@ def radial_parts(
     """As `iscat_analysis._kernels.image.signal_parts`."""
     x, y, offsets, weights = pixels.x, pixels.y, pixels.offsets, pixels.weights
     together, f = _strip(y.size, x.size)
-    ready = turned(profile, 4, intervals_needed(lens, pixels, x_p, y_p, profile.shape[1]))
     for first in range(0, y.size, together):
         rows = y[first : first + together]
         _begin(f, 2)
         for i in range(offsets.size):
             for j in range(offsets.size):
                 _place(lens.inv_step, x, rows, x_p - offsets[j], y_p - offsets[i], f)
-                evaluate(ready, f)
+                evaluate(profile, f)
                 _add_parts(
                     lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross, lens.ring,
                     weights[i] * weights[j], f,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.image import Lens, Pixels, signal_parts
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.radial import AxialTable, profile_at
-from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, row_value, scratch, span
+from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, scratch, signal_value, span
 
 FloatArray = NDArray[np.float64]
 
@@ -38,7 +38,8 @@ def scan_heights(
     """
     work, profile = scratch(axial, lens, 1)
     here = theta.copy()
-    parts, s = np.empty((pixels.y.size, 2, pixels.x.size)), np.empty(pixels.x.size)
+    parts = np.empty((pixels.y.size, 2, pixels.x.size))
+    s = np.empty((pixels.y.size, pixels.x.size))
     low, high = amplitude_range
     unit, level = theta[3] if theta[3] != 0.0 else 1.0, np.exp(theta[4])
     for k in range(heights.size):
@@ -55,18 +56,11 @@ def scan_heights(
                 known += two
             if known > 0:
                 a = min(max(a + pull / known, low), high)
-        values[k] = 0.0
         for row in range(parts.shape[0]):
-            _row_sum(parts[row], a, s)
-            values[k] += row_value(kind, data, row, level, s)
+            for j in range(s.shape[1]):
+                s[row, j] = a * (parts[row, 0, j] + a * parts[row, 1, j])
+        values[k] = signal_value(kind, data, level, s.reshape(s.size))
         amplitudes[k] = a
-
-
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _row_sum(parts: FloatArray, a: float, s: FloatArray) -> None:
-    """Fill one row of signals a P + a² Q."""
-    for j in range(s.size):
-        s[j] = a * (parts[0, j] + a * parts[1, j])
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")

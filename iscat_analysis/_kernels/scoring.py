@@ -27,7 +27,7 @@ from iscat_analysis._kernels.image import (
 )
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lattice_rows import lattice_span
-from iscat_analysis._kernels.radial import AxialTable, profile_at
+from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_at
 from iscat_analysis._kernels.radial_rows import intervals_needed
 
 FloatArray = NDArray[np.float64]
@@ -47,53 +47,66 @@ SERIES = 0.2
 FLOOR = 1e-300
 """Least expected count or intensity: keeps quotients finite where a dark fringe is exactly zero."""
 
+_TOGETHER = 256
+"""Pixels for which one series is tried: bright ones take the slow logarithm for these alone."""
+
 
 @njit(inline="always")
-def _log1p(x: float) -> float:
-    """ln(1+x) = 2 artanh(x/(2+x)) by its series, error below 1e-16 for |x| < SERIES."""
-    w = x / (2.0 + x)
+def _log_ratio(change: float, base: float) -> float:
+    """ln(1+x) = 2 artanh(x/(2+x)) of x = change/base, by its series; 1e-16 for |x| < SERIES."""
+    w = change / (2.0 * base + change)
     w2 = w * w
     tail = 1 / 3 + w2 * (1 / 5 + w2 * (1 / 7 + w2 * (1 / 9 + w2 * (1 / 11 + w2 / 13))))
     return 2.0 * w * (1.0 + w2 * tail)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def row_value(kind: int, data: FloatArray, row: int, level: float, s: FloatArray) -> float:
-    """Log-likelihood of one row of signals s, relative to the same row without a particle."""
-    c0, c1, c2, c3 = data[0, row], data[1, row], data[2, row], data[3, row]
+def _some_value(
+    kind: int, data: FloatArray, first: int, last: int, level: float, s: FloatArray, begin: int
+) -> float:
+    """Log-likelihood of some pixels of data (4, n); their signals are those from `begin` on."""
+    shift = begin - first
     total = 0.0
     largest = 0.0
     if kind == CONDITIONAL:
-        for j in range(s.size):
-            largest = max(largest, abs(level * (1.0 + s[j]) - 1.0))
+        for j in range(first, last):
+            largest = max(largest, abs(level * (1.0 + s[j + shift]) - 1.0))
         if largest < SERIES:
-            for j in range(s.size):
-                change = level * (1.0 + s[j]) - 1.0
-                total += c3[j] * (
-                    c0[j] * _log1p(change) - c1[j] * _log1p(change * c2[j] / (1.0 + c2[j]))
-                )
+            for j in range(first, last):
+                change = level * (1.0 + s[j + shift]) - 1.0
+                later = _log_ratio(change * data[2, j], 1.0 + data[2, j])
+                total += data[3, j] * (data[0, j] * _log_ratio(change, 1.0) - data[1, j] * later)
         else:
-            for j in range(s.size):
-                stretch = max(level * (1.0 + s[j]), FLOOR)
-                total += c3[j] * (
-                    c0[j] * np.log(stretch)
-                    - c1[j] * np.log1p((stretch - 1.0) * c2[j] / (1.0 + c2[j]))
+            for j in range(first, last):
+                stretch = max(level * (1.0 + s[j + shift]), FLOOR)
+                share = data[2, j] / (1.0 + data[2, j])
+                total += data[3, j] * (
+                    data[0, j] * np.log(stretch) - data[1, j] * np.log1p((stretch - 1.0) * share)
                 )
         return total
-    for j in range(s.size):
-        base = c1[j] + c3[j]
-        rate = level * (c1[j] + c2[j] * s[j]) + c3[j]
+    for j in range(first, last):
+        base = data[1, j] + data[3, j]
+        rate = level * (data[1, j] + data[2, j] * s[j + shift]) + data[3, j]
         largest = max(largest, abs(rate - base) / max(base, FLOOR))
     if largest < SERIES:
-        for j in range(s.size):
-            base = max(c1[j] + c3[j], FLOOR)
-            change = level * (c1[j] + c2[j] * s[j]) + c3[j] - base
-            total += c0[j] * _log1p(change / base) - change
+        for j in range(first, last):
+            base = max(data[1, j] + data[3, j], FLOOR)
+            change = level * (data[1, j] + data[2, j] * s[j + shift]) + data[3, j] - base
+            total += data[0, j] * _log_ratio(change, base) - change
     else:
-        for j in range(s.size):
-            base = max(c1[j] + c3[j], FLOOR)
-            rate = level * (c1[j] + c2[j] * s[j]) + c3[j]
-            total += c0[j] * np.log(max(rate, FLOOR) / base) - (rate - base)
+        for j in range(first, last):
+            base = max(data[1, j] + data[3, j], FLOOR)
+            rate = level * (data[1, j] + data[2, j] * s[j + shift]) + data[3, j]
+            total += data[0, j] * np.log(max(rate, FLOOR) / base) - (rate - base)
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def signal_value(kind: int, data: FloatArray, level: float, s: FloatArray) -> float:
+    """Log-likelihood of signals s (ny·nx,), relative to that without a particle."""
+    flat, total = data.reshape(4, s.size), 0.0
+    for first in range(0, s.size, _TOGETHER):
+        total += _some_value(kind, flat, first, min(first + _TOGETHER, s.size), level, s, first)
     return total
 
 
@@ -171,9 +184,15 @@ def row_score(
 @njit(cache=True, nogil=True, error_model="numpy")
 def image_value(kind: int, data: FloatArray, level: float, rows: FloatArray) -> float:
     """Log-likelihood of an image; `rows` (ny, 5 or more, nx) holds s and its gradient."""
-    total = 0.0
-    for row in range(rows.shape[0]):
-        total += row_value(kind, data, row, level, rows[row, 0])
+    ny, nx = rows.shape[0], rows.shape[2]
+    flat, total, together = data.reshape(4, ny * nx), 0.0, max(_TOGETHER // nx, 1)
+    s = np.empty(together * nx)
+    for first in range(0, ny, together):
+        last = min(first + together, ny)
+        for i in range(first, last):
+            for j in range(nx):
+                s[(i - first) * nx + j] = rows[i, 0, j]
+        total += _some_value(kind, flat, first * nx, last * nx, level, s, 0)
     return total
 
 
@@ -231,10 +250,8 @@ def value_pass(
     level = np.exp(theta[4])
     s = np.empty((pixels.y.size, pixels.x.size))
     signal_image(profile, lens, pixels, theta[0], theta[1], theta[3], s)
-    total = 0.0
-    for row in range(pixels.y.size):
-        total += row_value(kind, data, row, level, s[row])
-    return total
+    value: float = signal_value(kind, data, level, s.reshape(s.size))
+    return value
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -245,7 +262,7 @@ def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int
     if lens.half:
         first, last = lattice_span(lens, pixels.x, abs(pixels.offsets[-1]), theta[0])
         return first, last
-    return 0, 6 * intervals_needed(lens, pixels, theta[0], theta[1], width // 6)
+    return 0, POWERS * intervals_needed(lens, pixels, theta[0], theta[1], width // POWERS)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -254,9 +271,11 @@ def scratch(axial: AxialTable, lens: Lens, orders: int) -> tuple[FloatArray, Flo
     channels, width = axial.heights.shape[2:]
     if lens.fine:
         return np.empty((0, 0, 0)), np.empty((0, 0, 0))
-    last = 2 * lens.half + 1 if lens.half else 6
-    work = np.empty((channels, orders, width))
-    return work, np.empty((orders * channels, width // last, last))
+    work, every = np.empty((channels, orders, width)), orders * channels
+    if lens.half:
+        nodes = 2 * lens.half + 1
+        return work, np.empty((every, nodes, nodes))
+    return work, np.empty((width // POWERS, POWERS, every))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.curvature import derivatives_between
 from iscat_analysis._kernels.hessian import PAIRS, ROWS, signal_hessian
 from iscat_analysis._kernels.image import Lens, Pixels, signal_gradient, signal_image
-from iscat_analysis._kernels.radial import AxialTable, profile_between
+from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_between
 from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.aperture import Aperture, weight_on
@@ -469,7 +469,7 @@ class ForwardModel:
         """
         if height == "exact" or not isinstance(self.wave, RadialField):
             return sum(self.wave.peak(z_nm, amplitude, self.rho))
-        profile = np.empty((4, self.wave.table.shape[3] - 1, 6))
+        profile = np.empty((self.wave.table.shape[3] - 1, POWERS, 4))
         profile_between(self.axial_table, z_nm, profile)
         return sum(self.wave.peak(z_nm, amplitude, self.rho, profile))
 

@@ -27,6 +27,7 @@ from iscat_analysis._kernels.lattice import (
     window,
 )
 from iscat_analysis._kernels.radial import (
+    POWERS,
     STEP,
     AxialTable,
     bessel_table,
@@ -126,7 +127,7 @@ class RadialField:
         )  # fmt: skip
 
     def profile(self, z_nm: float, orders: int) -> FloatArray:
-        """Profile at a height, shape (4·orders, intervals, 6); the last few are kept."""
+        """Profile at a height, shape (intervals, 6, 4·orders); the last few are kept."""
         return self._profiles(z_nm, orders)
 
     @cached_property
@@ -136,13 +137,14 @@ class RadialField:
     def _profile(self, z_nm: float, orders: int, kappa: float) -> FloatArray:
         points = self.table.shape[3]
         nodes = np.empty((4 * orders, 3 * points))
-        out = np.empty((4 * orders, points - 1, 6))
+        out = np.empty((points - 1, POWERS, 4 * orders))
         radial_profile(self.table, self.source, self.axial - kappa, z_nm, orders, nodes, out)
         return out
 
     def profiles(self, heights_nm: FloatArray, kappa: float) -> FloatArray:
         """Profiles with ∂/∂z and ∂²/∂z² without exp(iκz), shape (n, 3, channels, width)."""
-        return np.stack([self._profile(float(z), 3, kappa).reshape(3, 4, -1) for z in heights_nm])
+        every = (self._profile(float(z), 3, kappa) for z in heights_nm)
+        return np.ascontiguousarray([np.moveaxis(one, 2, 0).reshape(3, 4, -1) for one in every])
 
     def components(self, dx_nm: FloatArray, dy_nm: FloatArray, z_nm: float) -> ComplexArray:
         """Components of the field at points, shape (1 or 2, *dx_nm.shape); see `ForwardModel`."""
@@ -169,10 +171,10 @@ class RadialField:
     def _radial(self, r: FloatArray, z_nm: float) -> tuple[ComplexArray, ComplexArray]:
         """F0 and F2 at distances r, from the table."""
         profile = self.profile(z_nm, 1)
-        index = np.minimum((r / self.step_nm).astype(int), profile.shape[1] - 1)
+        index = np.minimum((r / self.step_nm).astype(int), profile.shape[0] - 1)
         t = r / self.step_nm - index
-        powers = t[..., None] ** np.arange(6)
-        values = np.einsum("...p,c...p->...c", powers, profile[:, index])
+        powers = t[..., None] ** np.arange(POWERS)
+        values = np.einsum("...p,...pc->...c", powers, profile[index])
         return values[..., 0] + 1j * values[..., 1], values[..., 2] + 1j * values[..., 3]
 
 
