@@ -66,12 +66,11 @@ def _some_value(
 ) -> float:
     """Log-likelihood of some pixels of data (4, n); their signals are those from `begin` on."""
     shift = begin - first
-    total = 0.0
-    largest = 0.0
+    total, beyond = 0.0, 0  # counted, because the largest would be found one after the other
     if kind == CONDITIONAL:
         for j in range(first, last):
-            largest = max(largest, abs(level * (1.0 + s[j + shift]) - 1.0))
-        if largest < SERIES:
+            beyond += abs(level * (1.0 + s[j + shift]) - 1.0) >= SERIES
+        if not beyond:
             for j in range(first, last):
                 change = level * (1.0 + s[j + shift]) - 1.0
                 later = _log_ratio(change * data[2, j], 1.0 + data[2, j])
@@ -87,8 +86,8 @@ def _some_value(
     for j in range(first, last):
         base = data[1, j] + data[3, j]
         rate = level * (data[1, j] + data[2, j] * s[j + shift]) + data[3, j]
-        largest = max(largest, abs(rate - base) / max(base, FLOOR))
-    if largest < SERIES:
+        beyond += abs(rate - base) >= SERIES * max(base, FLOOR)
+    if not beyond:
         for j in range(first, last):
             base = max(data[1, j] + data[3, j], FLOOR)
             change = level * (data[1, j] + data[2, j] * s[j + shift]) + data[3, j] - base
