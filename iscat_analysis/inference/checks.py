@@ -37,6 +37,8 @@ def real_array(name: str, value: ArrayLike) -> FloatArray:
     DataError
         It does not hold real numbers.
     """
+    if type(value) is np.ndarray and value.dtype == np.float64 and value.flags.c_contiguous:
+        return value
     try:
         array: NDArray[Any] = np.asarray(value)
     except ValueError:
@@ -72,6 +74,8 @@ def vector_of(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray
         It has another shape or does not hold real numbers.
     """
     array = real_array(name, value)
+    if array.shape == shape:
+        return array
     fits = array.ndim == len(shape) and all(
         wanted in (-1, there) for wanted, there in zip(shape, array.shape, strict=True)
     )

@@ -252,8 +252,6 @@ class Likelihood:
             raise DataError(f"free: has shape {free.shape} where (5,) is needed")
         self._require_box(theta, free, lower, upper)
         score, fisher = np.empty(5), np.empty((5, 5))
-        wavelength = self.model.optics.wavelength_nm
-        max_step = np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, np.inf, 1.0])
         lens, pixels, kind, data = self._arguments
         if free[2]:
             table = self.model.axial_table
@@ -272,7 +270,7 @@ class Likelihood:
             free,
             lower,
             upper,
-            max_step,
+            self._farthest,
             tolerance,
             passes,
             theta,
@@ -497,6 +495,12 @@ class Likelihood:
         grid, model = self.grid, self.model
         half = grid.pixel_nm / 2
         return grid.x_nm, grid.y_nm, half, model.reach_nm, *model.z_range_nm, LARGEST_LEVEL
+
+    @cached_property
+    def _farthest(self) -> FloatArray:
+        """Largest change of each parameter in one step."""
+        wavelength = self.model.optics.wavelength_nm
+        return np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, np.inf, 1.0])
 
     @cached_property
     def _arguments(self) -> tuple[Lens, Pixels, int, FloatArray]:
