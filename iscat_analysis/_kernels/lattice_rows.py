@@ -187,7 +187,7 @@ def _add_gradient(
         out[4, j] += weight * (2 * rho * e_r[j] + 2 * a * power)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
 def lattice_gradient(
     lens: Lens,
     pixels: Pixels,
@@ -233,7 +233,7 @@ def _add_signal(
         out[j] += weight * a * (2 * rho * e_r[j] + a * (e_r[j] * e_r[j] + e_i[j] * e_i[j]))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
 def lattice_signal(
     lens: Lens,
     pixels: Pixels,

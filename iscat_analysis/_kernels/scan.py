@@ -37,9 +37,9 @@ def scan_heights(
     empty amplitude range holds the amplitude fixed.
     """
     work, profile = scratch(axial, lens, 1)
-    here = theta.copy()
-    parts = np.empty((pixels.y.size, 2, pixels.x.size))
-    s = np.empty((pixels.y.size, pixels.x.size))
+    here, ny, nx = theta.copy(), pixels.y.size, pixels.x.size
+    flat, parts = data.reshape(4, ny * nx), np.empty((ny, 2, nx))
+    p, q, s = np.empty(ny * nx), np.empty(ny * nx), np.empty(ny * nx)
     low, high = amplitude_range
     unit, level = theta[3] if theta[3] != 0.0 else 1.0, np.exp(theta[4])
     for k in range(heights.size):
@@ -47,40 +47,39 @@ def scan_heights(
         start, stop = span(lens, pixels, here, axial.heights.shape[3])
         profile_at(axial, here[2], start, stop, work, profile)
         signal_parts(profile, lens, pixels, theta[0], theta[1], unit, parts)
+        for i in range(ny):
+            for j in range(nx):
+                p[i * nx + j], q[i * nx + j] = parts[i, 0, j], parts[i, 1, j]
         a = theta[3]
         for _ in range(2 if low < high else 0):
-            pull = known = 0.0
-            for row in range(parts.shape[0]):
-                one, two = _row_amplitude(kind, data, row, level, a, parts[row])
-                pull += one
-                known += two
+            pull, known = _amplitude(kind, flat, level, a, p, q)
             if known > 0:
                 a = min(max(a + pull / known, low), high)
-        for row in range(parts.shape[0]):
-            for j in range(s.shape[1]):
-                s[row, j] = a * (parts[row, 0, j] + a * parts[row, 1, j])
-        values[k] = signal_value(kind, data, level, s.reshape(s.size))
+        for j in range(s.size):
+            s[j] = a * (p[j] + a * q[j])
+        values[k] = signal_value(kind, data, level, s)
         amplitudes[k] = a
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _row_amplitude(
-    kind: int, data: FloatArray, row: int, level: float, a: float, parts: FloatArray
+def _amplitude(
+    kind: int, data: FloatArray, level: float, a: float, p: FloatArray, q: FloatArray
 ) -> tuple[float, float]:
-    """Score of one row about the amplitude, and its information."""
-    c0, c1, c2, c3 = data[0, row], data[1, row], data[2, row], data[3, row]
+    """Score about the amplitude, and its information; data has shape (4, n)."""
     pull = known = 0.0
-    for j in range(c0.size):
-        s, slope = a * (parts[0, j] + a * parts[1, j]), parts[0, j] + 2 * a * parts[1, j]
-        if kind == CONDITIONAL:
+    if kind == CONDITIONAL:
+        for j in range(p.size):
+            s, slope = a * (p[j] + a * q[j]), p[j] + 2 * a * q[j]
             bright = max(1.0 + s, FLOOR)
-            odds = c2[j] * level * bright
+            odds = data[2, j] * level * bright
             per = 1.0 / (bright * (1.0 + odds))
-            pull += c3[j] * (c0[j] + odds * (c0[j] - c1[j])) * per * slope
-            known += c3[j] * c1[j] * odds * (per * slope) ** 2
-        else:
-            gain = level * c2[j]
-            per = 1.0 / max(level * (c1[j] + c2[j] * s) + c3[j], FLOOR)
-            pull += gain * (c0[j] * per - 1.0) * slope
-            known += gain * gain * per * slope * slope
+            pull += data[3, j] * (data[0, j] + odds * (data[0, j] - data[1, j])) * per * slope
+            known += data[3, j] * data[1, j] * odds * (per * slope) ** 2
+        return pull, known
+    for j in range(p.size):
+        s, slope = a * (p[j] + a * q[j]), p[j] + 2 * a * q[j]
+        gain = level * data[2, j]
+        per = 1.0 / max(level * (data[1, j] + data[2, j] * s) + data[3, j], FLOOR)
+        pull += gain * (data[0, j] * per - 1.0) * slope
+        known += gain * gain * per * slope * slope
     return pull, known
