@@ -3,7 +3,7 @@
     python benchmarks/kernel.py [--quick] [--against COMMIT]
 
 One pass gives value, score and Fisher matrix of five parameters on n × n pixels.  Its parts are
-timed one at a time on rows of 32 pixels, beside a chain of scalar fused multiply-adds that keeps
+timed one at a time on 32 × 32 pixels, beside a chain of scalar fused multiply-adds that keeps
 every unit busy, and the time per pass of three sizes is split into a part per pass and one per
 pixel.  The whole pass is compared with that of an earlier commit, and that of a pupil with
 astigmatism and coma with that of a round one.
@@ -29,7 +29,8 @@ import numpy as np
 from fits import Batch
 from numba import njit
 
-from iscat_analysis._kernels import image, radial, scoring
+from iscat_analysis._kernels import image, quintics, radial, scoring
+from iscat_analysis._kernels.quintics import evaluate_slopes
 from iscat_analysis.records import FloatArray
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -62,29 +63,29 @@ def heights(repeats, axial, z, stop, work, profile):  # type: ignore[no-untyped-
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
-def quintics(repeats, profile, lens, x, f):  # type: ignore[no-untyped-def]
-    for k in range(repeats):
-        image._row_fields(profile, lens.inv_step, x, 0.1 * (k % 7), 100.0, True, f)
+def strips(repeats, profile, f):  # type: ignore[no-untyped-def]
+    for _ in range(repeats):
+        evaluate_slopes(profile, f)
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
-def gradients(repeats, profile, lens, x, f, g):  # type: ignore[no-untyped-def]
+def gradients(repeats, profile, lens, pixels, theta, g):  # type: ignore[no-untyped-def]
     for k in range(repeats):
-        image._row_gradient(profile, lens, x, 0.1 * (k % 7), 100.0, 1e-3, 1e-9, f, g)
+        image.signal_gradient(profile, lens, pixels, theta[0] + 0.1 * (k % 7), theta[1], 1e-3, g)
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def values(repeats, kind, data, g):  # type: ignore[no-untyped-def]
     total = 0.0
-    for k in range(repeats):
-        total += scoring.row_value(kind, data, k % data.shape[1], 1.0, g[0])
+    for _ in range(repeats):
+        total += scoring.image_value(kind, data, 1.0, g)
     return total
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
-def scores(repeats, kind, data, g, sums):  # type: ignore[no-untyped-def]
-    for k in range(repeats):
-        scoring.row_score(kind, data, k % data.shape[1], 1.0, g, sums)
+def scores(repeats, kind, data, g, score, fisher):  # type: ignore[no-untyped-def]
+    for _ in range(repeats):
+        scoring.image_score(kind, data, 1.0, g, score, fisher)
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
@@ -209,26 +210,22 @@ def parts(repeats: int) -> dict[str, float]:
     lens, pixels, kind, data = likelihood._arguments
     work, profile = scoring.scratch(axial, lens, 2)
     _, stop = scoring.span(lens, pixels, start, axial.heights.shape[3])
-    x = pixels.x - pixels.x.mean()
-    f: FloatArray = np.zeros((image.SCRATCH, x.size))
-    g, sums = np.zeros((5, x.size)), np.zeros(20)
-    whole = seconds(gradients, repeats, profile, lens, x, f, g)
-    radii = seconds(quintics, repeats, profile, lens, x, f)
-    samples = pixels.offsets.size**2
+    turn = seconds(heights, repeats, axial, start[2], stop, work, profile)
+    f: FloatArray = np.zeros((20, quintics.padded(SIDE**2)))
+    f[quintics.DISTANCE] = np.linspace(0, stop // radial.POWERS - 1, f.shape[1])
+    g = np.zeros((SIDE, 5, SIDE))
+    whole = seconds(gradients, repeats, profile, lens, pixels, start, g)
+    horner = seconds(strips, repeats, profile, f) * pixels.offsets.size**2
     g[:] = 1e-3
-    value, score = (
-        seconds(values, repeats, kind, data, g),
-        seconds(scores, repeats, kind, data, g, sums),
-    )
-    per = 1e9 / x.size
-    return {
-        "heights_ns_per_pass": 1e9
-        * seconds(heights, repeats, axial, start[2], stop, work, profile),
-        "quintics_ns_per_pixel": radii * samples * per,
-        "fields_ns_per_pixel": (whole - radii) * samples * per,
-        "value_ns_per_pixel": value * per,
-        "score_and_fisher_ns_per_pixel": score * per,
+    found = {
+        "quintics": horner,
+        "fields": whole - horner,
+        "value": seconds(values, repeats, kind, data, g),
+        "score_and_fisher": seconds(scores, repeats, kind, data, g, np.zeros(5), np.zeros((5, 5))),
     }
+    per = 1e9 / SIDE**2
+    parts = {f"{name}_ns_per_pixel": per * took for name, took in found.items()}
+    return {"heights_ns_per_pass": 1e9 * turn} | parts
 
 
 def main() -> None:
