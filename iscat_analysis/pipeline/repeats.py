@@ -237,13 +237,9 @@ def _cuts(chunk: Chunk, start: int, stop: int) -> Iterator[slice]:
 
 
 def _summed(chunk: Chunk, cut: slice) -> FloatArray:
-    camera = chunk.camera
-    good = chunk.good[cut]
-    counts = chunk.counts[cut][good]
-    whole = np.issubdtype(counts.dtype, np.integer)
-    total = counts.sum(axis=0, dtype=np.int64 if whole else np.float64)
-    electrons: FloatArray = camera.gain_e_per_adu * (total - good.sum() * camera.offset_adu)
-    return electrons
+    span = chunk.first + cut.start, chunk.first + cut.stop
+    (rows, columns) = chunk.shape
+    return chunk.patch(*span, (0, rows), (0, columns)).window(*span)[0]
 
 
 # ---- background frames -----------------------------------------------------------------------

@@ -25,6 +25,7 @@ from iscat_analysis.inference.noise import conditional, poisson
 from iscat_analysis.movie.camera import Camera, check_counts
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.pipeline.chunks import Reader, counts_budget, plan_chunks
 from iscat_analysis.pipeline.noise import judge_window
 from iscat_analysis.pipeline.ranges import frame_ranges, measured_windows
@@ -146,9 +147,10 @@ def landing_sights(
     bright.sort(key=lambda step: -step.snr)
     unique = _without_repeats(bright)
     others = _without_repeats(rest)
+    model = build_microscope(config, 1000.0, settings_of(config))
     sights = [
         [
-            replace(_sight_of(step, config), neighbours=_neighbours(step, others, config))
+            replace(_sight_of(step, config, model), neighbours=_neighbours(step, others, config))
             for step in steps
         ]
         for steps in (unique[:MOST_SIGHTS], others)
@@ -353,10 +355,9 @@ def _bright(sights: Iterable[Sight]) -> list[Sight]:
     return sorted((s for s in sights if s.snr > FAINTEST), key=lambda s: -s.snr)[:MOST_SIGHTS]
 
 
-def _sight_of(step: BrightStep, config: Config) -> Sight:
+def _sight_of(step: BrightStep, config: Config, model: ForwardModel) -> Sight:
     """Make a sight of a step."""
     grid = PixelGrid.region(step.rows, step.columns, _pixel_nm(config))
-    model = build_microscope(config, 1000.0, settings_of(config))
     likelihood = conditional(
         model, grid, step.before_e, step.after_e, step.power_ratio,
         read_variance_before_e2=step.n_before * step.read_variance_e2,

@@ -47,6 +47,8 @@ STYLE: Any = {
     "xtick.color": INK,
     "ytick.color": INK,
     "legend.frameon": False,
+    "figure.autolayout": False,
+    "figure.constrained_layout.use": False,
     "svg.fonttype": "none",
     "svg.hashsalt": "iscat-analysis",
     "pdf.fonttype": 42,  # letters, which can be edited
@@ -103,7 +105,8 @@ def publish(
         for name, figure in figures:
             if (engine := figure.get_layout_engine()) is not None:
                 engine.execute(figure)
-                figure.set_layout_engine("none")  # laid out once, not again for each file
+                # laid out once; with an engine, or "none", each file would be drawn twice
+                figure.set_layout_engine(None)
             if folder is not None:
                 path = folder / f"{name}.png"
                 dpi = PRINT_DPI if printed else DPI
