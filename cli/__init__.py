@@ -16,7 +16,7 @@ __all__ = ["main", "main_fit"]
 
 INTERRUPTED = 130
 
-_OBJECTS = 50_000
+_OBJECTS = 200_000
 """New containers after which cycles among them are looked for: loading the libraries makes some
 ten times as many, which stay, and looking through them every 700 took a quarter of a short run."""
 
