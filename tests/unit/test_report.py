@@ -9,10 +9,13 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
 from markupsafe import Markup
+from matplotlib.backend_bases import RendererBase
+from matplotlib.figure import Figure
 
 from iscat_analysis.config import load_config, parse_config
 from iscat_analysis.errors import DataError
@@ -23,6 +26,7 @@ from iscat_analysis.report.event_figures import CREDIBLE_LEVELS, credible_shades
 from iscat_analysis.report.headline import NOT_A_MASS, headline, precision_of
 from iscat_analysis.report.numbers import number
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder
+from iscat_analysis.report.style import new_figure, publish
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.result import Result
 from iscat_analysis.schemas import jsonable
@@ -42,6 +46,25 @@ def payload(page: str) -> dict[str, object]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     analysis = make_analysis(12, "joint", posteriors=2, refused=1)
     return write_report(analysis, tmp_path_factory.mktemp("out") / "movie.iscat")
+
+
+def test_a_figure_is_drawn_once_for_each_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Figure] = []
+    draw = Figure.draw
+
+    def count(figure: Figure, renderer: RendererBase) -> None:
+        drawn.append(figure)
+        draw(figure, renderer)
+
+    monkeypatch.setattr(Figure, "draw", count)
+    figure = new_figure(2.0, 1.5)
+    figure.add_subplot().plot([0, 1], [0, 1])
+    with mpl.rc_context({"figure.constrained_layout.use": True}):  # as a user may have it
+        publish([("line", figure)], tmp_path)
+    assert drawn == [figure, figure]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["line.png", "line.svg"]
 
 
 class TestFolder:
