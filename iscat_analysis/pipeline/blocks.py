@@ -33,6 +33,7 @@ from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory, follow_pattern, trusted
 from iscat_analysis.pipeline.moving import LEAST_FRAMES
+from iscat_analysis.pipeline.ranges import fitted_frames
 from iscat_analysis.records import FloatArray, FrameSource
 
 BYTES = 16
@@ -150,12 +151,7 @@ def plan_blocks(
     DataError
         The frames are not there, or a block does not fit into the memory.
     """
-    first, last = config.fit.frames or (0, movie.shape[0])
-    if last > movie.shape[0]:
-        raise DataError(
-            f"{movie.name}: has {movie.shape[0]} frames, but fit.frames asks for {first}:{last}; "
-            "change fit.frames"
-        )
+    first, last = fitted_frames(movie, config)
     frames, pixels = last - first, movie.shape[1] * movie.shape[2]
     room = int(config.compute.memory_limit_mb * 1e6) // (BYTES * pixels)
     given = None if config.track.block_frames == "auto" else config.track.block_frames

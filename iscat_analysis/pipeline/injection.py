@@ -26,6 +26,7 @@ from iscat_analysis.movie.drift import Mover, Trajectory
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.landing import analyse_landings
 from iscat_analysis.pipeline.prepare import Prepared
+from iscat_analysis.pipeline.ranges import fitted_frames
 from iscat_analysis.pipeline.results import Found
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene, reported_steps
@@ -235,7 +236,7 @@ def inject_and_recover(
     KeyboardInterrupt
         The user stopped it: half of a search says nothing of what is found.
     """
-    frames = config.fit.frames or (0, movie.shape[0])
+    frames = fitted_frames(movie, config)
     window = int(result.summary["window_frames"])
     fixed = config.background.model_copy(update={"window_frames": window})
     seed = config.compute.seed

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.config import Config, with_absolute_paths
-from iscat_analysis.errors import DataError, FloodError
+from iscat_analysis.errors import FloodError
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.movie.lines import Lines, SteadyFrames
@@ -27,6 +27,7 @@ from iscat_analysis.pipeline.merging import Done, Merged
 from iscat_analysis.pipeline.noise import judge_opening
 from iscat_analysis.pipeline.odd_frames import frame_warnings
 from iscat_analysis.pipeline.prepare import Prepared
+from iscat_analysis.pipeline.ranges import fitted_frames
 from iscat_analysis.pipeline.results import Compared, Found
 from iscat_analysis.pipeline.resume import Store
 from iscat_analysis.pipeline.run import Run
@@ -141,12 +142,7 @@ def analyse_landings(
         ``compute.memory_limit_mb``.
     """
     place = place or Here()
-    first, last = config.fit.frames or (0, movie.shape[0])
-    if last > movie.shape[0]:
-        raise DataError(
-            f"{movie.name}: has {movie.shape[0]} frames, but fit.frames asks for {first}:{last}; "
-            "change fit.frames"
-        )
+    first, last = fitted_frames(movie, config)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     reader = Reader(frames, camera, first, last, counts_budget(config))
     with threads(config.compute.workers) as pool:

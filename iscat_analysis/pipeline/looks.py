@@ -25,7 +25,12 @@ from iscat_analysis.pipeline.field import search_field
 from iscat_analysis.pipeline.moving import LEAST_FRAMES, load_field, search_frames, track_scene
 from iscat_analysis.pipeline.noise import judge_background, judge_opening
 from iscat_analysis.pipeline.pattern import SPAN, corrected
-from iscat_analysis.pipeline.ranges import checked, frame_ranges, measured_windows
+from iscat_analysis.pipeline.ranges import (
+    checked,
+    fitted_frames,
+    frame_ranges,
+    measured_windows,
+)
 from iscat_analysis.pipeline.regions import contrast_image
 from iscat_analysis.pipeline.scene import Scene, make_scene, reported_steps
 from iscat_analysis.pipeline.sidelobes import Sieve
@@ -133,7 +138,7 @@ class LandingSearch:
     """
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
-        self.frames = first, last = config.fit.frames or (0, movie.shape[0])
+        self.frames = first, last = fitted_frames(movie, config)
         self.longest = (last - first) // 2
         frames = movie if lines is None else SteadyFrames(movie, lines, camera)
         self._config = config
@@ -295,7 +300,7 @@ class MovingSearch:
         self._movie = steady(movie, lines, camera)
         self._camera, self._config = camera, config
         self._check = checked(movie, camera)
-        self.frames = first, last = config.fit.frames or (0, movie.shape[0])
+        self.frames = first, last = fitted_frames(movie, config)
         self.longest = last - first
         self.window = min(AROUND, self.longest)
         shape = (movie.shape[1], movie.shape[2])

@@ -99,6 +99,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     for note in (*movie.notes, *notes):
         run.tell(note)
     way = way_of(config)
+    span = fitted_frames(movie, config, config.background.frames)
     tracked = config.fit.mode == "track"
     if tracked:
         for note in judge_times(config, tracked_frames(movie, config), movie.name):
@@ -121,7 +122,6 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         steady = movie.seen_as(SteadyFrames(movie, lines, camera))
     looking: Future[Changes] | None = None
     if way == "sliding" or tracked:
-        span = fitted_frames(movie, config, config.background.frames)
         looking = beside(look_at_changes, steady, config, camera, span)
     configured = config
     config, learned = learn_optics(steady, config, camera, tell=run.tell)

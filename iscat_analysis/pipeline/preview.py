@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Mapping
 
 from iscat_analysis.config import Config
-from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.errors import ConfigError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_ratio
 from iscat_analysis.movie.lines import Lines
@@ -77,11 +77,6 @@ class Preview:
         camera = camera_from_config(config.camera, shape, movie.dtype)
         refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
         lines = judge_lines(movie, config, camera)
-        if config.fit.frames and config.fit.frames[1] > movie.shape[0]:
-            raise DataError(
-                f"{movie.name}: has {movie.shape[0]} frames, but fit.frames asks for "
-                f"{config.fit.frames[0]}:{config.fit.frames[1]}; change fit.frames"
-            )
         self._search = _SEARCHES[way_of(config)](movie, config, camera, lines)
         self._lock = threading.Lock()  # a viewer may ask from several threads
 

@@ -54,24 +54,37 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
     return before, after
 
 
-def fitted_frames(movie: Stack, config: Config, before: tuple[int, int] | None) -> tuple[int, int]:
+def fitted_frames(
+    movie: FrameSource, config: Config, before: tuple[int, int] | None = None
+) -> tuple[int, int]:
     """Which frames are looked at: ``fit.frames``, or all after the background.
 
     Parameters
     ----------
-    movie : Stack
+    movie : FrameSource
         The movie.
     config : Config
         ``fit.frames``.
-    before : (int, int) or None
-        The background's frames, None where it has none.
+    before : (int, int), optional
+        The background's frames, where it has some.
 
     Returns
     -------
     (int, int)
         Half-open; it may be empty.
+
+    Raises
+    ------
+    DataError
+        ``fit.frames`` reaches beyond the movie.
     """
-    return config.fit.frames or (before[1] if before else 0, movie.shape[0])
+    first, last = config.fit.frames or (before[1] if before else 0, movie.shape[0])
+    if last > movie.shape[0]:
+        raise DataError(
+            f"{movie.name}: has {movie.shape[0]} frames, but fit.frames asks for {first}:{last}; "
+            "change fit.frames"
+        )
+    return first, last
 
 
 def tracked_frames(movie: Stack, config: Config) -> int:
@@ -90,7 +103,7 @@ def tracked_frames(movie: Stack, config: Config) -> int:
         At least 0.
     """
     first, last = fitted_frames(movie, config, config.background.frames)
-    return max(min(last, movie.shape[0]) - first, 0)
+    return max(last - first, 0)
 
 
 def checked(movie: FrameSource, camera: Camera) -> Check:

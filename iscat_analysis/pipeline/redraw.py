@@ -33,7 +33,12 @@ from iscat_analysis.pipeline.field import add_signal
 from iscat_analysis.pipeline.moving import blurred_rows, exposure_of, load_field, track_scene
 from iscat_analysis.pipeline.neighbours import Neighbours, Step
 from iscat_analysis.pipeline.pattern import corrected
-from iscat_analysis.pipeline.ranges import checked, frame_ranges, measured_windows
+from iscat_analysis.pipeline.ranges import (
+    checked,
+    fitted_frames,
+    frame_ranges,
+    measured_windows,
+)
 from iscat_analysis.pipeline.regions import (
     Region,
     photons_scale,
@@ -103,7 +108,7 @@ def _landings(
     window: int,
 ) -> Redraw:
     """Draw what landed or left: windows before and after, in a chunk of their own."""
-    first, last = config.fit.frames or (0, movie.shape[0])
+    first, last = fitted_frames(movie, config)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     reader = Reader(frames, camera, first, last, counts_budget(config))
     scene = make_scene(config, reader.shape, lines=lines, sliding=True)
@@ -213,7 +218,7 @@ def _moving(
     blocks: int,
 ) -> Redraw:
     """Draw particles in single frames, over the background of their block under all of them."""
-    first, last = config.fit.frames or (0, movie.shape[0])
+    first, last = fitted_frames(movie, config)
     scene = track_scene(config, (movie.shape[1], movie.shape[2]), max(last - first, 1))
     edges = [first + (last - first) * k // blocks for k in range(blocks + 1)]
     known = table["mass_kda"].notna() & table["track"].notna()

@@ -28,7 +28,7 @@ from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.pipeline.chunks import Reader, counts_budget, plan_chunks
 from iscat_analysis.pipeline.noise import judge_window
-from iscat_analysis.pipeline.ranges import frame_ranges, measured_windows
+from iscat_analysis.pipeline.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.search.bright import (
     ALONE_NM,
@@ -122,8 +122,8 @@ def landing_sights(
     others : list of Sight
         Every bright step, on small regions.
     """
-    first, last = config.fit.frames or (0, movie.shape[0])
-    reader = Reader(movie, camera, first, min(last, movie.shape[0]), counts_budget(config))
+    first, last = fitted_frames(movie, config)
+    reader = Reader(movie, camera, first, last, counts_budget(config))
     _, _, window = judge_window(reader, config, pool.map)
     stride = max(1, window // STRIDES)
     found: list[BrightStep] = []

@@ -24,7 +24,7 @@ from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.joining import join_blocks
 from iscat_analysis.pipeline.moving import track_scene
 from iscat_analysis.pipeline.prepare import Prepared
-from iscat_analysis.pipeline.ranges import checked
+from iscat_analysis.pipeline.ranges import checked, fitted_frames
 from iscat_analysis.pipeline.regions import contrast_image
 from iscat_analysis.pipeline.results import Compared, Followed, Found, rows_of, view_of
 from iscat_analysis.pipeline.run import Run
@@ -61,7 +61,7 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         The user stopped it before the first block was finished.
     """
     movie, config, camera = ready.steady, ready.config, ready.camera
-    first, last = config.fit.frames or (0, movie.shape[0])
+    first, last = fitted_frames(movie, config)
     scene = track_scene(config, ready.shape, max(last - first, 1))
     run.clock.lap("model")
     check = checked(movie, camera)

@@ -12,11 +12,13 @@ import pytest
 from scenes import PIXEL_NM
 
 from iscat_analysis.config import Config, configure
+from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline import FIND, analyse
 from iscat_analysis.pipeline.events import Event, remarks, standing_out
 from iscat_analysis.pipeline.field import fit_field
+from iscat_analysis.pipeline.preview import Preview
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.pipeline.ways import Way, way_of
 from iscat_analysis.records import EVENT_COLUMNS, SEVERITY, Analysis, Status, Windows
@@ -98,6 +100,16 @@ def test_every_way_weighs_the_particles_alike(analyses: dict[Way, Analysis], way
     pulls = (table["mass_kda"] - 480) / table["sigma_mass_kda"]
     assert len(pulls) == len(PLACES)
     assert pulls.abs().max() < 4.5
+
+
+@pytest.mark.parametrize("way", list(MOVIES))
+def test_frames_that_are_not_there_are_refused_alike(way: Way, tmp_path: Path) -> None:
+    config = configure(_config(way), settings={"fit.frames": [50, 900]})
+    np.save(tmp_path / "movie.npy", np.full((100, SIDE, SIDE), 1000, dtype=np.uint16))
+    for job in (analyse, Preview):
+        with open_stack(tmp_path / "movie.npy") as movie, pytest.raises(DataError) as refused:
+            job(movie, config)
+        assert "has 100 frames, but fit.frames asks for 50:900" in str(refused.value)
 
 
 def _event() -> tuple[Scene, Event]:
