@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from iscat_analysis.config import Config, with_absolute_paths
 from iscat_analysis.errors import FloodError
@@ -30,7 +31,7 @@ from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.ranges import fitted_frames
 from iscat_analysis.pipeline.results import Compared, Found
 from iscat_analysis.pipeline.resume import Store
-from iscat_analysis.pipeline.run import Run
+from iscat_analysis.pipeline.run import Notify, Run
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.places import Here, Place
 from iscat_analysis.records import CountSource, Progress, Status
@@ -39,8 +40,6 @@ from iscat_analysis.threads import one_thread_algebra, threads
 
 POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""
-
-Tell = Callable[[str], None]
 
 
 def find_landings(ready: Prepared, run: Run) -> Found:
@@ -96,7 +95,7 @@ def analyse_landings(
     config: Config,
     camera: Camera,
     *,
-    tell: Tell,
+    tell: Notify,
     progress: Progress,
     prepare: Callable[[Scene], None] = _nothing,
     partial: Path | None = None,
@@ -204,14 +203,11 @@ def analyse_landings(
             "background.power_normalization = false has no effect on a landing movie: each frame "
             "is weighed by its own light"
         )
-    counted = table[table["status"] != Status.SIDELOBE]
-    left = counted["mass_kda"] < 0
     summary = {
         "window_frames": window,
         "stride_frames": stride,
         "boundaries_searched": count,
-        "landings": int((~left).sum()),
-        "leavings": int(left.sum()),
+        **_counted(table),
         "shot_noise_limited_frames": curve.shot_limited,
         "noise_frames": list(curve.frames),
         "noise_variance_over_shot": list(curve.variance_over_shot),
@@ -268,6 +264,12 @@ def _finished(
             merged.add(waiting.pop(ready))
             ready += 1
         yield frames, done.stopped
+
+
+def _counted(table: pd.DataFrame) -> dict[str, int]:
+    """Count landings and leavings."""
+    left = table["mass_kda"][table["status"] != Status.SIDELOBE] < 0
+    return {"landings": int((~left).sum()), "leavings": int(left.sum())}
 
 
 def _way(trajectory: Trajectory | None) -> dict[str, Any]:

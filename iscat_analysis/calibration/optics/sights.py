@@ -64,7 +64,7 @@ class Sight:
     grid : PixelGrid
         The region's pixels.
     kind : int
-        Noise model of `data`: CONDITIONAL or POISSON of `iscat_analysis.likelihood`.
+        Noise model of `data`: CONDITIONAL or POISSON of `iscat_analysis.inference.likelihood`.
     data : ndarray, shape (4, ny, nx)
         As in `Likelihood.data`.
     x_nm, y_nm : float
