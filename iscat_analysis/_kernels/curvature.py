@@ -31,7 +31,7 @@ def derivatives_between(
     work, profile = scratch(axial, lens, 3)
     start, stop = span(lens, pixels, theta, axial.heights.shape[3])
     profile_at(axial, theta[2], start, stop, work, profile)
-    signal_hessian(profile, lens, pixels, theta[0], theta[1], theta[3], True, rows)
+    signal_hessian(profile, lens, pixels, theta[0], theta[1], theta[3], rows)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")

@@ -28,6 +28,7 @@ ROWS = 15
 PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3))
 """Which of (x, y, z, a) the second derivatives from row 5 on are in."""
 
+_CHANNELS = 4  # of the first order of a radial profile
 _SCRATCH = 29  # 12 of the fields, 8 of ∂z, 4 of ∂zz, then DF and cosines
 _NEAR = 1e-6  # of a step: here DF is F″
 
@@ -40,7 +41,6 @@ def signal_hessian(
     x_p: float,
     y_p: float,
     amplitude: float,
-    with_z: bool,
     out: FloatArray,
 ) -> None:
     """Signal, gradient and second derivatives on a pixel grid, averaged over the samples.
@@ -48,16 +48,15 @@ def signal_hessian(
     Parameters
     ----------
     profile : ndarray
-        Three orders; of a radial one, shape (intervals, 6, 4·orders), the first is enough where
-        `with_z` is False.
+        Three orders; of a radial one, shape (intervals, 6, 4·orders), the first alone leaves out
+        derivatives in z, which then are 0.
     lens, pixels, x_p, y_p, amplitude
         As in `iscat_analysis._kernels.image.signal_gradient`.
-    with_z : bool
-        Whether derivatives in z are wanted of a radial profile; else they are 0.
     out : ndarray, shape (ny, ROWS, nx)
         Filled with s, its derivatives in (x_p, y_p, z, a), and those of `PAIRS`.
     """
     out[:] = 0.0
+    with_z = profile.shape[2] > _CHANNELS
     offsets, weights = pixels.offsets, pixels.weights
     f = np.empty((_SCRATCH, pixels.x.size))
     e = np.empty(2, dtype=np.complex128)

@@ -342,9 +342,9 @@ class ForwardModel:
         if height == "between":
             derivatives_between(self.axial_table, *geometry[:2], theta, rows)
         elif height == "fixed" and not self.lens.half:
-            signal_hessian(self.profile(z, 1), *geometry, False, rows)
+            signal_hessian(self.profile(z, 1), *geometry, rows)
         else:
-            signal_hessian(self.profile(z, 3), *geometry, True, rows)
+            signal_hessian(self.profile(z, 3), *geometry, rows)
         return rows
 
     def joint_gradient(

@@ -309,7 +309,7 @@ class LatticeField:
             profile = self.profile(z_nm, 3)
             for _ in range(_NEWTON):
                 pixels = Pixels(np.array([x]), np.array([y]), point, one)
-                signal_hessian(profile, lens, pixels, 0.0, 0.0, amplitude, True, out)
+                signal_hessian(profile, lens, pixels, 0.0, 0.0, amplitude, out)
                 # the particle's derivatives: those of the camera's position with the sign changed
                 _, s_x, s_y, _, _, s_xx, s_xy, s_yy = out[0, :8, 0]
                 move = np.linalg.solve([[s_xx, s_xy], [s_xy, s_yy]], [s_x, s_y])
