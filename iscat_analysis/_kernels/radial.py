@@ -28,6 +28,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.special import j0, j1
 
+from iscat_analysis._kernels.vectors import LANES, together
+
 FloatArray = NDArray[np.float64]
 
 STEP = 0.3
@@ -251,6 +253,15 @@ def _turn(
         out[first_im + j * stride] = a * sin + b * cos
 
 
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+def _turn_here(re: FloatArray, im: FloatArray, cos: float, sin: float) -> None:
+    """Multiply re + i·im by cos + i·sin where it stands."""
+    for j in range(re.size):
+        a, b = re[j], im[j]
+        re[j] = a * cos - b * sin
+        im[j] = a * sin + b * cos
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_carrier(
     kappa: float,
@@ -286,7 +297,7 @@ def profile_at(
         Height [nm], inside the table.
     start, stop : int
         Range of the flattened profile.
-    work : ndarray, shape (channels, orders, width)
+    work : ndarray, shape (orders, channels, width)
         Scratch.
     profile : ndarray
         Filled; with twice the channels of the table ∂/∂z too, with three times ∂²/∂z² as well.
@@ -323,40 +334,47 @@ def profile_at(
     every = profile.size // width
     with_slope, with_bend = every > channels, every > 2 * channels
     cos, sin = np.cos(kappa * z_nm), np.sin(kappa * z_nm)
+    radial = profile.shape[1] == POWERS
+    in_registers = radial and every == LANES
     flat = profile.reshape(profile.size)
-    apart, stride = (1, every) if profile.shape[1] == POWERS else (width, 1)
+    apart, stride = (1, every) if radial else (width, 1)
     begin = start * stride
     for channel in range(channels):
-        _mix(heights, i, channel, start, v, work[channel, 0, start:stop])
+        _mix(heights, i, channel, start, v, work[0, channel, start:stop])
         if with_slope:
-            _mix(heights, i, channel, start, d, work[channel, 1, start:stop])
+            _mix(heights, i, channel, start, d, work[1, channel, start:stop])
         if with_bend:
-            _mix(heights, i, channel, start, b, work[channel, 2, start:stop])
+            _mix(heights, i, channel, start, b, work[2, channel, start:stop])
     for c in range(0, channels, 2):
-        re, im = work[c, 0, start:stop], work[c + 1, 0, start:stop]
+        re, im = work[0, c, start:stop], work[0, c + 1, start:stop]
         if with_slope:
-            slope_re, slope_im = work[c, 1, start:stop], work[c + 1, 1, start:stop]
+            slope_re, slope_im = work[1, c, start:stop], work[1, c + 1, start:stop]
             for j in range(re.size):
                 slope_re[j] -= kappa * im[j]
                 slope_im[j] += kappa * re[j]
+            if in_registers:
+                _turn_here(re, im, cos, sin)
+                _turn_here(slope_re, slope_im, cos, sin)
+                continue
             there = begin + (c + channels) * apart
             _turn(slope_re, slope_im, cos, sin, flat, there, there + apart, stride)
         if with_bend:
-            _add_carrier(kappa, re, im, work[c, 1, start:stop], work[c + 1, 1, start:stop],
-                         work[c, 2, start:stop], work[c + 1, 2, start:stop])  # fmt: skip
+            bend_re, bend_im = work[2, c, start:stop], work[2, c + 1, start:stop]
+            _add_carrier(
+                kappa, re, im, work[1, c, start:stop], work[1, c + 1, start:stop], bend_re, bend_im
+            )
             there = begin + (c + 2 * channels) * apart
-            _turn(
-                work[c, 2, start:stop], work[c + 1, 2, start:stop], cos, sin,
-                flat, there, there + apart, stride,
-            )  # fmt: skip
+            _turn(bend_re, bend_im, cos, sin, flat, there, there + apart, stride)
         _turn(re, im, cos, sin, flat, begin + c * apart, begin + (c + 1) * apart, stride)
+    if in_registers:
+        together(work.reshape(every, width), start, stop, profile.reshape(width, every))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def profile_between(axial: AxialTable, z_nm: float, profile: FloatArray) -> None:
     """Fill a whole profile of one order or more by interpolation along z."""
     channels, width = axial.heights.shape[2:]
-    work = np.empty((channels, profile.size // (width * channels), width))
+    work = np.empty((profile.size // (width * channels), channels, width))
     profile_at(axial, z_nm, 0, width, work, profile)
 
 

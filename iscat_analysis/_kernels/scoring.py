@@ -270,7 +270,7 @@ def scratch(axial: AxialTable, lens: Lens, orders: int) -> tuple[FloatArray, Flo
     channels, width = axial.heights.shape[2:]
     if lens.fine:
         return np.empty((0, 0, 0)), np.empty((0, 0, 0))
-    work, every = np.empty((channels, orders, width)), orders * channels
+    work, every = np.empty((orders, channels, width)), orders * channels
     if lens.half:
         nodes = 2 * lens.half + 1
         return work, np.empty((every, nodes, nodes))

@@ -423,7 +423,7 @@ def test_profiles_between_the_tabulated_heights(optics: dict) -> None:
     model = forward_model(config, 2000.0)
     table = model.axial_table
     width = table.heights.shape[3]
-    work = np.empty((4, 2, width))
+    work = np.empty((2, 4, width))
     rng = np.random.default_rng(12)
     for z in [0.0, 2000.0, *rng.uniform(0, 2000, 12)]:
         direct = model.profile(z, 2)

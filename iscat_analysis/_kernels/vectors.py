@@ -1,0 +1,156 @@
+"""Registers of eight numbers, for loops that Numba leaves scalar.
+
+They are written as the instructions of LLVM, which a processor has for eight numbers or puts
+together from smaller registers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+LANES = 8
+"""Numbers in a register."""
+
+_DOUBLE, _BYTE = ir.DoubleType(), ir.IntType(8)
+_INDEX, _LANE = ir.IntType(64), ir.IntType(32)
+_FLAGS = ("contract", "nsz")
+
+
+class Code:
+    """Writes the instructions of a function of two arrays and the first of eight places.
+
+    Attributes
+    ----------
+    one, other
+        The arrays.
+    first
+        The place.
+    """
+
+    def __init__(self, context: Any, builder: Any, signature: Any, arguments: Any) -> None:
+        self._b = builder
+        self.one, self.other = (
+            context.make_array(kind)(context, builder, value)
+            for kind, value in zip(signature.args[:2], arguments[:2], strict=True)
+        )
+        self.first = arguments[2]
+
+    def index(self, number: int) -> Any:
+        """Write a whole number."""
+        return ir.Constant(_INDEX, number)
+
+    def length(self, array: Any, axis: int) -> Any:
+        """Give the length of an axis."""
+        return cgutils.unpack_tuple(self._b, array.shape)[axis]
+
+    def times(self, one: Any, other: Any) -> Any:
+        """Multiply whole numbers."""
+        return self._b.mul(one, other)
+
+    def plus(self, one: Any, other: Any) -> Any:
+        """Add whole numbers."""
+        return self._b.add(one, other)
+
+    def in_row(self, array: Any, row: int, place: Any) -> Any:
+        """Point to a place in a row of an array of two axes."""
+        stride = cgutils.unpack_tuple(self._b, array.strides)[0]
+        data = self._b.bitcast(array.data, _BYTE.as_pointer())
+        line = self._b.gep(data, [self._b.mul(stride, self.index(row))])
+        return self._b.gep(self._b.bitcast(line, _DOUBLE.as_pointer()), [place])
+
+    def at(self, array: Any, place: Any) -> Any:
+        """Point to a place in the memory of an array."""
+        return self._b.gep(array.data, [place])
+
+    def load(self, pointer: Any, count: int = LANES) -> Any:
+        """Read a register of numbers that follow one another."""
+        kind = ir.VectorType(_DOUBLE, count)
+        return self._b.load(self._b.bitcast(pointer, kind.as_pointer()), align=8)
+
+    def store(self, register: Any, pointer: Any) -> None:
+        """Write a register to memory."""
+        self._b.store(register, self._b.bitcast(pointer, register.type.as_pointer()), align=8)
+
+    def parted(self, pointer: Any, count: int = LANES) -> tuple[Any, Any]:
+        """Read a number: its whole part, and the rest in all lanes of a register."""
+        number = self._b.load(pointer)
+        whole = self._b.fptosi(number, _INDEX)
+        rest = self._b.fsub(number, self._b.sitofp(whole, _DOUBLE), flags=_FLAGS)
+        nothing = ir.Constant(ir.VectorType(_DOUBLE, count), ir.Undefined)
+        one = self._b.insert_element(nothing, rest, ir.Constant(_LANE, 0))
+        return whole, self._b.shuffle_vector(one, nothing, _lanes([0] * count))
+
+    def multiply_add(self, x: Any, y: Any, z: Any) -> Any:
+        """Give x y + z."""
+        return self._b.fadd(self._b.fmul(x, y, flags=_FLAGS), z, flags=_FLAGS)
+
+    def joined(self, one: Any, other: Any) -> Any:
+        """Put two halves of a register together."""
+        return self._b.shuffle_vector(one, other, _lanes(range(LANES)))
+
+    def exchanged(self, rows: list[Any]) -> list[Any]:
+        """Transpose eight registers; of four, each half as a square of its own."""
+        rows = list(rows)
+        width = 1
+        while width < len(rows):
+            for i in range(len(rows)):
+                if i & width:
+                    continue
+                low = [LANES + (k ^ width) if k & width else k for k in range(LANES)]
+                high = [LANES + k if k & width else k | width for k in range(LANES)]
+                pair = rows[i], rows[i + width]
+                rows[i] = self._b.shuffle_vector(*pair, _lanes(low))
+                rows[i + width] = self._b.shuffle_vector(*pair, _lanes(high))
+            width *= 2
+        return rows
+
+
+def _lanes(numbers: Any) -> Any:
+    chosen = list(numbers)
+    return ir.Constant(ir.VectorType(_LANE, len(chosen)), chosen)
+
+
+def instructions(write: Callable[[Code], None]) -> Callable[..., None]:
+    """Make a function for kernels, of two arrays and a place, of what writes its instructions."""
+
+    def typed(_: Any, one: Any, other: Any, first: Any) -> tuple[Any, Callable[..., Any]]:
+        def written(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            write(Code(context, builder, signature, arguments))
+            return context.get_dummy_value()
+
+        return types.void(one, other, first), written
+
+    made: Callable[..., None] = intrinsic(typed)
+    return made
+
+
+def _write_together(code: Code) -> None:
+    """Exchange eight numbers of eight rows for eight rows of eight numbers."""
+    rows = [code.load(code.in_row(code.one, k, code.first)) for k in range(LANES)]
+    for k, row in enumerate(code.exchanged(rows)):
+        place = code.times(code.plus(code.first, code.index(k)), code.index(LANES))
+        code.store(row, code.at(code.other, place))
+
+
+_eight_together = instructions(_write_together)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def together(rows: FloatArray, start: int, stop: int, out: FloatArray) -> None:
+    """Fill `out` (n, 8) from `start` to `stop` with what stands there in `rows` (8, n)."""
+    last = start + (stop - start) // LANES * LANES
+    for j in range(start, last, LANES):
+        _eight_together(rows, out, j)
+    for j in range(last, stop):
+        for k in range(LANES):
+            out[j, k] = rows[k, j]
