@@ -92,6 +92,7 @@ next(() => {
 def run(*arguments: str, kernels: Path | None = None) -> tuple[float, float]:
     """Seconds of the clock and of processors that a command takes."""
     environment = {**os.environ, **({"NUMBA_CACHE_DIR": str(kernels)} if kernels else {})}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installation has its modules compiled
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run(
         [sys.executable, "-c", PROGRAM, *arguments],
