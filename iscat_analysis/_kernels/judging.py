@@ -6,20 +6,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.moving import (
+from iscat_analysis._kernels.canvas import (
     Canvas,
     Field,
     Light,
     Pictures,
     cut,
-    directions,
     draw_gradient,
     ready_frame,
     square_of,
     stage,
     table_of,
 )
+from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.moving import directions
 from iscat_analysis._kernels.scoring import FLOOR, POISSON, image_score, image_value, scratch
 
 FloatArray = NDArray[np.float64]

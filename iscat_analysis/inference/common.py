@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, get_blas_funcs, solve_triangular
 
+from iscat_analysis.inference.modes import lost, patterns, pixels_of
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Judged, Rows
 from iscat_analysis.records import BoolArray, FloatArray
@@ -119,12 +120,12 @@ def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged
         if not mine.size:
             return
         fisher, of_track = judged.fisher[mine], rows.only(mine)
-        if field.pixels_of(of_track) <= MOST_PIXELS:
+        if pixels_of(field, of_track) <= MOST_PIXELS:
             extra, amplitudes = _all_pixels(field, ground, of_track, fisher, index)
             together[k] = mine, amplitudes
         else:
-            lost = field.lost(ground, of_track)
-            extra, taken[k] = _common_modes(fisher, lost, index)
+            taken_by = lost(field, ground, of_track)
+            extra, taken[k] = _common_modes(fisher, taken_by, index)
         covariance[np.ix_(mine, index, index)] = extra
 
     field.share(of_one, tracks)
@@ -163,9 +164,9 @@ def _all_pixels(
 ) -> tuple[FloatArray, FloatArray]:
     """Covariance of every row besides its own, and that of the amplitudes of all rows."""
     inverse = _inverse(fisher, index)
-    patterns, weight = field.patterns(ground, rows)
+    changes, weight = patterns(field, ground, rows)
     pixels = np.flatnonzero(weight > 0)
-    slopes = patterns.reshape(*patterns.shape[:2], -1)[:, index]
+    slopes = changes.reshape(*changes.shape[:2], -1)[:, index]
     if pixels.size < weight.size:
         slopes = slopes[:, :, pixels]
     follows, left = _undetermined(slopes, weight.flat[pixels], inverse)

@@ -262,22 +262,9 @@ class Likelihood:
         else:
             table = self.model.height_table(theta[2])
         value, used, outcome = maximize(
-            table,
-            lens,
-            pixels,
-            kind,
-            data,
-            free,
-            lower,
-            upper,
-            self._farthest,
-            tolerance,
-            passes,
-            theta,
-            score,
-            fisher,
-            least,
-        )
+            table, lens, pixels, kind, data, free, lower, upper, self._farthest, tolerance, passes,
+            theta, score, fisher, least,
+        )  # fmt: skip
         return Optimum(theta, value, used, outcome == CONVERGED, fisher)
 
     def scan_heights(

@@ -18,25 +18,22 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, cg
 
+from iscat_analysis._kernels.canvas import Canvas, Field, Light
 from iscat_analysis._kernels.judging import judge_frames
 from iscat_analysis._kernels.moving import (
-    Canvas,
-    Field,
-    Light,
     Response,
     Search,
     common_modes,
     fit_frames,
-    follow_rows,
 )
 from iscat_analysis._kernels.scoring import CONVERGED
 from iscat_analysis.inference.fit import window_nm
+from iscat_analysis.inference.newton import newton_step
 from iscat_analysis.inference.pictures import PictureBook
 from iscat_analysis.inference.rows import Ground, Judged, Rows
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
@@ -63,10 +60,6 @@ _PASSING = 0.02  # the same, of a fit that the next turn goes on with
 _PASSES = 40
 _SLACK = np.array([0.1, 0.1, 0.01, 0.05])
 """How far particles may go from their rings: pixels, wavelengths, relative."""
-_PARTS = 8  # of the rows, that threads take in turn
-_RESIDUE = 0.02  # of a step that is left to the next
-_MOST_STEPS = 40  # of the conjugate gradients
-_FARTHEST = 0.05  # step of the logarithm of the background
 _ANY = 1e300
 _BEYOND = 0.5  # resolutions λ/NA outside the field, from where a particle is still seen
 
@@ -151,6 +144,11 @@ class MovingField:
         )  # fmt: skip
         self._pictures = self._book.of(np.zeros(1))
 
+    @cached_property
+    def total_e(self) -> FloatArray:
+        """Photoelectrons of all frames, shape (y, x) [e]."""
+        return np.asarray(self.counts_e.sum(axis=0, dtype=np.float64))
+
     @property
     def frames(self) -> int:
         """Frames in the movie."""
@@ -191,11 +189,6 @@ class MovingField:
 
         level = np.stack(list(self._pool.map(median, range(len(self.used)))))
         return Ground(np.maximum(level, 1e-3), power)
-
-    @cached_property
-    def _total(self) -> FloatArray:
-        """Photoelectrons of all frames."""
-        return np.asarray(self.counts_e.sum(axis=0, dtype=np.float64))
 
     def fit(
         self, ground: Ground, rows: Rows, *, sweeps: int = 1, coarse: bool = False
@@ -247,7 +240,7 @@ class MovingField:
         stretch = self._sum_of(block)
         if sweeps:
             self._response = response
-        level = np.where(stretch > 0, self._total / np.where(stretch > 0, stretch, 1.0), 1.0)
+        level = np.where(stretch > 0, self.total_e / np.where(stretch > 0, stretch, 1.0), 1.0)
         totals = self._frame_totals
         power = np.where(expected > 0, totals / np.where(expected > 0, expected, 1.0), 1.0)
         fitted = replace(rows, theta=theta) if sweeps else rows
@@ -293,7 +286,7 @@ class MovingField:
         change : float
             Largest change of the background in the last turn [its standard deviations].
         """
-        sigma = 1 / np.sqrt(np.maximum(self._total, 1.0))
+        sigma = 1 / np.sqrt(np.maximum(self.total_e, 1.0))
         change = largest = 0.0
         done = np.ones(len(rows.frame), dtype=bool)
         for turn in range(turns):
@@ -305,7 +298,8 @@ class MovingField:
                 if settled or turn >= 2:
                     break
                 continue
-            step = self._newton(np.where(self.used, np.log(found.level / ground.level), 0.0))
+            move = np.where(self.used, np.log(found.level / ground.level), 0.0)
+            step = newton_step(move, self._response, self.total_e, self.used, self._pool)
             change = float(np.abs(step / sigma)[self.used].max(initial=0.0))
             if tell is not None:
                 tell(turn, change)
@@ -317,42 +311,6 @@ class MovingField:
             elif change < SETTLED:
                 break
         return rows, ground, done, change
-
-    def _newton(self, move: FloatArray) -> FloatArray:
-        """Where turns would end, of which one changes the logarithm of the background by `move`.
-
-        The rows follow the background and the background them: what a step δ leaves over is
-        move − δ + N⁻¹ Σ Gᵀ F⁻¹ G δ.  It vanishes where M δ = N move; the conjugate gradients that
-        solve it see M only by what it does to an image.
-        """
-        response, counts = self._response, np.where(self.used, self._total, 0.0)
-        rows = len(response.squares)
-        share = max(rows // _PARTS, 1)
-
-        def part(first: int, image: FloatArray) -> FloatArray:
-            out = np.zeros(self.used.shape)
-            follow_rows(response, first, min(first + share, rows), image, out)
-            return out
-
-        def undetermined(step: FloatArray) -> FloatArray:
-            image = step.reshape(self.used.shape)
-            out = counts * image
-            for taken in self._pool.map(partial(part, image=image), range(0, rows, share)):
-                out -= taken
-            return np.where(self.used, out, image).ravel()
-
-        weight = np.where(self.used, np.maximum(counts, 1.0), 1.0).ravel()
-        step, _ = cg(
-            LinearOperator((move.size, move.size), undetermined, dtype=np.float64),
-            (counts * move).ravel(),
-            x0=move.ravel(),
-            rtol=_RESIDUE,
-            maxiter=_MOST_STEPS,
-            M=LinearOperator(
-                (move.size, move.size), lambda v: v.ravel() / weight, dtype=np.float64
-            ),
-        )
-        return np.asarray(np.clip(step.reshape(move.shape), -_FARTHEST, _FARTHEST))
 
     def draw(self, ground: Ground, rows: Rows) -> None:
         """Draw the rows of all frames at once; `residual` of the same object then only subtracts.
@@ -537,77 +495,26 @@ class MovingField:
         snr = np.sqrt(2 * np.maximum(numbers[:, 0], 0.0))
         return replace(rows, theta=theta), outcome == CONVERGED, snr
 
-    def lost(self, ground: Ground, rows: Rows) -> FloatArray:
-        """Information on what the rows of one track have in common that their background takes.
+    def add_modes(
+        self, ground: Ground, rows: Rows, corner: tuple[int, int], out: FloatArray
+    ) -> None:
+        """Fill an array with the sum over rows of what they change of the light.
 
         Parameters
         ----------
         ground : Ground
             Background.
         rows : Rows
-            All of one track.
-
-        Returns
-        -------
-        ndarray, shape (4, 4)
-            Σ over pixels of (Σ_t w B ∂C)(Σ_t w B ∂C)ᵀ / Σ_t w B (1 + C), in (x, y, z, a).
+            Particles.
+        corner : (int, int)
+            First row and column of the pixels.
+        out : ndarray, shape (4, y, x)
+            Filled with Σ w B ∂C, in (x, y, z, a) [e per unit].
         """
-        cut = self.box(rows)
-        modes = np.empty((4, *ground.level[cut].shape))
-        self._modes(ground, rows, cut, modes)
-        return np.asarray(np.einsum("ayx,byx,yx->ab", modes, modes, self._weight(ground, cut)))
-
-    def pixels_of(self, rows: Rows) -> int:
-        """Count the pixels of the box in which all rows are fitted."""
-        rows_, columns = self.box(rows)
-        return int((rows_.stop - rows_.start) * (columns.stop - columns.start))
-
-    def patterns(self, ground: Ground, rows: Rows) -> tuple[NDArray[np.float32], FloatArray]:
-        """Give what each row changes of the light of every pixel of its track.
-
-        Parameters
-        ----------
-        ground : Ground
-            Background.
-        rows : Rows
-            All of one track.
-
-        Returns
-        -------
-        patterns : ndarray of float32, shape (n, 4, y, x)
-            w B ∂C of each row, in (x, y, z, a) [e per unit].
-        weight : ndarray, shape (y, x)
-            One over the counts of all frames; less where there is read noise, 0 where not used.
-        """
-        cut = self.box(rows)
-        one = np.empty((4, *ground.level[cut].shape))
-        out = np.empty((len(rows.frame), *one.shape), dtype=np.float32)
-        for i in range(len(out)):
-            self._modes(ground, rows.only(np.arange(len(out)) == i), cut, one)
-            out[i] = one
-        return out, self._weight(ground, cut)
-
-    def box(self, rows: Rows) -> tuple[slice, slice]:
-        """Give the pixels that the squares of rows cover."""
-        spans = []
-        for axis, size in ((1, self.used.shape[0]), (0, self.used.shape[1])):
-            first = np.rint(rows.theta[:, axis] / self.pixel_nm - (self.roi_px - 1) / 2)
-            low = int(np.clip(first.min(), 0, size - 1))
-            spans.append(slice(low, int(np.clip(first.max() + self.roi_px, low + 1, size))))
-        return spans[0], spans[1]
-
-    def _modes(self, ground: Ground, rows: Rows, cut: tuple[slice, slice], out: FloatArray) -> None:
-        """Fill `out` with the sum over rows of what they change of the light."""
         common_modes(
             self._light(ground), self._whole, self._pictures[0], rows.frame, rows.theta, rows.group,
-            cut[0].start, cut[1].start, out,
+            *corner, out,
         )  # fmt: skip
-
-    def _weight(self, ground: Ground, cut: tuple[slice, slice]) -> FloatArray:
-        """One over the information of the pixels on the logarithm of their light."""
-        level = ground.level[cut]
-        share = np.where(self.used[cut], level / (level + self.read_e2[cut]), 0.0)
-        return np.asarray(share / np.maximum(self._total[cut], 1.0))
 
     def on_wall(self, rows: Rows) -> BoolArray:
         """Tell which rows ended on a wall of the search.

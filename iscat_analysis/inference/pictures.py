@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from iscat_analysis._kernels.moving import Pictures
+from iscat_analysis._kernels.canvas import Pictures
 from iscat_analysis.optics.blur import blurred, spreads
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.stamp import sample_picture, weights_between

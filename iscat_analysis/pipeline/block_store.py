@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.moving import box_of
+from iscat_analysis._kernels.canvas import box_of
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.movie.camera import Camera
@@ -116,7 +116,7 @@ def analyse_block(
     Parameters
     ----------
     scene : Scene
-        From `iscat_analysis.pipeline.moving.track_scene`.
+        From `iscat_analysis.pipeline.moving_field.track_scene`.
     movie : FrameSource
         The movie.
     camera : Camera

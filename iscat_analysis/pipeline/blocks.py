@@ -32,7 +32,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory, follow_pattern, trusted
-from iscat_analysis.pipeline.moving import LEAST_FRAMES
+from iscat_analysis.pipeline.moving_field import LEAST_FRAMES
 from iscat_analysis.pipeline.ranges import fitted_frames
 from iscat_analysis.records import FloatArray, FrameSource
 

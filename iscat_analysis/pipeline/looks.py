@@ -22,7 +22,12 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.lines import Lines, SteadyFrames, steady
 from iscat_analysis.pipeline.chunks import Reader, counts_budget
 from iscat_analysis.pipeline.field import search_field
-from iscat_analysis.pipeline.moving import LEAST_FRAMES, load_field, search_frames, track_scene
+from iscat_analysis.pipeline.moving_field import (
+    LEAST_FRAMES,
+    load_field,
+    search_frames,
+    track_scene,
+)
 from iscat_analysis.pipeline.noise import judge_background, judge_opening
 from iscat_analysis.pipeline.pattern import SPAN, corrected
 from iscat_analysis.pipeline.ranges import (

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
-from iscat_analysis.errors import DataError
 from iscat_analysis.inference.common import (
     CommonAmplitudes,
     common_amplitudes,
@@ -24,7 +23,6 @@ from iscat_analysis.inference.common import (
 )
 from iscat_analysis.inference.moving import MOST_TURNS, MovingField
 from iscat_analysis.inference.rows import Ground, Judged, Rows
-from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.blur import path_variance_nm2
 from iscat_analysis.pipeline.extension import extended
@@ -44,24 +42,17 @@ from iscat_analysis.pipeline.linking import (
     typical,
     typical_error,
 )
-from iscat_analysis.pipeline.scene import Scene, make_scene
+from iscat_analysis.pipeline.moving_field import exposure_of, load_field, search_frames
+from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress
-from iscat_analysis.search.moving import FrameFilter, Sightings
+from iscat_analysis.search.moving import Sightings
 from iscat_analysis.species import fit_diffusion
-
-LEAST_FRAMES = 20
-"""Frames in a movie at least: fewer leave the background to the particles."""
 
 ROUNDS = 8
 """Searches of the whole movie; each sees what the fits so far leave over."""
 
-RING_SLOPE = 1.7
-"""Distance of the outer rings of a particle over its height, tan 60°: within it, what is much
-fainter than the particle may be what the model leaves over of them."""
-
 _FIRST_TURNS = 2  # of background and particles between two searches
 _NEXT_TURNS = 2  # between two extensions of the tracks
-_BLOCK = 64  # frames that are searched at a time
 _LEAST_POSITIONS = 4  # of a track whose D is fitted
 _USELESS = 300.0  # times the median error of a track: such a place says nothing
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
@@ -111,47 +102,6 @@ class Moving:
     field: MovingField
     shared: FloatArray
     common: CommonAmplitudes
-
-
-def exposure_of(config: Config) -> tuple[float, float]:
-    """Give the frame rate and the exposure.
-
-    Parameters
-    ----------
-    config : Config
-        Its camera.
-
-    Returns
-    -------
-    rate_hz, exposure_s : float
-        Where the rate is not known one frame is the unit of time, which it lasts as a whole: how
-        far a particle goes in it, and so its blur, is seen all the same.
-    """
-    rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
-    if rate is None:
-        return 1.0, 1.0
-    return rate, 1 / rate if exposure is None else exposure / 1e3
-
-
-def track_scene(config: Config, field_px: tuple[int, int], frames: int) -> Scene:
-    """Make models and matched filter for single frames.
-
-    Parameters
-    ----------
-    config : Config
-        In mode track.
-    field_px : (int, int)
-        Rows and columns.
-    frames : int
-        They share the expected false alarms.
-
-    Returns
-    -------
-    Scene
-        In mode mass or joint, as `track.free` says.
-    """
-    fit = config.fit.model_copy(update={"mode": config.track.free})
-    return make_scene(config.model_copy(update={"fit": fit}), field_px, searches=frames)
 
 
 def follow(
@@ -283,133 +233,6 @@ def follow(
     return Moving(
         rows, ground, judged, done, close, variances, diffusion, field, shared.covariance, common
     )
-
-
-def load_field(
-    scene: Scene,
-    movie: FrameSource,
-    camera: Camera,
-    span: tuple[int, int],
-    check: Callable[[NDArray[Any], int], None],
-    pool: ThreadPoolExecutor,
-    progress: Progress,
-) -> MovingField:
-    """Read the frames as photoelectrons.
-
-    Parameters
-    ----------
-    scene : Scene
-        From `track_scene`.
-    movie : FrameSource
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    span : (int, int)
-        Half-open range of frames.
-    check : callable
-        Refuses impossible counts.
-    pool : ThreadPoolExecutor
-        Runs blocks of frames.
-    progress : Progress
-        Told how many frames are read.
-
-    Returns
-    -------
-    MovingField
-        All frames of the span.
-
-    Raises
-    ------
-    DataError
-        The span is too short.
-    """
-    first, last = span
-    frames, shape = last - first, (movie.shape[1], movie.shape[2])
-    if frames < LEAST_FRAMES:
-        raise DataError(
-            f"{movie.name}: {frames} frames are too few to tell particles that move from what they "
-            f"move over; {LEAST_FRAMES} are needed, or background.frames without particles"
-        )
-    counts = np.empty((frames, *shape), dtype=np.float32)
-    saturated = np.zeros(shape, dtype=bool)
-    for start in range(first, last, _BLOCK):
-        stop = min(start + _BLOCK, last)
-        raw = movie.read(start, stop)
-        check(raw, start)
-        saturated |= camera.saturated(raw).any(axis=0)
-        counts[start - first : stop - first] = camera.to_electrons(raw)
-        progress("background", stop - first, frames)
-    read = np.broadcast_to(camera.read_variance_e2(shape), shape)
-    masked = saturated | find_defects(counts.sum(axis=0, dtype=np.float64), frames * read)
-    nominal = abs(scene.model.scale.amplitude(scene.model.material.mass_kda))
-    free_z = scene.mode == "joint"
-    return MovingField(
-        counts, read, ~masked, scene.model, scene.wide,
-        pixel_nm=scene.pixel_nm, roi_px=scene.roi_px,
-        z_range_nm=scene.config.fit.z_range_nm if free_z else None,
-        largest=100 * nominal, pool=pool,
-    )  # fmt: skip
-
-
-def search_frames(
-    scene: Scene,
-    field: MovingField,
-    ground: Ground,
-    rows: Rows,
-    snr: FloatArray,
-    pool: ThreadPoolExecutor,
-    frames: tuple[int, int] | None = None,
-) -> Sightings:
-    """Find candidates in what the rows leave over.
-
-    Parameters
-    ----------
-    scene : Scene
-        From `track_scene`.
-    field : MovingField
-        The frames.
-    ground : Ground
-        The light without particles.
-    rows : Rows
-        Particles that are known.
-    snr : ndarray, shape (n,)
-        Their signal-to-noise ratios.
-    pool : ThreadPoolExecutor
-        Runs blocks of frames; the result does not depend on its size.
-    frames : (int, int), optional
-        Which of the field's frames, half-open; default all.
-
-    Returns
-    -------
-    Sightings
-        Above the threshold.
-    """
-    side = scene.roi_px
-    if scene.mode == "joint":
-        side += round(2 * RING_SLOPE * scene.config.fit.z_range_nm[1] / field.pixel_nm)
-    search = FrameFilter(
-        scene.templates, ground.level, field.read_e2, field.used,
-        polarity=scene.config.detection.sign, roi_px=side,
-    )  # fmt: skip
-    if frames is None:
-        field.draw(ground, rows)
-    starts = rows.starts(field.frames)
-    pixel = field.pixel_nm
-    places = np.column_stack([rows.theta[:, :2] / pixel, snr])
-
-    def block(first: int) -> Sightings:
-        last = min(first + _BLOCK, end)
-        known = [places[starts[t] : starts[t + 1]] for t in range(first, last)]
-        return search.find(
-            field.residual(ground, rows, first, last), ground.power[first:last], first, known
-        )
-
-    begin, end = frames or (0, field.frames)
-    parts = list(pool.map(block, range(begin, end, _BLOCK)))
-    return Sightings(
-        *(np.concatenate([getattr(part, name) for part in parts])
-          for name in ("frame", "x_px", "y_px", "z_nm", "strength", "snr"))
-    )  # fmt: skip
 
 
 def _in_their_fringes(scene: Scene, field: MovingField, ground: Ground, rows: Rows) -> Rows:

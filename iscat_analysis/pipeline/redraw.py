@@ -30,7 +30,8 @@ from iscat_analysis.pipeline.chunks import HALO, Reader, counts_budget
 from iscat_analysis.pipeline.diagnosis import judge_lines
 from iscat_analysis.pipeline.events import Fitted, PlaceAndMass
 from iscat_analysis.pipeline.field import add_signal
-from iscat_analysis.pipeline.moving import blurred_rows, exposure_of, load_field, track_scene
+from iscat_analysis.pipeline.moving import blurred_rows
+from iscat_analysis.pipeline.moving_field import exposure_of, load_field, track_scene
 from iscat_analysis.pipeline.neighbours import Neighbours, Step
 from iscat_analysis.pipeline.pattern import corrected
 from iscat_analysis.pipeline.ranges import (

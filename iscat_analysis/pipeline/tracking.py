@@ -22,7 +22,7 @@ from iscat_analysis.pipeline.blocks import Plan, plan_blocks
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.joining import join_blocks
-from iscat_analysis.pipeline.moving import track_scene
+from iscat_analysis.pipeline.moving_field import track_scene
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.ranges import checked, fitted_frames
 from iscat_analysis.pipeline.regions import contrast_image
@@ -110,7 +110,7 @@ def track_movie(
     Parameters
     ----------
     scene : Scene
-        From `iscat_analysis.pipeline.moving.track_scene`.
+        From `iscat_analysis.pipeline.moving_field.track_scene`.
     movie : FrameSource
         The movie.
     camera : Camera

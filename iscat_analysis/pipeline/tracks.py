@@ -18,7 +18,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.materials import material
-from iscat_analysis.pipeline.moving import exposure_of
+from iscat_analysis.pipeline.moving_field import exposure_of
 from iscat_analysis.pipeline.regions import Region, region_likelihood
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.pipeline.ways import way_of

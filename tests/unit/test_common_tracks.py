@@ -12,6 +12,7 @@ from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.inference import common
 from iscat_analysis.inference.common import common_amplitudes, shared_errors
+from iscat_analysis.inference.modes import lost
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
@@ -72,7 +73,7 @@ def test_information_lost_is_that_of_all_parameters(
     ground = Ground(counts.mean(axis=0), np.ones(FRAMES))
     _, ground, _ = field.fit(ground, rows, sweeps=0)
     ground = Ground(ground.level, np.ones(FRAMES))
-    lost = field.lost(ground, rows)[3, 3]
+    taken = lost(field, ground, rows)[3, 3]
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
     own = across = within = 0.0
     for theta in rows.theta:
@@ -84,8 +85,8 @@ def test_information_lost_is_that_of_all_parameters(
         own = own + np.sum(ground.level * change**2 / (1 + signal))
         across = across + ground.level * change / ground.level  # ∂λ/∂a ∂λ/∂B / λ
         within = within + (1 + signal) / ground.level
-    assert lost == pytest.approx(np.sum(across**2 / within), rel=1e-3)
-    assert 0.5 < lost / own < 1.0  # it hardly moves: most of what it says is lost
+    assert taken == pytest.approx(np.sum(across**2 / within), rel=1e-3)
+    assert 0.5 < taken / own < 1.0  # it hardly moves: most of what it says is lost
 
 
 def test_common_mass_and_shared_errors_are_right(

@@ -1,0 +1,254 @@
+"""What the particles of a frame add up to, drawn row by row; see `moving`.
+
+The picture of a row is one of several, sharp or blurred, by its number in `group`: a table for the
+fit, which reaches over the fitted square, and one for drawing, which reaches farther.  What all
+rows of a frame add up to stays on a `Canvas` from one fit to the next: where a row moves by less
+than `Field.slack` only its fitted square is drawn anew, and its rings stay where they were.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.image import Lens, Pixels, signal_gradient, signal_image
+from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.radial import AxialTable
+from iscat_analysis._kernels.scoring import picture_at, span
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+class Pictures(NamedTuple):
+    """Pictures of one microscope, one for each blur.
+
+    Attributes
+    ----------
+    heights : ndarray, shape (groups or 1, n, 3, channels, width)
+        As in `AxialTable`.
+    first_nm, step_nm, kappa : float
+        As in `AxialTable`.
+    lens : Lens
+        What turns a profile into a signal, but for its window.
+    windows : ndarray, shape (groups or 1, degree + 1, TAPS)
+        Those of the blurs.
+    """
+
+    heights: FloatArray
+    first_nm: float
+    step_nm: float
+    kappa: float
+    lens: Lens
+    windows: FloatArray
+
+
+class Light(NamedTuple):
+    """A movie and what is known of its light.
+
+    Attributes
+    ----------
+    counts : ndarray of float32, shape (t, y, x)
+        Photoelectrons [e].
+    power : ndarray, shape (t,)
+        Power of each frame, 1 on average.
+    background : ndarray, shape (y, x)
+        Photoelectrons at power 1 [e].
+    read : ndarray, shape (y, x)
+        Variance of the read noise [e²].
+    used : ndarray of bool, shape (y, x)
+        Pixels that may be used.
+    """
+
+    counts: NDArray[np.float32]
+    power: FloatArray
+    background: FloatArray
+    read: FloatArray
+    used: BoolArray
+
+
+class Field(NamedTuple):
+    """The pixels, and how far each particle is drawn and fitted.
+
+    Attributes
+    ----------
+    pixels : Pixels
+        Of the whole field.
+    pixel_nm : float
+        Side of a pixel [nm].
+    side, drawn : int
+        Sides of the square that is fitted and of that which is drawn [pixels].
+    slack : ndarray, shape (4,)
+        How far x, y, z [nm] and the amplitude, relative, may be from where the rings were drawn.
+    """
+
+    pixels: Pixels
+    pixel_nm: float
+    side: int
+    drawn: int
+    slack: FloatArray
+
+
+class Canvas(NamedTuple):
+    """What the rows add up to in every frame.
+
+    Attributes
+    ----------
+    total : ndarray of float32, shape (t, y, x)
+        Signal of all rows of a frame.
+    rings, squares : ndarray, shape (rows, 5)
+        θ at which the rings and the fitted square of each row are drawn.
+    drawn : ndarray of bool, shape (t,)
+        Whether the frame holds these rows at all.
+    """
+
+    total: NDArray[np.float32]
+    rings: FloatArray
+    squares: FloatArray
+    drawn: BoolArray
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def table_of(pictures: Pictures, group: int) -> AxialTable:
+    """Table of one blur."""
+    k = min(group, pictures.heights.shape[0] - 1)
+    return AxialTable(pictures.heights[k], pictures.first_nm, pictures.step_nm, pictures.kappa)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lens_of(pictures: Pictures, group: int) -> Lens:
+    """Lens of one blur."""
+    one, window = pictures.lens, pictures.windows[min(group, pictures.windows.shape[0] - 1)]
+    return Lens(
+        one.inv_step, one.rho, one.cos_psi, one.sin_psi, one.co, one.cross, one.ring, one.half,
+        one.components, window, one.fine,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def box_of(centre_nm: float, pixel_nm: float, side: int, size: int) -> tuple[int, int]:
+    """Half-open range of pixels around a place, cut off at the edge of the field."""
+    first = int(np.rint(centre_nm / pixel_nm - (side - 1) / 2))
+    return max(first, 0), min(first + side, size)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def square_of(
+    field: Field, theta: FloatArray, side: int, rows: int, columns: int
+) -> tuple[int, int, int, int]:
+    """Half-open ranges of rows and of columns around a particle; all 0 where none is left."""
+    r0, r1 = box_of(theta[1], field.pixel_nm, side, rows)
+    c0, c1 = box_of(theta[0], field.pixel_nm, side, columns)
+    if r1 <= r0 or c1 <= c0:
+        return 0, 0, 0, 0
+    return r0, r1, c0, c1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def cut(pixels: Pixels, r0: int, r1: int, c0: int, c1: int) -> Pixels:
+    """Pixels of a part of the field."""
+    return Pixels(pixels.x[c0:c1], pixels.y[r0:r1], pixels.offsets, pixels.weights)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def draw(
+    pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
+    work: FloatArray, profile: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Fill `out` with the signal of one row."""
+    table, lens = table_of(pictures, group), lens_of(pictures, group)
+    start, stop = span(lens, pixels, theta, table.heights.shape[3])
+    picture = picture_at(table, lens, theta[2], start, stop, work, profile)
+    signal_image(picture, lens, pixels, theta[0], theta[1], theta[3], out)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def draw_gradient(
+    pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
+    work: FloatArray, profile: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Fill `out` (ny, 5, nx) with the signal of one row and its gradient."""
+    table, lens = table_of(pictures, group), lens_of(pictures, group)
+    start, stop = span(lens, pixels, theta, table.heights.shape[3])
+    picture = picture_at(table, lens, theta[2], start, stop, work, profile)
+    signal_gradient(picture, lens, pixels, theta[0], theta[1], theta[3], out)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def add(total: NDArray[np.float32], r0: int, c0: int, sign: float, image: FloatArray) -> None:
+    """Add an image, times a sign, to the part of a frame that begins at (r0, c0)."""
+    for i in range(image.shape[0]):
+        line, more = total[r0 + i, c0 : c0 + image.shape[1]], image[i]
+        for j in range(more.size):
+            line[j] += np.float32(sign * more[j])
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def stage(
+    light: Light, t: int, total: NDArray[np.float32], own: FloatArray, r0: int, c0: int,
+    data: FloatArray,
+) -> None:  # fmt: skip
+    """Fill the constants of a square's likelihood, with the other particles in its background."""
+    w, n = light.power[t], data.shape[2]
+    for i in range(data.shape[1]):
+        row, here = r0 + i, slice(c0, c0 + n)
+        used, background, read = light.used[row, here], light.background[row, here], light.read
+        counts, others, mine, v = (
+            light.counts[t, row, here],
+            total[row, here],
+            own[i],
+            read[row, here],
+        )
+        d0, d1, d2, d3 = data[0, i], data[1, i], data[2, i], data[3, i]
+        for j in range(n):
+            seen = 1.0 if used[j] else 0.0
+            level = seen * w * background[j]
+            d2[j] = level
+            d1[j] = level * (1.0 + others[j] - mine[j])
+        for j in range(n):
+            seen = 1.0 if used[j] else 0.0
+            d0[j] = seen * (counts[j] + v[j])
+            d3[j] = seen * v[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def ready_frame(
+    field: Field, near: Pictures, far: Pictures, starts: IntArray, t: int, theta: FloatArray,
+    group: IntArray, canvas: Canvas, near_work: tuple[FloatArray, FloatArray],
+    far_work: tuple[FloatArray, FloatArray], image: FloatArray,
+) -> None:  # fmt: skip
+    """Bring a frame of the canvas to the rows as they are."""
+    total = canvas.total[t]
+    rows, columns = total.shape
+    first, last = starts[t], starts[t + 1]
+    stale = not canvas.drawn[t]
+    for r in range(first, last):
+        for k in range(4):
+            limit = field.slack[k] * (abs(canvas.rings[r, 3]) if k == 3 else 1.0)
+            stale |= abs(theta[r, k] - canvas.rings[r, k]) > limit
+    if stale:
+        total[:] = 0.0
+        canvas.drawn[t] = True
+    for r in range(first, last):
+        if stale:
+            canvas.rings[r] = canvas.squares[r] = theta[r]
+            r0, r1, c0, c1 = square_of(field, theta[r], field.drawn, rows, columns)
+            if r1 > r0:
+                out = image[: (r1 - r0) * (c1 - c0)].reshape(r1 - r0, c1 - c0)
+                pixels = cut(field.pixels, r0, r1, c0, c1)
+                draw(far, group[r], theta[r], pixels, far_work[0], far_work[1], out)
+                add(total, r0, c0, 1.0, out)
+        elif np.any(theta[r] != canvas.squares[r]):
+            r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
+            if r1 > r0:
+                out = image[: (r1 - r0) * (c1 - c0)].reshape(r1 - r0, c1 - c0)
+                pixels = cut(field.pixels, r0, r1, c0, c1)
+                draw(near, group[r], canvas.squares[r], pixels, near_work[0], near_work[1], out)
+                add(total, r0, c0, -1.0, out)
+                draw(near, group[r], theta[r], pixels, near_work[0], near_work[1], out)
+                add(total, r0, c0, 1.0, out)
+            canvas.squares[r] = theta[r]
