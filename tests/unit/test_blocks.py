@@ -35,7 +35,8 @@ from iscat_analysis.pipeline.blocks import (
 )
 from iscat_analysis.pipeline.joining import combine_masses, join_tracks
 from iscat_analysis.pipeline.linking import unlike
-from iscat_analysis.pipeline.moving import follow, track_scene
+from iscat_analysis.pipeline.moving import follow
+from iscat_analysis.pipeline.moving_field import track_scene
 from iscat_analysis.pipeline.moving_table import common_masses, moving_table, table_of_tracks
 from iscat_analysis.pipeline.resume import partial_folder
 from iscat_analysis.threads import threads
