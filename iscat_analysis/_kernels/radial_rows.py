@@ -129,11 +129,11 @@ def _begin(f: FloatArray, count: int) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _end(f: FloatArray, count: int, first: int, rows: int, out: FloatArray) -> None:
+def _end(f: FloatArray, first: int, rows: int, out: FloatArray) -> None:
     """Copy the sums of a strip to the rows of an image, from `first` on."""
     columns = out.shape[2]
     for i in range(rows):
-        for k in range(count):
+        for k in range(out.shape[1]):
             for j in range(columns):
                 out[first + i, k, j] = f[_SUMS + k, i * columns + j]
 
@@ -148,7 +148,7 @@ def radial_gradient(
     together, f = _strip(y.size, x.size)
     for first in range(0, y.size, together):
         rows = y[first : first + together]
-        _begin(f, 5)
+        _begin(f, out.shape[1])
         for i in range(offsets.size):
             for j in range(offsets.size):
                 _place(lens.inv_step, x, rows, x_p - offsets[j], y_p - offsets[i], f)
@@ -157,7 +157,7 @@ def radial_gradient(
                     lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross,
                     lens.ring, amplitude, weights[i] * weights[j], f,
                 )  # fmt: skip
-        _end(f, 5, first, rows.size, out)
+        _end(f, first, rows.size, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -169,7 +169,7 @@ def radial_parts(
     together, f = _strip(y.size, x.size)
     for first in range(0, y.size, together):
         rows = y[first : first + together]
-        _begin(f, 2)
+        _begin(f, out.shape[1])
         for i in range(offsets.size):
             for j in range(offsets.size):
                 _place(lens.inv_step, x, rows, x_p - offsets[j], y_p - offsets[i], f)
@@ -178,7 +178,7 @@ def radial_parts(
                     lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross, lens.ring,
                     weights[i] * weights[j], f,
                 )  # fmt: skip
-        _end(f, 2, first, rows.size, out)
+        _end(f, first, rows.size, out)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")

@@ -62,22 +62,21 @@ def _log_ratio(change: float, base: float) -> float:
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _some_value(
-    kind: int, data: FloatArray, first: int, last: int, level: float, s: FloatArray, begin: int
+    kind: int, data: FloatArray, first: int, last: int, level: float, s: FloatArray
 ) -> float:
-    """Log-likelihood of some pixels of data (4, n); their signals are those from `begin` on."""
-    shift = begin - first
+    """Log-likelihood of some pixels of data (4, n), whose signals are s (n)."""
     total, beyond = 0.0, 0  # counted, because the largest would be found one after the other
     if kind == CONDITIONAL:
         for j in range(first, last):
-            beyond += abs(level * (1.0 + s[j + shift]) - 1.0) >= SERIES
+            beyond += abs(level * (1.0 + s[j]) - 1.0) >= SERIES
         if not beyond:
             for j in range(first, last):
-                change = level * (1.0 + s[j + shift]) - 1.0
+                change = level * (1.0 + s[j]) - 1.0
                 later = _log_ratio(change * data[2, j], 1.0 + data[2, j])
                 total += data[3, j] * (data[0, j] * _log_ratio(change, 1.0) - data[1, j] * later)
         else:
             for j in range(first, last):
-                stretch = max(level * (1.0 + s[j + shift]), FLOOR)
+                stretch = max(level * (1.0 + s[j]), FLOOR)
                 share = data[2, j] / (1.0 + data[2, j])
                 total += data[3, j] * (
                     data[0, j] * np.log(stretch) - data[1, j] * np.log1p((stretch - 1.0) * share)
@@ -85,17 +84,17 @@ def _some_value(
         return total
     for j in range(first, last):
         base = data[1, j] + data[3, j]
-        rate = level * (data[1, j] + data[2, j] * s[j + shift]) + data[3, j]
+        rate = level * (data[1, j] + data[2, j] * s[j]) + data[3, j]
         beyond += abs(rate - base) >= SERIES * max(base, FLOOR)
     if not beyond:
         for j in range(first, last):
             base = max(data[1, j] + data[3, j], FLOOR)
-            change = level * (data[1, j] + data[2, j] * s[j + shift]) + data[3, j] - base
+            change = level * (data[1, j] + data[2, j] * s[j]) + data[3, j] - base
             total += data[0, j] * _log_ratio(change, base) - change
     else:
         for j in range(first, last):
             base = max(data[1, j] + data[3, j], FLOOR)
-            rate = level * (data[1, j] + data[2, j] * s[j + shift]) + data[3, j]
+            rate = level * (data[1, j] + data[2, j] * s[j]) + data[3, j]
             total += data[0, j] * np.log(max(rate, FLOOR) / base) - (rate - base)
     return total
 
@@ -105,7 +104,7 @@ def signal_value(kind: int, data: FloatArray, level: float, s: FloatArray) -> fl
     """Log-likelihood of signals s (ny·nx,), relative to that without a particle."""
     flat, total = data.reshape(4, s.size), 0.0
     for first in range(0, s.size, _TOGETHER):
-        total += _some_value(kind, flat, first, min(first + _TOGETHER, s.size), level, s, first)
+        total += _some_value(kind, flat, first, min(first + _TOGETHER, s.size), level, s)
     return total
 
 
@@ -185,13 +184,13 @@ def image_value(kind: int, data: FloatArray, level: float, rows: FloatArray) -> 
     """Log-likelihood of an image; `rows` (ny, 5 or more, nx) holds s and its gradient."""
     ny, nx = rows.shape[0], rows.shape[2]
     flat, total, together = data.reshape(4, ny * nx), 0.0, max(_TOGETHER // nx, 1)
-    s = np.empty(together * nx)
+    s = np.empty(ny * nx)
     for first in range(0, ny, together):
         last = min(first + together, ny)
         for i in range(first, last):
             for j in range(nx):
-                s[(i - first) * nx + j] = rows[i, 0, j]
-        total += _some_value(kind, flat, first * nx, last * nx, level, s, 0)
+                s[i * nx + j] = rows[i, 0, j]
+        total += _some_value(kind, flat, first * nx, last * nx, level, s)
     return total
 
 

@@ -99,7 +99,9 @@ def sample_picture(model: ForwardModel, pixel_nm: float, half_px: float) -> tupl
     nodes = np.asarray(step * np.arange(-half, half + 1), dtype=np.float64)
     offsets, weights = model.samples
     offsets = np.asarray(offsets * pixel_nm)
-    profile, z = model.profile(model.height_nm, 1), 1.0 / abs(model.scale.amplitude(1.0))
+    profile = model.profile(model.height_nm, 1)
+    # as strong as the reference, so that neither P nor Q drowns in the rounding of the other
+    z = 1 / math.sqrt(model.wave.peak(model.height_nm, 1.0, model.rho)[1])
     reach = model.reach_nm - math.sqrt(2) * pixel_nm
     both = np.zeros((2, nodes.size, nodes.size))
     for row, y in enumerate(nodes):

@@ -11,7 +11,9 @@ import pytest
 from scenes import PIXEL_NM, gold, make_config
 
 from iscat_analysis._kernels.hessian import PAIRS
+from iscat_analysis._kernels.image import signal_image
 from iscat_analysis._kernels.scoring import CONDITIONAL
+from iscat_analysis.config import Calibration
 from iscat_analysis.inference import noise
 from iscat_analysis.inference.bias import first_order_bias
 from iscat_analysis.inference.fit import FOLLOWED, fit_particle, search_box
@@ -379,3 +381,28 @@ def test_a_place_that_is_held_may_lie_outside_the_bounds(place: float) -> None:
     free = np.array([False, False, False, True, False])
     found = which.maximize(start, free, lower, upper, passes=1)
     assert found.log_likelihood == pytest.approx(which.values(start[None])[0], abs=1e-3)
+
+
+@pytest.mark.parametrize("gradient_per_kda", [-3.1e-5, -1.0])
+def test_a_picture_is_exact_on_its_nodes_in_any_unit_of_mass(gradient_per_kda: float) -> None:
+    """Neither of its two parts drowns in the rounding of the other, however bright a particle."""
+    config = make_config().model_copy(
+        update={"calibration": Calibration(gradient_per_kda=gradient_per_kda)}
+    )
+    model = forward_model(config, 2200.0)
+    lens, table = model.picture_table(PIXEL_NM, max(GRID.shape))
+    x, y = 6 * PIXEL_NM, 7 * PIXEL_NM
+    amplitude = 0.5 / abs(model.amplitude_contrast(model.height_nm, 1.0))
+    field = model.amplitude_image(GRID, x, y, model.height_nm, amplitude)
+    picture = np.empty(GRID.shape)
+    nodes = 2 * lens.half + 1
+    signal_image(
+        table.heights[0, 0].reshape(2, nodes, -1),
+        lens,
+        model.pixels(GRID),
+        x,
+        y,
+        amplitude,
+        picture,
+    )
+    assert np.abs(picture - field).max() < 1e-12
