@@ -26,7 +26,7 @@ from iscat_analysis._kernels.lattice_rows import (
     lattice_signal,
     rows_needed,
 )
-from iscat_analysis._kernels.radial_rows import radial_gradient, radial_parts, radial_signal
+from iscat_analysis._kernels.radial_rows import radial_image, radial_signal
 from iscat_analysis._kernels.stamp import stamp_gradient, stamp_signal
 
 FloatArray = NDArray[np.float64]
@@ -111,7 +111,7 @@ def signal_parts(
     which are P and Q themselves.
     """
     if not lens.half:
-        radial_parts(profile, lens, pixels, x_p, y_p, out)
+        radial_image(profile, lens, pixels, x_p, y_p, unit, out)
         return
     f = _begin_lattice(profile, lens, pixels, x_p, y_p, False)
     for row in range(pixels.y.size):
@@ -178,4 +178,4 @@ def signal_gradient(
         for row in range(pixels.y.size):
             lattice_gradient(lens, pixels, row, y_p, amplitude, f, out[row])
     else:
-        radial_gradient(profile, lens, pixels, x_p, y_p, amplitude, out)
+        radial_image(profile, lens, pixels, x_p, y_p, amplitude, out)

@@ -29,7 +29,7 @@ FloatArray = NDArray[np.float64]
 _DX, _DY, _SUMS = DISTANCE + 1, DISTANCE + 2, DISTANCE + 3
 """Rows of scratch after those of the quintics: dx, dy, and what is summed over the samples."""
 
-_SCRATCH = 20
+_SCRATCH = _SUMS + 5
 _STRIP = 256  # pixels, or one row of more
 
 
@@ -114,13 +114,6 @@ def _add_parts(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _strip(rows: int, columns: int) -> tuple[int, FloatArray]:
-    """Choose the rows of a strip, as many as there are at most, and make its scratch."""
-    together = min(max(_STRIP // columns, 1), rows)
-    return together, np.empty((_SCRATCH, padded(together * columns)))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _begin(f: FloatArray, count: int) -> None:
     """Clear the sums of a strip."""
     for k in range(_SUMS, _SUMS + count):
@@ -139,45 +132,37 @@ def _end(f: FloatArray, first: int, rows: int, out: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def radial_gradient(
+def radial_image(
     profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
     out: FloatArray,
 ) -> None:  # fmt: skip
-    """As `iscat_analysis._kernels.image.signal_gradient`."""
+    """Fill `out` (ny, 5, nx) with signal and gradient, or (ny, 2, nx) with the parts of a signal.
+
+    These are as in `signal_gradient` and `signal_parts` of `iscat_analysis._kernels.image`; the
+    parts do not depend on the amplitude.
+    """
     x, y, offsets, weights = pixels.x, pixels.y, pixels.offsets, pixels.weights
-    together, f = _strip(y.size, x.size)
+    together = min(max(_STRIP // x.size, 1), y.size)
+    f = np.empty((_SCRATCH, padded(together * x.size)))
     for first in range(0, y.size, together):
         rows = y[first : first + together]
         _begin(f, out.shape[1])
         for i in range(offsets.size):
             for j in range(offsets.size):
                 _place(lens.inv_step, x, rows, x_p - offsets[j], y_p - offsets[i], f)
-                evaluate_slopes(profile, f)
-                _add_gradient(
-                    lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross,
-                    lens.ring, amplitude, weights[i] * weights[j], f,
-                )  # fmt: skip
-        _end(f, first, rows.size, out)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def radial_parts(
-    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, out: FloatArray
-) -> None:
-    """As `iscat_analysis._kernels.image.signal_parts`."""
-    x, y, offsets, weights = pixels.x, pixels.y, pixels.offsets, pixels.weights
-    together, f = _strip(y.size, x.size)
-    for first in range(0, y.size, together):
-        rows = y[first : first + together]
-        _begin(f, out.shape[1])
-        for i in range(offsets.size):
-            for j in range(offsets.size):
-                _place(lens.inv_step, x, rows, x_p - offsets[j], y_p - offsets[i], f)
-                evaluate(profile, f)
-                _add_parts(
-                    lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross, lens.ring,
-                    weights[i] * weights[j], f,
-                )  # fmt: skip
+                weight = weights[i] * weights[j]
+                if out.shape[1] == 5:
+                    evaluate_slopes(profile, f)
+                    _add_gradient(
+                        lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross,
+                        lens.ring, amplitude, weight, f,
+                    )  # fmt: skip
+                else:
+                    evaluate(profile, f)
+                    _add_parts(
+                        lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross, lens.ring,
+                        weight, f,
+                    )  # fmt: skip
         _end(f, first, rows.size, out)
 
 
@@ -188,7 +173,7 @@ def radial_signal(
 ) -> None:  # fmt: skip
     """As `iscat_analysis._kernels.image.signal_image`."""
     parts = np.empty((out.shape[0], 2, out.shape[1]))
-    radial_parts(profile, lens, pixels, x_p, y_p, parts)
+    radial_image(profile, lens, pixels, x_p, y_p, amplitude, parts)
     for row in range(out.shape[0]):
         for j in range(out.shape[1]):
             out[row, j] = amplitude * (parts[row, 0, j] + amplitude * parts[row, 1, j])

@@ -124,8 +124,8 @@ def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged
             extra, amplitudes = _all_pixels(field, ground, of_track, fisher, index)
             together[k] = mine, amplitudes
         else:
-            taken_by = lost(field, ground, of_track)
-            extra, taken[k] = _common_modes(fisher, taken_by, index)
+            hidden = lost(field, ground, of_track)
+            extra, taken[k] = _common_modes(fisher, hidden, index)
         covariance[np.ix_(mine, index, index)] = extra
 
     field.share(of_one, tracks)

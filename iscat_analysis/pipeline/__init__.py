@@ -27,7 +27,7 @@ from iscat_analysis.pipeline.landing import find_landings
 from iscat_analysis.pipeline.prepare import Prepared, prepare
 from iscat_analysis.pipeline.results import Found
 from iscat_analysis.pipeline.resume import is_resumable, partial_folder
-from iscat_analysis.pipeline.run import Notify, Run
+from iscat_analysis.pipeline.run import Notify, Run, unheard
 from iscat_analysis.pipeline.tracking import find_moving
 from iscat_analysis.pipeline.ways import Way, way_of
 from iscat_analysis.places import Here, Place
@@ -46,10 +46,6 @@ FEW_FIGURES = 2
 """Events of a landing movie that are drawn for print; the page shows hundreds."""
 
 
-def _quiet(text: str) -> None:
-    """Say nothing."""
-
-
 def fit_stack(
     stack: Path,
     config: Config,
@@ -57,7 +53,7 @@ def fit_stack(
     out: Path | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
-    notify: Notify = _quiet,
+    notify: Notify = unheard,
     command: str = "",
     inject: int = 0,
     place: Place | None = None,
@@ -130,7 +126,7 @@ def analyse(
     config: Config,
     *,
     progress: Progress = silent,
-    notify: Notify = _quiet,
+    notify: Notify = unheard,
     command: str = "",
     partial: Path | None = None,
     inject: int = 0,

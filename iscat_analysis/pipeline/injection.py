@@ -28,7 +28,7 @@ from iscat_analysis.pipeline.landing import analyse_landings
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.ranges import fitted_frames
 from iscat_analysis.pipeline.results import Found
-from iscat_analysis.pipeline.run import Run
+from iscat_analysis.pipeline.run import Run, unheard
 from iscat_analysis.pipeline.scene import Scene, reported_steps
 from iscat_analysis.places import Place
 from iscat_analysis.records import FRAME_COLUMN, CountSource, FloatArray, Progress, Status
@@ -247,7 +247,7 @@ def inject_and_recover(
         InjectedMovie(movie, camera, particles, seed, result.trajectory),
         config.model_copy(update={"background": fixed}),
         camera,
-        tell=_unheard,
+        tell=unheard,  # the user has been told already
         progress=progress,
         lines=result.scene.lines,
         place=place,
@@ -263,10 +263,6 @@ def inject_and_recover(
         sign=reported_steps(result.scene),
         threshold=result.scene.templates.threshold,
     )
-
-
-def _unheard(text: str) -> None:
-    """Say nothing: the user has been told already."""
 
 
 def draw_particles(

@@ -16,6 +16,10 @@ from iscat_analysis.records import Progress
 Notify = Callable[[str], None]
 
 
+def unheard(text: str) -> None:
+    """Tell nobody."""
+
+
 class Clock:
     """Seconds since the last lap, by name."""
 
