@@ -17,7 +17,13 @@ Notify = Callable[[str], None]
 
 
 def unheard(text: str) -> None:
-    """Tell nobody."""
+    """Tell nobody.
+
+    Parameters
+    ----------
+    text : str
+        What would have been told.
+    """
 
 
 class Clock:
