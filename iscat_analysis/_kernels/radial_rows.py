@@ -114,21 +114,43 @@ def _add_parts(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _begin(f: FloatArray, count: int) -> None:
-    """Clear the sums of a strip."""
-    for k in range(_SUMS, _SUMS + count):
-        for j in range(f.shape[1]):
-            f[k, j] = 0.0
+def strip_scratch(pixels: Pixels) -> tuple[int, FloatArray]:
+    """Rows of pixels in a strip, and its scratch."""
+    together = min(max(_STRIP // pixels.x.size, 1), pixels.y.size)
+    return together, np.empty((_SCRATCH, padded(together * pixels.x.size)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _end(f: FloatArray, first: int, rows: int, out: FloatArray) -> None:
-    """Copy the sums of a strip to the rows of an image, from `first` on."""
-    columns = out.shape[2]
-    for i in range(rows):
-        for k in range(out.shape[1]):
-            for j in range(columns):
-                out[first + i, k, j] = f[_SUMS + k, i * columns + j]
+def radial_strip(
+    profile: FloatArray, lens: Lens, pixels: Pixels, first: int, last: int, x_p: float, y_p: float,
+    amplitude: float, count: int, f: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """Make rows `first` to `last` of signal and gradient (`count` 5) or of the parts (2).
+
+    Returns the lines of `f` that hold them, of all pixels one after the other; the parts do not
+    depend on the amplitude.
+    """
+    x, y, offsets, weights = pixels.x, pixels.y[first:last], pixels.offsets, pixels.weights
+    sums = f[_SUMS : _SUMS + count]
+    for k in range(count):
+        for j in range(sums.shape[1]):
+            sums[k, j] = 0.0
+    for i in range(offsets.size):
+        for j in range(offsets.size):
+            _place(lens.inv_step, x, y, x_p - offsets[j], y_p - offsets[i], f)
+            weight = weights[i] * weights[j]
+            if count == 5:
+                evaluate_slopes(profile, f)
+                _add_gradient(
+                    lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross,
+                    lens.ring, amplitude, weight, f,
+                )  # fmt: skip
+            else:
+                evaluate(profile, f)
+                _add_parts(
+                    lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross, lens.ring, weight, f,
+                )  # fmt: skip
+    return sums
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -138,32 +160,17 @@ def radial_image(
 ) -> None:  # fmt: skip
     """Fill `out` (ny, 5, nx) with signal and gradient, or (ny, 2, nx) with the parts of a signal.
 
-    These are as in `signal_gradient` and `signal_parts` of `iscat_analysis._kernels.image`; the
-    parts do not depend on the amplitude.
+    These are as in `signal_gradient` and `signal_parts` of `iscat_analysis._kernels.image`.
     """
-    x, y, offsets, weights = pixels.x, pixels.y, pixels.offsets, pixels.weights
-    together = min(max(_STRIP // x.size, 1), y.size)
-    f = np.empty((_SCRATCH, padded(together * x.size)))
-    for first in range(0, y.size, together):
-        rows = y[first : first + together]
-        _begin(f, out.shape[1])
-        for i in range(offsets.size):
-            for j in range(offsets.size):
-                _place(lens.inv_step, x, rows, x_p - offsets[j], y_p - offsets[i], f)
-                weight = weights[i] * weights[j]
-                if out.shape[1] == 5:
-                    evaluate_slopes(profile, f)
-                    _add_gradient(
-                        lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross,
-                        lens.ring, amplitude, weight, f,
-                    )  # fmt: skip
-                else:
-                    evaluate(profile, f)
-                    _add_parts(
-                        lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross, lens.ring,
-                        weight, f,
-                    )  # fmt: skip
-        _end(f, first, rows.size, out)
+    rows, count, columns = out.shape
+    together, f = strip_scratch(pixels)
+    for first in range(0, rows, together):
+        last = min(first + together, rows)
+        sums = radial_strip(profile, lens, pixels, first, last, x_p, y_p, amplitude, count, f)
+        for row in range(first, last):
+            for k in range(count):
+                for j in range(columns):
+                    out[row, k, j] = sums[k, (row - first) * columns + j]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")

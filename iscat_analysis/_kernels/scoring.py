@@ -28,7 +28,7 @@ from iscat_analysis._kernels.image import (
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lattice_rows import lattice_span
 from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_at
-from iscat_analysis._kernels.radial_rows import intervals_needed
+from iscat_analysis._kernels.radial_rows import intervals_needed, radial_strip, strip_scratch
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -52,9 +52,8 @@ _TOGETHER = 256
 
 
 @njit(inline="always")
-def _log_ratio(change: float, base: float) -> float:
-    """ln(1+x) = 2 artanh(x/(2+x)) of x = change/base, by its series; 1e-16 for |x| < SERIES."""
-    w = change / (2.0 * base + change)
+def _twice_artanh(w: float) -> float:
+    """ln(1+x) for w = x/(2+x), by its series; 1e-16 for |x| < SERIES."""
     w2 = w * w
     tail = 1 / 3 + w2 * (1 / 5 + w2 * (1 / 7 + w2 * (1 / 9 + w2 * (1 / 11 + w2 / 13))))
     return 2.0 * w * (1.0 + w2 * tail)
@@ -64,38 +63,43 @@ def _log_ratio(change: float, base: float) -> float:
 def _some_value(
     kind: int, data: FloatArray, first: int, last: int, level: float, s: FloatArray
 ) -> float:
-    """Log-likelihood of some pixels of data (4, n), whose signals are s (n)."""
+    """Log-likelihood of some pixels of data (4, n); their signals are the first of s."""
+    c0, c1 = data[0, first:last], data[1, first:last]
+    c2, c3 = data[2, first:last], data[3, first:last]
     total, beyond = 0.0, 0  # counted, because the largest would be found one after the other
     if kind == CONDITIONAL:
-        for j in range(first, last):
+        for j in range(c0.size):
             beyond += abs(level * (1.0 + s[j]) - 1.0) >= SERIES
         if not beyond:
-            for j in range(first, last):
+            for j in range(c0.size):
                 change = level * (1.0 + s[j]) - 1.0
-                later = _log_ratio(change * data[2, j], 1.0 + data[2, j])
-                total += data[3, j] * (data[0, j] * _log_ratio(change, 1.0) - data[1, j] * later)
+                part = change * c2[j]
+                one, other = 2.0 + change, 2.0 * (1.0 + c2[j]) + part
+                per = 1.0 / (one * other)  # of both quotients, as it takes longer than the rest
+                now, later = _twice_artanh(change * other * per), _twice_artanh(part * one * per)
+                total += c3[j] * (c0[j] * now - c1[j] * later)
         else:
-            for j in range(first, last):
+            for j in range(c0.size):
                 stretch = max(level * (1.0 + s[j]), FLOOR)
-                share = data[2, j] / (1.0 + data[2, j])
-                total += data[3, j] * (
-                    data[0, j] * np.log(stretch) - data[1, j] * np.log1p((stretch - 1.0) * share)
+                share = c2[j] / (1.0 + c2[j])
+                total += c3[j] * (
+                    c0[j] * np.log(stretch) - c1[j] * np.log1p((stretch - 1.0) * share)
                 )
         return total
-    for j in range(first, last):
-        base = data[1, j] + data[3, j]
-        rate = level * (data[1, j] + data[2, j] * s[j]) + data[3, j]
+    for j in range(c0.size):
+        base = c1[j] + c3[j]
+        rate = level * (c1[j] + c2[j] * s[j]) + c3[j]
         beyond += abs(rate - base) >= SERIES * max(base, FLOOR)
     if not beyond:
-        for j in range(first, last):
-            base = max(data[1, j] + data[3, j], FLOOR)
-            change = level * (data[1, j] + data[2, j] * s[j]) + data[3, j] - base
-            total += data[0, j] * _log_ratio(change, base) - change
+        for j in range(c0.size):
+            base = max(c1[j] + c3[j], FLOOR)
+            change = level * (c1[j] + c2[j] * s[j]) + c3[j] - base
+            total += c0[j] * _twice_artanh(change / (2.0 * base + change)) - change
     else:
-        for j in range(first, last):
-            base = max(data[1, j] + data[3, j], FLOOR)
-            rate = level * (data[1, j] + data[2, j] * s[j]) + data[3, j]
-            total += data[0, j] * np.log(max(rate, FLOOR) / base) - (rate - base)
+        for j in range(c0.size):
+            base = max(c1[j] + c3[j], FLOOR)
+            rate = level * (c1[j] + c2[j] * s[j]) + c3[j]
+            total += c0[j] * np.log(max(rate, FLOOR) / base) - (rate - base)
     return total
 
 
@@ -104,16 +108,22 @@ def signal_value(kind: int, data: FloatArray, level: float, s: FloatArray) -> fl
     """Log-likelihood of signals s (ny·nx,), relative to that without a particle."""
     flat, total = data.reshape(4, s.size), 0.0
     for first in range(0, s.size, _TOGETHER):
-        total += _some_value(kind, flat, first, min(first + _TOGETHER, s.size), level, s)
+        last = min(first + _TOGETHER, s.size)
+        total += _some_value(kind, flat, first, last, level, s[first:last])
     return total
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def row_score(
-    kind: int, data: FloatArray, row: int, level: float, g: FloatArray, sums: FloatArray
-) -> None:
-    """Add one row to the 5 scores and 15 Fisher entries in `sums`; g holds s and its gradient."""
-    c0, c1, c2, c3 = data[0, row], data[1, row], data[2, row], data[3, row]
+def _add_score(
+    kind: int, data: FloatArray, first: int, last: int, level: float, g: FloatArray,
+    sums: FloatArray,
+) -> None:  # fmt: skip
+    """Add some pixels of data (4, n) to the 5 scores and 15 Fisher entries in `sums`.
+
+    g (5, last − first or more) holds their signals and the gradient.
+    """
+    c0, c1 = data[0, first:last], data[1, first:last]
+    c2, c3 = data[2, first:last], data[3, first:last]
     b0 = b1 = b2 = b3 = b4 = 0.0
     f00 = f01 = f02 = f03 = f04 = 0.0
     f11 = f12 = f13 = f14 = 0.0
@@ -184,12 +194,12 @@ def image_value(kind: int, data: FloatArray, level: float, rows: FloatArray) -> 
     """Log-likelihood of an image; `rows` (ny, 5 or more, nx) holds s and its gradient."""
     ny, nx = rows.shape[0], rows.shape[2]
     flat, total, together = data.reshape(4, ny * nx), 0.0, max(_TOGETHER // nx, 1)
-    s = np.empty(ny * nx)
+    s = np.empty(together * nx)
     for first in range(0, ny, together):
         last = min(first + together, ny)
         for i in range(first, last):
             for j in range(nx):
-                s[i * nx + j] = rows[i, 0, j]
+                s[(i - first) * nx + j] = rows[i, 0, j]
         total += _some_value(kind, flat, first * nx, last * nx, level, s)
     return total
 
@@ -204,9 +214,16 @@ def image_score(
     fisher: FloatArray,
 ) -> None:
     """Fill score (5) and Fisher matrix (5, 5) of an image; `rows` as in `image_value`."""
-    sums = np.zeros(20)
-    for row in range(rows.shape[0]):
-        row_score(kind, data, row, level, rows[row], sums)
+    ny, nx = rows.shape[0], rows.shape[2]
+    flat, sums = data.reshape(4, ny * nx), np.zeros(20)
+    for row in range(ny):
+        _add_score(kind, flat, row * nx, (row + 1) * nx, level, rows[row], sums)
+    _unpack(sums, score, fisher)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _unpack(sums: FloatArray, score: FloatArray, fisher: FloatArray) -> None:
+    """Fill score and Fisher matrix from the sums of `_add_score`."""
     k = 5
     for i in range(5):
         score[i] = sums[i]
@@ -228,7 +245,18 @@ def score_pass(
 ) -> float:
     """Fill score (5) and Fisher matrix (5, 5) at θ and return the log-likelihood."""
     level = np.exp(theta[4])
-    g = np.empty((pixels.y.size, 5, pixels.x.size))
+    ny, nx = pixels.y.size, pixels.x.size
+    if not (lens.fine or lens.half):  # strip by strip, as long as the first cache holds it
+        flat, sums, total = data.reshape(4, ny * nx), np.zeros(20), 0.0
+        together, f = strip_scratch(pixels)
+        for row in range(0, ny, together):
+            end = min(row + together, ny)
+            here = radial_strip(profile, lens, pixels, row, end, theta[0], theta[1], theta[3], 5, f)
+            _add_score(kind, flat, row * nx, end * nx, level, here, sums)
+            total += _some_value(kind, flat, row * nx, end * nx, level, here[0])
+        _unpack(sums, score, fisher)
+        return total
+    g = np.empty((ny, 5, nx))
     signal_gradient(profile, lens, pixels, theta[0], theta[1], theta[3], g)
     image_score(kind, data, level, g, score, fisher)
     value: float = image_value(kind, data, level, g)
