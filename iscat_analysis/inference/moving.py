@@ -87,6 +87,8 @@ class MovingField:
         Largest amplitude that is searched.
     pool : ThreadPoolExecutor
         Runs blocks of frames; the result does not depend on its size.
+    saturated : ndarray of bool, shape (y, x), optional
+        Pixels that were too bright in some frame, which are not used.
     """
 
     def __init__(
@@ -102,8 +104,10 @@ class MovingField:
         z_range_nm: tuple[float, float] | None,
         largest: float,
         pool: ThreadPoolExecutor,
+        saturated: BoolArray | None = None,
     ) -> None:
         self.counts_e, self.used = counts_e, used
+        self.saturated = np.zeros_like(used) if saturated is None else saturated
         self.read_e2 = np.ascontiguousarray(np.broadcast_to(read_e2, used.shape), dtype=float)
         self._pool = pool
         rows, columns = used.shape

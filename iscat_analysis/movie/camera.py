@@ -71,6 +71,24 @@ class Camera:
         electrons *= self.gain_e_per_adu
         return electrons
 
+    def to_counts(self, electrons: NDArray[Any]) -> FloatArray:
+        """Convert photoelectrons to counts, the inverse of `to_electrons`.
+
+        Parameters
+        ----------
+        electrons : ndarray, shape (..., y, x)
+            Photoelectrons [e].
+
+        Returns
+        -------
+        ndarray of float64, shape (..., y, x)
+            electrons/gain + offset [counts], not rounded.
+        """
+        counts = np.array(electrons, dtype=np.float64)
+        counts /= self.gain_e_per_adu
+        counts += self.offset_adu
+        return counts
+
     def saturated(self, counts: NDArray[Any]) -> BoolArray:
         """Find the pixels that were too bright to be measured.
 

@@ -18,6 +18,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.linking import typical_error
 from iscat_analysis.pipeline.moving import follow
 from iscat_analysis.pipeline.moving_table import common_masses, moving_table
+from iscat_analysis.pipeline.noise import judge_beside
 from iscat_analysis.pipeline.resume import Shelf, packed_views, unpacked_views
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import BoolArray, EventView, FloatArray, FrameSource, Progress, Windows
@@ -49,8 +50,10 @@ class Block:
         Power of each frame, 1 on average.
     total_e : ndarray, shape (y, x)
         Sum of the frames [e].
-    used : ndarray of bool, shape (y, x)
-        Pixels that were used.
+    used, saturated : ndarray of bool, shape (y, x)
+        Pixels that were used, and those that were not because they were too bright in some frame.
+    gain_message : str
+        What the noise says of the gain; empty where they agree, and in all blocks but the first.
     """
 
     span: tuple[int, int]
@@ -64,6 +67,8 @@ class Block:
     power: FloatArray
     total_e: FloatArray
     used: BoolArray
+    saturated: BoolArray
+    gain_message: str = ""
 
     @property
     def frames(self) -> int:
@@ -93,7 +98,7 @@ class Block:
             read_variance_before_e2=read,
             read_variance_after_e2=read,
             masked=~self.used,
-            saturated=np.zeros_like(self.used),
+            saturated=self.saturated,
             frames_before=self.span,
             frames_after=self.span,
             power=np.concatenate([self.power, self.power]),
@@ -147,6 +152,16 @@ def analyse_block(
     table, inside = moving_table(scene, moving, first), moving.field.holds(moving.rows.theta)
     best = table.loc[table[inside].groupby("track")["snr"].idxmax()]
     field, rows = moving.field, moving.rows
+    ground = moving.ground
+
+    def without(count: int) -> FloatArray:
+        light: FloatArray = ground.level * ground.power[:count, None, None]
+        return light + field.residual(ground, rows, 0, count)
+
+    gain_message = ""
+    if not goes_on[0]:
+        seen = rows.frame + first, rows.theta[:, :2]
+        gain_message = judge_beside(scene, movie, camera, span, seen, field.used, without)
     return Block(
         span=span,
         rows=replace(rows, frame=rows.frame + first),
@@ -161,6 +176,8 @@ def analyse_block(
         power=moving.ground.power,
         total_e=field.counts_e.sum(axis=0, dtype=np.float64),
         used=field.used,
+        saturated=field.saturated,
+        gain_message=gain_message,
     )
 
 
@@ -244,6 +261,8 @@ class BlockStore(Shelf):
                 power=data["power"],
                 total_e=data["total_e"],
                 used=data["used"],
+                saturated=data["saturated"],
+                gain_message=str(data["gain_message"]),
             )
         except (ValueError, KeyError):
             return None
@@ -269,6 +288,7 @@ class BlockStore(Shelf):
             "events": np.array([view.event for view in block.views], dtype=np.int64),
             **packed_views(block.views),
             "level": block.level, "power": block.power, "total_e": block.total_e,
-            "used": block.used,
+            "used": block.used, "saturated": block.saturated,
+            "gain_message": np.array(block.gain_message),
         }  # fmt: skip
         self.write(number, block.table, arrays)

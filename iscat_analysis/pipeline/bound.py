@@ -9,6 +9,7 @@ from itertools import zip_longest
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from iscat_analysis.pipeline.diagnosis import (
     drift_warning,
@@ -17,17 +18,17 @@ from iscat_analysis.pipeline.diagnosis import (
     pixel_warnings,
 )
 from iscat_analysis.pipeline.events import Event, posterior_of
-from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.noise import Noise, judge_background
+from iscat_analysis.pipeline.field import add_signal, fit_field
+from iscat_analysis.pipeline.noise import Noise, judge_background, judge_beside
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.ranges import checked, frame_ranges, measured_windows
-from iscat_analysis.pipeline.regions import contrast_image
+from iscat_analysis.pipeline.regions import Region, contrast_image
 from iscat_analysis.pipeline.repeats import field_repeats
 from iscat_analysis.pipeline.results import Compared, Found, table_of, view_of
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.pipeline.tracking import track_frames
-from iscat_analysis.records import PosteriorResult, Progress, Windows
+from iscat_analysis.records import FloatArray, PosteriorResult, Progress, Windows
 from iscat_analysis.threads import threads
 
 
@@ -61,6 +62,9 @@ def find_bound(ready: Prepared, run: Run) -> Found:
                 scene, movie, camera, windows, summary,
                 check=checked(movie, camera), pool=pool, progress=run.progress,
             )  # fmt: skip
+            wrong = "" if windows.n_before else _judged_beside(ready, scene, windows, found.table)
+            if wrong:
+                run.tell(wrong)
         else:
             found = _together(ready, run, scene, windows, noise, summary, pool)
     run.clock.lap("results")
@@ -76,14 +80,12 @@ def _background(ready: Prepared, run: Run) -> tuple[Scene, Windows, Noise, dict[
     run.warm_up(scene)
     run.clock.lap("model")
     windows = measured_windows(movie, config, camera, before, after, progress=run.progress)
-    noise = judge_background(movie, camera, windows)
+    noise = judge_background(movie, camera, windows, still=config.fit.mode != "track")
     if noise.spectrum is not None:
         scene = make_scene(
             config, ready.shape, searches=searches, noise=noise.spectrum, lines=ready.lines
         )
-    saturated = int(windows.saturated.sum())
-    defects = int(np.sum(windows.masked & ~windows.saturated))
-    for text in (*noise.said(movie.name), *pixel_warnings(defects, saturated)):
+    for text in (*noise.said(movie.name), *pixel_warnings(*windows.left_out)):
         run.tell(text)
     summary: dict[str, Any] = {}
     if not scene.additive:
@@ -94,6 +96,28 @@ def _background(ready: Prepared, run: Run) -> tuple[Scene, Windows, Noise, dict[
             run.tell(moved)
     run.clock.lap("background")
     return scene, windows, noise, summary
+
+
+def _judged_beside(ready: Prepared, scene: Scene, windows: Windows, table: pd.DataFrame) -> str:
+    """Judge the gain where the background is known and all frames hold particles that move."""
+    movie, camera, (first, last) = ready.steady, ready.camera, windows.frames_after
+    frame = table["frame"].to_numpy(np.int64)
+    particles = table[["x_nm", "y_nm", "z_nm", "mass_kda"]].to_numpy(float)
+    rows, columns = ready.shape
+    field = Region((0, rows), (0, columns))
+
+    def without(count: int) -> FloatArray:
+        electrons = camera.to_electrons(movie.read(first, first + count))
+        for number, image in enumerate(electrons if not scene.additive else ()):
+            signal = np.zeros(field.shape)
+            for x, y, z, mass in particles[frame == first + number].tolist():
+                add_signal(scene, (x, y, z, mass), field, signal)
+            image /= 1 + signal
+        return electrons
+
+    return judge_beside(
+        scene, movie, camera, (first, last), (frame, particles[:, :2]), ~windows.masked, without
+    )
 
 
 def _together(

@@ -229,6 +229,7 @@ def _together(blocks: Sequence[Block], parts: Sequence[Windows]) -> Windows:
         read_variance_before_e2=frames / blocks[0].frames * parts[0].read_variance_before_e2,
         read_variance_after_e2=frames / blocks[0].frames * parts[0].read_variance_after_e2,
         masked=np.logical_or.reduce([p.masked for p in parts]),
+        saturated=np.logical_or.reduce([p.saturated for p in parts]),
         frames_before=span,
         frames_after=span,
         power=np.concatenate([power, power]),

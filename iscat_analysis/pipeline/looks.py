@@ -239,7 +239,12 @@ class BoundSearch:
         self._windows = measured_windows(
             self._movie, config, camera, before, (after[0], after[0] + 1)
         )
-        noise = judge_background(self._movie, camera, self._windows)
+        noise = judge_background(
+            self._movie,
+            camera,
+            replace(self._windows, n_after=self.longest, frames_after=after),
+            still=not tracked,
+        )
         searches = self.longest if tracked else 1
         self._scene = make_scene(
             config, shape, searches=searches, noise=noise.spectrum, lines=lines

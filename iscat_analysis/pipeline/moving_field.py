@@ -132,7 +132,7 @@ def load_field(
         counts, read, ~masked, scene.model, scene.wide,
         pixel_nm=scene.pixel_nm, roi_px=scene.roi_px,
         z_range_nm=scene.config.fit.z_range_nm if free_z else None,
-        largest=100 * nominal, pool=pool,
+        largest=100 * nominal, pool=pool, saturated=saturated,
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from iscat_analysis.inference.common import variances_left
 from iscat_analysis.inference.fit import POOR_FIT_P
 from iscat_analysis.optics.blur import PATH_SPREAD, blurred
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+from iscat_analysis.pieces.regions import saturated_near
 from iscat_analysis.pipeline.linking import unlike
 from iscat_analysis.pipeline.moving import Moving
 from iscat_analysis.pipeline.paths import path_covariances
@@ -239,10 +240,15 @@ def _flags(
     rows, free = moving.rows, np.flatnonzero(moving.field.free[:4])
     lost = ~moving.converged | ~np.isfinite(sigma[:, free]).all(axis=1)
     poor = (p_value < POOR_FIT_P) | (losses > LARGEST_LOSS)
-    bound = moving.field.on_wall(rows)
+    field = moving.field
+    too_bright = np.zeros(len(rows.frame), dtype=np.bool_)
+    if field.saturated.any():
+        too_bright[:] = [
+            saturated_near(field.saturated, x, y, field.pixel_nm) for x, y in rows.theta[:, :2]
+        ]
     marks = (
-        (lost, Status.NOT_CONVERGED), (bound, Status.AT_BOUND), (poor, Status.POOR_FIT),
-        (moving.close, Status.TOO_CLOSE),
+        (lost, Status.NOT_CONVERGED), (field.on_wall(rows), Status.AT_BOUND),
+        (too_bright, Status.SATURATED), (poor, Status.POOR_FIT), (moving.close, Status.TOO_CLOSE),
     )  # fmt: skip
     return [[mark for told, mark in marks if told[i]] for i in range(len(rows.frame))]
 

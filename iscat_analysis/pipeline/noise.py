@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
@@ -15,7 +16,8 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain
 from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.pipeline.chunks import NOISE_FRAMES, Reader
-from iscat_analysis.records import BoolArray, Mapper, Windows
+from iscat_analysis.pipeline.scene import Scene
+from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Mapper, Windows
 from iscat_analysis.search.sliding import (
     SHORTEST_MOVIE,
     NoiseCurve,
@@ -31,6 +33,9 @@ SPECTRUM_FRAMES = 128
 """Background frames on which the spectrum of the noise is measured."""
 
 _GAIN_FRAMES = 64  # on which the gain is judged
+_FEWEST_FRAMES = 8  # in which particles that move leave pixels free
+_FREE = 0.25  # of the pixels at least, that no particle comes near in these frames
+_AWAY = 1.5  # λ/NA from a particle, from where its light changes the variance by some per cent
 
 
 @dataclass(frozen=True)
@@ -100,7 +105,7 @@ def judge_counts(
     Noise
         Silent of the gain where it is too dark to tell.
     """
-    spectrum = measure_spectrum(counts, camera, mapper=mapper)
+    spectrum = measure_spectrum(counts, camera, masked=masked, mapper=mapper)
     try:
         gain = diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=masked)
     except DataError:  # too dark to tell
@@ -110,8 +115,8 @@ def judge_counts(
     return Noise(message, message if gain.noise_ratio > EXCESS_NOISE else "", spectrum)
 
 
-def judge_background(movie: Stack, camera: Camera, windows: Windows) -> Noise:
-    """Judge the noise of the background frames.
+def judge_background(movie: Stack, camera: Camera, windows: Windows, *, still: bool) -> Noise:
+    """Judge the noise of the background frames; where it is known, of those with the particles.
 
     Parameters
     ----------
@@ -120,17 +125,76 @@ def judge_background(movie: Stack, camera: Camera, windows: Windows) -> Noise:
     camera : Camera
         Counts → photoelectrons.
     windows : Windows
-        The background.
+        The background, and the frames after it.
+    still : bool
+        Whether particles stay where they are in these; otherwise nothing is judged where the
+        background is known, and `judge_beside` does once they are found.
 
     Returns
     -------
     Noise
         Silent where there is no shot noise to look at.
     """
-    if windows.n_before < 2 or not is_lit(windows):
+    frames = windows.n_before or (windows.n_after if still else 0)
+    if frames < 2 or not is_lit(windows):
         return Noise()
     counts = first_counts(movie, windows, SPECTRUM_FRAMES)
     return judge_counts(counts, camera, masked=windows.masked)
+
+
+def judge_beside(
+    scene: Scene,
+    movie: FrameSource,
+    camera: Camera,
+    span: tuple[int, int],
+    seen: tuple[NDArray[np.int64], FloatArray],
+    used: BoolArray,
+    without: Callable[[int], FloatArray],
+) -> str:
+    """Judge the gain by frames in which particles move, from pixels that none of them comes near.
+
+    Particles that move add to the variance between frames.  Where they are near, pixels are left
+    out; farther away their rings are taken off as they were fitted, and where a fit went astray
+    that adds as well: the gain is called wrong only where it seems so with the rings and without.
+
+    Parameters
+    ----------
+    scene : Scene
+        Size of a pixel, and resolution.
+    movie : FrameSource
+        The movie.
+    camera : Camera
+        Counts → photoelectrons.
+    span : (int, int)
+        Half-open range of frames; the first of them are looked at, fewer where particles go
+        everywhere in them.
+    seen : (ndarray of int, shape (n,), ndarray, shape (n, 2))
+        Frame of the movie and place x, y [nm] of every particle in every frame, as it was fitted.
+    used : ndarray of bool, shape (y, x)
+        Pixels that may be used.
+    without : callable
+        Number of frames → the first of the span without the light of the particles [e].
+
+    Returns
+    -------
+    str
+        As `Noise.gain_message`; empty where particles leave too few pixels free.
+    """
+    optics = scene.config.optics
+    away = _AWAY * optics.wavelength_nm / optics.na
+    y, x = np.indices(used.shape) * scene.pixel_nm
+    frame, places_nm = seen
+    count = min(_GAIN_FRAMES, span[1] - span[0])
+    while count >= _FEWEST_FRAMES:
+        free = used.copy()
+        for place in places_nm[(frame >= span[0]) & (frame < span[0] + count)]:
+            free &= np.hypot(x - place[0], y - place[1]) > away
+        if free.any() and free.sum() >= _FREE * used.sum():
+            counts = movie.read(span[0], span[0] + count)
+            said = judge_counts(camera.to_counts(without(count)), camera, masked=~free).gain_message
+            return said if judge_counts(counts, camera, masked=~free).gain_message else ""
+        count //= 2
+    return ""
 
 
 def judge_opening(
@@ -254,7 +318,7 @@ def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -
 
 
 def first_counts(movie: Stack, windows: Windows, most: int) -> NDArray[Any]:
-    """Read the first background frames.
+    """Read the first background frames, or those after it where it is known.
 
     Parameters
     ----------
@@ -270,7 +334,7 @@ def first_counts(movie: Stack, windows: Windows, most: int) -> NDArray[Any]:
     ndarray, shape (t, y, x)
         Counts.
     """
-    start, stop = windows.frames_before
+    start, stop = windows.frames_before if windows.n_before else windows.frames_after
     return movie.read(start, min(stop, start + most))
 
 

@@ -19,6 +19,7 @@ from iscat_analysis.pieces.regions import table_from
 from iscat_analysis.pipeline.blank import FrameNoise
 from iscat_analysis.pipeline.block_store import Block, BlockStore, analyse_block
 from iscat_analysis.pipeline.blocks import Plan, plan_blocks
+from iscat_analysis.pipeline.diagnosis import pixel_warnings
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.joining import join_blocks
@@ -30,7 +31,6 @@ from iscat_analysis.pipeline.results import Compared, Followed, Found, rows_of, 
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import EventView, FloatArray, FrameSource, Progress, Windows
-from iscat_analysis.report.numbers import count
 from iscat_analysis.search.moving import link
 from iscat_analysis.threads import threads
 
@@ -77,9 +77,10 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         )
     joined = join_blocks(config, blocks, camera)
     windows = joined.followed.windows
-    masked = int(windows.masked.sum())
-    if masked:
-        run.tell(f"{count(masked, 'pixel')} left out: dead, hot, or saturated in some frame")
+    if blocks[0].gain_message:
+        run.tell(blocks[0].gain_message)
+    for text in pixel_warnings(*windows.left_out):
+        run.tell(text)
     run.clock.lap("track")
     return Found(
         scene=replace(scene, mode="track", config=config),

@@ -97,6 +97,12 @@ class Windows:
     frames_after: tuple[int, int]
     power: FloatArray
 
+    @property
+    def left_out(self) -> tuple[int, int]:
+        """Numbers of dead or hot pixels, and of saturated ones."""
+        defects = self.masked & ~self.saturated
+        return int(defects.sum()), int(self.saturated.sum())
+
     def cut(self, region: tuple[slice, slice]) -> Windows:
         """Give the sums of some pixels.
 

@@ -203,6 +203,7 @@ def _block(span: tuple[int, int], tracks: list[tuple[range, float, float, float]
         span=span, rows=Rows.of(frame, track, theta), error=1.0, table=pd.DataFrame(),
         inside=np.ones(len(frame), dtype=bool), masses=pd.DataFrame(), views=(),
         level=nothing, power=np.ones(span[1] - span[0]), total_e=nothing, used=nothing == 0,
+        saturated=nothing > 0,
     )  # fmt: skip
 
 

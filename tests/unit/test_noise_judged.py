@@ -1,0 +1,124 @@
+"""Saturated pixels and a wrong gain are remarked on, whichever frames make the background."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scenes import PIXEL_NM, make_config
+from wanderers import wander
+
+from iscat_analysis.config import Config
+from iscat_analysis.movie import open_stack
+from iscat_analysis.movie.camera import camera_from_config
+from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.pieces.regions import SATURATION_NM
+from iscat_analysis.pipeline import analyse
+from iscat_analysis.pipeline.noise import judge_beside
+from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.records import Analysis
+
+GAIN, TOO_LARGE = 20.0, 1.6
+SHAPE, FRAMES, LEVEL_E = (40, 44), 26, 2e5
+FIT = {"roi_nm": 1800.0, "frames": None}
+TOLERANCE = 0.1  # of a gain, from which on it is said to be off
+
+Counts = NDArray[np.uint16]
+
+
+def _config(mode: str, gain: float, **background: Any) -> Config:
+    return make_config(
+        background={"frames": None, "power_normalization": False, **background},
+        camera={"pixel_size_nm": PIXEL_NM, "frame_rate_hz": 331.0, "gain_e_per_adu": gain},
+        optics={"calibrate": "never"},
+        particle={"mass_kda": 2000.0},
+        fit={"mode": mode, **FIT},
+        track={"free": "mass"},
+        simulation={"shape": list(SHAPE)},
+    )
+
+
+def _known(mode: str, gain: float) -> Config:
+    return _config(mode, gain, method="known", level_e=LEVEL_E * gain / GAIN)
+
+
+def _learnt(gain: float) -> Config:
+    return _config("track", gain, power_normalization=True)
+
+
+def _movie(*, moves: bool) -> Counts:
+    """Make counts of one particle over a flat background."""
+    rng = np.random.default_rng(6)
+    config = _known("mass", GAIN)
+    model, grid = forward_model(config, 1e4), PixelGrid.region((0, 40), (0, 44), PIXEL_NM)
+    steps = rng.normal(0, 60.0 if moves else 0.0, (FRAMES, 2))
+    places = np.array([1600.0, 1700.0]) + np.cumsum(steps, axis=0)
+    signal = np.array([model.image(grid, x, y, model.height_nm, 2000.0) for x, y in places])
+    electrons = rng.poisson(LEVEL_E * (1 + signal))
+    return np.floor(electrons / GAIN + rng.random(electrons.shape)).astype(np.uint16)
+
+
+@pytest.fixture(scope="module")
+def wandering() -> Counts:
+    species = ((400.0, 0.15, 1), (300.0, 0.4, 1))
+    return wander((60, *SHAPE), seed=4, species=species, gain_e_per_adu=GAIN).counts
+
+
+def _analysed(counts: Counts, config: Config) -> Analysis:
+    with open_stack(counts) as movie:
+        return analyse(movie, config)
+
+
+def _gains(found: Analysis) -> list[float]:
+    """Gains that are advised."""
+    words = " ".join(found.warnings)
+    return [float(gain) for gain in re.findall(r"set camera\.gain_e_per_adu = ([\d.]+)", words)]
+
+
+@pytest.mark.parametrize("way", ["track", "known track", "known mass"])
+def test_a_wrong_gain_is_named(way: str, wandering: Counts) -> None:
+    mode = way.split()[-1]
+    if way == "track":
+        counts, right, wrong = wandering, *(_learnt(gain) for gain in (GAIN, TOO_LARGE * GAIN))
+    else:
+        counts = _movie(moves=mode == "track")
+        right, wrong = (_known(mode, gain) for gain in (GAIN, TOO_LARGE * GAIN))
+    assert not _gains(_analysed(counts, right))
+    found = _analysed(counts, wrong)
+    (advised,) = _gains(found)
+    assert advised == pytest.approx(GAIN, rel=TOLERANCE)
+    assert len(found.table)
+
+
+def test_particles_that_go_everywhere_leave_nothing_to_judge(wandering: Counts) -> None:
+    """Their motion alone would be taken for noise; where none comes near, it is judged."""
+    config = _config("track", TOO_LARGE * GAIN)
+    scene, used = make_scene(config, SHAPE), np.ones(SHAPE, dtype=bool)
+    camera = camera_from_config(config.camera, SHAPE, np.uint16)
+    frame = np.repeat(np.arange(60), 20)
+    everywhere = np.random.default_rng(1).uniform(0, 40 * PIXEL_NM, (frame.size, 2))
+    with open_stack(wandering) as movie:
+        said = [
+            judge_beside(
+                scene, movie, camera, (0, 60), (frame, places), used,
+                lambda count: camera.to_electrons(wandering[:count]),
+            )
+            for places in (everywhere, everywhere + 1e5)
+        ]  # fmt: skip
+    assert not said[0]
+    assert said[1]
+
+
+def test_tracks_near_saturated_pixels_are_flagged() -> None:
+    counts, y, x = _movie(moves=True), 21, 19
+    counts[20, y, x] = np.iinfo(np.uint16).max
+    found = _analysed(counts, _config("track", GAIN))
+    table = found.table
+    near = np.hypot(table["x_px"] - x, table["y_px"] - y) * PIXEL_NM < SATURATION_NM
+    assert 0 < near.sum() < len(table)
+    assert (table["flags"].str.contains("saturated") == near).all()
+    assert any("1 pixel is saturated" in text for text in found.warnings)
+    assert found.summary["masked_pixels"] == 1
