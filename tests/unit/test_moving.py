@@ -356,4 +356,4 @@ def test_an_empty_movie_has_no_tracks(tmp_path: Path) -> None:
     tifffile.imwrite(movie, counts, photometric="minisblack")
     found = fit_stack(movie, _config(camera={"frame_rate_hz": None}))
     assert len(found.table) == 0
-    assert "1 pixel left out: dead, hot, or saturated in some frame" in found.warnings
+    assert "1 dead or hot pixel is left out" in found.warnings
