@@ -152,7 +152,7 @@ def analyse(movie: InstrumentMovie, config: Config, said: list[str]) -> Found:
 
 def counted(result: Found) -> pd.DataFrame:
     """Give the rows of a result that are not side lobes."""
-    return result.table[result.table["status"] != "sidelobe"].reset_index(drop=True)
+    return result.fits[result.fits["status"] != "sidelobe"].reset_index(drop=True)
 
 
 def judge(name: str, seed: int) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def analyse(config: Config, seed: int) -> tuple[pd.DataFrame, Found]:
 
 def match(steps: pd.DataFrame, result: Found, pixel_nm: float) -> pd.DataFrame:
     """Add to every step what was found of it; the nearest in space, each row once."""
-    window, table = result.summary["window_frames"], result.table
+    window, table = result.summary["window_frames"], result.fits
     taken: set[int] = set()
     rows = []
     for step in steps.itertuples():
@@ -191,7 +191,7 @@ def main() -> int:
     blank = config.model_copy(update={"simulation": nothing, "detection": one})
     alarms = []
     for seed in range(options.seed, options.seed + blanks):
-        alarms.append(len(analyse(blank, 1000 + seed)[1].table))
+        alarms.append(len(analyse(blank, 1000 + seed)[1].fits))
         print(f"blank {seed}: {alarms[-1]}", flush=True)
     low, high = poisson.ppf(TAIL / 2, blanks), poisson.isf(TAIL / 2, blanks)
     promises.hold(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -152,50 +152,65 @@ def fit_rois(
     compile_kernels(counts.model)
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
-    return table_from(rows)
+    return numbered(lines_from(rows), range(count))
 
 
-def table_from(
-    rows: Sequence[dict[str, Any]], numbers: Sequence[int] | NDArray[np.int64] | None = None
-) -> pd.DataFrame:
-    """Make a table of rows.
+def lines_from(lines: Sequence[Mapping[str, Any]], *further: str) -> pd.DataFrame:
+    """Put fits below one another.
 
     Parameters
     ----------
-    rows : sequence of dict
-        With the keys `EVENT_COLUMNS`.
-    numbers : sequence of int, optional
-        Of the events, where they are not those of the rows.
+    lines : sequence of mapping
+        From `line_of`; what one does not have is empty.
+    *further : str
+        Columns beside `EVENT_COLUMNS` that all of them have, of whole numbers.
 
     Returns
     -------
     pandas.DataFrame
-        Columns `EVENT_COLUMNS`; a frame that is not known is empty.
+        Columns `EVENT_COLUMNS` but for ``event``, and `further`; a frame that is not known is
+        empty.
     """
-    table = pd.DataFrame(list(rows), columns=list(EVENT_COLUMNS))
-    if numbers is not None:
-        table["event"] = numbers
+    names = [name for name in (*EVENT_COLUMNS, *further) if name != "event"]
+    table = pd.DataFrame(list(lines), columns=names)
     known = bool(table["frame"].notna().all())
-    kinds = dict.fromkeys(("event", "n_before", "n_after"), "int64")
+    kinds = dict.fromkeys(("n_before", "n_after", *further), "int64")
     kinds["frame"] = "int64" if known else "Int64"
-    texts = ("status", "flags")
-    values = [name for name in EVENT_COLUMNS if name not in kinds and name not in texts]
-    return table.astype({**kinds, **dict.fromkeys(values, "float64")})
+    kinds |= dict.fromkeys(("status", "flags"), "object")
+    return table.astype({name: kinds.get(name, "float64") for name in names})
 
 
-def row_of(
+def numbered(lines: pd.DataFrame, numbers: Sequence[int] | NDArray[np.int64]) -> pd.DataFrame:
+    """Make rows of lines: the number of an event is known where all events are.
+
+    Parameters
+    ----------
+    lines : pandas.DataFrame
+        From `lines_from`, of all events, in their order.
+    numbers : sequence of int
+        Of the events.
+
+    Returns
+    -------
+    pandas.DataFrame
+        ``event``, then the columns of the lines; rows are counted from 0.
+    """
+    event = pd.Series(np.asarray(numbers, dtype=np.int64), name="event")
+    return pd.concat([event, lines.reset_index(drop=True)], axis=1)
+
+
+def line_of(
     likelihood: Likelihood,
     fit: FitResult,
     collected: float,
     *,
     flags: Iterable[Status],
-    event: int,
     frame: int | None,
     n_before: int,
     n_after: int,
     sign: int = 1,
 ) -> dict[str, Any]:
-    """Put a fit and its bounds into a row of the table.
+    """Put a fit and its bounds into a line of the table, which has no number yet.
 
     Parameters
     ----------
@@ -207,8 +222,6 @@ def row_of(
         Scattered photons that the pupil collected in the frames after.
     flags : iterable of Status
         What the fit and its surroundings are remarked for.
-    event : int
-        Number of the row.
     frame : int or None
         First frame of the new state, where it is known.
     n_before, n_after : int
@@ -219,7 +232,7 @@ def row_of(
     Returns
     -------
     dict
-        With the keys `EVENT_COLUMNS`.
+        With the keys `EVENT_COLUMNS`, but for ``event``.
     """
     model, pixel_nm = likelihood.model, likelihood.grid.pixel_nm
     bounds = event_bounds(
@@ -227,7 +240,6 @@ def row_of(
     )
     status, noticed = verdict(flags)
     row: dict[str, Any] = {
-        "event": event,
         "frame": frame,
         "n_before": n_before,
         "n_after": n_after,
@@ -261,7 +273,6 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
         flags = [Status.NOT_CONVERGED, *([Status.SATURATED] if saturated.any() else [])]
         status, noticed = verdict(flags)
         return {
-            "event": index,
             "n_before": counts.n_before,
             "n_after": counts.n_after,
             "status": str(status),
@@ -280,9 +291,9 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
     if saturated_near(saturated, fit.x_nm, fit.y_nm, pixel_nm):
         flags.append(Status.SATURATED)
     collected = counts.collected(index, fit.z_nm, fit.mass_kda)
-    return row_of(
+    return line_of(
         likelihood, fit.shifted(corner[1] * pixel_nm, corner[0] * pixel_nm), collected,
-        flags=flags, event=index, frame=None, n_before=counts.n_before, n_after=counts.n_after,
+        flags=flags, frame=None, n_before=counts.n_before, n_after=counts.n_after,
     )  # fmt: skip
 
 

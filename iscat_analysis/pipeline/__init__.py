@@ -1,12 +1,12 @@
 """The main job: load → calibrate → background → detect → fit → posterior → bounds → report.
 
 `analyse` is that line.  `prepare` loads and calibrates; one of `FIND` measures the background,
-searches, fits and samples, and gives each event its row with the bounds; `gather` sets the errors
-that events share, and those that their own frames show, beside them, and describes tracks and
-species.  Which of `FIND` is asked follows from ``background.method`` alone (`ways`).
+searches, fits, samples and bounds; `gather` makes the rows, and describes tracks and species.
+Which of `FIND` is asked follows from ``background.method`` alone (`ways`).
 
 An event is a candidate, then `Fitted` while its neighbours are being found, then an `Event` with
-the verdict on it, and at last a row of the table.
+the verdict on it.  Its row is made when all events are there, with its number and with the errors
+that are known only then (`rows`).
 """
 
 from __future__ import annotations

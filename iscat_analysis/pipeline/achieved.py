@@ -1,4 +1,4 @@
-"""The measured spread of an analysis: columns ``repeat_*``, and the pooled ratio to the bound."""
+"""The measured spread of an analysis: that of each event, and the pooled ratio to the bound."""
 
 from __future__ import annotations
 
@@ -63,8 +63,10 @@ def measure_spread(
     return found
 
 
-def with_repeats(mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray]) -> pd.DataFrame:
-    """Add the columns ``repeat_*``: the error of each event as its own frames show it.
+def repeat_columns(
+    mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray]
+) -> dict[str, FloatArray]:
+    """Give the columns ``repeat_*``: the error of each event as its own frames show it.
 
     Parameters
     ----------
@@ -77,8 +79,8 @@ def with_repeats(mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray]) 
 
     Returns
     -------
-    pandas.DataFrame
-        A copy; NaN where the parameter is not free or the frames could not be compared.
+    dict of str to ndarray
+        By column; NaN where the parameter is not free or the frames could not be compared.
     """
     columns = {name: np.full(len(table), np.nan) for name in REPEAT_COLUMNS}
     for k, name in enumerate(FREE_PARAMETERS[mode]):
@@ -86,28 +88,23 @@ def with_repeats(mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray]) 
         with np.errstate(divide="ignore", invalid="ignore"):
             spread = np.sqrt(squares / counts)
         columns[f"repeat_{name}"] = table[f"crb_{name}"].to_numpy(float) * spread
-    return table.assign(**columns)
+    return columns
 
 
-def with_measured_sigma(table: pd.DataFrame, found: Mapping[str, Achieved]) -> pd.DataFrame:
-    """Scale σ by the measured spread over the bound, for ``fit.sigma = "measured"``.
+def measured_scale(found: Mapping[str, Achieved]) -> dict[str, float]:
+    """Give what σ is multiplied by with ``fit.sigma = "measured"``: the spread over the bound.
 
     Parameters
     ----------
-    table : pandas.DataFrame
-        With columns ``sigma_*``.
     found : mapping of str to Achieved
         From `measure_spread`.
 
     Returns
     -------
-    pandas.DataFrame
-        A copy; σ never becomes smaller.
+    dict of str to float
+        By column ``sigma_*``; never less than 1.
     """
-    return table.assign(
-        **{f"sigma_{name}": table[f"sigma_{name}"] * max(a.over_crb, 1.0)
-           for name, a in found.items()}
-    )  # fmt: skip
+    return {f"sigma_{name}": max(a.over_crb, 1.0) for name, a in found.items()}
 
 
 def spread_verdict(

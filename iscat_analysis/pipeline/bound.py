@@ -62,7 +62,7 @@ def find_bound(ready: Prepared, run: Run) -> Found:
                 scene, movie, camera, windows, summary,
                 check=checked(movie, camera), pool=pool, progress=run.progress,
             )  # fmt: skip
-            wrong = "" if windows.n_before else _judged_beside(ready, scene, windows, found.table)
+            wrong = "" if windows.n_before else _judged_beside(ready, scene, windows, found.fits)
             if wrong:
                 run.tell(wrong)
         else:
@@ -146,7 +146,7 @@ def _together(
         run.clock.lap("posterior")
     return Found(
         scene=scene,
-        table=table_of(scene, events),
+        fits=table_of(scene, events),
         views=tuple(
             view_of(number, event, posterior=chain)
             for number, (event, chain) in enumerate(zip_longest(events, chains))

@@ -11,15 +11,23 @@ from iscat_analysis.config import Config
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.spectrum import NoiseSpectrum
+from iscat_analysis.pieces.regions import lines_from
 from iscat_analysis.pipeline.chunks import Reader, counts_budget
 from iscat_analysis.pipeline.diagnosis import misfit_warning
 from iscat_analysis.pipeline.events import posterior_of
 from iscat_analysis.pipeline.merging import CLIPS, VIEWS, Done
 from iscat_analysis.pipeline.pattern import corrected
-from iscat_analysis.pipeline.results import table_of, view_of
+from iscat_analysis.pipeline.results import lines_of, view_of
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.pipeline.steps import ChunkFitter
-from iscat_analysis.records import CountSource, FloatArray, PosteriorResult, Progress, silent
+from iscat_analysis.records import (
+    FRAME_COLUMN,
+    CountSource,
+    FloatArray,
+    PosteriorResult,
+    Progress,
+    silent,
+)
 from iscat_analysis.search.sliding import STRIDES, Chunk, stride_of
 from iscat_analysis.threads import threads
 
@@ -157,7 +165,7 @@ def analyse_chunk(
     light = np.where(chunk.good, chunk.power, np.nan) * float(chunk.mean_e.mean())
     return Done(
         core=core,
-        table=table_of(scene, events, dated=True, mapper=pool.map),
+        lines=lines_from(lines_of(scene, events, mapper=pool.map), FRAME_COLUMN),
         repeats=np.array([step.repeats for step in steps]),
         views=tuple(
             view_of(n, events[n], posterior=chains.get(n), trace=trace, clip=clip)

@@ -9,59 +9,17 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.config import config_to_toml
-from iscat_analysis.inference.achieved import Achieved
 from iscat_analysis.movie.stack import printable
-from iscat_analysis.pipeline.achieved import (
-    measure_spread,
-    spread_verdict,
-    with_measured_sigma,
-    with_repeats,
-)
+from iscat_analysis.pipeline.achieved import spread_verdict
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.results import Found
+from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.summary import summary_of
-from iscat_analysis.pipeline.systematic import with_systematic
 from iscat_analysis.pipeline.tracks import make_films, tracks_of
-from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.places import versions
 from iscat_analysis.records import Analysis, Film, Provenance, silent
 from iscat_analysis.report.spread import rejection
-
-
-def with_errors(found: Found) -> tuple[pd.DataFrame, dict[str, Achieved], dict[str, Any]]:
-    """Put what all events share, and what their own frames show, beside the errors of the fits.
-
-    Parameters
-    ----------
-    found : Found
-        Events with the errors of their likelihoods.
-
-    Returns
-    -------
-    table : pandas.DataFrame
-        With the columns ``systematic_*`` and ``repeat_*``, where they are known; with
-        ``fit.sigma = "measured"`` σ is scaled by the measured spread.
-    achieved : dict of str to Achieved
-        The measured spread over the bound, by free parameter.
-    verdict : dict
-        What ``summary.json`` says of it; empty where nothing could be compared.
-    """
-    config, mode = found.scene.config, found.scene.mode
-    table = with_systematic(config, found.table)
-    if not found.repeats:
-        return table, {}, {}
-    achieved = measure_spread(mode, table, found.repeats, found.empty)
-    rejected = bool(rejection(table))
-    table = with_repeats(mode, table, found.repeats)
-    scaled = config.fit.sigma == "measured"
-    if scaled:
-        table = with_measured_sigma(table, achieved)
-    verdict = spread_verdict(
-        achieved, found.summary,
-        scaled=scaled, rejected=rejected, sliding=way_of(config) == "sliding",
-    )  # fmt: skip
-    return table, achieved, verdict
 
 
 def gather(
@@ -108,11 +66,21 @@ def gather(
     if found.summary:
         further[found.heading] = found.summary
     further |= extra
-    table, achieved, verdict = with_errors(found)
-    if verdict:
+    table, achieved = reported_rows(found)
+    scaled = config.fit.sigma == "measured"
+    if found.repeats:
+        verdict = spread_verdict(
+            achieved, found.summary,
+            scaled=scaled, rejected=bool(rejection(table)), sliding=ready.way == "sliding",
+        )  # fmt: skip
         further["repeats"] = verdict
         if verdict["message"]:
             run.tell(verdict["message"])
+    elif scaled and len(table):
+        run.tell(
+            'fit.sigma = "measured" has no effect: the spread is not measured where the background '
+            "is learnt with the tracks, and σ is that of the likelihood"
+        )
     tracks: pd.DataFrame | None = None
     films: tuple[Film, ...] = ()
     if found.followed is not None:

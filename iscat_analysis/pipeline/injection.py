@@ -28,6 +28,7 @@ from iscat_analysis.pipeline.landing import analyse_landings
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.ranges import fitted_frames
 from iscat_analysis.pipeline.results import Found
+from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.pipeline.run import Run, unheard
 from iscat_analysis.pipeline.scene import Scene, reported_steps
 from iscat_analysis.places import Place
@@ -241,7 +242,7 @@ def inject_and_recover(
     fixed = config.background.model_copy(update={"window_frames": window})
     seed = config.compute.seed
     particles = draw_particles(
-        result.scene, (movie.shape[1], movie.shape[2]), frames, window, count, result.table, seed
+        result.scene, (movie.shape[1], movie.shape[2]), frames, window, count, result.fits, seed
     )
     again = analyse_landings(
         InjectedMovie(movie, camera, particles, seed, result.trajectory),
@@ -254,9 +255,10 @@ def inject_and_recover(
     )
     if again.interrupted:
         raise KeyboardInterrupt
+    rows, _ = reported_rows(again)
     return recovery(
         particles,
-        again.table[again.table["status"] != Status.SIDELOBE],
+        rows[rows["status"] != Status.SIDELOBE],
         frames[1],
         result.scene.roi_px / 2,
         window,

@@ -43,7 +43,7 @@ class Joined:
 
     Attributes
     ----------
-    table : pandas.DataFrame
+    fits : pandas.DataFrame
         One row per particle and frame.
     views : tuple of EventView
         One per track, of its clearest frame.
@@ -51,7 +51,7 @@ class Joined:
         Backgrounds, and the masses of tracks.
     """
 
-    table: pd.DataFrame
+    fits: pd.DataFrame
     views: tuple[EventView, ...]
     followed: Followed
 

@@ -191,7 +191,7 @@ def analyse_landings(
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
             interrupted = True
-    table, views, repeats = merged.result(scene)
+    fits, views, repeats = merged.result()
     light = merged.light()
     wanted = config.background.drift_correction
     for text in frame_warnings(movie.name, merged, light, first, window, corrected=wanted):
@@ -207,7 +207,7 @@ def analyse_landings(
         "window_frames": window,
         "stride_frames": stride,
         "boundaries_searched": count,
-        **_counted(table),
+        **_counted(fits),
         "shot_noise_limited_frames": curve.shot_limited,
         "noise_frames": list(curve.frames),
         "noise_variance_over_shot": list(curve.variance_over_shot),
@@ -219,7 +219,7 @@ def analyse_landings(
     }
     return Found(
         scene=scene,
-        table=table,
+        fits=fits,
         views=views,
         image=scene.contrasts(merged.image),
         compared=Compared(

@@ -10,8 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.movie.drift import Trajectory, measure_drift
-from iscat_analysis.pipeline.results import table_of
-from iscat_analysis.pipeline.scene import Scene
+from iscat_analysis.pieces.regions import lines_from, numbered
 from iscat_analysis.records import FRAME_COLUMN, BoolArray, EventView, FloatArray
 from iscat_analysis.search.empty import EmptySpread
 
@@ -29,7 +28,7 @@ class Done:
     """What is kept of a finished chunk."""
 
     core: tuple[int, int]
-    table: pd.DataFrame  # numbered in the chunk
+    lines: pd.DataFrame  # of fits.csv, which have no numbers yet
     repeats: FloatArray  # of every row, from `iscat_analysis.inference.repeats`
     views: tuple[EventView, ...]
     good: BoolArray  # of the core
@@ -85,14 +84,12 @@ class Merged:
         image: FloatArray = self._strongest[1]
         return image
 
-    def result(
-        self, scene: Scene
-    ) -> tuple[pd.DataFrame, tuple[EventView, ...], tuple[FloatArray, ...]]:
+    def result(self) -> tuple[pd.DataFrame, tuple[EventView, ...], tuple[FloatArray, ...]]:
         """Events of all chunks, each once, numbered in order of frame; their views and repeats."""
-        if not any(len(done.table) for done in self._done):
-            return table_of(scene, [], dated=True), (), ()
-        homes = [(done, row) for done in self._done for row in range(len(done.table))]
-        table = pd.concat([d.table for d in self._done if len(d.table)], ignore_index=True)
+        homes = [(done, row) for done in self._done for row in range(len(done.lines))]
+        if not homes:
+            return numbered(lines_from([], FRAME_COLUMN), []), (), ()
+        table = pd.concat([d.lines for d in self._done if len(d.lines)], ignore_index=True)
         cores = np.array([done.core for done, _ in homes])
         frame = table["frame"].to_numpy()
         own = (frame >= cores[:, 0]) & (frame < cores[:, 1])
@@ -104,15 +101,14 @@ class Merged:
             if not _same(table, int(stranger), kept):
                 kept = np.append(kept, stranger)
         order = sorted(kept, key=lambda i: (frame[i], table["y_nm"].iloc[i], table["x_nm"].iloc[i]))
-        result = table.iloc[order].reset_index(drop=True)
-        result["event"] = np.arange(len(result), dtype=np.int64)
         views, repeats = [], []
         for number, i in enumerate(order):
             done, row = homes[i]
             repeats.append(done.repeats[row])
             if number < VIEWS and row < len(done.views):
                 views.append(replace(done.views[row], event=number))
-        return result, tuple(views), tuple(repeats)
+        rows = numbered(table.iloc[order], range(len(order)))
+        return rows, tuple(views), tuple(repeats)
 
     def light(self) -> FloatArray:
         """Light of the frames that are done; NaN where one was left out."""

@@ -6,11 +6,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from iscat_analysis.movie.drift import Trajectory
-from iscat_analysis.pieces.regions import row_of, table_from
+from iscat_analysis.pieces.regions import line_of, lines_from, numbered
 from iscat_analysis.pipeline.events import Event, Fitted
 from iscat_analysis.pipeline.regions import photons_scale
 from iscat_analysis.pipeline.scene import Scene
@@ -96,10 +95,11 @@ class Found:
     ----------
     scene : Scene
         Models, threshold and the configuration as it was used.
-    table : pandas.DataFrame
-        Columns `EVENT_COLUMNS`; of a landing movie also `FRAME_COLUMN`.
+    fits : pandas.DataFrame
+        Columns `EVENT_COLUMNS`, with the errors of the likelihoods alone; of a landing movie also
+        `FRAME_COLUMN`, of one in mode ``track`` also ``track``.
     views : tuple of EventView
-        Images, in the order of the table, or one per track; of the first events only, where there
+        Images, in the order of the fits, or one per track; of the first events only, where there
         are many.
     image : ndarray, shape (y, x)
         Contrast of the field; of a landing movie that of the strongest step at each pixel.
@@ -123,7 +123,7 @@ class Found:
     """
 
     scene: Scene
-    table: pd.DataFrame
+    fits: pd.DataFrame
     views: tuple[EventView, ...]
     image: FloatArray
     compared: Compared
@@ -160,7 +160,7 @@ def collected_photons(scene: Scene, event: Event) -> float:
     return per_pixel * area / scene.pixel_nm**2
 
 
-def rows_of(
+def lines_of(
     scene: Scene, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
 ) -> list[dict[str, Any]]:
     """Make the lines of ``fits.csv``.
@@ -177,50 +177,35 @@ def rows_of(
     Returns
     -------
     list of dict
-        With the keys `EVENT_COLUMNS`, numbered from 0; and `FRAME_COLUMN`, where steps were dated.
+        As from `line_of`; with `FRAME_COLUMN`, where steps were dated.
     """
-    return list(mapper(lambda n, event: _row(scene, n, event), range(len(events)), events))
+    return list(mapper(lambda event: _line(scene, event), events))
 
 
-def _row(scene: Scene, number: int, event: Event) -> dict[str, Any]:
-    row = row_of(
+def _line(scene: Scene, event: Event) -> dict[str, Any]:
+    line = line_of(
         event.likelihood, event.fit, collected_photons(scene, event), flags=event.flags,
-        event=number, frame=event.frame, n_before=event.n_before, n_after=event.n_after,
-        sign=event.sign,
+        frame=event.frame, n_before=event.n_before, n_after=event.n_after, sign=event.sign,
     )  # fmt: skip
-    return row if event.half_width is None else row | {FRAME_COLUMN: event.half_width}
+    return line if event.half_width is None else line | {FRAME_COLUMN: event.half_width}
 
 
-def table_of(
-    scene: Scene,
-    events: Sequence[Event],
-    *,
-    dated: bool = False,
-    mapper: Callable[..., Iterable[Any]] = map,
-) -> pd.DataFrame:
-    """Make the table of ``fits.csv``.
+def table_of(scene: Scene, events: Sequence[Event]) -> pd.DataFrame:
+    """Make a table of events whose frames are given.
 
     Parameters
     ----------
     scene : Scene
         Models.
     events : sequence of Event
-        The events.
-    dated : bool
-        Whether they are steps of a landing movie, whose frames have errors.
-    mapper : callable
-        `map`, or the one of a pool.
+        The events, in their order.
 
     Returns
     -------
     pandas.DataFrame
-        Columns `EVENT_COLUMNS`, and `FRAME_COLUMN` where `dated`.
+        Columns `EVENT_COLUMNS`.
     """
-    rows = rows_of(scene, events, mapper=mapper)
-    table = table_from(rows)
-    if dated:
-        table[FRAME_COLUMN] = np.array([row[FRAME_COLUMN] for row in rows], dtype=np.int64)
-    return table
+    return numbered(lines_from(lines_of(scene, events)), range(len(events)))
 
 
 def view_of(

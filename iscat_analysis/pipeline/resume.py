@@ -126,12 +126,12 @@ class Store(Shelf):
         found = self.read(number)
         if found is None:
             return None
-        table, data = found
+        lines, data = found
         try:
             low, high = (int(n) for n in data["core"])
             return Done(
                 core=(low, high),
-                table=table,
+                lines=lines,
                 repeats=data["repeats"],
                 views=unpacked_views(data),
                 good=data["good"],
@@ -165,7 +165,7 @@ class Store(Shelf):
             "number": np.empty(0) if done.empty is None else done.empty.counts,
             "shared": np.empty(0) if done.empty is None else done.empty.shared,
         }
-        self.write(number, done.table, arrays)
+        self.write(number, done.lines, arrays)
 
 
 def packed_views(views: Sequence[EventView]) -> dict[str, FloatArray]:

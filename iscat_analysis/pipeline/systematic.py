@@ -58,31 +58,6 @@ def systematic(config: Config, table: pd.DataFrame) -> dict[str, FloatArray]:
     return {name: np.sqrt(squares[name]) for name in _COMMON if name in squares}
 
 
-def with_systematic(config: Config, table: pd.DataFrame) -> pd.DataFrame:
-    """Put the columns ``systematic_*`` after ``flags``.
-
-    Parameters
-    ----------
-    config : Config
-        Says what was calibrated, and how well.
-    table : pandas.DataFrame
-        Events, with the columns of ``fits.csv``.
-
-    Returns
-    -------
-    pandas.DataFrame
-        The same table where no such error is known.
-    """
-    found = systematic(config, table)
-    if not found:
-        return table
-    changed = table.copy()
-    place = list(table.columns).index("flags") + 1
-    for name in reversed(found):
-        changed.insert(place, f"systematic_{name}", found[name])
-    return changed
-
-
 def _of_the_line(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
     """Give what the line between contrast and mass may be wrong by."""
     line = config.calibration

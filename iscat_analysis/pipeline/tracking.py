@@ -15,7 +15,7 @@ import numpy as np
 
 from iscat_analysis.movie.background import Check, add_frames, start_power
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.pieces.regions import table_from
+from iscat_analysis.pieces.regions import lines_from, numbered
 from iscat_analysis.pipeline.blank import FrameNoise
 from iscat_analysis.pipeline.block_store import Block, BlockStore, analyse_block
 from iscat_analysis.pipeline.blocks import Plan, plan_blocks
@@ -27,7 +27,7 @@ from iscat_analysis.pipeline.moving_field import track_scene
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.ranges import checked, fitted_frames
 from iscat_analysis.pipeline.regions import contrast_image
-from iscat_analysis.pipeline.results import Compared, Followed, Found, rows_of, view_of
+from iscat_analysis.pipeline.results import Compared, Followed, Found, lines_of, view_of
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import EventView, FloatArray, FrameSource, Progress, Windows
@@ -84,7 +84,7 @@ def find_moving(ready: Prepared, run: Run) -> Found:
     run.clock.lap("track")
     return Found(
         scene=replace(scene, mode="track", config=config),
-        table=joined.table,
+        fits=joined.fits,
         views=joined.views,
         image=windows.after_e / windows.before_e - 1,
         compared=Compared.of(windows),
@@ -216,7 +216,7 @@ def track_frames(
         the frames that are done.
     """
     first, last = windows.frames_after
-    rows: list[dict[str, Any]] = []
+    lines: list[dict[str, Any]] = []
     views: list[EventView] = []
     repeats: list[FloatArray] = []
     noise: FrameNoise | None = None
@@ -233,23 +233,24 @@ def track_frames(
             if events and noise is not None:
                 repeats += [noise.look(here, events)] * len(events)
             views += [view_of(number, event) for number, event in enumerate(events)]
-            rows += rows_of(scene, events)  # last: of what an interrupt cuts off, no row is
+            lines += lines_of(scene, events)  # last: of what an interrupt cuts off, no line is
             progress("track", frame + 1 - first, last - first)
     except KeyboardInterrupt:
         interrupted = True
     track = scene.config.track
-    places = np.array([(row["x_nm"], row["y_nm"]) for row in rows]).reshape(-1, 2)
-    frames = np.array([row["frame"] for row in rows], dtype=np.int64)
+    places = np.array([(line["x_nm"], line["y_nm"]) for line in lines]).reshape(-1, 2)
+    frames = np.array([line["frame"] for line in lines], dtype=np.int64)
     numbers = link(frames, places, reach_nm=track.max_step_nm, memory=track.memory_frames)
     order = np.lexsort((frames, numbers))
-    table = table_from([rows[k] for k in order], numbers[order])
+    own = numbers[order]
+    fits = numbered(lines_from([lines[k] for k in order]).assign(track=own), own)
     seen: dict[int, EventView] = {}
-    for number, view in zip(numbers.tolist(), views[: len(rows)], strict=True):
+    for number, view in zip(numbers.tolist(), views[: len(lines)], strict=True):
         if number not in seen:
             seen[number] = replace(view, event=number)
     return Found(
         scene=scene,
-        table=table.assign(track=table["event"]),
+        fits=fits,
         views=tuple(seen[number] for number in sorted(seen)),
         image=contrast_image(scene, windows),
         compared=Compared.of(windows),

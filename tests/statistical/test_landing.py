@@ -80,7 +80,7 @@ def _analyse(config: Config, seed: int) -> pd.DataFrame:
     return analyse_landings(
         Memory(counts), config, Camera(gain_e_per_adu=4.0),
         tell=lambda _: None, progress=lambda *_: None,
-    ).table  # fmt: skip
+    ).fits  # fmt: skip
 
 
 # ---- blank movies ----------------------------------------------------------------------------
@@ -153,7 +153,7 @@ def _alarms_in(kind: str, movies: int) -> int:
             analyse_landings(
                 Memory(np.clip(counts, 0, 65535).astype(np.uint16)), config,
                 Camera(gain_e_per_adu=4.0), tell=lambda _: None, progress=lambda *_: None,
-            ).table
+            ).fits
         )  # fmt: skip
     return found
 

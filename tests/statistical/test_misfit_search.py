@@ -72,7 +72,7 @@ def test_a_wrong_model_finds_what_is_there_and_no_more(
     instrument: Instrument, cause: str | None
 ) -> None:
     result, said = _analysed(instrument)
-    table = result.table[result.table["status"] != "sidelobe"]
+    table = result.fits[result.table["status"] != "sidelobe"]
     for x, y, frame in zip(LANDINGS.x_px, LANDINGS.y_px, LANDINGS.frame, strict=True):
         near = np.hypot(table["x_px"] - x, table["y_px"] - y) < 3
         near &= np.abs(table["frame"] - frame) <= 8 + table["frame_ci95"]
@@ -119,7 +119,7 @@ def test_a_wrong_gain_is_said_and_invents_nothing() -> None:
     """Seven times the noise that the camera's gain predicts: the threshold knows what it is."""
     result, said = _analysed(Instrument(), gain=28.0)
     assert any(re.search(r"set camera\.gain_e_per_adu = [34]\.", text) for text in said)
-    assert 0.9 * COUNT <= len(result.table) <= COUNT
+    assert 0.9 * COUNT <= len(result.fits) <= COUNT
 
 
 def test_noise_that_passes_the_threshold_everywhere_stops_the_search(

@@ -131,7 +131,7 @@ def plain(counts: np.ndarray) -> tuple[Any, list[str]]:
 def test_every_step_is_found_dated_and_weighed(plain: tuple[Any, list[str]]) -> None:
     result, told = plain
     assert told == []
-    table = result.table
+    table = result.fits
     assert list(table.columns) == [*EVENT_COLUMNS, FRAME_COLUMN]
     _assert_all_found(table)
     assert set(table["status"]) == {"ok"}
@@ -145,7 +145,7 @@ def test_every_step_is_found_dated_and_weighed(plain: tuple[Any, list[str]]) -> 
 
 def test_the_bound_is_that_of_the_frames_used(plain: tuple[Any, list[str]]) -> None:
     """n_b n_a/(n_b + n_a) frames inform: the 480 kDa steps differ by their windows alone."""
-    table = plain[0].table
+    table = plain[0].fits
     heavy = table[table["mass_kda"].abs() > 300]
     frames = heavy["n_before"] * heavy["n_after"] / (heavy["n_before"] + heavy["n_after"])
     scaled = heavy["crb_mass_kda"] * np.sqrt(frames)
@@ -157,8 +157,8 @@ def test_the_bound_is_that_of_the_frames_used(plain: tuple[Any, list[str]]) -> N
 def test_nothing_is_found_in_a_blank_movie() -> None:
     blank = np.array(list(Movie(_config(events=[]), 2).frames(2)))
     result, told = _run(blank)
-    assert len(result.table) == 0
-    assert list(result.table.columns) == [*EVENT_COLUMNS, FRAME_COLUMN]
+    assert len(result.fits) == 0
+    assert list(result.fits.columns) == [*EVENT_COLUMNS, FRAME_COLUMN]
     assert result.views == ()
     assert told == []
 
@@ -174,14 +174,14 @@ def test_chunks_change_nothing_but_the_last_digits(
     assert cut.summary["chunks"] > 1
     spans = sorted(set(movie.reads))
     assert sum(b - a for a, b in spans) <= 4 * FRAMES + 2 * 400  # the noise curve reads again
-    table = cut.table
+    table = cut.fits
     for part in range(4):
         here = table[
             (table["frame"] >= part * FRAMES + 60) & (table["frame"] < (part + 1) * FRAMES - 60)
         ]
         here = here.assign(frame=here["frame"] - part * FRAMES).reset_index(drop=True)
         _assert_all_found(here)
-        np.testing.assert_allclose(here["mass_kda"], plain[0].table["mass_kda"], rtol=3e-3)
+        np.testing.assert_allclose(here["mass_kda"], plain[0].fits["mass_kda"], rtol=3e-3)
     whole = [view.trace for view in cut.views if 80 <= view.trace.frame < 4 * FRAMES - 80]
     assert len(whole) > 15
     assert all(trace.contrast.size == 4 * 40 for trace in whole)  # a seam cuts none
@@ -205,7 +205,7 @@ def _misfit(view: EventView, factor: float = 1.0) -> float:
 
 def test_a_trace_is_a_step_of_the_height_that_was_fitted(plain: tuple[Any, list[str]]) -> None:
     result = plain[0]
-    for view, row in zip(result.views, result.table.itertuples(), strict=True):
+    for view, row in zip(result.views, result.fits.itertuples(), strict=True):
         trace = view.trace
         assert trace.after - trace.before == pytest.approx(row.contrast)
         assert (trace.before == 0) == (
@@ -259,7 +259,7 @@ def test_fine_pixels_of_a_clip_are_summed() -> None:
 def _close(second_frame: int, distance_px: float) -> pd.DataFrame:
     events = [(150, None, 30.2, 31.6, 480.0), (second_frame, None, 30.2 + distance_px, 31.6, 480.0)]
     config = _config(events=events)
-    return _run(np.array(list(Movie(config, 5).frames(2))), config)[0].table
+    return _run(np.array(list(Movie(config, 5).frames(2))), config)[0].fits
 
 
 def test_a_window_ends_where_a_close_neighbour_lands() -> None:
@@ -276,7 +276,7 @@ def test_a_window_ends_where_a_close_neighbour_lands() -> None:
 def test_a_short_visit_is_weighed_while_it_lasts(land: int, leave: int) -> None:
     """Where one step is dated anew, the other's window has to follow."""
     config = _config("background.window_frames=100", events=[(land, leave, 30.2, 31.7, 480.0)])
-    table = _run(np.array(list(Movie(config, land).frames(2))), config)[0].table
+    table = _run(np.array(list(Movie(config, land).frames(2))), config)[0].fits
     assert table["frame"].tolist() == [land, leave]
     assert table["n_after"].tolist() == [leave - land, 100]
     assert table["n_before"].tolist() == [100, leave - land]
@@ -304,7 +304,7 @@ def test_a_converter_that_clips_makes_no_steps(counts: np.ndarray) -> None:
     """Fourteen per cent of the pixels reach the full scale of twelve bits, stored as sixteen."""
     clipped = np.minimum(counts // 7, 4095).astype(np.uint16)
     result, told = _run(clipped, camera=Camera(gain_e_per_adu=28.0, full_scale_adu=65535.0))
-    assert result.table["frame"].tolist() == pytest.approx([s[0] for s in STEPS], abs=1)
+    assert result.fits["frame"].tolist() == pytest.approx([s[0] for s in STEPS], abs=1)
     assert any("pixels are saturated" in line for line in told)
 
 
@@ -313,12 +313,12 @@ def test_stuck_and_dropped_frames_are_left_out(counts: np.ndarray) -> None:
     odd[100] = odd[99]
     odd[210] = 0
     result, told = _run(odd)
-    _assert_all_found(result.table, frames=2)
+    _assert_all_found(result.fits, frames=2)
     (line,) = told
     assert "100, 210" in line
     assert "left out" in line
     assert result.summary["frames_left_out"] == 2
-    spread = summary_of(result.scene, result.table, result.compared, {})["power_spread"]
+    spread = summary_of(result.scene, result.fits, result.compared, {})["power_spread"]
     assert 0.005 < spread < 0.02, "of the other frames, whose light has 1 % of noise"
 
 
@@ -326,8 +326,8 @@ def test_stuck_and_dropped_frames_are_left_out(counts: np.ndarray) -> None:
 def test_one_polarity_is_that_part_of_both(
     counts: np.ndarray, plain: tuple[Any, list[str]], polarity: str, sign: int
 ) -> None:
-    table = plain[0].table
-    found = _run(counts, _config(f"detection.polarity={polarity}"))[0].table
+    table = plain[0].fits
+    found = _run(counts, _config(f"detection.polarity={polarity}"))[0].fits
     wanted = table[sign * table["mass_kda"] > 0]
     assert len(found) == len(wanted) > 0
     for name in ("frame", "x_px", "y_px", "mass_kda"):
@@ -347,13 +347,49 @@ def test_what_was_injected_is_looked_for_in_the_polarity_that_is_reported(
     assert found["recovered"] >= 2
 
 
+def test_pulls_of_injected_particles_are_in_units_of_the_errors_that_are_reported(
+    counts: np.ndarray,
+) -> None:
+    """The camera claims half as many photoelectrons again: σ is too small by √1.5."""
+    excess, pulls = 1.5, []
+    camera = Camera(gain_e_per_adu=4.0 * excess)
+    for kind in ("curvature", "measured"):
+        config = _config(f"fit.sigma={kind}")
+        result, _ = _run(counts, config, camera=camera)
+        found = inject_and_recover(
+            Memory(counts), config, camera, result, 8, progress=lambda *_: None
+        )  # fmt: skip
+        pulls.append(found["pull_std"])
+    assert pulls[0] > 1.1 * pulls[1]
+
+
+def test_lines_of_chunks_have_no_numbers(
+    counts: np.ndarray, plain: tuple[Any, list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A row is numbered when it is made, and that is when all chunks are there."""
+    monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.005)
+    real, lines = landing_module.analyse_chunk, []
+
+    def looked_at(*arguments: Any) -> Done:
+        done = real(*arguments)
+        lines.append(done.lines)
+        return done
+
+    monkeypatch.setattr(landing_module, "analyse_chunk", looked_at)
+    fits = _run(counts)[0].fits
+    assert len(lines) > 1
+    assert not any("event" in part for part in lines)
+    assert fits["event"].tolist() == list(range(len(STEPS)))
+    assert fits.dtypes.equals(plain[0].fits.dtypes)
+
+
 def test_a_movie_that_freezes_has_no_odd_numbers(counts: np.ndarray) -> None:
     odd = counts.copy()
     odd[250:] = odd[249]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         result, told = _run(odd)
-    assert len(result.table) == 3
+    assert len(result.fits) == 3
     assert result.summary["frames_left_out"] == FRAMES - 250
     assert len(told) == 1
 
@@ -368,7 +404,7 @@ def test_a_brightness_jump_is_divided_out_and_named(counts: np.ndarray) -> None:
     thinned = np.random.default_rng(1).binomial(counts[250:].astype(int) * 4, 0.7)
     odd[250:] = np.rint(thinned / 4)
     result, told = _run(odd)
-    _assert_all_found(result.table, sigmas=6.0)
+    _assert_all_found(result.fits, sigmas=6.0)
     (line,) = [text for text in told if "jumps" in text]
     assert "frame 250 " in line
     assert "by up to -3" in line
@@ -382,7 +418,7 @@ def test_a_moving_pattern_is_named(shift: int, named: bool) -> None:
     merged.add(
         Done(
             core=(0, 400),
-            table=pd.DataFrame(),
+            lines=pd.DataFrame(),
             repeats=np.empty(0),
             views=(),
             good=np.ones(400, dtype=bool),
@@ -451,7 +487,7 @@ def test_rings_of_neighbours_are_those_of_their_height(mode: str) -> None:
     raised = [event.model_copy(update={"z_nm": 30.0}) for event in config.simulation.events]
     simulation = config.simulation.model_copy(update={"events": raised})
     movie = Movie(config.model_copy(update={"simulation": simulation}), 1)
-    table = _run(np.array(list(movie.frames(2))), config)[0].table.sort_values("frame")
+    table = _run(np.array(list(movie.frames(2))), config)[0].fits.sort_values("frame")
     assert table["status"].tolist() == ["ok", "ok"]
     for row, (_, _, x, y, _) in zip(table.itertuples(), events, strict=True):
         assert abs(row.x_nm - x * PIXEL_NM) < 4.5 * row.sigma_x_nm
@@ -578,8 +614,8 @@ def followed(drifting: np.ndarray) -> tuple[Any, list[str]]:
 
 def test_a_drifting_movie_is_analysed_as_a_still_one(followed: tuple[Any, list[str]]) -> None:
     result, told = followed
-    _assert_moved(result.table)
-    assert set(result.table["status"]) == {"ok"}
+    _assert_moved(result.fits)
+    assert set(result.fits["status"]) == {"ok"}
     assert all(_misfit(view) < 4.5 for view in result.views)
     (line,) = told
     assert "+1.6" in line
@@ -597,7 +633,7 @@ def test_its_result_does_not_depend_on_the_workers(
     drifting: np.ndarray, followed: tuple[Any, list[str]]
 ) -> None:
     alone, _ = _run(drifting, _config(CORRECTED, "compute.workers=1"))
-    pd.testing.assert_frame_equal(alone.table, followed[0].table)
+    pd.testing.assert_frame_equal(alone.fits, followed[0].fits)
 
 
 def test_its_chunks_agree(
@@ -606,10 +642,10 @@ def test_its_chunks_agree(
     monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.005)
     cut, _ = _run(drifting, _config(CORRECTED))
     assert cut.summary["chunks"] > 1
-    _assert_moved(cut.table)
+    _assert_moved(cut.fits)
     whole = followed[0]
-    sigma = whole.table["sigma_mass_kda"]
-    assert ((cut.table["mass_kda"] - whole.table["mass_kda"]).abs() < 0.2 * sigma).all()
+    sigma = whole.fits["sigma_mass_kda"]
+    assert ((cut.fits["mass_kda"] - whole.fits["mass_kda"]).abs() < 0.2 * sigma).all()
     np.testing.assert_allclose(cut.summary["drift_frames"], whole.summary["drift_frames"])
     np.testing.assert_allclose(
         cut.summary["drift_x_px"], whole.summary["drift_x_px"], atol=5 * 3e-4
@@ -620,10 +656,10 @@ def test_where_nothing_drifts_the_correction_changes_nothing(
     counts: np.ndarray, plain: tuple[Any, list[str]]
 ) -> None:
     result, told = _run(counts, _config(CORRECTED))
-    _assert_all_found(result.table)
+    _assert_all_found(result.fits)
     for name in ("x_nm", "y_nm", "mass_kda"):
-        sigma = plain[0].table[f"sigma_{name}"]
-        change = (result.table[name] - plain[0].table[name]) / sigma
+        sigma = plain[0].fits[f"sigma_{name}"]
+        change = (result.fits[name] - plain[0].fits[name]) / sigma
         assert change.abs().max() < 0.2
     assert any("corrected, to" in line for line in told)
 
@@ -659,7 +695,7 @@ def test_an_interrupt_of_the_chains_keeps_the_fits(
     monkeypatch.setattr(events_module, "sample_posterior", interrupt)
     result, _ = _run(counts, _config("posterior.enabled=true"))
     assert result.interrupted
-    pd.testing.assert_frame_equal(result.table, plain[0].table)
+    pd.testing.assert_frame_equal(result.fits, plain[0].fits)
 
 
 @pytest.mark.usefixtures("sketched")
@@ -695,8 +731,8 @@ def test_chunks_of_another_camera_map_are_not_used(counts: np.ndarray, tmp_path:
         camera = Camera(gain_e_per_adu=np.full((SIDE, SIDE), gain))
         result, _ = _run(counts, camera=camera, partial=tmp_path, identity="movie")
         if gain == 4.0:
-            first = result.table["sigma_mass_kda"]
-    assert (result.table["sigma_mass_kda"] < first).all()
+            first = result.fits["sigma_mass_kda"]
+    assert (result.fits["sigma_mass_kda"] < first).all()
 
 
 def test_a_corrected_run_resumes_to_the_same_result(
@@ -716,7 +752,7 @@ def test_a_corrected_run_resumes_to_the_same_result(
     _run(drifting, _config(CORRECTED), partial=tmp_path, identity="movie")
     resumed, _ = _run(drifting, _config(CORRECTED), partial=tmp_path, identity="movie")
     assert len(calls) == 1 + whole.summary["chunks"]
-    pd.testing.assert_frame_equal(resumed.table, whole.table)
+    pd.testing.assert_frame_equal(resumed.fits, whole.fits)
     assert resumed.summary == whole.summary
     same = {"contrast": None}
     for view, other in zip(resumed.views, whole.views, strict=True):

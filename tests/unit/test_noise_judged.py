@@ -6,6 +6,7 @@ import re
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.typing import NDArray
 from scenes import PIXEL_NM, make_config
@@ -122,3 +123,19 @@ def test_tracks_near_saturated_pixels_are_flagged() -> None:
     assert (table["flags"].str.contains("saturated") == near).all()
     assert any("1 pixel is saturated" in text for text in found.warnings)
     assert found.summary["masked_pixels"] == 1
+
+
+def test_errors_that_stay_as_they_are_are_said_to(wandering: Counts) -> None:
+    config = _learnt(GAIN)
+    measured = config.fit.model_copy(update={"sigma": "measured"})
+    plain, asked = (
+        _analysed(wandering, config.model_copy(update={"fit": fit}))
+        for fit in (config.fit, measured)
+    )
+    pd.testing.assert_frame_equal(asked.table, plain.table)
+    said = [text for text in asked.warnings if "fit.sigma" in text]
+    assert said == [
+        'fit.sigma = "measured" has no effect: the spread is not measured where the background is '
+        "learnt with the tracks, and σ is that of the likelihood"
+    ]
+    assert not any("fit.sigma" in text for text in plain.warnings)

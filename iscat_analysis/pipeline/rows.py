@@ -1,0 +1,47 @@
+"""The rows of ``fits.csv``: fits get their errors from all that is known of them together, at once.
+
+A fit knows the error of its own likelihood.  What calibrations may be wrong by, what its frames
+show elsewhere, and how the spread of all fits compares with the bound is known when all are there;
+only then a row is made, and with ``fit.sigma = "measured"`` its σ is the measured one from the
+beginning.
+"""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from iscat_analysis.inference.achieved import Achieved
+from iscat_analysis.pipeline.achieved import measure_spread, measured_scale, repeat_columns
+from iscat_analysis.pipeline.results import Found
+from iscat_analysis.pipeline.systematic import systematic
+from iscat_analysis.records import FloatArray
+
+
+def reported_rows(found: Found) -> tuple[pd.DataFrame, dict[str, Achieved]]:
+    """Make the rows of all events of a movie.
+
+    Parameters
+    ----------
+    found : Found
+        Fits, with the errors of their likelihoods.
+
+    Returns
+    -------
+    rows : pandas.DataFrame
+        The columns of `Found.fits`; after ``flags`` ``systematic_*``, where they are known, and at
+        the end ``repeat_*``, where the frames could be compared.
+    achieved : dict of str to Achieved
+        The measured spread over the bound, by free parameter; empty where it was not measured.
+    """
+    fits, config, mode = found.fits, found.scene.config, found.scene.mode
+    achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
+    scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
+    columns: dict[str, pd.Series | FloatArray] = {}
+    for name in fits:
+        columns[name] = fits[name] * scale[name] if name in scale else fits[name]
+        if name == "flags":
+            shared = systematic(config, fits)
+            columns |= {f"systematic_{key}": sigma for key, sigma in shared.items()}
+    if found.repeats:
+        columns |= repeat_columns(mode, fits, found.repeats)
+    return pd.DataFrame(columns), achieved
