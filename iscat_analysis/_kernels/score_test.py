@@ -1,4 +1,4 @@
-"""Residuals of a fit and Rao's score test against modes, with the fitted directions projected out.
+"""Rao's score test of a fit against modes, with the fitted directions projected out.
 
 A mode is a product H_i(x) H_j(y).  The information between two of them is therefore a sum over rows
 of pixels of H_j H_l Σ_x ω H_i H_k, ω the information of a pixel on the logarithm of its light: a
@@ -6,8 +6,9 @@ few multiply-adds per pixel, whatever the number of modes.  With G the informati
 directions and the modes, G = L Lᵀ in this order and b the residual along them, the squares of L⁻¹b
 that belong to the modes add up to a χ².
 
-Data are those of `iscat_analysis._kernels.scoring`, `rows` those of `iscat_analysis._kernels.image`
-or `iscat_analysis._kernels.hessian`: s and its derivatives in (x, y, z, a), each row of pixels.
+`rows` are those of `iscat_analysis._kernels.image` or `iscat_analysis._kernels.hessian`: s and its
+derivatives in (x, y, z, a), each row of pixels; `terms` are those that
+`iscat_analysis._kernels.residuals` fills.
 """
 
 from __future__ import annotations
@@ -17,106 +18,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
-_DARK = 1e-100  # expected light below which a pixel knows nothing of relative changes
-
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _row_residuals(
-    kind: int,
-    data: FloatArray,
-    row: int,
-    level: float,
-    s: FloatArray,
-    rate: FloatArray,
-    residual: FloatArray,
-    t: FloatArray,
-) -> None:
-    """Fill expectation and residual, and t (4, nx); see `residuals`."""
-    c0, c1, c2, c3 = data[0, row], data[1, row], data[2, row], data[3, row]
-    for j in range(s.size):
-        if kind == CONDITIONAL:
-            bright = max(1.0 + s[j], FLOOR)
-            part = 1.0 / (1.0 + c2[j] * level * bright)
-            rate[j] = c1[j] * (1.0 - part)
-            t[0, j] = c3[j] * rate[j] * part
-            t[1, j] = (c0[j] - rate[j]) * c3[j]
-            t[2, j] = 1.0 / bright
-            total = c1[j] if c1[j] > 0 else 1.0
-            t[3, j] = c3[j] * (1.0 / max(rate[j] * part, 1.0) - 6.0 / total)
-        else:
-            # A background of read noise alone may be measured below zero.
-            raw = level * (c1[j] + c2[j] * s[j])
-            used = c2[j] > 0
-            light = max(raw, FLOOR) if used else 0.0
-            rate[j] = max(raw + c3[j], FLOOR)
-            t[0, j] = light * light / rate[j]
-            t[1, j] = light * (c0[j] - rate[j]) / rate[j]
-            t[2, j] = c2[j] * level / light if light > _DARK else 0.0
-            t[3, j] = 1.0 / rate[j] if used else 0.0
-    if kind == CONDITIONAL:
-        for j in range(s.size):
-            residual[j] = t[1, j] / max(np.sqrt(t[0, j]), FLOOR)
-    else:
-        for j in range(s.size):
-            residual[j] = (c0[j] - rate[j]) / np.sqrt(rate[j]) if c2[j] > 0 else 0.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def residuals(
-    kind: int,
-    data: FloatArray,
-    level: float,
-    rows: FloatArray,
-    rate: FloatArray,
-    residual: FloatArray,
-    terms: FloatArray,
-) -> None:
-    """Fill what every pixel expects and how far its count is from it.
-
-    Parameters
-    ----------
-    kind, data, level
-        As in `iscat_analysis._kernels.scoring.row_value`.
-    rows : ndarray, shape (ny, 5 or more, nx)
-        Signal and gradient.
-    rate : ndarray, shape (ny, nx)
-        Filled with the expected counts after landing.
-    residual : ndarray, shape (ny, nx)
-        Filled with the residuals in standard deviations; 0 where masked.
-    terms : ndarray, shape (ny, 4, nx)
-        Filled with the information ω on the logarithm of the light, the residual times √ω, the
-        derivative of that logarithm by the signal, and the excess kurtosis of the counts; all but
-        the third are 0 where masked.
-    """
-    for row in range(rows.shape[0]):
-        _row_residuals(kind, data, row, level, rows[row, 0], rate[row], residual[row], terms[row])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def largest(residual: FloatArray, index: IntArray) -> None:
-    """Fill `index` (k) with the flat places of the residuals of largest size, largest first."""
-    flat = residual.reshape(-1)
-    index[:] = 0
-    size = np.full(index.size, -1.0)
-    last = index.size - 1
-    for i in range(flat.size):
-        here = abs(flat[i])
-        if here > size[last]:
-            k = last
-            while k > 0 and here > size[k - 1]:
-                size[k], index[k] = size[k - 1], index[k - 1]
-                k -= 1
-            size[k], index[k] = here, i
-
-
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def hermite(axis: FloatArray, centre: float, waist: float, order: int) -> FloatArray:
+def _hermite(axis: FloatArray, centre: float, waist: float, order: int) -> FloatArray:
     """Hermite functions of order 0 to `order`, shape (order + 1, n), by their recurrence."""
     out = np.empty((order + 1, axis.size))
     for j in range(axis.size):
@@ -210,7 +119,7 @@ def _add_fitted(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mode_information(
+def _mode_information(
     rows: FloatArray,
     terms: FloatArray,
     free: BoolArray,
@@ -269,7 +178,7 @@ def mode_information(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def score_statistic(
+def _score_statistic(
     matrix: FloatArray, vector: FloatArray, fitted: int, dependent: float, used: BoolArray
 ) -> tuple[float, int]:
     """Sum of squares of the residual along the modes.
@@ -340,7 +249,7 @@ def _orthonormal(w: FloatArray, factor: FloatArray, used: BoolArray) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def leverages(
+def _leverages(
     rows: FloatArray,
     terms: FloatArray,
     free: BoolArray,
@@ -350,7 +259,7 @@ def leverages(
     used: BoolArray,
     out: FloatArray,
 ) -> None:
-    """Fill `out` (ny, nx) with each pixel's part in the statistic, after `score_statistic`.
+    """Fill `out` (ny, nx) with each pixel's part in the statistic, after `_score_statistic`.
 
     It is the sum of the squares of the pixel's components of the orthonormal modes.
     """
@@ -374,3 +283,70 @@ def leverages(
             if used[k]:
                 for p in range(along.shape[1]):
                     out[row, p] += w[k, p] * w[k, p]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def mode_statistic(
+    x: FloatArray,
+    y: FloatArray,
+    theta: FloatArray,
+    waist: float,
+    order: int,
+    rows: FloatArray,
+    terms: FloatArray,
+    free: BoolArray,
+    dependent: float,
+    excess: float,
+    negligible: float,
+) -> tuple[float, int, float]:
+    """Rao's score test of the modes H_i(x) H_j(y) around a particle, i + j ≤ `order`.
+
+    Parameters
+    ----------
+    x, y : ndarray, shape (nx,), (ny,)
+        Pixel centres [nm].
+    theta : ndarray, shape (2 or more,)
+        Centre of the modes [nm].
+    waist : float
+        Theirs [nm].
+    order : int
+        The largest.
+    rows, terms
+        From `signal_gradient` or `signal_hessian`, and from `residuals`.
+    free : ndarray of bool, shape (5,)
+        Fitted parameters.
+    dependent : float
+        Share of a mode outside the fitted directions that counts as none.
+    excess : float
+        Largest size of a pixel's excess kurtosis.
+    negligible : float
+        Excess kurtosis that changes no p-value.
+
+    Returns
+    -------
+    chi2 : float
+        The statistic.
+    freedom : int
+        Modes that took part.
+    excess : float
+        Excess kurtosis of the statistic over `freedom`, or its bound where that is negligible.
+    """
+    along, across = _hermite(x, theta[0], waist, order), _hermite(y, theta[1], waist, order)
+    fitted = 0
+    for i in range(free.size):
+        fitted += free[i]
+    size = fitted + (order + 1) * (order + 2) // 2
+    matrix, vector = np.empty((size, size)), np.empty(size)
+    used = np.empty(size, dtype=np.bool_)
+    _mode_information(rows, terms, free, along, across, matrix, vector)
+    chi2, freedom = _score_statistic(matrix, vector, fitted, dependent, used)
+    # the leverages are at most 1 and their sum is `freedom`, so that this much is all they could do
+    if excess > negligible and freedom > 0:
+        leverage = np.empty((y.size, x.size))
+        _leverages(rows, terms, free, along, across, matrix, used, leverage)
+        excess = 0.0
+        for i in range(y.size):
+            for j in range(x.size):
+                excess += terms[i, 3, j] * leverage[i, j] ** 2
+        excess /= freedom
+    return chi2, freedom, excess

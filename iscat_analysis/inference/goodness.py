@@ -21,17 +21,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betainc, gammainc, gammaincc, ndtr, pdtr, pdtrc
+from scipy.special import betainc, gammainc, gammaincc, pdtr, pdtrc
 
-from iscat_analysis._kernels.score_test import (
-    hermite,
-    largest,
-    leverages,
-    mode_information,
-    residuals,
-    score_statistic,
-)
-from iscat_analysis._kernels.scoring import CONDITIONAL
+from iscat_analysis._kernels.residuals import residuals, suspects
+from iscat_analysis._kernels.score_test import mode_statistic
+from iscat_analysis._kernels.scoring import CONDITIONAL, POISSON
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 
 FloatArray = NDArray[np.float64]
@@ -54,7 +48,6 @@ _NARROWEST = 0.1  # variance of a sum of squares over that of normal residuals, 
 _SUSPECTS = 8  # largest residuals whose exact tail is looked up
 _DEPENDENT = 1e-8  # share of a mode outside the fitted directions that counts as none
 _NORMAL = 1e-4  # excess kurtosis that changes no p-value
-_MODES = (ORDER + 1) * (ORDER + 2) // 2
 _FINEST = 1e-11  # tail below which whole counts are not told from continuous ones
 
 
@@ -90,7 +83,8 @@ def goodness_of_fit(
     Z. Šidák, J. Am. Stat. Assoc. 62, 626 (1967).
     """
     view = _look(likelihood, theta, derivatives)
-    chi2, spread_p = _scatter(view, free)
+    free = np.asarray(free, dtype=np.bool_)
+    chi2, spread_p = _scatter(view, int(np.count_nonzero(free)))
     if not math.isfinite(spread_p):
         return chi2, math.nan
     worst = min(spread_p, _structure(likelihood, theta, free, view), _outlier(view))
@@ -119,7 +113,7 @@ def scatter(likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> tuple
     The squared residual of a count of excess kurtosis κ has variance 2 + κ; χ² follows a gamma law
     with that variance.
     """
-    return _scatter(_look(likelihood, theta), free)
+    return _scatter(_look(likelihood, theta), int(np.count_nonzero(free)))
 
 
 def structure(likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> float:
@@ -144,6 +138,7 @@ def structure(likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> flo
     A mode B multiplies the expected counts by 1 + ε B.  Its score, made independent of the fitted
     directions, is compared with its information (C. R. Rao, Proc. Camb. Phil. Soc. 44, 50, 1948).
     """
+    free = np.asarray(free, dtype=np.bool_)
     return _structure(likelihood, theta, free, _look(likelihood, theta))
 
 
@@ -170,37 +165,37 @@ class _View:
     """One fit as its pixels see it."""
 
     data: FloatArray  # (4, ny, nx)
-    conditional: bool
-    used: BoolArray  # (ny, nx)
+    kind: int
     rows: FloatArray  # (ny, 5 or more, nx), signal and derivatives
     rate: FloatArray  # (ny, nx), expected counts after landing
     residual: FloatArray  # (ny, nx), in standard deviations
     terms: FloatArray  # (ny, 4, nx), see `residuals`
-
-    @property
-    def kurtosis(self) -> FloatArray:
-        """Excess kurtosis of each pixel's counts, shape (ny, nx); 0 where masked."""
-        return self.terms[:, 3]
+    chi2: float  # and what else `residuals` returns
+    pixels: int
+    excess: float
+    largest_excess: float
+    least_rate: float
 
 
 def _look(likelihood: Likelihood, theta: FloatArray, rows: FloatArray | None = None) -> _View:
     if rows is None:
         rows = likelihood.derivatives(theta)
-    rate, residual = np.empty(likelihood.grid.shape), np.empty(likelihood.grid.shape)
+    rate, residual = np.empty((2, *likelihood.grid.shape))
     terms = np.empty((rate.shape[0], 4, rate.shape[1]))
-    level = math.exp(theta[LEVEL])
-    residuals(likelihood.kind, likelihood.data, level, rows, rate, residual, terms)
-    conditional = likelihood.kind == CONDITIONAL
-    return _View(likelihood.data, conditional, likelihood.used, rows, rate, residual, terms)
+    level, kind, data = math.exp(theta[LEVEL]), likelihood.kind, likelihood.data
+    totals = residuals(kind, data, level, rows, rate, residual, terms)
+    return _View(data, kind, rows, rate, residual, terms, *totals)
 
 
-def _scatter(view: _View, free: BoolArray) -> tuple[float, float]:
-    residual, kurtosis = _cells(view)
-    freedom = residual.size - int(np.count_nonzero(free))
+def _scatter(view: _View, fitted: int) -> tuple[float, float]:
+    chi2, cells, excess = view.chi2, view.pixels, view.excess
+    if view.kind == POISSON and view.least_rate < POOLED_COUNTS:
+        residual, kurtosis = _pooled(view)
+        chi2, cells, excess = float(residual @ residual), residual.size, float(kurtosis.sum())
+    freedom = cells - fitted
     if freedom <= 0:
         return math.nan, math.nan
-    chi2 = float(residual @ residual)
-    above = _gamma_above(chi2, freedom, float(kurtosis.mean()))
+    above = _gamma_above(chi2, freedom, excess / cells)
     return chi2 / freedom, 2 * min(above, 1 - above)
 
 
@@ -210,15 +205,11 @@ def _gamma_above(chi2: float, freedom: float, excess: float) -> float:
     return float(gammaincc(freedom / spread / 2, chi2 / spread / 2))
 
 
-def _cells(view: _View) -> tuple[FloatArray, FloatArray]:
+def _pooled(view: _View) -> tuple[FloatArray, FloatArray]:
     """Residuals in standard deviations and their excess kurtosis, cells of few counts pooled."""
-    used = view.used
-    if view.conditional:
-        return view.residual[used], view.kurtosis[used]
+    used = view.data[2] > 0
     rate = view.rate[used]
     few = rate < POOLED_COUNTS
-    if not np.any(few):
-        return view.residual[used], 1 / rate
     excess = view.data[0][used] - rate
     order = np.argsort(-rate[few])
     bins = (np.cumsum(rate[few][order]) / POOLED_COUNTS).astype(int)
@@ -231,65 +222,31 @@ def _cells(view: _View) -> tuple[FloatArray, FloatArray]:
 
 
 def _structure(likelihood: Likelihood, theta: FloatArray, free: BoolArray, view: _View) -> float:
-    free = np.asarray(free, dtype=bool)
     optics, grid = likelihood.model.optics, likelihood.grid
-    waist = WAIST * optics.wavelength_nm / optics.na
-    along = hermite(grid.x_nm, theta[0], waist, ORDER)
-    across = hermite(grid.y_nm, theta[1], waist, ORDER)
-    fitted = int(np.count_nonzero(free))
-    matrix = np.empty((fitted + _MODES, fitted + _MODES))
-    vector, took_part = np.empty(len(matrix)), np.empty(len(matrix), dtype=bool)
-    where = view.rows, view.terms, free, along, across
-    mode_information(*where, matrix, vector)
-    chi2, freedom = score_statistic(matrix, vector, fitted, _DEPENDENT, took_part)
-    if not freedom:
-        return 1.0
-    # the leverages are at most 1 and their sum is `freedom`, so that this much is all they could do
-    excess = float(np.abs(view.kurtosis).max())
-    if excess > _NORMAL:
-        leverage = np.empty(view.rate.shape)
-        leverages(*where, matrix, took_part, leverage)
-        excess = float(np.sum(view.kurtosis * leverage**2)) / freedom
-    return _gamma_above(chi2, freedom, excess)
+    chi2, freedom, excess = mode_statistic(
+        grid.x_nm, grid.y_nm, theta, WAIST * optics.wavelength_nm / optics.na, ORDER, view.rows,
+        view.terms, free, _DEPENDENT, view.largest_excess, _NORMAL,
+    )  # fmt: skip
+    return _gamma_above(chi2, freedom, excess) if freedom else 1.0
 
 
 def _outlier(view: _View) -> float:
-    suspects = np.empty(min(_SUSPECTS, view.residual.size), dtype=np.int64)
-    largest(view.residual, suspects)
-    suspects = suspects[view.used.flat[suspects]]
-    least = float(np.min(_tails(view, suspects), initial=1.0))
-    pixels = int(np.count_nonzero(view.used))
-    if view.conditional:
-        return -math.expm1(pixels * math.log1p(-min(least, 1 - 1e-16)))
+    tails = np.empty((3, _SUSPECTS))
+    least, count = suspects(view.kind, view.data, view.rate, view.residual, MANY_COUNTS, tails)
+    if count:
+        least = min(least, 2 * float(_tails(view.kind, *tails[:, :count]).min()))
+    if view.kind == CONDITIONAL:
+        return -math.expm1(view.pixels * math.log1p(-min(least, 1 - 1e-16)))
     # counts are whole: what each pixel can attain below `least` is less than that
-    below = _attainable(view.rate[view.used], least)
+    below = _attainable(view.rate[view.data[2] > 0], least)
     return -math.expm1(float(np.sum(np.log1p(-np.minimum(below, 1 - 1e-16)))))
 
 
-def _tails(view: _View, suspects: NDArray[np.int64]) -> FloatArray:
-    """Two-sided probability of counts as far out as those of some pixels."""
-    observed, total, _, share = view.data.reshape(4, -1)[:, suspects]
-    mean = view.rate.flat[suspects]
-    variance = share * mean * (1 - mean / total) if view.conditional else mean
-    normal = 2 * ndtr(-np.abs(view.residual.flat[suspects]))
-    if np.all(variance > MANY_COUNTS):
-        return np.asarray(normal)
-    if view.conditional:
-        # read noise takes its share of the variance, as if that share of the counts were lost
-        n, p, k = share * total, mean / total, share * observed
-        above, below = _between(k, n, p), _between(n - k, n, 1 - p)
-    else:
-        k = np.maximum(np.floor(observed + 1e-9), 0)
-        above = np.where(k > 0, gammainc(np.maximum(k, 1), mean), 1.0)
-        below = gammaincc(k + 1, mean)
-    exact = np.minimum(2 * np.minimum(above, below), 1.0)
-    return np.asarray(np.where(variance > MANY_COUNTS, normal, exact))
-
-
-def _between(k: FloatArray, n: FloatArray, p: FloatArray) -> FloatArray:
-    """Probability that a binomial count is at least k."""
-    possible = np.clip(k, 1e-9, n)
-    return np.asarray(np.where(k > 0, betainc(possible, n - possible + 1, p), 1.0))
+def _tails(kind: int, a: FloatArray, b: FloatArray, x: FloatArray) -> FloatArray:
+    """Probability of counts at least as far out, on their side; see `suspects`."""
+    if kind == CONDITIONAL:
+        return np.asarray(betainc(a, b, x))
+    return np.asarray(np.where(x > 0, gammainc(a, b), gammaincc(a, b)))
 
 
 def _attainable(rate: FloatArray, tail: float) -> FloatArray:

@@ -30,6 +30,7 @@ _ABOUT = {
     "moving": "tracks",
     "radial": "the tables of the microscope",
     "scan": "the search of heights",
+    "residuals": "the goodness of fits",
     "score_test": "the goodness of fits",
     "scoring": "fits",
     "sliding": "sums of frames",
