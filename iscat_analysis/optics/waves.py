@@ -26,12 +26,12 @@ from iscat_analysis._kernels.lattice import (
     sum_waves,
     window,
 )
+from iscat_analysis._kernels.peak import largest_signal
 from iscat_analysis._kernels.radial import (
     POWERS,
     STEP,
     AxialTable,
     bessel_table,
-    largest_signal,
     radial_profile,
 )
 from iscat_analysis.errors import ConfigError

@@ -28,6 +28,7 @@ _ABOUT = {
     "judging": "the precision of tracks",
     "mixture": "species",
     "moving": "tracks",
+    "peak": "the precision of fits",
     "radial": "the tables of the microscope",
     "scan": "the search of heights",
     "residuals": "the goodness of fits",
