@@ -1,11 +1,11 @@
-"""Second derivatives of the signal, for the observed information, a row of pixels at a time.
+"""Second derivatives of the signal, for the observed information, some rows of pixels at a time.
 
 With the field e and D = (1/r)∂/∂r, a radial function F has
 
     ∂u F = u DF,   ∂uu F = DF + (F″ − DF) u²/r²,   ∂uv F = (F″ − DF) uv/r²,
 
-so that one loop evaluates the quintics, their slopes and their second derivatives, and another,
-which runs in vector registers, contracts them to
+so that one loop over the pixels of a few rows evaluates the quintics, their slopes and their second
+derivatives (`iscat_analysis._kernels.quintics`), and another contracts them to
 
     ∂i∂j s = Re[g* ∂ij e_u + h* ∂ij e_v] + 2a² Re Σ ∂i e* ∂j e,   g = 2aρ + 2a² e_u,   h = 2a² e_v.
 """
@@ -19,6 +19,11 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.image import Lens, Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lattice_rows import lattice_fields
+from iscat_analysis._kernels.quintics import (
+    DISTANCE,
+    evaluate_bends,
+    evaluate_last_slopes,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -29,7 +34,10 @@ PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3),
 """Which of (x, y, z, a) the second derivatives from row 5 on are in."""
 
 _CHANNELS = 4  # of the first order of a radial profile
-_SCRATCH = 29  # 12 of the fields, 8 of ∂z, 4 of ∂zz, then DF and cosines
+_FIELDS = 12  # rows of scratch: four channels, their slopes and second derivatives
+_DISTANCE = _FIELDS + DISTANCE  # after as many of ∂z, ∂zz and slopes of ∂z
+_DX, _DY, _SUMS = _DISTANCE + 1, _DISTANCE + 2, _DISTANCE + 3
+_STRIP = 64  # pixels: a fixed number, so that lines of scratch are known not to overlap
 _NEAR = 1e-6  # of a step: here DF is F″
 
 
@@ -55,10 +63,67 @@ def signal_hessian(
     out : ndarray, shape (ny, ROWS, nx)
         Filled with s, its derivatives in (x_p, y_p, z, a), and those of `PAIRS`.
     """
+    if lens.half:
+        _lattice_hessian(profile, lens, pixels, x_p, y_p, amplitude, out)
+        return
+    nx, offsets, weights = pixels.x.size, pixels.offsets, pixels.weights
+    flat = np.empty((_SUMS + ROWS) * _STRIP)
+    f = flat.reshape(_SUMS + ROWS, _STRIP)
+    fields, sums = f[_FIELDS:], f[_SUMS:]
+    for first in range(0, pixels.y.size * nx, _STRIP):
+        for j in range(_SUMS * _STRIP, flat.size):
+            flat[j] = 0.0
+        for i in range(offsets.size):
+            for k in range(offsets.size):
+                _place(lens.inv_step, pixels, first, x_p - offsets[k], y_p - offsets[i], f)
+                evaluate_bends(profile, f)
+                _bend(lens, amplitude, weights[i] * weights[k], flat)
+                if profile.shape[2] > _CHANNELS:
+                    evaluate_last_slopes(profile, fields)
+                    _bend_z(lens, amplitude, weights[i] * weights[k], flat)
+        _copy(sums, first, out)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _place(
+    inv_step: float, pixels: Pixels, first: int, x_p: float, y_p: float, f: FloatArray
+) -> None:
+    """Fill distances and places of a strip that begins at pixel `first`; beyond the last with 0."""
+    dx, dy, nx = f[_DX], f[_DY], pixels.x.size
+    row, column = first // nx, first % nx
+    for j in range(_STRIP):
+        inside = row < pixels.y.size
+        dx[j] = pixels.x[column] - x_p if inside else 0.0
+        dy[j] = pixels.y[row] - y_p if inside else 0.0
+        column += 1
+        if column == nx:
+            row, column = row + 1, 0
+    for j in range(_STRIP):
+        f[_DISTANCE, j] = f[DISTANCE, j] = np.sqrt(dx[j] * dx[j] + dy[j] * dy[j]) * inv_step
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _copy(sums: FloatArray, first: int, out: FloatArray) -> None:
+    """Fill the pixels of `out` (ny, ROWS, nx) from `first` on with a strip of sums."""
+    ny, _, nx = out.shape
+    row, column, begin = first // nx, first % nx, 0
+    while begin < _STRIP and row < ny:
+        end = begin + min(nx - column, _STRIP - begin)
+        for k in range(ROWS):
+            here, there = sums[k, begin:end], out[row, k, column : column + end - begin]
+            for j in range(here.size):
+                there[j] = here[j]
+        row, column, begin = row + 1, 0, end
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lattice_hessian(
+    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Do the same as `signal_hessian` with a lattice."""
     out[:] = 0.0
-    with_z = profile.shape[2] > _CHANNELS
     offsets, weights = pixels.offsets, pixels.weights
-    f = np.empty((_SCRATCH, pixels.x.size))
     e = np.empty(2, dtype=np.complex128)
     de = np.empty((3, 2), dtype=np.complex128)
     dde = np.empty((3, 3, 2), dtype=np.complex128)
@@ -67,108 +132,42 @@ def signal_hessian(
             dy = pixels.y[row] + offsets[i] - y_p
             for k in range(offsets.size):
                 x, weight = x_p - offsets[k], weights[i] * weights[k]
-                if lens.half:
-                    for j in range(pixels.x.size):
-                        lattice_fields(profile, lens, pixels.x[j] - x, dy, e, de, dde)
-                        _contract(lens.rho, amplitude, weight, e, de, dde, out[row], j)
-                else:
-                    _quintics(profile, lens.inv_step, pixels.x, x, dy, with_z, f)
-                    _bend(lens, pixels.x, x, dy, amplitude, weight, f, out[row])
-                    if with_z:
-                        _bend_z(lens, pixels.x, x, dy, amplitude, weight, f, out[row])
+                for j in range(pixels.x.size):
+                    lattice_fields(profile, lens, pixels.x[j] - x, dy, e, de, dde)
+                    _contract(lens.rho, amplitude, weight, e, de, dde, out[row], j)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _quintics(
-    profile: FloatArray,
-    inv_step: float,
-    x: FloatArray,
-    x_p: float,
-    dy: float,
-    with_z: bool,
-    f: FloatArray,
-) -> None:
-    """Fill f: values, slopes and second derivatives of the fields by t, then those of ∂z, ∂zz."""
-    for j in range(x.size):
-        dx = x[j] - x_p
-        f[24, j] = np.sqrt(dx * dx + dy * dy) * inv_step
-    for j in range(x.size):
-        t = f[24, j]
-        n = int(t)
-        t -= n
-        i = np.uintp(n)
-        for k in range(4):
-            b = d = profile[i, 5, k]
-            v = d * t + profile[i, 4, k]
-            d = d * t + v
-            v = v * t + profile[i, 3, k]
-            b = b * t + d
-            d = d * t + v
-            v = v * t + profile[i, 2, k]
-            b = b * t + d
-            d = d * t + v
-            v = v * t + profile[i, 1, k]
-            f[8 + k, j] = 2 * (b * t + d)
-            f[4 + k, j] = d * t + v
-            f[k, j] = v * t + profile[i, 0, k]
-        if with_z:
-            for k in range(4, 8):
-                d = profile[i, 5, k]
-                v = d * t + profile[i, 4, k]
-                d = d * t + v
-                v = v * t + profile[i, 3, k]
-                d = d * t + v
-                v = v * t + profile[i, 2, k]
-                d = d * t + v
-                v = v * t + profile[i, 1, k]
-                f[12 + k, j] = d * t + v
-                f[8 + k, j] = v * t + profile[i, 0, k]
-            for k in range(8, 12):
-                v = profile[i, 5, k]
-                v = v * t + profile[i, 4, k]
-                v = v * t + profile[i, 3, k]
-                v = v * t + profile[i, 2, k]
-                v = v * t + profile[i, 1, k]
-                f[12 + k, j] = v * t + profile[i, 0, k]
-
-
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _bend(
-    lens: Lens,
-    x: FloatArray,
-    x_p: float,
-    dy: float,
-    amplitude: float,
-    weight: float,
-    f: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Add weight × all that needs no derivative in z; leave DF (8 to 11 in f) and (F″ − DF)/r²."""
+def _bend(lens: Lens, amplitude: float, weight: float, f: FloatArray) -> None:
+    """Add weight × all that needs no derivative in z; leave DF (4 to 7 in f) and (F″ − DF)/r²."""
     inv_step, rho, cos, sin = lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi
     co, cross, ring, a = lens.co, lens.cross, lens.ring, amplitude
     square = inv_step * inv_step
-    for j in range(x.size):
-        t = f[24, j]
+    for j in range(_STRIP):
+        t = f[_DISTANCE * _STRIP + j]
         near = t < _NEAR
         per = square / (t if t > _NEAR else 1.0)
         per_r2 = 0.0 if near else square / (t * t)
         for k in range(4):
-            once = square * f[8 + k, j] if near else per * f[4 + k, j]
-            f[8 + k, j] = (square * f[8 + k, j] - once) * per_r2
-            f[4 + k, j] = once
-    for j in range(x.size):
-        dx = x[j] - x_p
+            once = square * f[(8 + k) * _STRIP + j] if near else per * f[(4 + k) * _STRIP + j]
+            f[(8 + k) * _STRIP + j] = (square * f[(8 + k) * _STRIP + j] - once) * per_r2
+            f[(4 + k) * _STRIP + j] = once
+    for j in range(_STRIP):
+        dx, dy = f[_DX * _STRIP + j], f[_DY * _STRIP + j]
         u, v = cos * dx + sin * dy, cos * dy - sin * dx
         uu, vv, uv = u * u, v * v, u * v
         c2, s2 = co * (uu - vv), cross * 2 * uv + ring * (uu + vv)
         s2_u, s2_v = 2 * (cross * v + ring * u), 2 * (cross * u + ring * v)
-        n_r, n_i = f[2, j], f[3, j]
-        m_r, m_i = f[6, j], f[7, j]
-        e_r, e_i = f[0, j] + n_r * c2, f[1, j] + n_i * c2
+        n_r, n_i = f[2 * _STRIP + j], f[3 * _STRIP + j]
+        m_r, m_i = f[6 * _STRIP + j], f[7 * _STRIP + j]
+        e_r, e_i = f[0 * _STRIP + j] + n_r * c2, f[1 * _STRIP + j] + n_i * c2
         h_r, h_i = n_r * s2, n_i * s2
-        p_r, p_i = f[4, j] + m_r * c2, f[5, j] + m_i * c2
-        b_r, b_i = f[8, j] + f[10, j] * c2, f[9, j] + f[11, j] * c2
-        d_r, d_i = f[10, j] * s2, f[11, j] * s2
+        p_r, p_i = f[4 * _STRIP + j] + m_r * c2, f[5 * _STRIP + j] + m_i * c2
+        b_r, b_i = (
+            f[8 * _STRIP + j] + f[10 * _STRIP + j] * c2,
+            f[9 * _STRIP + j] + f[11 * _STRIP + j] * c2,
+        )
+        d_r, d_i = f[10 * _STRIP + j] * s2, f[11 * _STRIP + j] * s2
         # first derivatives of e_u and e_v along u and v
         eu_r, eu_i = p_r * u + 2 * co * u * n_r, p_i * u + 2 * co * u * n_i
         ev_r, ev_i = p_r * v - 2 * co * v * n_r, p_i * v - 2 * co * v * n_i
@@ -203,55 +202,55 @@ def _bend(
         a_u = g_r * eu_r + g_i * eu_i + w * (h_r * hu_r + h_i * hu_i)
         a_v = g_r * ev_r + g_i * ev_i + w * (h_r * hv_r + h_i * hv_i)
         power = e_r * e_r + e_i * e_i + h_r * h_r + h_i * h_i
-        out[0, j] += weight * a * (2 * rho * e_r + a * power)
-        out[1, j] += weight * (sin * s_v - cos * s_u)
-        out[2, j] -= weight * (sin * s_u + cos * s_v)
-        out[4, j] += weight * (2 * rho * e_r + 2 * a * power)
-        out[5, j] += weight * (cos * cos * s_uu - 2 * cos * sin * s_uv + sin * sin * s_vv)
-        out[6, j] += weight * (cos * sin * (s_uu - s_vv) + (cos * cos - sin * sin) * s_uv)
-        out[7, j] += weight * (sin * sin * s_uu + 2 * cos * sin * s_uv + cos * cos * s_vv)
-        out[11, j] += weight * (sin * a_v - cos * a_u)
-        out[12, j] -= weight * (sin * a_u + cos * a_v)
-        out[14, j] += weight * 2 * power
+        f[(_SUMS + 0) * _STRIP + j] += weight * a * (2 * rho * e_r + a * power)
+        f[(_SUMS + 1) * _STRIP + j] += weight * (sin * s_v - cos * s_u)
+        f[(_SUMS + 2) * _STRIP + j] -= weight * (sin * s_u + cos * s_v)
+        f[(_SUMS + 4) * _STRIP + j] += weight * (2 * rho * e_r + 2 * a * power)
+        f[(_SUMS + 5) * _STRIP + j] += weight * (
+            cos * cos * s_uu - 2 * cos * sin * s_uv + sin * sin * s_vv
+        )
+        f[(_SUMS + 6) * _STRIP + j] += weight * (
+            cos * sin * (s_uu - s_vv) + (cos * cos - sin * sin) * s_uv
+        )
+        f[(_SUMS + 7) * _STRIP + j] += weight * (
+            sin * sin * s_uu + 2 * cos * sin * s_uv + cos * cos * s_vv
+        )
+        f[(_SUMS + 11) * _STRIP + j] += weight * (sin * a_v - cos * a_u)
+        f[(_SUMS + 12) * _STRIP + j] -= weight * (sin * a_u + cos * a_v)
+        f[(_SUMS + 14) * _STRIP + j] += weight * 2 * power
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _bend_z(
-    lens: Lens,
-    x: FloatArray,
-    x_p: float,
-    dy: float,
-    amplitude: float,
-    weight: float,
-    f: FloatArray,
-    out: FloatArray,
-) -> None:
+def _bend_z(lens: Lens, amplitude: float, weight: float, f: FloatArray) -> None:
     """Add weight × the derivatives in z, after `_bend`."""
     inv_step, rho, cos, sin = lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi
     co, cross, ring, a = lens.co, lens.cross, lens.ring, amplitude
     square = inv_step * inv_step
-    for j in range(x.size):
-        dx = x[j] - x_p
+    for j in range(_STRIP):
+        dx, dy = f[_DX * _STRIP + j], f[_DY * _STRIP + j]
         u, v = cos * dx + sin * dy, cos * dy - sin * dx
         uu, vv = u * u, v * v
         c2, s2 = co * (uu - vv), cross * 2 * u * v + ring * (uu + vv)
         s2_u, s2_v = 2 * (cross * v + ring * u), 2 * (cross * u + ring * v)
-        n_r, n_i = f[2, j], f[3, j]
-        e_r, e_i = f[0, j] + n_r * c2, f[1, j] + n_i * c2
+        n_r, n_i = f[2 * _STRIP + j], f[3 * _STRIP + j]
+        e_r, e_i = f[0 * _STRIP + j] + n_r * c2, f[1 * _STRIP + j] + n_i * c2
         h_r, h_i = n_r * s2, n_i * s2
-        p_r, p_i = f[4, j] + f[6, j] * c2, f[5, j] + f[7, j] * c2
+        p_r, p_i = (
+            f[4 * _STRIP + j] + f[6 * _STRIP + j] * c2,
+            f[5 * _STRIP + j] + f[7 * _STRIP + j] * c2,
+        )
         eu_r, eu_i = p_r * u + 2 * co * u * n_r, p_i * u + 2 * co * u * n_i
         ev_r, ev_i = p_r * v - 2 * co * v * n_r, p_i * v - 2 * co * v * n_i
-        hu_r = f[6, j] * s2 * u + n_r * s2_u
-        hu_i = f[7, j] * s2 * u + n_i * s2_u
-        hv_r = f[6, j] * s2 * v + n_r * s2_v
-        hv_i = f[7, j] * s2 * v + n_i * s2_v
-        per = square / (f[24, j] + 1e-30)
-        n_r, n_i = f[14, j], f[15, j]
-        m_r, m_i = per * f[18, j], per * f[19, j]
-        z_r, z_i = f[12, j] + n_r * c2, f[13, j] + n_i * c2
+        hu_r = f[6 * _STRIP + j] * s2 * u + n_r * s2_u
+        hu_i = f[7 * _STRIP + j] * s2 * u + n_i * s2_u
+        hv_r = f[6 * _STRIP + j] * s2 * v + n_r * s2_v
+        hv_i = f[7 * _STRIP + j] * s2 * v + n_i * s2_v
+        per = square / (f[_DISTANCE * _STRIP + j] + 1e-30)
+        n_r, n_i = f[14 * _STRIP + j], f[15 * _STRIP + j]
+        m_r, m_i = per * f[22 * _STRIP + j], per * f[23 * _STRIP + j]
+        z_r, z_i = f[12 * _STRIP + j] + n_r * c2, f[13 * _STRIP + j] + n_i * c2
         y_r, y_i = n_r * s2, n_i * s2
-        p_r, p_i = per * f[16, j] + m_r * c2, per * f[17, j] + m_i * c2
+        p_r, p_i = per * f[20 * _STRIP + j] + m_r * c2, per * f[21 * _STRIP + j] + m_i * c2
         zu_r, zu_i = p_r * u + 2 * co * u * n_r, p_i * u + 2 * co * u * n_i
         zv_r, zv_i = p_r * v - 2 * co * v * n_r, p_i * v - 2 * co * v * n_i
         yu_r, yu_i = m_r * s2 * u + n_r * s2_u, m_i * s2 * u + n_i * s2_u
@@ -262,15 +261,19 @@ def _bend_z(
         s_uz += q * (eu_r * z_r + eu_i * z_i + hu_r * y_r + hu_i * y_i)
         s_vz = k_r * zv_r + k_i * zv_i + l_r * yv_r + l_i * yv_i
         s_vz += q * (ev_r * z_r + ev_i * z_i + hv_r * y_r + hv_i * y_i)
-        s_zz = k_r * (f[20, j] + f[22, j] * c2) + k_i * (f[21, j] + f[23, j] * c2)
-        s_zz += (l_r * f[22, j] + l_i * f[23, j]) * s2
+        s_zz = k_r * (f[16 * _STRIP + j] + f[18 * _STRIP + j] * c2) + k_i * (
+            f[17 * _STRIP + j] + f[19 * _STRIP + j] * c2
+        )
+        s_zz += (l_r * f[18 * _STRIP + j] + l_i * f[19 * _STRIP + j]) * s2
         s_zz += q * (z_r * z_r + z_i * z_i + y_r * y_r + y_i * y_i)
         g_r, g_i, w = 2 * rho + 4 * a * e_r, 4 * a * e_i, 4 * a
-        out[3, j] += weight * (k_r * z_r + k_i * z_i + l_r * y_r + l_i * y_i)
-        out[8, j] += weight * (sin * s_vz - cos * s_uz)
-        out[9, j] -= weight * (sin * s_uz + cos * s_vz)
-        out[10, j] += weight * s_zz
-        out[13, j] += weight * (g_r * z_r + g_i * z_i + w * (h_r * y_r + h_i * y_i))
+        f[(_SUMS + 3) * _STRIP + j] += weight * (k_r * z_r + k_i * z_i + l_r * y_r + l_i * y_i)
+        f[(_SUMS + 8) * _STRIP + j] += weight * (sin * s_vz - cos * s_uz)
+        f[(_SUMS + 9) * _STRIP + j] -= weight * (sin * s_uz + cos * s_vz)
+        f[(_SUMS + 10) * _STRIP + j] += weight * s_zz
+        f[(_SUMS + 13) * _STRIP + j] += weight * (
+            g_r * z_r + g_i * z_i + w * (h_r * y_r + h_i * y_i)
+        )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -169,8 +169,10 @@ def radial_image(
         sums = radial_strip(profile, lens, pixels, first, last, x_p, y_p, amplitude, count, f)
         for row in range(first, last):
             for k in range(count):
+                here, begin = out[row, k], (row - first) * columns
+                there = sums[k, begin : begin + columns]
                 for j in range(columns):
-                    out[row, k, j] = sums[k, (row - first) * columns + j]
+                    here[j] = there[j]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")

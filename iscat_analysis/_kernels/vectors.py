@@ -94,6 +94,10 @@ class Code:
         """Give x y + z."""
         return self._b.fadd(self._b.fmul(x, y, flags=_FLAGS), z, flags=_FLAGS)
 
+    def plus_itself(self, x: Any) -> Any:
+        """Give 2 x."""
+        return self._b.fadd(x, x, flags=_FLAGS)
+
     def joined(self, one: Any, other: Any) -> Any:
         """Put two halves of a register together."""
         return self._b.shuffle_vector(one, other, _lanes(range(LANES)))
