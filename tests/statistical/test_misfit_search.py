@@ -72,7 +72,7 @@ def test_a_wrong_model_finds_what_is_there_and_no_more(
     instrument: Instrument, cause: str | None
 ) -> None:
     result, said = _analysed(instrument)
-    table = result.fits[result.table["status"] != "sidelobe"]
+    table = result.fits[result.fits["status"] != "sidelobe"]
     for x, y, frame in zip(LANDINGS.x_px, LANDINGS.y_px, LANDINGS.frame, strict=True):
         near = np.hypot(table["x_px"] - x, table["y_px"] - y) < 3
         near &= np.abs(table["frame"] - frame) <= 8 + table["frame_ci95"]
