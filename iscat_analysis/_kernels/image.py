@@ -26,7 +26,7 @@ from iscat_analysis._kernels.lattice_rows import (
     lattice_signal,
     rows_needed,
 )
-from iscat_analysis._kernels.radial_rows import radial_image, radial_signal
+from iscat_analysis._kernels.radial_rows import radial_gradient, radial_parts, radial_signal
 from iscat_analysis._kernels.stamp import stamp_gradient, stamp_signal
 
 FloatArray = NDArray[np.float64]
@@ -105,17 +105,17 @@ def signal_parts(
     unit: float,
     out: FloatArray,
 ) -> None:
-    """Fill `out` (ny, 2, nx) with P and Q of the signal a P + a² Q.
+    """Fill `out` (2, ny·nx) with P and Q of the signal a P + a² Q.
 
     `unit` is an amplitude at which neither drowns in the other.  Not for samples at one height,
     which are P and Q themselves.
     """
     if not lens.half:
-        radial_image(profile, lens, pixels, x_p, y_p, unit, out)
+        radial_parts(profile, lens, pixels, x_p, y_p, out)
         return
-    f = _begin_lattice(profile, lens, pixels, x_p, y_p, False)
+    f, nx = _begin_lattice(profile, lens, pixels, x_p, y_p, False), pixels.x.size
     for row in range(pixels.y.size):
-        p, q = out[row, 0], out[row, 1]
+        p, q = out[0, row * nx : (row + 1) * nx], out[1, row * nx : (row + 1) * nx]
         lattice_signal(lens, pixels, row, y_p, unit, f, p)
         lattice_signal(lens, pixels, row, y_p, -unit, f, q)
         for j in range(p.size):
@@ -178,4 +178,4 @@ def signal_gradient(
         for row in range(pixels.y.size):
             lattice_gradient(lens, pixels, row, y_p, amplitude, f, out[row])
     else:
-        radial_image(profile, lens, pixels, x_p, y_p, amplitude, out)
+        radial_gradient(profile, lens, pixels, x_p, y_p, amplitude, out)

@@ -154,25 +154,38 @@ def radial_strip(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def radial_image(
+def radial_gradient(
     profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
     out: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill `out` (ny, 5, nx) with signal and gradient, or (ny, 2, nx) with the parts of a signal.
-
-    These are as in `signal_gradient` and `signal_parts` of `iscat_analysis._kernels.image`.
-    """
-    rows, count, columns = out.shape
+    """As `iscat_analysis._kernels.image.signal_gradient`."""
+    rows, columns = pixels.y.size, pixels.x.size
     together, f = strip_scratch(pixels)
     for first in range(0, rows, together):
         last = min(first + together, rows)
-        sums = radial_strip(profile, lens, pixels, first, last, x_p, y_p, amplitude, count, f)
+        sums = radial_strip(profile, lens, pixels, first, last, x_p, y_p, amplitude, 5, f)
         for row in range(first, last):
-            for k in range(count):
-                here, begin = out[row, k], (row - first) * columns
-                there = sums[k, begin : begin + columns]
+            begin = (row - first) * columns
+            for k in range(5):
+                here, there = sums[k, begin : begin + columns], out[row, k]
                 for j in range(columns):
-                    here[j] = there[j]
+                    there[j] = here[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def radial_parts(
+    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, out: FloatArray
+) -> None:
+    """As `iscat_analysis._kernels.image.signal_parts`."""
+    rows, columns = pixels.y.size, pixels.x.size
+    together, f = strip_scratch(pixels)
+    for first in range(0, rows, together):
+        last = min(first + together, rows)
+        sums = radial_strip(profile, lens, pixels, first, last, x_p, y_p, 1.0, 2, f)
+        for k in range(2):
+            here, there = sums[k], out[k, first * columns : last * columns]
+            for j in range(there.size):
+                there[j] = here[j]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -181,8 +194,13 @@ def radial_signal(
     out: FloatArray,
 ) -> None:  # fmt: skip
     """As `iscat_analysis._kernels.image.signal_image`."""
-    parts = np.empty((out.shape[0], 2, out.shape[1]))
-    radial_image(profile, lens, pixels, x_p, y_p, amplitude, parts)
-    for row in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[row, j] = amplitude * (parts[row, 0, j] + amplitude * parts[row, 1, j])
+    rows, columns = pixels.y.size, pixels.x.size
+    together, f = strip_scratch(pixels)
+    for first in range(0, rows, together):
+        last = min(first + together, rows)
+        sums = radial_strip(profile, lens, pixels, first, last, x_p, y_p, 1.0, 2, f)
+        for row in range(first, last):
+            begin, there = (row - first) * columns, out[row]
+            p, q = sums[0, begin : begin + columns], sums[1, begin : begin + columns]
+            for j in range(columns):
+                there[j] = amplitude * (p[j] + amplitude * q[j])

@@ -37,9 +37,9 @@ def scan_heights(
     empty amplitude range holds the amplitude fixed.
     """
     work, profile = scratch(axial, lens, 1)
-    here, ny, nx = theta.copy(), pixels.y.size, pixels.x.size
-    flat, parts = data.reshape(4, ny * nx), np.empty((ny, 2, nx))
-    p, q, s = np.empty(ny * nx), np.empty(ny * nx), np.empty(ny * nx)
+    here, size = theta.copy(), pixels.y.size * pixels.x.size
+    flat, parts, s = data.reshape(4, size), np.empty((2, size)), np.empty(size)
+    p, q = parts[0], parts[1]
     low, high = amplitude_range
     unit, level = theta[3] if theta[3] != 0.0 else 1.0, np.exp(theta[4])
     for k in range(heights.size):
@@ -47,9 +47,6 @@ def scan_heights(
         start, stop = span(lens, pixels, here, axial.heights.shape[3])
         profile_at(axial, here[2], start, stop, work, profile)
         signal_parts(profile, lens, pixels, theta[0], theta[1], unit, parts)
-        for i in range(ny):
-            for j in range(nx):
-                p[i * nx + j], q[i * nx + j] = parts[i, 0, j], parts[i, 1, j]
         a = theta[3]
         for _ in range(2 if low < high else 0):
             pull, known = _amplitude(kind, flat, level, a, p, q)
