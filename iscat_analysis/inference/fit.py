@@ -299,33 +299,32 @@ def _heights(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[tuple[
 
     Each start is θ with a maximum's height and amplitude; beside it the log-likelihood there.
     """
-    low, high = box.lower[2], box.upper[2]
-    count = math.ceil((high - low) / likelihood.model.fringe_nm * SCANS_PER_FRINGE) + 1
-    heights = np.unique(np.append(np.linspace(low, high, max(count, 3)), theta[2]))
+    low, high, given = float(box.lower[2]), float(box.upper[2]), float(theta[2])
+    count = max(math.ceil((high - low) / likelihood.model.fringe_nm * SCANS_PER_FRINGE) + 1, 3)
+    heights = sorted({*np.linspace(low, high, count).tolist(), given})
     bounds = (float(box.lower[3]), float(box.upper[3])) if box.free[3] else None
-    values, amplitudes = likelihood.scan_heights(heights, theta, bounds)
-    padded = np.concatenate([[-np.inf], values, [-np.inf]])
-    peaks = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]))
+    values, amplitudes = likelihood.scan_heights(np.array(heights), theta, bounds)
+    padded = [-math.inf, *values.tolist(), -math.inf]
+    peaks = [i for i in range(len(heights)) if padded[i] <= padded[i + 1] >= padded[i + 2]]
     starts = []
-    for i in peaks[np.argsort(-values[peaks], kind="stable")][:_STARTS]:
+    for i in sorted(peaks, key=lambda i: -padded[i + 1])[:_STARTS]:
         begin = theta.copy()
         begin[2], begin[3] = heights[i], amplitudes[i]
-        starts.append((begin, float(values[i])))
+        starts.append((begin, padded[i + 1]))
     return starts
 
 
 def _alternatives(optima: list[Optimum], fringe_nm: float) -> tuple[Alternative, ...]:
     """Optima at other heights than the best one and than each other."""
-    best = optima[0]
-    kept: list[Optimum] = [best]
-    for other in optima[1:]:
-        if all(abs(other.theta[2] - o.theta[2]) > fringe_nm / 8 for o in kept):
-            kept.append(other)
-    gaps = [
-        Alternative(float(o.theta[2]), max(best.log_likelihood - o.log_likelihood, 0.0))
-        for o in kept[1:]
-    ]
-    return tuple(sorted(gaps, key=lambda a: a.log_likelihood_gap))
+    best = optima[0].log_likelihood
+    places = [(float(o.theta[2]), max(best - o.log_likelihood, 0.0)) for o in optima]
+    kept = places[:1]
+    for z, gap in places[1:]:
+        if all(abs(z - other) > fringe_nm / 8 for other, _ in kept):
+            kept.append((z, gap))
+    return tuple(
+        sorted((Alternative(*one) for one in kept[1:]), key=lambda a: a.log_likelihood_gap)
+    )
 
 
 def _uncertainty(

@@ -292,15 +292,18 @@ class Likelihood:
             An array has another shape or does not hold real numbers.
         """
         heights, point = vector_of("heights", heights, (-1,)), vector_of("theta", theta, (5,))
-        points = np.tile(point, (heights.size, 1))
+        points = np.empty((heights.size, 5))
+        points[:] = point
         points[:, 2] = heights
         inside = self.supports(points)
-        known = heights[inside]
-        found, refitted = np.empty(known.size), np.empty(known.size)
+        known = heights if inside.all() else heights[inside]
+        found, refitted = np.empty((2, known.size))
         scan_heights(
             self.model.axial_table, *self._arguments, known, amplitude_range or (0.0, 0.0), point,
             found, refitted,
         )  # fmt: skip
+        if known is heights:
+            return found, refitted
         values, amplitudes = np.full(heights.size, -np.inf), np.full(heights.size, np.nan)
         values[inside], amplitudes[inside] = found, refitted
         return values, amplitudes
