@@ -143,7 +143,9 @@ def main() -> int:
     parser.add_argument("--median", action="store_true", help="the median as background")
     parser.add_argument("--movies", type=int, default=MOVIES)
     options = parser.parse_args()
-    settings = {**SETTINGS, "background.method": "median" if options.median else "tracks"}
+    settings = dict(SETTINGS)
+    if options.median:
+        settings["background.frames"] = "all"
     count = 1 if options.quick else options.movies
     counted, tables, seconds, peer = [], [], [], []
     warm = wander((40, 64, 64), seed=1, species=((400.0, 0.15, 2),))
@@ -163,7 +165,7 @@ def main() -> int:
     megabytes = 2e-6 * np.prod(SHAPE)
     numbers = {
         "movies": count,
-        "background": settings["background.method"],
+        "background": "median" if options.median else "tracks",
         "found": sum(c["found"] for c in counted) / positions,
         "not_there": sum(c["not there"] for c in counted) / positions,
         "false_tracks_per_movie": sum(c["false tracks"] for c in counted) / count,

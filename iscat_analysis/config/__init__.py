@@ -41,10 +41,19 @@ from iscat_analysis.config.synthetic import (
     SimulatedMover,
     Simulation,
 )
-from iscat_analysis.config.values import PIXEL_NM, Method, Mode, Scheme, Section, plausible_pixel
+from iscat_analysis.config.values import (
+    ALL,
+    PIXEL_NM,
+    Method,
+    Mode,
+    Scheme,
+    Section,
+    plausible_pixel,
+)
 
 __all__ = [
     "ABERRATIONS",
+    "ALL",
     "MEASURABLE",
     "PIXEL_NM",
     "SIMULATED",

@@ -7,8 +7,10 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from iscat_analysis.config.values import (
+    ALL,
     LARGEST_NM,
     FrameRange,
+    FramesOrAll,
     Method,
     Mode,
     NonNegative,
@@ -23,12 +25,13 @@ class BackgroundConfig(Section):
 
     method: Method | None = Field(
         None,
-        description='"fixed": the mean of frames | "median": their median, in mode track without '
-        'frames that of all | "sliding": landing movies | "tracks": moving particles, together '
-        'with their tracks | "known": level_e',
+        description='"fixed": the mean of frames | "median": their median | "sliding": landing '
+        'movies | "tracks": moving particles, together with their tracks | "known": level_e',
     )
-    frames: FrameRange | None = Field(
-        None, description="pre-binding frames [start, stop); absent in landing movies"
+    frames: FramesOrAll | None = Field(
+        None,
+        description='pre-binding frames [start, stop); absent in landing movies | "all": in mode '
+        "track, the median of all analysed frames, particles included",
     )
     window_frames: Annotated[int, Field(ge=4)] | None = Field(
         None,
@@ -46,8 +49,18 @@ class BackgroundConfig(Section):
         False, description="landing movies: divide out the motion of the fixed pattern"
     )
 
+    @property
+    def recorded(self) -> tuple[int, int] | None:
+        """Frames that were recorded before the particles; None where there are none."""
+        return None if isinstance(self.frames, str) else self.frames
+
     @model_validator(mode="after")
     def _consistent(self) -> BackgroundConfig:
+        if self.frames == ALL and self.method not in (None, "median"):
+            raise ValueError(
+                f'frames = "all" is for method = "median", and method is "{self.method}": give the '
+                "frames before the particles, as in frames = [0, 200], or leave frames out"
+            )
         if self.method == "known" and self.level_e is None:
             raise ValueError('method = "known" needs level_e, the known background level')
         if self.method == "sliding" and self.frames is not None:

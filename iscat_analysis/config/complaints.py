@@ -119,6 +119,6 @@ def model_of(annotation: Any) -> type[Section]:
 
 def _is_union_branch(part: Any) -> bool:
     return isinstance(part, str) and (
-        part in {"str", "float", "int", "bool"}
+        part in {"str", "float", "int", "bool", "tuple"}
         or any(mark in part for mark in ("constrained", "literal", "function"))
     )

@@ -19,6 +19,7 @@ from iscat_analysis.config.complaints import complaint
 from iscat_analysis.config.files import read_optics_file, read_toml
 from iscat_analysis.config.renamed import rename
 from iscat_analysis.config.schema import Config
+from iscat_analysis.config.values import ALL
 from iscat_analysis.errors import ConfigError
 
 _RIVALS = {
@@ -243,7 +244,7 @@ def _choose_method_again(values: dict[str, Any], changes: Iterable[Change]) -> N
         if named["method"] in _WITHOUT_FRAMES and "frames" not in named:
             background.pop("frames", None)
     elif background.get("method") in _WITHOUT_FRAMES or (
-        background.get("method") == "fixed" and background.get("frames") is None
+        background.get("method") == "fixed" and background.get("frames") in (None, ALL)
     ):
         del background["method"]
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
+from iscat_analysis.config.values import ALL
+
 OLD_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("background", "method"): {"mean": "fixed", "none": "known"}
 }
@@ -27,6 +29,7 @@ def rename(values: dict[str, Any]) -> None:
         if isinstance(table, dict) and key in table:
             values.setdefault(new_section, {}).setdefault(new_key, table.pop(key))
             _notice(f"{section}.{key}", f"{new_section}.{new_key}")
+    _name_all_frames(values)
     for (section, key), names in OLD_VALUES.items():
         table = values.get(section)
         old = table.get(key) if isinstance(table, dict) else None
@@ -38,6 +41,20 @@ def rename(values: dict[str, Any]) -> None:
                 continue
             table[key] = names[old]
             _notice(f'{section}.{key} = "{old}"', f'"{names[old]}"')
+
+
+def _name_all_frames(values: dict[str, Any]) -> None:
+    """Say of which frames a median is, which without frames meant all of them in mode track."""
+    background, fit, optics = (values.get(name) for name in ("background", "fit", "optics"))
+    if not (isinstance(background, dict) and isinstance(fit, dict)):
+        return
+    dark = isinstance(optics, dict) and str(optics.get("scheme")).lower() == "darkfield"
+    median = background.get("method") == "median" and background.get("frames") is None
+    if median and fit.get("mode") == "track" and not dark:
+        background["frames"] = ALL
+        _notice(
+            'background.method = "median" without background.frames', 'background.frames = "all"'
+        )
 
 
 def _notice(old: str, new: str) -> None:

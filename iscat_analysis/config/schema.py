@@ -19,15 +19,15 @@ from iscat_analysis.config.analysis import (
 )
 from iscat_analysis.config.instrument import Calibration, CameraConfig, Optics, Particle
 from iscat_analysis.config.synthetic import BoundsConfig, Simulation
-from iscat_analysis.config.values import LARGEST_NM, Section, unit_guess
+from iscat_analysis.config.values import ALL, LARGEST_NM, Section, unit_guess
 
 
 class Config(Section):
     """A whole configuration; `iscat_analysis.config.configure` makes one.
 
     The method of the background is explicit in it: where `background.method` is not given, it is
-    ``"fixed"`` if background frames are given and in dark field, else ``"tracks"`` in mode track
-    and ``"sliding"`` in the others.
+    ``"fixed"`` if background frames are given and in dark field (``"median"`` where these are
+    ``"all"``), else ``"tracks"`` in mode track and ``"sliding"`` in the others.
     """
 
     optics: Optics = Field(default_factory=Optics)
@@ -49,6 +49,7 @@ class Config(Section):
         if self.background.method is None:
             method = "tracks" if self.fit.mode == "track" else "sliding"
             method = "fixed" if known else method
+            method = "median" if self.background.frames == ALL else method
             # The model is frozen for its users; here it is still being made.
             self.__dict__["background"] = self.background.model_copy(update={"method": method})
         elif self.background.method == "sliding" and self.optics.scheme == "darkfield":
@@ -71,6 +72,23 @@ class Config(Section):
             raise ValueError(
                 'background.method = "tracks" needs an interferometric scheme: dark field needs '
                 "background.frames"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _median_has_frames(self) -> Config:
+        background, tracked = self.background, self.fit.mode == "track"
+        if background.frames == ALL and not (tracked and self.optics.scheme != "darkfield"):
+            raise ValueError(
+                'background.frames = "all" is for particles that move over an interferometric '
+                f'background: with fit.mode = "{self.fit.mode}" and optics.scheme = '
+                f'"{self.optics.scheme}" give the frames before the particles, as in '
+                "background.frames = [0, 200]"
+            )
+        if background.method == "median" and background.frames is None and tracked:
+            raise ValueError(
+                'background.method = "median": of which frames?  Give those before the particles, '
+                'as in background.frames = [0, 200], or background.frames = "all"'
             )
         return self
 

@@ -9,7 +9,9 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
+    Tag,
     ValidationError,
 )
 
@@ -45,6 +47,9 @@ def _ordered(frames: tuple[int, int]) -> tuple[int, int]:
         raise ValueError(f"[start, stop) needs 0 <= start < stop, got {list(frames)}")
     return frames
 
+
+ALL = "all"
+"""In place of a range of frames: all that are analysed."""
 
 WAVELENGTH_NM = (200.0, 3000.0)
 """Vacuum wavelengths that a light microscope uses [nm]."""
@@ -130,7 +135,15 @@ def length(low_nm: float, high_nm: float) -> AfterValidator:
     return AfterValidator(check)
 
 
+def _kind_of_frames(frames: Any) -> str:
+    return "literal" if isinstance(frames, str) and frames == ALL else "tuple"
+
+
 FrameRange = Annotated[tuple[int, int], BeforeValidator(_two), AfterValidator(_ordered)]
+FramesOrAll = Annotated[
+    Annotated[FrameRange, Tag("tuple")] | Annotated[Literal["all"], Tag("literal")],
+    Discriminator(_kind_of_frames),
+]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]

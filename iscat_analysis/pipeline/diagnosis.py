@@ -61,7 +61,7 @@ def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
         or (way_of(config) == "tracks" and config.track.free == "joint")
     ):
         return None
-    first, last = background.frames or config.fit.frames or (0, movie.shape[0])
+    first, last = background.recorded or config.fit.frames or (0, movie.shape[0])
     counts = movie.read(first, max(first, min(last, movie.shape[0], first + SPECTRUM_FRAMES)))
     if not len(counts):
         return None

@@ -24,7 +24,7 @@ from iscat_analysis.pipeline.recognise import (
 )
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.tracks import judge_times
-from iscat_analysis.pipeline.ways import Way, way_of
+from iscat_analysis.pipeline.ways import Way, way_of, way_said
 from iscat_analysis.search.changes import Changes
 from iscat_analysis.threads import beside
 
@@ -99,7 +99,8 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     for note in (*movie.notes, *notes):
         run.tell(note)
     way = way_of(config)
-    span = fitted_frames(movie, config, config.background.frames)
+    run.notify(way_said(config))
+    span = fitted_frames(movie, config, config.background.recorded)
     tracked = config.fit.mode == "track"
     if tracked:
         for note in judge_times(config, tracked_frames(movie, config), movie.name):

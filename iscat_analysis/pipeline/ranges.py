@@ -36,7 +36,7 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
     DataError
         The background leaves no frame to fit.
     """
-    before = config.background.frames
+    before = config.background.recorded
     if config.background.method == "known":
         before = None
     elif before is None:
@@ -102,7 +102,7 @@ def tracked_frames(movie: Stack, config: Config) -> int:
     int
         At least 0.
     """
-    first, last = fitted_frames(movie, config, config.background.frames)
+    first, last = fitted_frames(movie, config, config.background.recorded)
     return max(last - first, 0)
 
 

@@ -277,7 +277,7 @@ def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
     list of Sight
         At most `MOST_SIGHTS`, spread evenly over the frames.
     """
-    known = config.background.frames
+    known = config.background.recorded
     start = known[1] if known else 0
     first, last = config.fit.frames or (start, movie.shape[0])
     counts = movie.read(first, last)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import ALL, Config
 from iscat_analysis.errors import ConfigError
 
 Way = Literal["fixed", "sliding", "tracks"]
@@ -27,8 +27,8 @@ def way_of(config: Config) -> Way:
     Parameters
     ----------
     config : Config
-        Its ``background.method`` decides; a median is that of ``background.frames``, or in mode
-        ``track`` of all frames where these are not given.
+        Its ``background.method`` decides; a median is that of ``background.frames``, which may be
+        ``"all"``.
 
     Returns
     -------
@@ -49,7 +49,33 @@ def way_of(config: Config) -> Way:
                 'background.frames = [0, 200], or a known level with background.method = "known"'
             )
         return "sliding"
-    median_of_all = (
-        method == "median" and config.fit.mode == "track" and config.background.frames is None
-    )
-    return "tracks" if method == "tracks" or median_of_all else "fixed"
+    learnt = method == "tracks" or config.background.frames == ALL
+    return "tracks" if learnt else "fixed"
+
+
+def way_said(config: Config) -> str:
+    """Say which frames stand against which.
+
+    Parameters
+    ----------
+    config : Config
+        Its ``background.method`` decides.
+
+    Returns
+    -------
+    str
+        One line that names the method, which need not be written in the configuration.
+    """
+    background = config.background
+    those = "all of them" if background.frames == ALL else "background.frames"
+    if background.recorded:
+        those = "frames {}:{}".format(*background.recorded)
+    others = "frames are compared with"
+    words = {
+        "fixed": f"{others} the mean of {those}",
+        "median": f"{others} the median of {those}",
+        "known": f"{others} background.level_e = {background.level_e or 0:g}",
+        "sliding": "frames just after each frame are compared with those just before it",
+        "tracks": f"{others} the light that all have in common, learnt with the tracks",
+    }
+    return f'background.method = "{background.method}": {words[str(background.method)]}'

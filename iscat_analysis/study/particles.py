@@ -55,7 +55,7 @@ def place_particles(config: Config, rng: np.random.Generator) -> tuple[Simulated
     count = simulation.count
     x = rng.uniform(margin, columns - 1 - margin, count)
     y = rng.uniform(margin, rows - 1 - margin, count)
-    first = config.background.frames
+    first = config.background.recorded
     start = first[1] if first is not None else simulation.frames // 20
     landing = np.sort(rng.integers(start, max(simulation.frames - start // 2, start + 1), count))
     species = np.array(simulation.species or (nominal,))

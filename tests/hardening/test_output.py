@@ -357,7 +357,7 @@ def test_a_run_that_is_under_way_is_respected(forker: Forker, place: Path) -> No
 # ---- disks ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("limit", [400, 8_000, 30_000])
+@pytest.mark.parametrize("limit", [600, 8_000, 30_000])
 def test_a_file_that_cannot_grow(forker: Forker, place: Path, limit: int) -> None:
     (answer,) = forker.run({"run": FIT, "cwd": str(place), "limit": limit})
     assert answer["status"] == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import iscat_analysis as ia
-from iscat_analysis.config import Config, config_to_toml, configure, load_config, read_optics_file
+from iscat_analysis.config import (
+    BackgroundConfig,
+    Config,
+    Fit,
+    config_to_toml,
+    configure,
+    load_config,
+    parse_config,
+    read_optics_file,
+)
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.pipeline.regions import photons_scale
 from iscat_analysis.pipeline.scene import make_scene
@@ -27,6 +37,7 @@ SETTINGS: list[tuple[str, Any]] = [
     ("particle.index", 1.5),
     ("particle.permittivity", (2.1, 0.0)),
     ("background.frames", (0, 50)),
+    ("background.frames", "all"),
     ("background.method", "sliding"),
     ("background.method", "median"),
     ("fit.mode", "track"),
@@ -50,6 +61,7 @@ def _outcome(make: Any) -> Config | str:
         return str(error).partition(": ")[2]
 
 
+@pytest.mark.filterwarnings("ignore:background.method = .median. without:FutureWarning")
 @given(st.lists(st.sampled_from(SETTINGS), max_size=5, unique_by=lambda pair: pair[0]))
 def test_every_way_of_changing_keys_gives_the_same(chosen: list[tuple[str, Any]]) -> None:
     source = {"particle": {"mass_kda": 480.0, "permittivity": [2.0, 0.0]}}
@@ -167,6 +179,45 @@ def test_old_values_work_with_a_line_that_names_the_new_ones() -> None:
     with pytest.warns(FutureWarning, match='"known"'):
         known = configure(settings=["background.method=none", "background.level_e=3"])
     assert known.background.method == "known"
+
+
+# ---- the median of all frames ----------------------------------------------------------------
+
+TRACKED = {"fit": {"mode": "track"}}
+
+
+def test_a_median_of_all_frames_is_asked_for_by_name() -> None:
+    config = configure({**TRACKED, "background": {"frames": "all"}})
+    assert (config.background.method, config.background.frames) == ("median", "all")
+    assert config.background.recorded is None
+    again = parse_config(tomllib.loads(config_to_toml(config)))
+    assert again == config
+    assert configure(again, settings={"background.method": "tracks"}) == configure(TRACKED)
+    assert configure(configure(TRACKED), settings={"background.frames": "all"}) == config
+
+
+def test_a_median_without_frames_means_all_for_one_release_more() -> None:
+    old = {**TRACKED, "background": {"method": "median"}}
+    with pytest.warns(FutureWarning, match=r'without background.frames.*frames = "all"'):
+        assert configure(old).background.frames == "all"
+    with pytest.raises(ConfigError, match=r"of which frames\?.*\[0, 200\].*\"all\""):
+        Config(fit=Fit(mode="track"), background=BackgroundConfig(method="median"))
+
+
+@pytest.mark.parametrize(
+    ("sections", "words"),
+    [
+        ({"background": {"frames": "all"}}, 'fit.mode = "mass"'),
+        ({**TRACKED, "background": {"frames": "all"}, "optics": {"scheme": "darkfield"}}, "dark"),
+        ({**TRACKED, "background": {"frames": "all", "method": "fixed"}}, 'for method = "median"'),
+        ({**TRACKED, "background": {"frames": "every"}}, "[start, stop)"),
+        ({**TRACKED, "background": {"frames": [3, 2]}}, "0 <= start < stop"),
+        ({**TRACKED, "background": {"frames": [0, "x"]}}, "background.frames"),
+    ],
+)
+def test_all_frames_are_no_background_elsewhere(sections: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        configure(sections)
 
 
 # ---- files -----------------------------------------------------------------------------------

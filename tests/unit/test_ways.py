@@ -20,7 +20,7 @@ from iscat_analysis.pipeline.events import Event, remarks, standing_out
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.preview import Preview
 from iscat_analysis.pipeline.scene import Scene, make_scene
-from iscat_analysis.pipeline.ways import Way, way_of
+from iscat_analysis.pipeline.ways import Way, way_of, way_said
 from iscat_analysis.records import EVENT_COLUMNS, SEVERITY, Analysis, Status, Windows
 from iscat_analysis.study.simulate import Movie
 
@@ -162,3 +162,32 @@ def test_the_sums_of_a_region_are_views() -> None:
     assert part.before_e.shape == part.masked.shape == part.saturated.shape == (3, 5)
     assert np.shares_memory(part.after_e, event.windows.after_e)
     assert part.power_ratio == event.windows.power_ratio
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ([], '"sliding": frames just after'),
+        (["fit.mode=track"], '"tracks": frames are compared with the light that all have'),
+        (
+            ["background.frames=[0, 40]"],
+            '"fixed": frames are compared with the mean of frames 0:40',
+        ),
+        (["background.method=median", "background.frames=[0, 40]"], "the median of frames 0:40"),
+        (["background.frames=all", "fit.mode=track"], '"median": frames are compared with the med'),
+        (["background.method=known", "background.level_e=2e4"], "background.level_e = 20000"),
+        (["optics.scheme=darkfield"], "the mean of background.frames"),
+    ],
+)
+def test_the_method_is_said_whether_it_was_written_or_not(settings: list[str], words: str) -> None:
+    assert words in way_said(configure(settings=settings))
+
+
+def test_a_run_says_its_method_first() -> None:
+    told: list[str] = []
+    config = _config("fixed")
+    counts = np.array(list(Movie(config, 1).frames(1)))
+    with open_stack(counts) as movie:
+        analyse(movie, config, notify=told.append)
+    said = way_said(config)
+    assert [text for text in told if "background.method" in text] == [said]
