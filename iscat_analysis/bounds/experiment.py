@@ -23,6 +23,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
+from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
 
@@ -153,13 +154,13 @@ def plan(
     theta = np.array([at.x_nm, at.y_nm, height, model.scale.amplitude(mass), 0.0])
     # with ρ = 0 the signal is the scattered light alone, still in units of the reference
     scattered = replace(model, rho=0.0).image(grid, at.x_nm, at.y_nm, height, mass)
-    area = model.collected_area_nm2(height, mass) / pixel_nm**2
+    area = collected_area_nm2(model, height, mass) / pixel_nm**2
     if model.rho:
         level, per_frame = at.photons_per_pixel, at.photons_per_pixel
         signal = model.image(grid, at.x_nm, at.y_nm, height, mass)
     else:
         level = config.background.level_e or 0.0
-        per_frame = model.photons_per_intensity(at.photons_per_pixel, pixel_nm)
+        per_frame = photons_per_intensity(model, at.photons_per_pixel, pixel_nm)
         signal = scattered
     return Experiment(
         config=config,

@@ -28,6 +28,7 @@ from iscat_analysis.optics.aperture import (
     harmonics,
     weight_on,
 )
+from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.materials import material
 from iscat_analysis.optics.measured import MeasuredField, Template
@@ -200,7 +201,7 @@ def peak_per_amplitude(model: ForwardModel) -> float:
     """
     if isinstance(model.wave, MeasuredField):
         return model.wave.gain
-    weak = 1e-6 / math.sqrt(model.collected_area_nm2(model.height_nm, 1.0))
+    weak = 1e-6 / math.sqrt(collected_area_nm2(model, model.height_nm, 1.0))
     linear, _ = model.wave.peak(model.height_nm, weak, model.rho)
     return abs(linear / weak)
 
@@ -262,7 +263,7 @@ def _mass_scale(model: ForwardModel, line: Calibration) -> MassScale:
     if not model.rho:
         raise ConfigError("[calibration] relates contrast to mass; dark field has no contrast")
     measured = isinstance(model.wave, MeasuredField)
-    area = 0.0 if measured else model.collected_area_nm2(model.height_nm, 1.0)
+    area = 0.0 if measured else collected_area_nm2(model, model.height_nm, 1.0)
     weak = 1e-6 / (peak_per_amplitude(model) if measured else math.sqrt(area))
     linear, quadratic = model.wave.peak(model.height_nm, weak, model.rho)
     linear, quadratic = linear / weak, quadratic / weak**2

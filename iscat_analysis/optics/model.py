@@ -473,56 +473,6 @@ class ForwardModel:
         profile_between(self.axial_table, z_nm, profile)
         return sum(self.wave.peak(z_nm, amplitude, self.rho, profile))
 
-    def collected_area_nm2(self, z_nm: float, mass_kda: float) -> float:
-        """Scattered light that the pupil collects, as an equivalent area of reference.
-
-        Before mask and analyser; aberrations do not matter.
-
-        Multiplied by the background per area it gives the collected scattered photons
-        (physics.md, section 1).
-
-        Parameters
-        ----------
-        z_nm : float
-            Height [nm]; evanescent waves weaken with it.
-        mass_kda : float
-            Mass [kDa].
-
-        Returns
-        -------
-        float
-            Area [nm²]; in dark field per unit incident intensity; NaN where the picture was
-            measured.
-        """
-        if self.is_measured:
-            return math.nan
-        p = self.aperture.pupil
-        decay = np.exp(-2 * p.axial.imag * z_nm)
-        density = (np.abs(p.t_p_cos) ** 2 + np.abs(p.t_s) ** 2) * np.sin(p.theta) * decay
-        pupil_integral = math.pi * float(np.sum(p.weight * density))
-        medium = 1.0 if self.optics.emission == "reciprocal" else 1 / self.optics.n_immersion**2
-        over = self.reference**2 if self.rho else 1.0
-        e1 = abs(self.strength) * self.scale.amplitude(mass_kda)
-        return e1**2 * medium * pupil_integral / over
-
-    def photons_per_intensity(self, photons_per_frame: float, pixel_nm: float) -> float:
-        """Dark field's scale s: photoelectrons per pixel and frame for unit |E_sca|².
-
-        Parameters
-        ----------
-        photons_per_frame : float
-            Scattered photons collected per frame from a particle of the nominal mass.
-        pixel_nm : float
-            Pixel side [nm].
-
-        Returns
-        -------
-        float
-            s.
-        """
-        area = self.collected_area_nm2(self.height_nm, self.material.mass_kda)
-        return photons_per_frame * pixel_nm**2 / area
-
     def _geometry(
         self, grid: PixelGrid, x_nm: float, y_nm: float, amplitude: float
     ) -> tuple[Lens, Pixels, float, float, float]:

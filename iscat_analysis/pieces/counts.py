@@ -14,6 +14,7 @@ from iscat_analysis.inference.checks import BoolArray, real_array
 from iscat_analysis.inference.counts import KNOWN, MEAN, counts_likelihood
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.pieces.setups import darkfield_photons, number_in
 
@@ -96,7 +97,7 @@ class Counts:
         float
             Photoelectrons.
         """
-        area = self.model.collected_area_nm2(z_nm, mass_kda) / self.grid.pixel_nm**2
+        area = collected_area_nm2(self.model, z_nm, mass_kda) / self.grid.pixel_nm**2
         ratio = float(self.ratio[index])
         if not self.model.rho:
             return self._scale_e(ratio) * area
@@ -106,7 +107,7 @@ class Counts:
     def _scale_e(self, ratio: float) -> float:
         """Photoelectrons per pixel for unit signal in dark field."""
         photons = darkfield_photons(self.config.particle)
-        per_frame = self.model.photons_per_intensity(photons, self.grid.pixel_nm)
+        per_frame = photons_per_intensity(self.model, photons, self.grid.pixel_nm)
         return per_frame * ratio * max(self.n_before, 1)
 
 

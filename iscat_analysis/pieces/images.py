@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle
+from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pieces.setups import config_of, darkfield_photons, number_in, together
 
@@ -87,7 +88,7 @@ def psf(
     reach = math.hypot(*(half + np.abs(at[name]).max(initial=0.0) for name in ("x_nm", "y_nm")))
     highest = max(float(at["z_nm"].max(initial=0.0)), particle.height_nm)
     model = forward_model(config, reach * 1.0001 + pixel_nm, z_max_nm=highest)
-    unit = 1.0 if model.rho else model.photons_per_intensity(darkfield_photons(particle), pixel_nm)
+    unit = 1.0 if model.rho else photons_per_intensity(model, darkfield_photons(particle), pixel_nm)
     grid = PixelGrid.centred(side, pixel_nm)
     out = np.empty((*at["x_nm"].shape, side, side))
     for place in np.ndindex(at["x_nm"].shape):

@@ -12,6 +12,7 @@ from iscat_analysis.bounds import event_bounds, quantum_information
 from iscat_analysis.bounds.experiment import expected_likelihood
 from iscat_analysis.config import Calibration, CameraConfig, Config, Optics, Particle
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.pieces.setups import config_of, darkfield_photons, number_in, together
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
@@ -291,8 +292,8 @@ class _Setups:
         level_e = scale_e = now["photons_per_pixel"]
         if self._dark:
             photons = darkfield_photons(self._config.particle)
-            scale_e = model.photons_per_intensity(photons, self._pixel_nm)
-        area = model.collected_area_nm2(now["z_nm"], now["mass_kda"]) / self._pixel_nm**2
+            scale_e = photons_per_intensity(model, photons, self._pixel_nm)
+        area = collected_area_nm2(model, now["z_nm"], now["mass_kda"]) / self._pixel_nm**2
         collected = now["n_after"] * scale_e * area
         return _At(model, theta, level_e, scale_e, now["n_before"], now["n_after"], collected)
 

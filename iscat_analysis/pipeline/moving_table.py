@@ -11,6 +11,7 @@ from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.inference.common import variances_left
 from iscat_analysis.inference.fit import POOR_FIT_P
 from iscat_analysis.optics.blur import PATH_SPREAD, blurred
+from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.pieces.regions import saturated_near
 from iscat_analysis.pipeline.linking import unlike
@@ -276,7 +277,7 @@ def _areas(model: ForwardModel, z_nm: FloatArray, mass_kda: FloatArray) -> Float
     """Give the collected light as an area of background [nm²]."""
     heights = _heights(z_nm)
     nominal = model.material.mass_kda
-    unit = [model.collected_area_nm2(float(z), nominal) for z in heights]
+    unit = [collected_area_nm2(model, float(z), nominal) for z in heights]
     scale = [model.scale.amplitude(float(m)) / model.scale.amplitude(nominal) for m in mass_kda]
     return np.asarray(np.interp(z_nm, heights, unit) * np.array(scale) ** 2)
 

@@ -11,6 +11,7 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import MEAN, counts_likelihood
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.movie.background import smooth_background
+from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.scene import Scene, is_counted
 from iscat_analysis.records import Candidate, FloatArray, Windows
@@ -228,7 +229,7 @@ def photons_scale(scene: Scene, windows: Windows) -> float:
             "give the scattered photons that are collected per frame from a particle of "
             "particle.mass_kda"
         )
-    per_frame = scene.model.photons_per_intensity(photons, scene.pixel_nm)
+    per_frame = photons_per_intensity(scene.model, photons, scene.pixel_nm)
     return per_frame * windows.power_ratio * max(windows.n_before, 1)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from iscat_analysis.movie.drift import Trajectory
+from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.pieces.regions import line_of, lines_from, numbered
 from iscat_analysis.pipeline.events import Event, Fitted
 from iscat_analysis.pipeline.regions import photons_scale
@@ -152,7 +153,7 @@ def collected_photons(scene: Scene, event: Event) -> float:
         Photoelectrons (the quantum efficiency counts as part of the collection).
     """
     windows = event.windows
-    area = scene.model.collected_area_nm2(event.fit.z_nm, event.fit.mass_kda)
+    area = collected_area_nm2(scene.model, event.fit.z_nm, event.fit.mass_kda)
     if scene.additive:
         per_pixel = photons_scale(scene, windows)
     else:

@@ -17,6 +17,7 @@ from iscat_analysis.bounds import EventBounds, Experiment, plan
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.regions import Region, region_likelihood
 from iscat_analysis.pipeline.scene import Scene, make_scene
@@ -96,7 +97,7 @@ class Setting:
         signal = model.image(grid, *(float(v) for v in truth))
         if self.scene.additive:
             photons = self.config.bounds.photons_per_pixel
-            return signal * model.photons_per_intensity(photons, self.scene.pixel_nm)
+            return signal * photons_per_intensity(model, photons, self.scene.pixel_nm)
         return signal * self.config.bounds.photons_per_pixel
 
     def draw(self, truth: FloatArray, random: np.random.Generator | None) -> Windows:

@@ -30,6 +30,7 @@ from scipy.ndimage import gaussian_filter
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.camera import camera_from_config, read_map
+from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import FloatArray, Progress, silent
 from iscat_analysis.study.movers import MovingParticle, place_movers, track_rows
@@ -438,8 +439,8 @@ class Movie:
     def _scale(self) -> float:
         if self._model.rho:
             return 1.0
-        return self._model.photons_per_intensity(
-            self._config.simulation.photons_per_pixel, self._pixel_nm
+        return photons_per_intensity(
+            self._model, self._config.simulation.photons_per_pixel, self._pixel_nm
         )
 
     def _peak_contrasts(self) -> dict[tuple[float, float], float]:

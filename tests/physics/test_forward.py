@@ -11,6 +11,7 @@ from golden_setups import CASES, GOLD, NAMES, PAPER, golden_config, reference_se
 
 from iscat_analysis.bounds import plan
 from iscat_analysis.config import Config
+from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 
 GOLDEN_FIELD = 1e-6  # precision promised by the golden files
@@ -173,7 +174,7 @@ def test_parseval(name: str, share: float) -> None:
     along = np.abs(model.field(r, np.zeros_like(r), 5.0, mass)) ** 2
     across = np.abs(model.field(np.zeros_like(r), r, 5.0, mass)) ** 2
     mean = (along + across).sum(0) / 2  # |e|² turns with cos 2φ only
-    disc = np.cumsum(mean * 2 * np.pi * r * 5.0) / model.collected_area_nm2(5.0, mass)
+    disc = np.cumsum(mean * 2 * np.pi * r * 5.0) / collected_area_nm2(model, 5.0, mass)
     assert disc[-1] == pytest.approx(share, abs=3e-4)
     assert 2 * disc[-1] - disc[1999] == pytest.approx(1.0, abs=2e-3)  # R → ∞
 

@@ -1,0 +1,62 @@
+"""Light that a particle sends into the pupil: how much, and in photons (physics.md, section 1)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from iscat_analysis.optics.model import ForwardModel
+
+
+def collected_area_nm2(model: ForwardModel, z_nm: float, mass_kda: float) -> float:
+    """Scattered light that the pupil collects, as an equivalent area of reference.
+
+    It is counted before mask and analyser; aberrations do not change it.  Multiplied by the
+    background per area it gives the collected scattered photons.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        Of the microscope and the particle's material.
+    z_nm : float
+        Height [nm]; evanescent waves weaken with it.
+    mass_kda : float
+        Mass [kDa].
+
+    Returns
+    -------
+    float
+        Area [nm²]; in dark field per unit incident intensity; NaN where the picture was measured.
+    """
+    if model.is_measured:
+        return math.nan
+    p = model.aperture.pupil
+    decay = np.exp(-2 * p.axial.imag * z_nm)
+    density = (np.abs(p.t_p_cos) ** 2 + np.abs(p.t_s) ** 2) * np.sin(p.theta) * decay
+    pupil_integral = math.pi * float(np.sum(p.weight * density))
+    medium = 1.0 if model.optics.emission == "reciprocal" else 1 / model.optics.n_immersion**2
+    over = model.reference**2 if model.rho else 1.0
+    e1 = abs(model.strength) * model.scale.amplitude(mass_kda)
+    return e1**2 * medium * pupil_integral / over
+
+
+def photons_per_intensity(model: ForwardModel, photons_per_frame: float, pixel_nm: float) -> float:
+    """Dark field's scale s: photoelectrons per pixel and frame for unit |E_sca|².
+
+    Parameters
+    ----------
+    model : ForwardModel
+        In dark field.
+    photons_per_frame : float
+        Scattered photons collected per frame from a particle of the nominal mass.
+    pixel_nm : float
+        Pixel side [nm].
+
+    Returns
+    -------
+    float
+        s.
+    """
+    area = collected_area_nm2(model, model.height_nm, model.material.mass_kda)
+    return photons_per_frame * pixel_nm**2 / area
