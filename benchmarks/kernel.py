@@ -57,9 +57,9 @@ def multiply_add(repeats: int, a: float, b: float) -> float:
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
-def heights(repeats, axial, z, stop, work, profile):  # type: ignore[no-untyped-def]
+def heights(repeats, axial, z, stop, profile):  # type: ignore[no-untyped-def]
     for k in range(repeats):
-        radial.profile_at(axial, z + 1e-3 * k, 0, stop, work, profile)
+        radial.profile_at(axial, z + 1e-3 * k, 0, stop, profile)
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
@@ -90,10 +90,10 @@ def scores(repeats, kind, data, g, score, fisher):  # type: ignore[no-untyped-de
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def passes(  # type: ignore[no-untyped-def]
-    repeats, axial, theta, start, stop, work, profile, lens, pixels, kind, data, score, fisher
+    repeats, axial, theta, start, stop, profile, lens, pixels, kind, data, score, fisher
 ):
     for _ in range(repeats):
-        radial.profile_at(axial, theta[2], start, stop, work, profile)
+        radial.profile_at(axial, theta[2], start, stop, profile)
         scoring.score_pass(profile, lens, pixels, kind, data, theta, score, fisher)
 
 
@@ -113,12 +113,10 @@ def pass_seconds(side: int, repeats: int) -> float:
     likelihood, theta, _ = Batch(side, 1).sets[0]
     axial, arguments = likelihood.model.axial_table, likelihood._arguments
     lens, pixels = arguments[:2]
-    work, profile = scoring.scratch(axial, lens, 2)
+    profile = scoring.blank_profile(axial, lens, 2)
     start, stop = scoring.span(lens, pixels, theta, axial.heights.shape[3])
     score, fisher = np.empty(5), np.empty((5, 5))
-    return seconds(
-        passes, repeats, axial, theta, start, stop, work, profile, *arguments, score, fisher
-    )
+    return seconds(passes, repeats, axial, theta, start, stop, profile, *arguments, score, fisher)
 
 
 COMPARED = """
@@ -208,9 +206,9 @@ def parts(repeats: int) -> dict[str, float]:
     likelihood, start, _ = Batch(SIDE, 1).sets[0]
     axial = likelihood.model.axial_table
     lens, pixels, kind, data = likelihood._arguments
-    work, profile = scoring.scratch(axial, lens, 2)
+    profile = scoring.blank_profile(axial, lens, 2)
     _, stop = scoring.span(lens, pixels, start, axial.heights.shape[3])
-    turn = seconds(heights, repeats, axial, start[2], stop, work, profile)
+    turn = seconds(heights, repeats, axial, start[2], stop, profile)
     f: FloatArray = np.zeros((20, quintics.padded(SIDE**2)))
     f[quintics.DISTANCE] = np.linspace(0, stop // radial.POWERS - 1, f.shape[1])
     g = np.zeros((SIDE, 5, SIDE))

@@ -157,24 +157,24 @@ def cut(pixels: Pixels, r0: int, r1: int, c0: int, c1: int) -> Pixels:
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw(
     pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
-    work: FloatArray, profile: FloatArray, out: FloatArray,
+    _work: FloatArray, profile: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` with the signal of one row."""
     table, lens = table_of(pictures, group), lens_of(pictures, group)
     start, stop = span(lens, pixels, theta, table.heights.shape[3])
-    picture = picture_at(table, lens, theta[2], start, stop, work, profile)
+    picture = picture_at(table, lens, theta[2], start, stop, profile)
     signal_image(picture, lens, pixels, theta[0], theta[1], theta[3], out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw_gradient(
     pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
-    work: FloatArray, profile: FloatArray, out: FloatArray,
+    _work: FloatArray, profile: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (ny, 5, nx) with the signal of one row and its gradient."""
     table, lens = table_of(pictures, group), lens_of(pictures, group)
     start, stop = span(lens, pixels, theta, table.heights.shape[3])
-    picture = picture_at(table, lens, theta[2], start, stop, work, profile)
+    picture = picture_at(table, lens, theta[2], start, stop, profile)
     signal_gradient(picture, lens, pixels, theta[0], theta[1], theta[3], out)
 
 

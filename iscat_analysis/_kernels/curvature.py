@@ -15,7 +15,7 @@ from iscat_analysis._kernels.hessian import signal_hessian
 from iscat_analysis._kernels.image import Lens, Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.radial import AxialTable, profile_at
-from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, image_score, scratch, span
+from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, blank_profile, image_score, span
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -28,9 +28,9 @@ def derivatives_between(
     axial: AxialTable, lens: Lens, pixels: Pixels, theta: FloatArray, rows: FloatArray
 ) -> None:
     """Fill `rows` at a height between those of a table."""
-    work, profile = scratch(axial, lens, 3)
+    profile = blank_profile(axial, lens, 3)
     start, stop = span(lens, pixels, theta, axial.heights.shape[3])
-    profile_at(axial, theta[2], start, stop, work, profile)
+    profile_at(axial, theta[2], start, stop, profile)
     signal_hessian(profile, lens, pixels, theta[0], theta[1], theta[3], rows)
 
 

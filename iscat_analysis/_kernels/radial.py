@@ -21,14 +21,15 @@ interval; the channels are Re F0, Im F0, Re F2, Im F2, followed by the same four
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.special import j0, j1
 
-from iscat_analysis._kernels.vectors import LANES, together
+from iscat_analysis._kernels.vectors import LANES, Code, instructions
 
 FloatArray = NDArray[np.float64]
 
@@ -38,6 +39,9 @@ STEP = 0.3
 
 POWERS = 6
 """Of a quintic."""
+
+_ROWS = 6  # of a table, of which one height between two is mixed
+_CHANNELS = 4  # of an order of a radial profile
 
 
 class AxialTable(NamedTuple):
@@ -214,79 +218,79 @@ def radial_profile(
             )
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
-def _mix(
-    heights: FloatArray, i: int, channel: int, start: int, w: FloatArray, out: FloatArray
-) -> None:
-    """Fill `out` (n) with the combination w (6) of a channel's rows at heights i and i + 1.
+def _mixed(code: Code, place: Any, orders: int) -> list[tuple[Any, Any]]:
+    """Write what mixes eight numbers of a channel and of the next with the carrier put back.
 
-    The rows begin at `start`.  Three at a time: against more that might overlap, the compiler gives
-    up on vectors, as it does where it does not know that a row's numbers follow one another.
+    One pair, real and imaginary part, for each order.
     """
-    span = slice(start, start + out.size)
-    low, high = heights[i], heights[i + 1]
-    t0, t1, t2 = low[0, channel, span], low[1, channel, span], low[2, channel, span]
-    w0, w1, w2 = w[0], w[1], w[2]
-    for j in range(out.size):
-        out[j] = w0 * t0[j] + w1 * t1[j] + w2 * t2[j]
-    t0, t1, t2 = high[0, channel, span], high[1, channel, span], high[2, channel, span]
-    w0, w1, w2 = w[3], w[4], w[5]
-    for j in range(out.size):
-        out[j] += w0 * t0[j] + w1 * t1[j] + w2 * t2[j]
+    *weights, cos, sin, kappa = code.factors
+    width = code.length(code.one, 3)
+    line = code.times(code.length(code.one, 2), width)
+    below = code.negative(kappa)
+
+    def channel(begin: Any) -> list[Any]:
+        places = (code.plus(begin, code.times(code.index(k), line)) for k in range(_ROWS))
+        rows = [code.load(code.at(code.one, where)) for where in places]
+        out = []
+        for order in range(orders):
+            first, *others = weights[_ROWS * order : _ROWS * (order + 1)]
+            total = code.multiply(first, rows[0])
+            for weight, row in zip(others, rows[1:], strict=True):
+                total = code.multiply_add(weight, row, total)
+            out.append(total)
+        return out
+
+    re, im = channel(place), channel(code.plus(place, width))
+    if orders > 1:  # ∂z + iκ
+        re[1] = code.multiply_add(below, im[0], re[1])
+        im[1] = code.multiply_add(kappa, re[0], im[1])
+    if orders > 2:  # ∂z² + 2iκ (∂z + iκ) + κ²
+        turned_re, turned_im = code.negative(code.plus_itself(im[1])), code.plus_itself(re[1])
+        re[2] = code.multiply_add(kappa, code.multiply_add(kappa, re[0], turned_re), re[2])
+        im[2] = code.multiply_add(kappa, code.multiply_add(kappa, im[0], turned_im), im[2])
+    back = code.negative(sin)
+    return [
+        (
+            code.multiply_add(cos, a, code.multiply(back, b)),
+            code.multiply_add(sin, a, code.multiply(cos, b)),
+        )
+        for a, b in zip(re, im, strict=True)
+    ]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
-def _turn(
-    re: FloatArray,
-    im: FloatArray,
-    cos: float,
-    sin: float,
-    out: FloatArray,
-    first_re: int,
-    first_im: int,
-    stride: int,
-) -> None:
-    """Multiply re + i·im by cos + i·sin, into the numbers of `out` from two first ones on."""
-    for j in range(re.size):
-        a, b = re[j], im[j]
-        out[first_re + j * stride] = a * cos - b * sin
-        out[first_im + j * stride] = a * sin + b * cos
+def _write_radial(code: Code, orders: int) -> None:
+    """Fill eight places of a profile whose channels follow one another."""
+    begin = code.times(code.first, code.index(_CHANNELS * orders))
+    far = code.plus(code.first, code.times(code.index(2), code.length(code.one, 3)))
+    both = zip(_mixed(code, code.first, orders), _mixed(code, far, orders), strict=True)
+    for order, (one, other) in enumerate(both):
+        pairs = (code.halves(row) for row in code.exchanged([*one, *other]))
+        low, high = zip(*pairs, strict=True)
+        for k, four in enumerate((*low, *high)):
+            place = code.plus(begin, code.index(_CHANNELS * (k * orders + order)))
+            code.store(four, code.at(code.other, place))
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
-def _turn_here(re: FloatArray, im: FloatArray, cos: float, sin: float) -> None:
-    """Multiply re + i·im by cos + i·sin where it stands."""
-    for j in range(re.size):
-        a, b = re[j], im[j]
-        re[j] = a * cos - b * sin
-        im[j] = a * sin + b * cos
+def _write_lattice(code: Code, orders: int) -> None:
+    """Fill eight places of a channel of a lattice and of the next."""
+    width = code.length(code.one, 3)
+    for order, pair in enumerate(_mixed(code, code.first, orders)):
+        line = code.times(code.times(code.index(order), code.length(code.one, 2)), width)
+        place = code.plus(code.first, line)
+        for row in pair:
+            code.store(row, code.at(code.other, place))
+            place = code.plus(place, width)
+
+
+_radial_1, _radial_2, _radial_3, _lattice_1, _lattice_2, _lattice_3 = (
+    instructions(partial(write, orders=orders), factors=True)
+    for write in (_write_radial, _write_lattice)
+    for orders in (1, 2, 3)
+)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_carrier(
-    kappa: float,
-    re: FloatArray,
-    im: FloatArray,
-    slope_re: FloatArray,
-    slope_im: FloatArray,
-    bend_re: FloatArray,
-    bend_im: FloatArray,
-) -> None:
-    """Add to ∂²/∂z² what the carrier gives, 2iκ (∂z + iκ) + κ², the slopes having theirs."""
-    for j in range(re.size):
-        bend_re[j] += kappa * (kappa * re[j] - 2 * slope_im[j])
-        bend_im[j] += kappa * (kappa * im[j] + 2 * slope_re[j])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def profile_at(
-    axial: AxialTable,
-    z_nm: float,
-    start: int,
-    stop: int,
-    work: FloatArray,
-    profile: FloatArray,
-) -> None:
+def profile_at(axial: AxialTable, z_nm: float, start: int, stop: int, profile: FloatArray) -> None:
     """Fill a range of a flattened profile by interpolation along z.
 
     Parameters
@@ -296,9 +300,7 @@ def profile_at(
     z_nm : float
         Height [nm], inside the table.
     start, stop : int
-        Range of the flattened profile.
-    work : ndarray, shape (orders, channels, width)
-        Scratch.
+        Range of the flattened profile, of eight numbers at least.
     profile : ndarray
         Filled; with twice the channels of the table ∂/∂z too, with three times ∂²/∂z² as well.
         The channels of a radial profile are its last axis, those of a lattice its first; a lattice
@@ -307,72 +309,42 @@ def profile_at(
     heights, first_nm, step_nm, kappa = axial
     place = (z_nm - first_nm) / step_nm
     i = min(max(int(place), 0), heights.shape[0] - 2)
-    t = place - i
-    t2, t3, t4, t5 = t**2, t**3, t**4, t**5
-    v, d, b = np.empty(6), np.empty(6), np.empty(6)
-    v[3] = 10 * t3 - 15 * t4 + 6 * t5
-    v[0] = 1 - v[3]
-    v[1] = t - 6 * t3 + 8 * t4 - 3 * t5
-    v[2] = 0.5 * t2 - 1.5 * t3 + 1.5 * t4 - 0.5 * t5
-    v[4] = -4 * t3 + 7 * t4 - 3 * t5
-    v[5] = 0.5 * t3 - t4 + 0.5 * t5
-    d[3] = 30 * t2 - 60 * t3 + 30 * t4
-    d[0] = -d[3]
-    d[1] = 1 - 18 * t2 + 32 * t3 - 15 * t4
-    d[2] = t - 4.5 * t2 + 6 * t3 - 2.5 * t4
-    d[4] = -12 * t2 + 28 * t3 - 15 * t4
-    d[5] = 1.5 * t2 - 4 * t3 + 2.5 * t4
-    d /= step_nm
-    b[3] = 60 * t - 180 * t2 + 120 * t3
-    b[0] = -b[3]
-    b[1] = -36 * t + 96 * t2 - 60 * t3
-    b[2] = 1 - 9 * t + 18 * t2 - 10 * t3
-    b[4] = -24 * t + 84 * t2 - 60 * t3
-    b[5] = 3 * t - 12 * t2 + 10 * t3
-    b /= step_nm * step_nm
+    t, per = place - i, 1.0 / step_nm
+    t2, t3, t4, t5, per2 = t**2, t**3, t**4, t**5, per * per
+    value = 10 * t3 - 15 * t4 + 6 * t5
+    slope = per * (30 * t2 - 60 * t3 + 30 * t4)
+    bend = per2 * (60 * t - 180 * t2 + 120 * t3)
+    factors = (
+        1 - value, t - 6 * t3 + 8 * t4 - 3 * t5, 0.5 * t2 - 1.5 * t3 + 1.5 * t4 - 0.5 * t5,
+        value, -4 * t3 + 7 * t4 - 3 * t5, 0.5 * t3 - t4 + 0.5 * t5,
+        -slope, per * (1 - 18 * t2 + 32 * t3 - 15 * t4), per * (t - 4.5 * t2 + 6 * t3 - 2.5 * t4),
+        slope, per * (-12 * t2 + 28 * t3 - 15 * t4), per * (1.5 * t2 - 4 * t3 + 2.5 * t4),
+        -bend, per2 * (-36 * t + 96 * t2 - 60 * t3), per2 * (1 - 9 * t + 18 * t2 - 10 * t3),
+        bend, per2 * (-24 * t + 84 * t2 - 60 * t3), per2 * (3 * t - 12 * t2 + 10 * t3),
+        np.cos(kappa * z_nm), np.sin(kappa * z_nm), kappa,
+    )  # fmt: skip
     channels, width = heights.shape[2:]
-    every = profile.size // width
-    with_slope, with_bend = every > channels, every > 2 * channels
-    cos, sin = np.cos(kappa * z_nm), np.sin(kappa * z_nm)
-    radial = profile.shape[1] == POWERS
-    in_registers = radial and every == LANES
-    flat = profile.reshape(profile.size)
-    apart, stride = (1, every) if radial else (width, 1)
-    begin = start * stride
-    for channel in range(channels):
-        _mix(heights, i, channel, start, v, work[0, channel, start:stop])
-        if with_slope:
-            _mix(heights, i, channel, start, d, work[1, channel, start:stop])
-        if with_bend:
-            _mix(heights, i, channel, start, b, work[2, channel, start:stop])
-    for c in range(0, channels, 2):
-        re, im = work[0, c, start:stop], work[0, c + 1, start:stop]
-        if with_slope:
-            slope_re, slope_im = work[1, c, start:stop], work[1, c + 1, start:stop]
-            for j in range(re.size):
-                slope_re[j] -= kappa * im[j]
-                slope_im[j] += kappa * re[j]
-            if in_registers:
-                _turn_here(re, im, cos, sin)
-                _turn_here(slope_re, slope_im, cos, sin)
-                continue
-            there = begin + (c + channels) * apart
-            _turn(slope_re, slope_im, cos, sin, flat, there, there + apart, stride)
-        if with_bend:
-            bend_re, bend_im = work[2, c, start:stop], work[2, c + 1, start:stop]
-            _add_carrier(
-                kappa, re, im, work[1, c, start:stop], work[1, c + 1, start:stop], bend_re, bend_im
-            )
-            there = begin + (c + 2 * channels) * apart
-            _turn(bend_re, bend_im, cos, sin, flat, there, there + apart, stride)
-        _turn(re, im, cos, sin, flat, begin + c * apart, begin + (c + 1) * apart, stride)
-    if in_registers:
-        together(work.reshape(every, width), start, stop, profile.reshape(width, every))
+    near, orders, last = heights[i : i + 2], profile.size // (channels * width), stop - LANES
+    if profile.shape[1] == POWERS:
+        for j in range(start, stop, LANES):  # the last eight once more where fewer are left
+            if orders == 1:
+                _radial_1(near, profile, min(j, last), factors)
+            elif orders == 2:
+                _radial_2(near, profile, min(j, last), factors)
+            else:
+                _radial_3(near, profile, min(j, last), factors)
+        return
+    for begin in range(0, channels * width, 2 * width):
+        for j in range(start, stop, LANES):
+            if orders == 1:
+                _lattice_1(near, profile, begin + min(j, last), factors)
+            elif orders == 2:
+                _lattice_2(near, profile, begin + min(j, last), factors)
+            else:
+                _lattice_3(near, profile, begin + min(j, last), factors)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def profile_between(axial: AxialTable, z_nm: float, profile: FloatArray) -> None:
     """Fill a whole profile of one order or more by interpolation along z."""
-    channels, width = axial.heights.shape[2:]
-    work = np.empty((profile.size // (width * channels), channels, width))
-    profile_at(axial, z_nm, 0, width, work, profile)
+    profile_at(axial, z_nm, 0, axial.heights.shape[3], profile)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.image import Lens, Pixels, signal_parts
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.radial import AxialTable, profile_at
-from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, scratch, signal_value, span
+from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, blank_profile, signal_value, span
 
 FloatArray = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ def scan_heights(
     Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the rest and the start.  An
     empty amplitude range holds the amplitude fixed.
     """
-    work, profile = scratch(axial, lens, 1)
+    profile = blank_profile(axial, lens, 1)
     here, size = theta.copy(), pixels.y.size * pixels.x.size
     flat, parts, s = data.reshape(4, size), np.empty((2, size)), np.empty(size)
     p, q = parts[0], parts[1]
@@ -45,7 +45,7 @@ def scan_heights(
     for k in range(heights.size):
         here[2] = heights[k]
         start, stop = span(lens, pixels, here, axial.heights.shape[3])
-        profile_at(axial, here[2], start, stop, work, profile)
+        profile_at(axial, here[2], start, stop, profile)
         signal_parts(profile, lens, pixels, theta[0], theta[1], unit, parts)
         a = theta[3]
         for _ in range(2 if low < high else 0):

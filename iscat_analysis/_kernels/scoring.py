@@ -292,16 +292,21 @@ def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def scratch(axial: AxialTable, lens: Lens, orders: int) -> tuple[FloatArray, FloatArray]:
-    """Work space and profile for `picture_at`."""
+def blank_profile(axial: AxialTable, lens: Lens, orders: int) -> FloatArray:
+    """Profile for `picture_at` to fill."""
     channels, width = axial.heights.shape[2:]
     if lens.fine:
-        return np.empty((0, 0, 0)), np.empty((0, 0, 0))
-    work, every = np.empty((orders, channels, width)), orders * channels
+        return np.empty((0, 0, 0))
     if lens.half:
         nodes = 2 * lens.half + 1
-        return work, np.empty((every, nodes, nodes))
-    return work, np.empty((width // POWERS, POWERS, every))
+        return np.empty((orders * channels, nodes, nodes))
+    return np.empty((width // POWERS, POWERS, orders * channels))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def scratch(axial: AxialTable, lens: Lens, orders: int) -> tuple[FloatArray, FloatArray]:
+    """Work space and profile for the pictures of a canvas, which need no work space any more."""
+    return np.empty((0, 0, 0)), blank_profile(axial, lens, orders)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -311,7 +316,6 @@ def picture_at(
     z_nm: float,
     start: int,
     stop: int,
-    work: FloatArray,
     profile: FloatArray,
 ) -> FloatArray:
     """Profile at a height, of which a range is filled; that of a stamp is the table's only one."""
@@ -319,7 +323,7 @@ def picture_at(
         rows = 2 * lens.half + 1
         only: FloatArray = axial.heights[0, 0].reshape(2, rows, axial.heights.shape[3] // rows)
         return only
-    profile_at(axial, z_nm, start, stop, work, profile)
+    profile_at(axial, z_nm, start, stop, profile)
     return profile
 
 
@@ -334,7 +338,7 @@ def value_batch(
     out: FloatArray,
 ) -> None:
     """Fill `out` (n) with the log-likelihood at θ (n, 5); where z repeats, so does the profile."""
-    work, profile = scratch(axial, lens, 1)
+    profile = blank_profile(axial, lens, 1)
     width = axial.heights.shape[3]
     z, first, last = np.nan, 0, 0
     for k in range(thetas.shape[0]):
@@ -343,7 +347,7 @@ def value_batch(
             if thetas[k, 2] == z:
                 start, stop = min(start, first), max(stop, last)
             z, first, last = thetas[k, 2], start, stop
-            profile = picture_at(axial, lens, z, first, last, work, profile)
+            profile = picture_at(axial, lens, z, first, last, profile)
         out[k] = value_pass(profile, lens, pixels, kind, data, thetas[k])
 
 
@@ -449,14 +453,14 @@ def maximize(
     outcome : int
         CONVERGED, STALLED, EXHAUSTED or HOPELESS.
     """
-    work, profile = scratch(axial, lens, 2)
+    profile = blank_profile(axial, lens, 2)
     width = axial.heights.shape[3]
     step, trial = np.empty(5), np.empty(5)
     trial_score, trial_fisher = np.empty(5), np.empty((5, 5))
     active = np.empty(5, dtype=np.bool_)
     damping = 0.0
     start, stop = (0, width) if not free[2] else span(lens, pixels, theta, width)
-    profile = picture_at(axial, lens, theta[2], start, stop, work, profile)
+    profile = picture_at(axial, lens, theta[2], start, stop, profile)
     value = score_pass(profile, lens, pixels, kind, data, theta, score, fisher)
     passes = 1
     while passes < iterations:
@@ -493,7 +497,7 @@ def maximize(
             return value + gain, passes, HOPELESS
         if free[2]:
             start, stop = span(lens, pixels, trial, width)
-            profile_at(axial, trial[2], start, stop, work, profile)
+            profile_at(axial, trial[2], start, stop, profile)
         trial_value = score_pass(
             profile, lens, pixels, kind, data, trial, trial_score, trial_fisher
         )

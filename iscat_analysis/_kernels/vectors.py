@@ -9,14 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
-from numpy.typing import NDArray
-
-FloatArray = NDArray[np.float64]
 
 LANES = 8
 """Numbers in a register."""
@@ -35,6 +31,8 @@ class Code:
         The arrays.
     first
         The place.
+    factors
+        Registers of numbers that are the same in all lanes.
     """
 
     def __init__(self, context: Any, builder: Any, signature: Any, arguments: Any) -> None:
@@ -44,6 +42,8 @@ class Code:
             for kind, value in zip(signature.args[:2], arguments[:2], strict=True)
         )
         self.first = arguments[2]
+        numbers = cgutils.unpack_tuple(builder, arguments[3]) if len(arguments) > 3 else []
+        self.factors = [self.everywhere(number) for number in numbers]
 
     def index(self, number: int) -> Any:
         """Write a whole number."""
@@ -86,13 +86,25 @@ class Code:
         number = self._b.load(pointer)
         whole = self._b.fptosi(number, _INDEX)
         rest = self._b.fsub(number, self._b.sitofp(whole, _DOUBLE), flags=_FLAGS)
+        return whole, self.everywhere(rest, count)
+
+    def everywhere(self, number: Any, count: int = LANES) -> Any:
+        """Put a number in all lanes of a register."""
         nothing = ir.Constant(ir.VectorType(_DOUBLE, count), ir.Undefined)
-        one = self._b.insert_element(nothing, rest, ir.Constant(_LANE, 0))
-        return whole, self._b.shuffle_vector(one, nothing, _lanes([0] * count))
+        one = self._b.insert_element(nothing, number, ir.Constant(_LANE, 0))
+        return self._b.shuffle_vector(one, nothing, _lanes([0] * count))
+
+    def multiply(self, x: Any, y: Any) -> Any:
+        """Give x y."""
+        return self._b.fmul(x, y, flags=_FLAGS)
+
+    def negative(self, x: Any) -> Any:
+        """Give −x."""
+        return self._b.fneg(x)
 
     def multiply_add(self, x: Any, y: Any, z: Any) -> Any:
         """Give x y + z."""
-        return self._b.fadd(self._b.fmul(x, y, flags=_FLAGS), z, flags=_FLAGS)
+        return self._b.fadd(self.multiply(x, y), z, flags=_FLAGS)
 
     def plus_itself(self, x: Any) -> Any:
         """Give 2 x."""
@@ -101,6 +113,12 @@ class Code:
     def joined(self, one: Any, other: Any) -> Any:
         """Put two halves of a register together."""
         return self._b.shuffle_vector(one, other, _lanes(range(LANES)))
+
+    def halves(self, x: Any) -> tuple[Any, Any]:
+        """Take a register apart."""
+        middle = LANES // 2
+        low, high = _lanes(range(middle)), _lanes(range(middle, LANES))
+        return self._b.shuffle_vector(x, x, low), self._b.shuffle_vector(x, x, high)
 
     def exchanged(self, rows: list[Any]) -> list[Any]:
         """Transpose eight registers; of four, each half as a square of its own."""
@@ -124,37 +142,23 @@ def _lanes(numbers: Any) -> Any:
     return ir.Constant(ir.VectorType(_LANE, len(chosen)), chosen)
 
 
-def instructions(write: Callable[[Code], None]) -> Callable[..., None]:
-    """Make a function for kernels, of two arrays and a place, of what writes its instructions."""
+def instructions(write: Callable[[Code], None], *, factors: bool = False) -> Callable[..., None]:
+    """Make a function for kernels of what writes its instructions.
+
+    It takes two arrays, a place, and with `factors` a tuple of numbers.
+    """
+
+    def written(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        write(Code(context, builder, signature, arguments))
+        return context.get_dummy_value()
 
     def typed(_: Any, one: Any, other: Any, first: Any) -> tuple[Any, Callable[..., Any]]:
-        def written(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            write(Code(context, builder, signature, arguments))
-            return context.get_dummy_value()
-
         return types.void(one, other, first), written
 
-    made: Callable[..., None] = intrinsic(typed)
+    def with_factors(
+        _: Any, one: Any, other: Any, first: Any, numbers: Any
+    ) -> tuple[Any, Callable[..., Any]]:
+        return types.void(one, other, first, numbers), written
+
+    made: Callable[..., None] = intrinsic(with_factors if factors else typed)
     return made
-
-
-def _write_together(code: Code) -> None:
-    """Exchange eight numbers of eight rows for eight rows of eight numbers."""
-    rows = [code.load(code.in_row(code.one, k, code.first)) for k in range(LANES)]
-    for k, row in enumerate(code.exchanged(rows)):
-        place = code.times(code.plus(code.first, code.index(k)), code.index(LANES))
-        code.store(row, code.at(code.other, place))
-
-
-_eight_together = instructions(_write_together)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def together(rows: FloatArray, start: int, stop: int, out: FloatArray) -> None:
-    """Fill `out` (n, 8) from `start` to `stop` with what stands there in `rows` (8, n)."""
-    last = start + (stop - start) // LANES * LANES
-    for j in range(start, last, LANES):
-        _eight_together(rows, out, j)
-    for j in range(last, stop):
-        for k in range(LANES):
-            out[j, k] = rows[k, j]

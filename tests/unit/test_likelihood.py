@@ -423,12 +423,11 @@ def test_profiles_between_the_tabulated_heights(optics: dict) -> None:
     model = forward_model(config, 2000.0)
     table = model.axial_table
     width = table.heights.shape[3]
-    work = np.empty((2, 4, width))
     rng = np.random.default_rng(12)
     for z in [0.0, 2000.0, *rng.uniform(0, 2000, 12)]:
         direct = model.profile(z, 2)
         got = np.empty((width // 6, 6, 8))
-        profile_at(table, z, 0, width, work, got)
+        profile_at(table, z, 0, width, got)
         for pair in range(0, 8, 2):  # real and imaginary part of F0, F2 and their ∂/∂z
             size = np.abs(direct[:, 0, pair : pair + 2]).max()
             # nodes of the radial spline, then its polynomial inside the intervals
