@@ -21,6 +21,7 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.movie.addresses import MARK, beside, split_address
 from iscat_analysis.movie.folders import SUFFIXES, find_movies, members_of
 from iscat_analysis.movie.ome_zarr import is_zarr
+from iscat_analysis.movie.text_tables import separator
 
 ROLES = ("sample", "calibrant", "blank", "flat")
 """What a movie is for."""
@@ -33,7 +34,6 @@ COLUMNS = (
 TABLES = ("samples.csv", "samples.toml")
 """The table of a folder that is watched."""
 
-_DELIMITERS = ",;\t"
 _CLOSE = 0.85  # likeness of a column's name to one that has a meaning
 _SAID = 5  # complaints in one line
 
@@ -272,9 +272,7 @@ def _text(source: Path) -> str:
 
 
 def _from_csv(source: Path, text: str) -> Records:
-    lines = text.splitlines()
-    heading = next((line for line in lines if line.strip() and line[0] != "#"), "")
-    delimiter = max(_DELIMITERS, key=heading.count)
+    delimiter = separator(text)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
     names: list[str] = []
     records: Records = []

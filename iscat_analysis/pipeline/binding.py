@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.movie.text_tables import separator, without_remarks
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.binding import binding_figure
@@ -270,10 +272,8 @@ def check_reaction(
 
 def _read_samples(path: Path) -> pd.DataFrame:
     try:
-        with path.open(encoding="utf-8-sig") as file:
-            first = next((line for line in file if line.strip() and line[0] != "#"), "")
-        sign = next((sign for sign in (",", ";", "\t") if sign in first), ",")
-        return pd.read_csv(path, sep=sign, encoding="utf-8-sig", comment="#")
+        text = path.read_text(encoding="utf-8-sig")
+        return pd.read_csv(io.StringIO("\n".join(without_remarks(text))), sep=separator(text))
     except OSError as error:
         what = "is a folder" if path.is_dir() else f"cannot be read ({error.strerror})"
         raise DataError(f"{path}: {what}; give a CSV file with a row for each table") from None

@@ -12,6 +12,7 @@ from event_tables import draw_series
 from scipy.optimize import approx_fprime, brentq
 
 import iscat_analysis as ia
+from iscat_analysis.day.table import read_table
 from iscat_analysis.species import Efficiency
 from iscat_analysis.species.equilibrium import _Series
 from iscat_analysis.species.mass_action import (
@@ -150,6 +151,19 @@ def test_samples_are_read_and_results_written(dimers, tmp_path: Path) -> None:
     assert json.loads((out / "kd.json").read_text())["kd_nm"] == pytest.approx(found.fit.kd_nm)
     assert list(pd.read_csv(out / "kd.csv")["replicate"]) == [1] * 4
     assert (out / "figures" / "kd.png").stat().st_size > 10_000
+
+
+def test_samples_are_read_as_the_table_of_a_day_is(dimers, tmp_path: Path) -> None:
+    lines = ["# of Monday, 3 buffers", "path;buffer, pH;concentration_nm", ""]
+    for number, (table, given) in enumerate(zip(dimers, DIMER["concentration_nm"], strict=True)):
+        table.to_csv(tmp_path / f"#{number}.csv", index=False)
+        lines.append(f"run#{number}/../#{number}.csv;PBS, 7.4;{given}")
+        (tmp_path / f"run#{number}").mkdir()
+    samples = tmp_path / "samples.csv"
+    samples.write_text("\n".join(lines))
+    found = ia.fit_kd(samples, model="dimer", masses_kda=[66.0])
+    assert list(found.samples["buffer, pH"]) == ["PBS, 7.4"] * 4
+    assert [row.given for row in read_table(samples).rows] == list(found.samples["path"])
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,43 @@
+"""Tables of text, as spreadsheets save them."""
+
+from __future__ import annotations
+
+_SEPARATORS = ",;\t"
+
+
+def without_remarks(text: str) -> list[str]:
+    """Leave out empty lines and those that begin with ``#``.
+
+    Parameters
+    ----------
+    text : str
+        Of the whole table.
+
+    Returns
+    -------
+    list of str
+        The other lines, the heading first.
+    """
+    return [line for line in text.splitlines() if line.strip() and line.lstrip()[0] != "#"]
+
+
+def separator(text: str) -> str:
+    r"""Find what separates the cells of a table.
+
+    Parameters
+    ----------
+    text : str
+        Of the whole table.
+
+    Returns
+    -------
+    str
+        Comma, semicolon or tab, whichever the heading has most of.
+
+    Examples
+    --------
+    >>> separator("# of Monday\npath;buffer, pH;concentration_nm\na.tif;PBS, 7.4;10\n")
+    ';'
+    """
+    heading = next(iter(without_remarks(text)), "")
+    return max(_SEPARATORS, key=heading.count)
