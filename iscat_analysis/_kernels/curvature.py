@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.dense import factorise
 from iscat_analysis._kernels.hessian import signal_hessian
 from iscat_analysis._kernels.image import Lens, Pixels
 from iscat_analysis._kernels.lattice import FAST
@@ -19,8 +20,6 @@ from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, blank_profile, i
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-
-_LEAST = 1e-13  # pivot of a matrix with ones on its diagonal below which it is no information
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -138,18 +137,9 @@ def invert(matrix: FloatArray, scale: FloatArray, active: BoolArray, out: FloatA
     n = index.size
     lower, inverse = np.zeros((n, n)), np.zeros((n, n))
     out[:] = 0.0
-    for j in range(n):
-        for i in range(j, n):
-            total = matrix[index[i], index[j]] * scale[index[i]] * scale[index[j]]
-            for k in range(j):
-                total -= lower[i, k] * lower[j, k]
-            if i > j:
-                lower[i, j] = total / lower[j, j]
-            elif total > _LEAST:
-                lower[j, j] = np.sqrt(total)
-            else:
-                out[:] = np.nan
-                return False
+    if not factorise(matrix, index, scale[index], 0.0, lower):
+        out[:] = np.nan
+        return False
     for j in range(n):
         inverse[j, j] = 1.0 / lower[j, j]
         for i in range(j + 1, n):

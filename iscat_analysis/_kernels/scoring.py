@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.dense import factorise
 from iscat_analysis._kernels.image import (
     Lens,
     Pixels,
@@ -369,19 +370,8 @@ def scoring_step(
     for i in range(n):
         scale[i] = 1.0 / np.sqrt(fisher[index[i], index[i]])
     lower = np.empty((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            total = fisher[index[i], index[j]] * scale[i] * scale[j]
-            if i == j:
-                total += damping
-            for k in range(j):
-                total -= lower[i, k] * lower[j, k]
-            if i == j:
-                if not total > 1e-13:
-                    return False
-                lower[i, i] = np.sqrt(total)
-            else:
-                lower[i, j] = total / lower[j, j]
+    if not factorise(fisher, index[:n], scale, damping, lower):
+        return False
     z = np.empty(n)
     for i in range(n):
         total = score[index[i]] * scale[i]

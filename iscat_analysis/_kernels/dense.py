@@ -1,0 +1,37 @@
+"""Small dense systems: some of the parameters of a symmetric positive matrix."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LEAST = 1e-13
+"""Pivot of a matrix with ones on its diagonal below which it is no information."""
+
+
+@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
+def factorise(
+    matrix: FloatArray, index: IntArray, scale: FloatArray, damping: float, lower: FloatArray
+) -> bool:
+    """Fill `lower` (n, n) with Cholesky's factor of the parameters `index` (n); False if singular.
+
+    `scale` (n) makes a diagonal near one, to which `damping` is added.
+    """
+    for i in range(index.size):
+        for j in range(i + 1):
+            total = matrix[index[i], index[j]] * scale[i] * scale[j]
+            if i == j:
+                total += damping
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            if j < i:
+                lower[i, j] = total / lower[j, j]
+            elif total > LEAST:
+                lower[i, i] = np.sqrt(total)
+            else:
+                return False
+    return True
