@@ -1,8 +1,7 @@
-"""Likelihoods of a particle's track, in time proportional to its length.
+"""The likelihood of a particle's track that diffuses freely, in time proportional to its length.
 
-Positions are averages over an exposure and have an error of their own each.  The displacements of
-free diffusion then have a covariance with three bands, linear in the diffusion coefficient; those
-of a particle in a harmonic well follow a filter with one number as its state.
+Positions are averages over an exposure and have an error of their own each.  Their displacements
+then have a covariance with three bands, linear in the diffusion coefficient.
 """
 
 from __future__ import annotations
@@ -13,10 +12,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.lattice import FAST
+
 FloatArray = NDArray[np.float64]
 
 _LOG_2PI = math.log(2.0 * math.pi)
-_SHORT = 1e-2  # below, a well hardly acts during one exposure and the moments are a series
+_TOGETHER = 8  # variances whose product is far from overflow, of which one logarithm is taken
+_SPAN = 1e-5  # the lowest of the first ladder's values of D over the highest
+_RUNGS = 25
+_LADDERS = 2  # between the neighbours of the highest rung of the one before
+_NEWTON, _FINE = 20, 1e-12  # steps at most; the last one's length over the scale of D
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -88,74 +93,103 @@ def displacement_likelihood(
     return value, slope, curvature, -0.5 * total2, total0, total1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def harmonic_likelihood(
-    positions: FloatArray,
-    variance: FloatArray,
-    gaps: FloatArray,
-    exposure: float,
-    diffusion: float,
-    stiffness: float,
-) -> float:
-    """Log-likelihood of the displacements of a particle in a harmonic well of unknown centre.
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def displacement_likelihoods(
+    steps: FloatArray,
+    error: FloatArray,
+    error_next: FloatArray,
+    rate: FloatArray,
+    rate_next: FloatArray,
+    diffusion: FloatArray,
+) -> FloatArray:
+    """Log-likelihoods alone, of many D at once.
 
-    The state is the place at the start of an exposure, dx = −κ x dt + √(2D) dW, in equilibrium at
-    first.  A flat prior of the centre is integrated out, which leaves the density of displacements.
+    A pivot waits for the division by the one before it; those of several D need not wait for each
+    other, so that ten cost twice as much as one.
 
     Parameters
     ----------
-    positions : ndarray, shape (c, n)
-        Averages over each exposure, along each axis.
-    variance : ndarray, shape (c, n)
-        Of the error of each position.
-    gaps : ndarray, shape (n − 1,)
-        Time from the start of one exposure to the start of the next [s].
-    exposure : float
-        Its length [s].
-    diffusion : float
+    steps, error, error_next, rate, rate_next
+        As in `displacement_likelihood`.
+    diffusion : ndarray, shape (m,)
         D.
-    stiffness : float
-        κ, above 0 [1/s].
+
+    Returns
+    -------
+    ndarray, shape (m,)
+        Log-likelihoods.
+    """
+    axes, n = steps.shape
+    state = np.empty((4, diffusion.size))
+    p, z, product, quad = state[0], state[1], state[2], state[3]
+    out = np.full(diffusion.size, -0.5 * axes * n * _LOG_2PI)
+    for c in range(axes):
+        p[:], z[:], product[:], quad[:] = 1.0, 0.0, 1.0, 0.0
+        for k in range(n):
+            main, turn, step = error[c, k], rate[k], steps[c, k]
+            beside, beside_turn = 0.0, 0.0
+            if k:
+                beside, beside_turn = error_next[c, k - 1], rate_next[k - 1]
+            for i in range(diffusion.size):
+                band = beside + diffusion[i] * beside_turn
+                ratio = band / p[i]
+                z[i] = step - ratio * z[i]
+                p[i] = main + diffusion[i] * turn - band * ratio
+                quad[i] += z[i] * z[i] / p[i]
+                product[i] *= p[i]
+            if k % _TOGETHER == 0 or k == n - 1:
+                for i in range(diffusion.size):
+                    out[i] -= 0.5 * math.log(product[i])
+                    product[i] = 1.0
+        for i in range(diffusion.size):
+            out[i] -= 0.5 * quad[i]
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def most_likely_diffusion(
+    steps: FloatArray,
+    error: FloatArray,
+    error_next: FloatArray,
+    rate: FloatArray,
+    rate_next: FloatArray,
+    scale: float,
+) -> float:
+    """Maximise the likelihood of free diffusion: a ladder of D, finer ones, Newton's method.
+
+    Parameters
+    ----------
+    steps, error, error_next, rate, rate_next
+        As in `displacement_likelihood`.
+    scale : float
+        Above 0; D is looked for up to twice it and beyond, as long as the likelihood rises.
 
     Returns
     -------
     float
-        Log-likelihood.
+        D, at least 0.
     """
-    axes, n = positions.shape
-    u = stiffness * exposure
-    width = diffusion / stiffness
-    decay, mean, var_end, var_mean, both = 1.0, 1.0, 0.0, 0.0, 0.0
-    if exposure > 0.0:
-        decay = math.exp(-u)
-        left = -math.expm1(-u)
-        mean = left / u
-        var_end = -width * math.expm1(-2.0 * u)
-        both = width * left * left / u
-        if u < _SHORT:
-            series = 1.0 / 3.0 - u * (0.25 - u * (7.0 / 60.0 - u / 24.0))
-            var_mean = 2.0 * diffusion * exposure * series
-        else:
-            var_mean = 2.0 * width * (u - 2.0 * left - 0.5 * math.expm1(-2.0 * u)) / (u * u)
-    value: float = -0.5 * axes * (n - 1) * _LOG_2PI
-    for c in range(axes):
-        place, unit, spread = 0.0, 0.0, width
-        log_determinant, q11, q12, q22 = 0.0, 0.0, 0.0, 0.0
-        for k in range(n):
-            if k:
-                kept = math.exp(-stiffness * (gaps[k - 1] - exposure))
-                place *= kept
-                unit *= kept
-                spread = width + kept * kept * (spread - width)
-            s = mean * mean * spread + var_mean + variance[c, k]
-            e1, e2 = positions[c, k] - mean * place, 1.0 - mean * unit
-            log_determinant += math.log(s)
-            q11 += e1 * e1 / s
-            q12 += e1 * e2 / s
-            q22 += e2 * e2 / s
-            gain = (decay * mean * spread + both) / s
-            place = decay * place + gain * e1
-            unit = decay * unit + gain * e2
-            spread = decay * decay * spread + var_end - gain * gain * s
-        value -= 0.5 * (log_determinant + q11 - q12 * q12 / q22 + math.log(q22))
-    return value
+    top = 2.0 * scale
+    while displacement_likelihood(steps, error, error_next, rate, rate_next, top)[1] > 0.0:
+        top *= 2.0
+    ladder = np.empty(_RUNGS + 1)
+    ladder[0] = 0.0
+    for k in range(_RUNGS):
+        ladder[k + 1] = top * _SPAN ** (1.0 - k / (_RUNGS - 1.0))
+    for _ in range(_LADDERS):
+        values = displacement_likelihoods(steps, error, error_next, rate, rate_next, ladder)
+        highest = np.argmax(values)
+        best = ladder[highest]
+        low, high = ladder[max(highest - 1, 0)], ladder[min(highest + 1, ladder.size - 1)]
+        ladder = np.linspace(low, high, _RUNGS)
+    for _ in range(_NEWTON):
+        there = displacement_likelihood(steps, error, error_next, rate, rate_next, best)
+        if not there[2] < 0.0:
+            break
+        step = -there[1] / there[2]
+        if not low <= best + step <= high:
+            break
+        best += step
+        if abs(step) < _FINE * scale:
+            break
+    return best

@@ -19,18 +19,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.constants import Boltzmann, zero_Celsius
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
+from iscat_analysis._kernels.diffusion import most_likely_diffusion
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import real_array
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.displacements import Displacements, gather
 
 _UM2 = 1e6  # nm²
-_COARSE = 25  # values of D among which the highest likelihood is looked for before it is refined
-_SPAN = 1e-5  # the lowest of them over the highest
-_FINE = 1e-12  # of D over its scale, in the refinement
 
 
 @dataclass(frozen=True)
@@ -239,23 +237,7 @@ def most_likely(track: Displacements) -> float:
     scale = float(np.mean(track.steps_nm**2 / track.rate[0])) or float(
         np.mean(track.error[0] / track.rate[0])
     )
-    top = 2 * scale
-    while track.likelihood(top).slope > 0:
-        top *= 2
-    ladder = np.concatenate([[0.0], top * np.geomspace(_SPAN, 1, _COARSE)])
-    values = [track.likelihood(d).value for d in ladder]
-    highest = int(np.argmax(values))
-    low, high = ladder[max(highest - 1, 0)], ladder[min(highest + 1, _COARSE)]
-    rising, falling = track.likelihood(low).slope > 0, track.likelihood(high).slope < 0
-    if highest == 0 and not rising:
-        return 0.0
-    if rising and falling:
-        return float(brentq(lambda d: track.likelihood(d).slope, low, high, xtol=_FINE * scale))
-    found = minimize_scalar(
-        lambda d: -track.likelihood(d).value, bounds=(low, high), method="bounded",
-        options={"xatol": _FINE * scale},
-    )  # fmt: skip
-    return float(found.x)
+    return float(most_likely_diffusion(track.steps_nm, *track.error, *track.rate, scale))
 
 
 def _interval(track: Displacements, best: float, level: float) -> tuple[float, float]:

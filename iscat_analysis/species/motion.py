@@ -20,7 +20,7 @@ from scipy.linalg import LinAlgError, cho_solve, cholesky
 from scipy.optimize import minimize
 from scipy.special import chdtrc
 
-from iscat_analysis._kernels.diffusion import harmonic_likelihood
+from iscat_analysis._kernels.well import most_likely_well
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.diffusion import most_likely
@@ -38,8 +38,6 @@ _EXPONENTS = (0.02, 1.98)
 _FLASH = 1e-2  # an exposure this small a part of a lag blurs by a series; the closed form cancels
 _STIFFEST = 3.0  # times the frame rate: there a well is flat noise within one frame
 _SOFTEST = 0.3  # per length of the track: there a well is not felt
-_RUNGS = 10
-_SETTLED = 1e-4  # of a log-likelihood, in the search for its maximum
 _PART = 1e-4  # of an exponent, for the derivative of the covariance
 
 
@@ -379,23 +377,11 @@ def _well(track: Displacements, free: float) -> tuple[float, float, float]:
     softest = _SOFTEST / float(track.gaps_s.sum())
     stiffest = _STIFFEST / track.interval_s
 
-    def lost(theta: FloatArray) -> float:
-        value = harmonic_likelihood(
-            track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s,
-            scale * math.exp(theta[0]), math.exp(theta[1]),
-        )  # fmt: skip
-        return -float(value)
-
-    rungs = np.log(np.geomspace(softest, stiffest, _RUNGS))
-    d, k = min(((d, k) for k in rungs for d in (0.0, 0.5)), key=lambda at: lost(np.array(at)))
-    beside = k - 0.6 if k > rungs[0] else k + 0.6
-    found = minimize(
-        lost, (d, k), method="Nelder-Mead", bounds=[(-10, 10), (rungs[0], rungs[-1])],
-        options={"fatol": _SETTLED, "xatol": 1e-2,
-                 "initial_simplex": [(d, k), (d + 0.3, k), (d, beside)]},
+    value, d, stiffness = most_likely_well(
+        track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s,
+        scale, softest, stiffest,
     )  # fmt: skip
-    ratio = 2 * (-float(found.fun) - none)
-    return max(ratio, 0.0), scale * math.exp(found.x[0]), math.exp(found.x[1])
+    return max(2 * (value - none), 0.0), d, stiffness
 
 
 def _free_track(track: Displacements, d: float, rng: np.random.Generator) -> Displacements:

@@ -1,0 +1,198 @@
+"""The likelihood of a particle's track in a harmonic well: a filter with one number as its state.
+
+Positions are averages over an exposure and have an error of their own each.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.lattice import FAST
+
+FloatArray = NDArray[np.float64]
+
+_LOG_2PI = math.log(2.0 * math.pi)
+_SHORT = 1e-2  # below, a well hardly acts during one exposure and the moments are a series
+_TOGETHER = 8  # variances whose product is far from overflow, of which one logarithm is taken
+_RUNGS = 10  # of the stiffnesses among which the search begins
+_FIRST, _FINER = 0.3, 0.3  # distance of the points that are compared, and what is left of it
+_WIDEST = 10.0  # logarithm of D over that of free diffusion
+_SETTLED = 1e-4  # of a log-likelihood, in the search for its maximum
+_MOST = 100  # rounds of the search
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def harmonic_likelihoods(
+    positions: FloatArray,
+    variance: FloatArray,
+    gaps: FloatArray,
+    exposure: float,
+    diffusion: FloatArray,
+    stiffness: FloatArray,
+) -> FloatArray:
+    """Log-likelihoods of the displacements of a particle in harmonic wells of unknown centre.
+
+    The state is the place at the start of an exposure, dx = −κ x dt + √(2D) dW, in equilibrium at
+    first.  A flat prior of the centre is integrated out, which leaves the density of displacements.
+
+    Parameters
+    ----------
+    positions : ndarray, shape (c, n)
+        Averages over each exposure, along each axis.
+    variance : ndarray, shape (c, n)
+        Of the error of each position.
+    gaps : ndarray, shape (n − 1,)
+        Time from the start of one exposure to the start of the next [s].
+    exposure : float
+        Its length [s].
+    diffusion, stiffness : ndarray, shape (m,)
+        D and κ of each well, κ above 0 [1/s].
+
+    Returns
+    -------
+    ndarray, shape (m,)
+        Log-likelihoods.
+    """
+    axes, n = positions.shape
+    m = diffusion.size
+    wells, state = np.empty((7, m)), np.empty((8, m))
+    width, decay, mean, var_end, var_mean, both, kept = wells
+    place, unit, spread, product, q11, q12, q22, log_determinant = state
+    for i in range(m):
+        width[i] = diffusion[i] / stiffness[i]
+        u = stiffness[i] * exposure
+        decay[i], mean[i], var_end[i], var_mean[i], both[i] = 1.0, 1.0, 0.0, 0.0, 0.0
+        if exposure > 0.0:
+            left = -math.expm1(-u)
+            decay[i], mean[i] = math.exp(-u), left / u
+            var_end[i] = -width[i] * math.expm1(-2.0 * u)
+            both[i] = width[i] * left * left / u
+            if u < _SHORT:
+                series = 1.0 / 3.0 - u * (0.25 - u * (7.0 / 60.0 - u / 24.0))
+                var_mean[i] = 2.0 * diffusion[i] * exposure * series
+            else:
+                curved = u - 2.0 * left - 0.5 * math.expm1(-2.0 * u)
+                var_mean[i] = 2.0 * width[i] * curved / (u * u)
+    out = np.full(m, -0.5 * axes * (n - 1) * _LOG_2PI)
+    for c in range(axes):
+        place[:], unit[:], spread[:], product[:] = 0.0, 0.0, width, 1.0
+        q11[:], q12[:], q22[:], log_determinant[:] = 0.0, 0.0, 0.0, 0.0
+        for k in range(n):
+            if k < 2 or gaps[k - 1] != gaps[k - 2]:
+                dark = gaps[k - 1] - exposure if k else 0.0
+                for i in range(m):
+                    kept[i] = math.exp(-stiffness[i] * dark)
+            here, error = positions[c, k], variance[c, k]
+            for i in range(m):
+                before, one = kept[i] * place[i], kept[i] * unit[i]
+                wide = width[i] + kept[i] * kept[i] * (spread[i] - width[i])
+                s = mean[i] * mean[i] * wide + var_mean[i] + error
+                inverse = 1.0 / s
+                e1, e2 = here - mean[i] * before, 1.0 - mean[i] * one
+                product[i] *= s
+                q11[i] += e1 * e1 * inverse
+                q12[i] += e1 * e2 * inverse
+                q22[i] += e2 * e2 * inverse
+                gain = (decay[i] * mean[i] * wide + both[i]) * inverse
+                place[i] = decay[i] * before + gain * e1
+                unit[i] = decay[i] * one + gain * e2
+                spread[i] = decay[i] * decay[i] * wide + var_end[i] - gain * gain * s
+            if k % _TOGETHER == 0 or k == n - 1:
+                for i in range(m):
+                    log_determinant[i] += math.log(product[i])
+                    product[i] = 1.0
+        for i in range(m):
+            inside = q11[i] - q12[i] * q12[i] / q22[i]
+            out[i] -= 0.5 * (log_determinant[i] + inside + math.log(q22[i]))
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def most_likely_well(
+    positions: FloatArray,
+    variance: FloatArray,
+    gaps: FloatArray,
+    exposure: float,
+    scale: float,
+    softest: float,
+    stiffest: float,
+) -> tuple[float, float, float]:
+    """Maximise the likelihood of a harmonic well over D and stiffness.
+
+    Of a square of nine points in their logarithms the highest becomes the middle of the next; where
+    it is the middle already, the square shrinks around the vertex of a parabola.
+
+    Parameters
+    ----------
+    positions, variance, gaps, exposure
+        As in `harmonic_likelihoods`.
+    scale : float
+        D of free diffusion.
+    softest, stiffest : float
+        Range of κ [1/s].
+
+    Returns
+    -------
+    value : float
+        Log-likelihood.
+    diffusion, stiffness : float
+        D and κ there.
+    """
+    low = np.array([-_WIDEST, math.log(softest)])
+    high = np.array([_WIDEST, math.log(stiffest)])
+    points = np.empty((2 * _RUNGS, 2))
+    for k in range(_RUNGS):
+        points[2 * k : 2 * k + 2, 1] = low[1] + (high[1] - low[1]) * k / (_RUNGS - 1.0)
+        points[2 * k, 0], points[2 * k + 1, 0] = 0.0, 0.5
+    values = _logarithmic(positions, variance, gaps, exposure, scale, points)
+    best, value = points[np.argmax(values)].copy(), values.max()
+    apart, square = _FIRST, np.empty((9, 2))
+    for _ in range(_MOST):
+        for k in range(9):
+            square[k, 0], square[k, 1] = best[0] + (k // 3 - 1) * apart, best[1]
+            square[k, 1] += (k % 3 - 1) * apart
+            for a in range(2):
+                square[k, a] = min(max(square[k, a], low[a]), high[a])
+        values = _logarithmic(positions, variance, gaps, exposure, scale, square)
+        if values.max() > value:
+            best, value = square[np.argmax(values)].copy(), values.max()
+            continue
+        g0, g1 = 0.5 * (values[7] - values[1]), 0.5 * (values[5] - values[3])
+        h0, h1 = values[7] + values[1] - 2.0 * value, values[5] + values[3] - 2.0 * value
+        h01 = 0.25 * (values[8] + values[0] - values[2] - values[6])
+        det = h0 * h1 - h01 * h01
+        apart *= _FINER
+        if not (h0 < 0.0 and det > 0.0):
+            if apart < _SETTLED:
+                break
+            continue
+        step0, step1 = (h01 * g1 - h1 * g0) / det, (h01 * g0 - h0 * g1) / det
+        if 0.5 * (g0 * step0 + g1 * step1) < _SETTLED:
+            break
+        vertex = np.empty((1, 2))
+        for a in range(2):
+            move = (step0 if a == 0 else step1) * apart / _FINER
+            vertex[0, a] = min(max(best[a] + move, low[a]), high[a])
+        there = _logarithmic(positions, variance, gaps, exposure, scale, vertex)[0]
+        if there > value:
+            best, value = vertex[0].copy(), there
+    return value, scale * math.exp(best[0]), math.exp(best[1])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _logarithmic(
+    positions: FloatArray,
+    variance: FloatArray,
+    gaps: FloatArray,
+    exposure: float,
+    scale: float,
+    points: FloatArray,
+) -> FloatArray:
+    """Log-likelihoods at (log D/scale, log κ)."""
+    return harmonic_likelihoods(
+        positions, variance, gaps, exposure, scale * np.exp(points[:, 0]), np.exp(points[:, 1])
+    )
