@@ -182,9 +182,8 @@ def draw_gradient(
 def add(total: NDArray[np.float32], r0: int, c0: int, sign: float, image: FloatArray) -> None:
     """Add an image, times a sign, to the part of a frame that begins at (r0, c0)."""
     for i in range(image.shape[0]):
-        line, more = total[r0 + i, c0 : c0 + image.shape[1]], image[i]
-        for j in range(more.size):
-            line[j] += np.float32(sign * more[j])
+        for j in range(image.shape[1]):
+            total[r0 + i, c0 + j] += np.float32(sign * image[i, j])
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -192,27 +191,23 @@ def stage(
     light: Light, t: int, total: NDArray[np.float32], own: FloatArray, r0: int, c0: int,
     data: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill the constants of a square's likelihood, with the other particles in its background."""
-    w, n = light.power[t], data.shape[2]
+    """Fill the constants of a square's likelihood, with the other particles in its background.
+
+    `own` (ny, 5, nx) begins with the particle's own signal.
+    """
+    used, background, read, counts = light.used, light.background, light.read, light.counts
+    w = light.power[t]
     for i in range(data.shape[1]):
-        row, here = r0 + i, slice(c0, c0 + n)
-        used, background, read = light.used[row, here], light.background[row, here], light.read
-        counts, others, mine, v = (
-            light.counts[t, row, here],
-            total[row, here],
-            own[i],
-            read[row, here],
-        )
-        d0, d1, d2, d3 = data[0, i], data[1, i], data[2, i], data[3, i]
-        for j in range(n):
-            seen = 1.0 if used[j] else 0.0
-            level = seen * w * background[j]
-            d2[j] = level
-            d1[j] = level * (1.0 + others[j] - mine[j])
-        for j in range(n):
-            seen = 1.0 if used[j] else 0.0
-            d0[j] = seen * (counts[j] + v[j])
-            d3[j] = seen * v[j]
+        r = r0 + i
+        for j in range(data.shape[2]):
+            level = w * background[r, c0 + j] if used[r, c0 + j] else 0.0
+            data[2, i, j] = level
+            data[1, i, j] = level * (1.0 + total[r, c0 + j] - own[i, 0, j])
+        for j in range(data.shape[2]):
+            noise = read[r, c0 + j] if used[r, c0 + j] else 0.0
+            seen = counts[t, r, c0 + j] if used[r, c0 + j] else 0.0
+            data[0, i, j] = seen + noise
+            data[3, i, j] = noise
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -161,7 +161,7 @@ def judge_frames(
             here = g[: 5 * ny * nx].reshape(ny, 5, nx)
             draw_gradient(near, group[r], p, pixels, work[0], work[1], here)
             data = square[: 4 * ny * nx].reshape(4, ny, nx)
-            stage(light, t, canvas.total[t], here[:, 0], r0, c0, data)
+            stage(light, t, canvas.total[t], here, r0, c0, data)
             value = image_value(POISSON, data, 1.0, here)
             image_score(POISSON, data, 1.0, here, pull, known)
             for i in range(4):

@@ -164,10 +164,11 @@ def fit_frames(
                 both = gradients[: 10 * ny * nx].reshape(2, ny, 5, nx)
                 draw_gradient(near, group[r], p, pixels, slope_work[0], slope_work[1], both[0])
                 data = square[: 4 * ny * nx].reshape(4, ny, nx)
-                stage(light, t, total, both[0, :, 0], r0, c0, data)
+                stage(light, t, total, both[0], r0, c0, data)
                 moved = change[: ny * nx].reshape(ny, nx)
                 for i in range(ny):
-                    moved[i] = -both[0, i, 0]
+                    for j in range(nx):
+                        moved[i, j] = -both[0, i, 0, j]
                 outcome[r], last_one = _climb(
                     near, group[r], pixels, data, search, p, both, slope_work, fisher, step
                 )
@@ -253,10 +254,9 @@ def _add_signal(here: FloatArray, step: FloatArray, out: FloatArray) -> None:
     """Add the signal after a small step to `out`."""
     dx, dy, dz, da = step[0], step[1], step[2], step[3]
     for i in range(out.shape[0]):
-        s, x, y, z, a = here[i, 0], here[i, 1], here[i, 2], here[i, 3], here[i, 4]
-        line = out[i]
-        for j in range(line.size):
-            line[j] += s[j] + dx * x[j] + dy * y[j] + dz * z[j] + da * a[j]
+        for j in range(out.shape[1]):
+            sideways = dx * here[i, 1, j] + dy * here[i, 2, j]
+            out[i, j] += here[i, 0, j] + sideways + dz * here[i, 3, j] + da * here[i, 4, j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -313,11 +313,10 @@ def _keep_slopes(
     """Fill `out` (k, pixels) with level × gradient of the free parameters."""
     ny, nx = level.shape
     for k in range(index.size):
+        parameter = 1 + index[k]
         for i in range(ny):
-            light, slope = level[i], gradient[i, 1 + index[k]]
-            line = out[k, i * nx : (i + 1) * nx]
             for j in range(nx):
-                line[j] = light[j] * slope[j]
+                out[k, i * nx + j] = level[i, j] * gradient[i, parameter, j]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -364,12 +363,12 @@ def follow_rows(
 def _add_stretch(light: Light, t: int, total: NDArray[np.float32], stretch: FloatArray) -> float:
     """Add w (1 + C) of a frame to `stretch`; return what the used pixels expect at power 1."""
     amount, w = 0.0, light.power[t]
+    background, used = light.background, light.used
     for i in range(stretch.shape[0]):
-        line, out, background, used = total[i], stretch[i], light.background[i], light.used[i]
-        for j in range(out.size):
-            out[j] += w * (1.0 + line[j])
-        for j in range(out.size):
-            amount += background[j] * (1.0 + line[j]) if used[j] else 0.0
+        for j in range(stretch.shape[1]):
+            stretch[i, j] += w * (1.0 + total[i, j])
+        for j in range(stretch.shape[1]):
+            amount += background[i, j] * (1.0 + total[i, j]) if used[i, j] else 0.0
     return amount
 
 

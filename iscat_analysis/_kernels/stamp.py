@@ -63,7 +63,7 @@ def _begin(lens: Lens, pixels: Pixels, x_p: float, y_p: float) -> FloatArray:
     return w
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _copy(
     profile: FloatArray, row: int, step: int, first: int, last: int, line: int, a: float,
     signal: FloatArray, slope: FloatArray,
