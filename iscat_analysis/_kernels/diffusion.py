@@ -178,7 +178,7 @@ def most_likely_diffusion(
         ladder[k + 1] = top * _SPAN ** (1.0 - k / (_RUNGS - 1.0))
     for _ in range(_LADDERS):
         values = displacement_likelihoods(steps, error, error_next, rate, rate_next, ladder)
-        highest = np.argmax(values)
+        highest = int(np.argmax(values))
         best = ladder[highest]
         low, high = ladder[max(highest - 1, 0)], ladder[min(highest + 1, ladder.size - 1)]
         ladder = np.linspace(low, high, _RUNGS)
@@ -192,4 +192,4 @@ def most_likely_diffusion(
         best += step
         if abs(step) < _FINE * scale:
             break
-    return best
+    return float(best)

@@ -10,7 +10,7 @@ threads.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -382,27 +382,33 @@ def common_modes(
     group: IntArray,
     top: int,
     left: int,
-    out: FloatArray,
+    index: IntArray,
+    owner: IntArray,
+    out: NDArray[np.floating[Any]],
 ) -> None:
-    """Add up what the frames of one track change of each pixel's light, per parameter in common.
+    """Add up what rows of a track change of each pixel's light.
 
     Parameters
     ----------
     light, field, near
         As in `fit_frames`.
     frame, group : ndarray of int, shape (n,)
-        Frames and pictures of the track's rows.
+        Frames and pictures of the rows.
     theta : ndarray, shape (n, 5)
         Their estimates.
     top, left : int
         First row and column of `out` in the field.
-    out : ndarray, shape (4, y, x)
-        Filled with Σ w B ∂C over the frames, for (x, y, z, a) [e per unit].
+    index : ndarray of int, shape (k,)
+        Parameters, of (x, y, z, a).
+    owner : ndarray of int, shape (n,)
+        To which image of `out` each row adds.
+    out : ndarray, shape (m, k, y, x)
+        Σ w B ∂C is added to it [e per unit].
     """
     rows, columns = light.background.shape
+    background, used = light.background, light.used
     work, profile = scratch(table_of(near, 0), near.lens, 2)
     g = np.empty(5 * field.side**2)
-    out[:] = 0.0
     for k in range(frame.size):
         p, w = theta[k], light.power[frame[k]]
         r0, r1, c0, c1 = square_of(field, p, field.side, rows, columns)
@@ -412,9 +418,9 @@ def common_modes(
         here = g[: 5 * ny * nx].reshape(ny, 5, nx)
         pixels = cut(field.pixels, r0, r1, c0, c1)
         draw_gradient(near, group[k], p, pixels, work, profile, here)
-        for i in range(ny):
-            for j in range(nx):
-                if light.used[r0 + i, c0 + j]:
-                    level = w * light.background[r0 + i, c0 + j]
-                    for a in range(4):
-                        out[a, r0 - top + i, c0 - left + j] += level * here[i, 1 + a, j]
+        mine = out[owner[k]]
+        for a in range(index.size):
+            for i in range(ny):
+                for j in range(nx):
+                    level = w * background[r0 + i, c0 + j] if used[r0 + i, c0 + j] else 0.0
+                    mine[a, r0 - top + i, c0 - left + j] += level * here[i, 1 + index[a], j]

@@ -193,6 +193,7 @@ def _logarithmic(
     points: FloatArray,
 ) -> FloatArray:
     """Log-likelihoods at (log D/scale, log κ)."""
-    return harmonic_likelihoods(
+    values: FloatArray = harmonic_likelihoods(
         positions, variance, gaps, exposure, scale * np.exp(points[:, 0]), np.exp(points[:, 1])
     )
+    return values

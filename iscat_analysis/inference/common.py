@@ -166,7 +166,7 @@ def _all_pixels(
     inverse = _inverse(fisher, index)
     changes, weight = patterns(field, ground, rows)
     pixels = np.flatnonzero(weight > 0)
-    slopes = changes.reshape(*changes.shape[:2], -1)[:, index]
+    slopes = changes.reshape(*changes.shape[:2], -1)
     if pixels.size < weight.size:
         slopes = slopes[:, :, pixels]
     follows, left = _undetermined(slopes, weight.flat[pixels], inverse)
@@ -213,10 +213,9 @@ def _common_modes(
     fisher: FloatArray, lost: FloatArray, index: IntArray
 ) -> tuple[FloatArray, float]:
     """Covariance that all rows share, and the share of a common amplitude that is lost."""
-    square = np.ix_(index, index)
-    whole = fisher.sum(axis=0)[square]
+    whole = fisher.sum(axis=0)[np.ix_(index, index)]
     scale = 1 / np.sqrt(np.diag(whole))
-    whole, part = (m * np.outer(scale, scale) for m in (whole, lost[square]))
+    whole, part = (m * np.outer(scale, scale) for m in (whole, lost))
     taken = float(np.clip(part[-1, -1], 0.0, 1.0 - _SINGULAR))
     if np.linalg.eigvalsh(whole - part)[0] < _SINGULAR:
         return np.diag(np.full(index.size, np.inf)), taken

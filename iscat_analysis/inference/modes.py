@@ -24,13 +24,15 @@ def lost(field: MovingField, ground: Ground, rows: Rows) -> FloatArray:
 
     Returns
     -------
-    ndarray, shape (4, 4)
-        Σ over pixels of (Σ_t w B ∂C)(Σ_t w B ∂C)ᵀ / Σ_t w B (1 + C), in (x, y, z, a).
+    ndarray, shape (free, free)
+        Σ over pixels of (Σ_t w B ∂C)(Σ_t w B ∂C)ᵀ / Σ_t w B (1 + C), in the free ones of
+        (x, y, z, a).
     """
     cut = _box(field, rows)
-    modes = np.empty((4, *ground.level[cut].shape))
-    field.add_modes(ground, rows, (cut[0].start, cut[1].start), modes)
-    return np.asarray(np.einsum("ayx,byx,yx->ab", modes, modes, _weight(field, ground, cut)))
+    modes = np.zeros((1, int(field.free[:4].sum()), *ground.level[cut].shape))
+    together = np.zeros(len(rows.frame), dtype=np.int64)
+    field.add_modes(ground, rows, (cut[0].start, cut[1].start), together, modes)
+    return np.asarray(np.einsum("ayx,byx,yx->ab", *modes, *modes, _weight(field, ground, cut)))
 
 
 def pixels_of(field: MovingField, rows: Rows) -> int:
@@ -68,18 +70,15 @@ def patterns(
 
     Returns
     -------
-    patterns : ndarray of float32, shape (n, 4, y, x)
-        w B ∂C of each row, in (x, y, z, a) [e per unit].
+    patterns : ndarray of float32, shape (n, free, y, x)
+        w B ∂C of each row, in the free ones of (x, y, z, a) [e per unit].
     weight : ndarray, shape (y, x)
         One over the counts of all frames; less where there is read noise, 0 where not used.
     """
-    cut = _box(field, rows)
-    one = np.empty((4, *ground.level[cut].shape))
-    out = np.empty((len(rows.frame), *one.shape), dtype=np.float32)
-    for i in range(len(out)):
-        this = rows.only(np.arange(len(out)) == i)
-        field.add_modes(ground, this, (cut[0].start, cut[1].start), one)
-        out[i] = one
+    cut, each = _box(field, rows), np.arange(len(rows.frame))
+    free = int(field.free[:4].sum())
+    out = np.zeros((each.size, free, *ground.level[cut].shape), dtype=np.float32)
+    field.add_modes(ground, rows, (cut[0].start, cut[1].start), each, out)
     return out, _weight(field, ground, cut)
 
 

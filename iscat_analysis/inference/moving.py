@@ -10,15 +10,16 @@ score with the background that is most likely given the particles,
 put in (envelope theorem), so that fitting the particles over B̂ and B̂ under the particles in turn
 ends at its maximum, and nothing is left of the particles in their background.  Turns alone converge
 as slowly as the particles move.  How the rows follow a change of the background is known from their
-informations, so that Newton's method sees where the turns would end (`MovingField.settle`).
+informations, so that Newton's method sees where the turns would end (`settle`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,23 +37,17 @@ from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.newton import newton_step
 from iscat_analysis.inference.pictures import PictureBook
 from iscat_analysis.inference.rows import Ground, Judged, Rows
+from iscat_analysis.inference.sheet import Sheet, blank
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
+
+IntArray = NDArray[np.int64]
 
 DRAWN = 4
 """Side of the square in which a particle is drawn, over that in which it is fitted."""
 
 COARSE = 2
 """Of the fitted square's side, by which it is cut while particles are still being looked for."""
-
-SETTLED = 0.02
-"""Step of the background, in its own standard deviations, that is the last one."""
-
-MOST_TURNS = 12
-"""Steps at most."""
-
-NEAR, FAR = 0.5, 5.0
-"""A step of less than `NEAR` after one of more than `FAR` calls for new rings."""
 
 _BLOCK = 32  # frames that one thread takes at a time
 _TOLERANCE = 2e-4  # as in `Likelihood.maximize`
@@ -120,7 +115,7 @@ class MovingField:
         self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, roi_px, slack)
         if z_range_nm is not None:  # the rings tell one fringe from the next, and reach far
             self._coarse = self._whole
-        self._canvas: _Sheet | None = None
+        self._canvas: Sheet | None = None
         self.free = np.array([True, True, z_range_nm is not None, True, False])
         reach = window_nm(pixel_nm)
         half = pixel_nm / 2 + _BEYOND * wavelength / near.optics.na
@@ -153,6 +148,12 @@ class MovingField:
         """Photoelectrons of all frames, shape (y, x) [e]."""
         return np.asarray(self.counts_e.sum(axis=0, dtype=np.float64))
 
+    @cached_property
+    def frame_totals(self) -> FloatArray:
+        """Photoelectrons in the used pixels of each frame, shape (t,) [e]."""
+        unused = self.counts_e[:, ~self.used].sum(axis=1, dtype=np.float64)
+        return np.asarray(self.counts_e.sum(axis=(1, 2), dtype=np.float64) - unused)
+
     @property
     def frames(self) -> int:
         """Frames in the movie."""
@@ -169,37 +170,12 @@ class MovingField:
         self._pictures = self._book.of(variances_nm2)
         self._canvas = None
 
-    def first_ground(self, *, follow_power: bool) -> Ground:
-        """Median of the frames, each over its power.
-
-        Parameters
-        ----------
-        follow_power : bool
-            Whether the power changes from frame to frame.
-
-        Returns
-        -------
-        Ground
-            Wrong where a particle was in more than a fraction of the frames.
-        """
-        power = np.ones(self.frames)
-        if follow_power:
-            power = self._frame_totals / self._frame_totals.mean()
-        scale = (1 / power).astype(np.float32)
-
-        def median(row: int) -> FloatArray:
-            each = np.ascontiguousarray((self.counts_e[:, row] * scale[:, None]).T)
-            return np.asarray(np.median(each, axis=1, overwrite_input=True), dtype=float)
-
-        level = np.stack(list(self._pool.map(median, range(len(self.used)))))
-        return Ground(np.maximum(level, 1e-3), power)
-
     def fit(
         self, ground: Ground, rows: Rows, *, sweeps: int = 1, coarse: bool = False
     ) -> tuple[Rows, Ground, BoolArray]:
         """Fit every row over a background, and give the background under the rows.
 
-        How the rows follow their background is kept for the next step of `settle`.
+        How the rows follow their background is kept for `where_turns_end`.
 
         Parameters
         ----------
@@ -245,76 +221,30 @@ class MovingField:
         if sweeps:
             self._response = response
         level = np.where(stretch > 0, self.total_e / np.where(stretch > 0, stretch, 1.0), 1.0)
-        totals = self._frame_totals
+        totals = self.frame_totals
         power = np.where(expected > 0, totals / np.where(expected > 0, expected, 1.0), 1.0)
         fitted = replace(rows, theta=theta) if sweeps else rows
-        self._canvas = _Sheet(fitted, canvas, coarse)
+        self._canvas = Sheet(fitted, canvas, coarse)
         return fitted, Ground(np.maximum(level, 1e-3), power / power.mean()), outcome == CONVERGED
 
-    def settle(
-        self,
-        ground: Ground,
-        rows: Rows,
-        *,
-        follow_power: bool,
-        follow_level: bool = True,
-        turns: int = MOST_TURNS,
-        coarse: bool = False,
-        tell: Callable[[int, float], None] | None = None,
-    ) -> tuple[Rows, Ground, BoolArray, float]:
-        """Fit rows and background in turn, to the maximum of their likelihood.
+    def where_turns_end(self, move: FloatArray) -> FloatArray:
+        """Give the step of the background whose first turn, with the last fit, is `move`.
 
         Parameters
         ----------
-        ground : Ground
-            To begin with.
-        rows : Rows
-            Starts.
-        follow_power, follow_level : bool
-            Whether the power and the level are fitted, or stay.
-        turns : int
-            At most.
-        coarse : bool
-            As in `fit`.
-        tell : callable, optional
-            Told each turn and the change that it made.
+        move : ndarray, shape (y, x)
+            Change of the logarithm of the background.
 
         Returns
         -------
-        rows : Rows
-            Estimates.
-        ground : Ground
-            Under them.
-        converged : ndarray of bool
-            Which fits did.
-        change : float
-            Largest change of the background in the last turn [its standard deviations].
+        ndarray, shape (y, x)
+            As from `newton_step`.
         """
-        sigma = 1 / np.sqrt(np.maximum(self.total_e, 1.0))
-        change = largest = 0.0
-        done = np.ones(len(rows.frame), dtype=bool)
-        for turn in range(turns):
-            rows, found, done = self.fit(ground, rows, coarse=coarse)
-            power = found.power if follow_power else ground.power
-            if not follow_level:
-                settled = bool(np.abs(power - ground.power).max() < 1e-7)
-                ground, change = replace(ground, power=power), 0.0
-                if settled or turn >= 2:
-                    break
-                continue
-            move = np.where(self.used, np.log(found.level / ground.level), 0.0)
-            step = newton_step(move, self._response, self.total_e, self.used, self._pool)
-            change = float(np.abs(step / sigma)[self.used].max(initial=0.0))
-            if tell is not None:
-                tell(turn, change)
-            level = np.where(self.used, ground.level * np.exp(step), found.level)
-            ground = Ground(level, power)
-            largest = max(largest, change)
-            if change < NEAR and largest > FAR and not coarse:
-                self._canvas, largest = None, change
-            elif change < SETTLED:
-                break
-        return rows, ground, done, change
+        return newton_step(move, self._response, self.total_e, self.used, self._pool)
+
+    def draw_anew(self) -> None:
+        """Draw all rings where their particles are, at the next pass."""
+        self._canvas = None
 
     def draw(self, ground: Ground, rows: Rows) -> None:
         """Draw the rows of all frames at once; `residual` of the same object then only subtracts.
@@ -326,7 +256,7 @@ class MovingField:
         rows : Rows
             Particles.
         """
-        self._canvas = None  # rings that stayed where rows were before are not good enough
+        self.draw_anew()  # rings that stayed where rows were before are not good enough
         self.fit(ground, rows, sweeps=0, coarse=True)
 
     def residual(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
@@ -361,7 +291,10 @@ class MovingField:
     def _signal(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
         """Draw the rows of some frames alone."""
         within = rows.only((rows.frame >= first) & (rows.frame < last))
-        canvas, (near, far) = self._blank(last - first, within), self._pictures
+        canvas, (near, far) = (
+            blank(np.empty_like(self.counts_e[first:last]), within),
+            self._pictures,
+        )
         light = self._light(ground)
         part = light._replace(counts=light.counts[first:last], power=light.power[first:last])
         starts = np.searchsorted(within.frame, np.arange(first, last + 1)).astype(np.int64)
@@ -413,23 +346,7 @@ class MovingField:
             return np.zeros(1)
 
         self._sum_of(block)
-        index = np.flatnonzero(self.free[:4])
-        part = np.ix_(np.arange(n), index, np.arange(index.size))
-        observed = np.full((n, 4, 4), np.nan)
-        inverse = np.full((n, index.size, index.size), np.nan)
-        good = np.isfinite(turned[part]).all(axis=(1, 2)) if n else np.zeros(0, dtype=bool)
-        if good.any():
-            v, ov = ways[part][good], turned[part][good]
-            inverse[good] = v @ np.swapaxes(v, 1, 2)
-            o = ov @ np.linalg.inv(v)
-            square = np.ix_(good, index, index)
-            observed[square] = (o + np.swapaxes(o, 1, 2)) / 2
-        shift = np.zeros((n, 4))
-        shift[:, index] = np.einsum("nij,nj->ni", inverse, bias[:, index])
-        gain, chi2, pixels, worst, level = numbers.T
-        return Judged(
-            fisher, observed, np.nan_to_num(shift), score, gain, chi2, pixels, worst, level
-        )
+        return Judged.of(fisher, turned, ways, bias, score, numbers, free=self.free[:4])
 
     def share(self, task: Callable[[int], None], count: int) -> None:
         """Run a numbered task for every number below `count`, several at a time."""
@@ -482,7 +399,7 @@ class MovingField:
         light = light._replace(counts=light.counts[times], power=light.power[times])
         starts = np.searchsorted(frame, np.arange(times.size + 1)).astype(np.int64)
         theta, n = rows.theta.copy(), len(frame)
-        canvas = self._blank(times.size, rows)
+        canvas = blank(np.empty_like(light.counts), rows)
         outcome = np.zeros(n, dtype=np.int64)
         expected, stretch = np.zeros(times.size), np.zeros(self.used.shape)
         fisher, turned, ways = np.zeros((3, n, 4, 4))
@@ -500,9 +417,10 @@ class MovingField:
         return replace(rows, theta=theta), outcome == CONVERGED, snr
 
     def add_modes(
-        self, ground: Ground, rows: Rows, corner: tuple[int, int], out: FloatArray
-    ) -> None:
-        """Fill an array with the sum over rows of what they change of the light.
+        self, ground: Ground, rows: Rows, corner: tuple[int, int], owner: IntArray,
+        out: NDArray[np.floating[Any]],
+    ) -> None:  # fmt: skip
+        """Add what rows change of the light.
 
         Parameters
         ----------
@@ -512,12 +430,14 @@ class MovingField:
             Particles.
         corner : (int, int)
             First row and column of the pixels.
-        out : ndarray, shape (4, y, x)
-            Filled with Σ w B ∂C, in (x, y, z, a) [e per unit].
+        owner : ndarray of int, shape (n,)
+            To which image of `out` each row adds.
+        out : ndarray, shape (m, free, y, x)
+            Σ w B ∂C, in the free ones of (x, y, z, a) [e per unit].
         """
         common_modes(
             self._light(ground), self._whole, self._pictures[0], rows.frame, rows.theta, rows.group,
-            *corner, out,
+            *corner, np.flatnonzero(self.free[:4]), owner, out,
         )  # fmt: skip
 
     def on_wall(self, rows: Rows) -> BoolArray:
@@ -557,12 +477,6 @@ class MovingField:
             np.sqrt(2 * np.maximum(self.judge(ground, rows, brief=True, coarse=True).gain, 0.0))
         )
 
-    @cached_property
-    def _frame_totals(self) -> FloatArray:
-        """Photoelectrons in the used pixels of each frame."""
-        unused = self.counts_e[:, ~self.used].sum(axis=1, dtype=np.float64)
-        return np.asarray(self.counts_e.sum(axis=(1, 2), dtype=np.float64) - unused)
-
     def _light(self, ground: Ground) -> Light:
         return Light(self.counts_e, ground.power, ground.level, self.read_e2, self.used)
 
@@ -578,11 +492,11 @@ class MovingField:
         """Give the canvas, with the frames marked in which it holds other rows than these."""
         last = self._canvas
         if last is None or last.coarse != coarse:
-            total = last.canvas.total if last else np.empty(self.counts_e.shape, dtype=np.float32)
-            canvas = self._blank(self.frames, rows, total)
+            room = last.canvas.total if last else np.empty_like(self.counts_e)
+            canvas = blank(room, rows)
         else:
             canvas = last.moved(rows, self.frames)
-        self._canvas = _Sheet(rows, canvas, coarse)
+        self._canvas = Sheet(rows, canvas, coarse)
         return canvas
 
     def _response_of(self, rows: int, side: int) -> Response:
@@ -593,32 +507,3 @@ class MovingField:
             np.empty((rows, free, side**2), dtype=np.float32),
             np.empty((rows, free, free)),
         )
-
-    def _blank(self, frames: int, rows: Rows, total: NDArray[np.float32] | None = None) -> Canvas:
-        """Canvas on which nothing is drawn."""
-        if total is None:
-            total = np.empty((frames, *self.used.shape), dtype=np.float32)
-        nothing = np.zeros(frames, dtype=bool)
-        return Canvas(total, np.zeros_like(rows.theta), np.zeros_like(rows.theta), nothing)
-
-
-@dataclass(frozen=True)
-class _Sheet:
-    """A canvas and the rows that are on it."""
-
-    rows: Rows
-    canvas: Canvas
-    coarse: bool
-
-    def moved(self, rows: Rows, frames: int) -> Canvas:
-        """Turn to other rows; frames in which they are not the same ones are marked."""
-        old, canvas = self.rows, self.canvas
-        here, there = rows.starts(frames), old.starts(frames)
-        same = np.diff(here) == np.diff(there)
-        mine = np.flatnonzero(np.repeat(same, np.diff(here)))
-        theirs = np.flatnonzero(np.repeat(same, np.diff(there)))
-        other = (rows.group[mine] != old.group[theirs]) | (rows.track[mine] != old.track[theirs])
-        same[rows.frame[mine[other]]] = False
-        rings, squares = np.zeros((2, *rows.theta.shape))
-        rings[mine], squares[mine] = canvas.rings[theirs], canvas.squares[theirs]
-        return Canvas(canvas.total, rings, squares, canvas.drawn & same)

@@ -112,3 +112,43 @@ class Judged:
     pixels: FloatArray
     worst: FloatArray
     level: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        fisher: FloatArray,
+        turned: FloatArray,
+        ways: FloatArray,
+        bias: FloatArray,
+        score: FloatArray,
+        numbers: FloatArray,
+        *,
+        free: BoolArray,
+    ) -> Judged:
+        """Make it of what `iscat_analysis._kernels.judging.judge_frames` fills.
+
+        Parameters
+        ----------
+        fisher, turned, ways, bias, score, numbers : ndarray
+            As there.
+        free : ndarray of bool, shape (4,)
+            Free parameters.
+
+        Returns
+        -------
+        Judged
+            With the observed information and the bias where second derivatives were taken.
+        """
+        n, index = len(fisher), np.flatnonzero(free)
+        part = np.ix_(np.arange(n), index, np.arange(index.size))
+        observed = np.full((n, 4, 4), np.nan)
+        inverse = np.full((n, index.size, index.size), np.nan)
+        good = np.isfinite(turned[part]).all(axis=(1, 2))
+        if good.any():
+            v, ov = ways[part][good], turned[part][good]
+            inverse[good] = v @ np.swapaxes(v, 1, 2)
+            o = ov @ np.linalg.inv(v)
+            observed[np.ix_(good, index, index)] = (o + np.swapaxes(o, 1, 2)) / 2
+        shift = np.zeros((n, 4))
+        shift[:, index] = np.einsum("nij,nj->ni", inverse, bias[:, index])
+        return cls(fisher, observed, np.nan_to_num(shift), score, *numbers.T)

@@ -16,6 +16,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.inference.settling import first_ground
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.background import measure_windows, start_power
 from iscat_analysis.movie.camera import Camera
@@ -323,7 +324,7 @@ class MovingSearch:
                     self._scene, self._movie, camera, span, self._check, pool, silent
                 )
                 power = config.background.power_normalization
-                return field, field.first_ground(follow_power=power)
+                return field, first_ground(field, follow_power=power)
 
         self._background = background
 

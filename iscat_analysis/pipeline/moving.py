@@ -21,8 +21,9 @@ from iscat_analysis.inference.common import (
     shared_errors,
     variances_left,
 )
-from iscat_analysis.inference.moving import MOST_TURNS, MovingField
+from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Judged, Rows
+from iscat_analysis.inference.settling import MOST_TURNS, first_ground, settle
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.blur import path_variance_nm2
 from iscat_analysis.pipeline.extension import extended
@@ -151,7 +152,7 @@ def follow(
     field = load_field(scene, movie, camera, span, check, pool, progress)
     follow_power = config.background.power_normalization
     follow_level = config.background.method != "median"
-    ground = field.first_ground(follow_power=follow_power)
+    ground = first_ground(field, follow_power=follow_power)
     nothing = np.zeros(0, dtype=np.int64)
     rows, snr = Rows.of(nothing, nothing, np.zeros((0, 5))), np.zeros(0)
     total = ROUNDS + 3
@@ -162,7 +163,8 @@ def follow(
         if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(scene, rows, found)
-        rows, ground, done, _ = field.settle(
+        rows, ground, done, _ = settle(
+            field,
             ground,
             rows,
             follow_power=follow_power,
@@ -177,8 +179,8 @@ def follow(
             rows = linked(config, rows, mass_places(config, field, ground, rows))
             rows, variances, _ = _moved(config, field, ground, rows)
             field.set_blurs(variances)
-            rows, ground, done, _ = field.settle(
-                ground, rows, follow_power=follow_power, follow_level=follow_level,
+            rows, ground, done, _ = settle(
+                field, ground, rows, follow_power=follow_power, follow_level=follow_level,
                 turns=_NEXT_TURNS, coarse=True,
             )  # fmt: skip
             snr = field.snr_of(ground, rows)
@@ -188,8 +190,8 @@ def follow(
     rows = linked(config, rows, mass_places(config, field, ground, rows), inner=inner)
     resolution = config.optics.wavelength_nm / config.optics.na
     for number in range(ROUNDS):
-        rows, ground, done, _ = field.settle(
-            ground, rows, follow_power=follow_power, follow_level=follow_level,
+        rows, ground, done, _ = settle(
+            field, ground, rows, follow_power=follow_power, follow_level=follow_level,
             turns=_NEXT_TURNS, coarse=True,
         )  # fmt: skip
         rows = trimmed(rows)
@@ -212,8 +214,8 @@ def follow(
     for stage in range(2):
         if scene.mode == "joint":
             rows = _in_their_fringes(scene, field, ground, rows)
-        rows, ground, done, _ = field.settle(
-            ground, rows, follow_power=follow_power, follow_level=follow_level,
+        rows, ground, done, _ = settle(
+            field, ground, rows, follow_power=follow_power, follow_level=follow_level,
             turns=MOST_TURNS if stage else _NEXT_TURNS, coarse=not stage,
         )  # fmt: skip
         progress("track", ROUNDS + 1 + stage, total)

@@ -21,6 +21,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.inference.settling import first_ground
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.background import refine_power
 from iscat_analysis.movie.camera import Camera, camera_from_config
@@ -249,7 +250,7 @@ def _moving(
             field = load_field(scene, movie, camera, (start, stop), check, pool, silent)
             field.set_blurs(variances)
             follows = config.background.power_normalization
-            ground = field.first_ground(follow_power=follows)
+            ground = first_ground(field, follow_power=follows)
             for _ in range(_TURNS):
                 found = field.fit(ground, rows, sweeps=0)[1]
                 level = ground.level if config.background.method == "median" else found.level

@@ -161,13 +161,16 @@ def describe_tracks(
     records, tests = [], {}
     with threads(workers) as pool:
         for track, rows in groups.items():
-            known = masses is not None and track in masses.index
-            exact = masses.loc[track].to_dict() if known else {}
+            exact: dict[str, float] = {}
+            if masses is not None and track in masses.index:
+                exact = masses.loc[track].to_dict()
             record = _record(track, rows, setup, power, correlation, exact)
             record["nearest_nm"] = nearest.get(track, np.inf)
             records.append(record)
             if np.isfinite(record["d_um2_s"]):
-                tests[track] = pool.submit(_tests, rows, setup, np.random.default_rng([seed, track]))
+                tests[track] = pool.submit(
+                    _tests, rows, setup, np.random.default_rng([seed, track])
+                )
         try:
             for done, record in enumerate(records):
                 track = record["track"]

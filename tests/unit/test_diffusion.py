@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.integrate import dblquad
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import multivariate_normal, norm
 
 import iscat_analysis as ia
-from iscat_analysis._kernels.diffusion import harmonic_likelihood
+from iscat_analysis._kernels.diffusion import displacement_likelihoods
+from iscat_analysis._kernels.well import harmonic_likelihoods, most_likely_well
 from iscat_analysis.species import diffusion, motion
 from iscat_analysis.species.displacements import Displacements, gather
 
@@ -75,6 +76,16 @@ def test_three_bands_are_the_whole_likelihood(axes: int, exposure: float) -> Non
     track = make_track(axes=axes, exposure=exposure)
     for d in (0.0, 1e3, 0.15e6, 3e6):
         assert track.likelihood(d).value == pytest.approx(dense(track, d), rel=EXACT)
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.8])
+def test_likelihoods_of_many_d_are_those_of_each(kept: float) -> None:
+    arguments = given(make_track(n=90))
+    counted = np.random.default_rng(5).random(89) <= kept
+    track = gather(**arguments, counted=counted)
+    ladder = np.array([0.0, 1e2, 1e4, 0.15e6, 3e6, 1e8, 5.0])
+    found = displacement_likelihoods(track.steps_nm, *track.error, *track.rate, ladder)
+    assert found == pytest.approx([track.likelihood(d).value for d in ladder], rel=1e-12)
 
 
 def test_derivatives_and_information() -> None:
@@ -265,18 +276,43 @@ def test_the_filter_of_a_well_is_the_dense_likelihood(exposure: float, stiffness
         u = stiffness * e
         mean *= 2 * (np.cosh(u) - 1) / u**2
         np.fill_diagonal(mean, 2 * (u - 1 + np.exp(-u)) / u**2)
-    found = harmonic_likelihood(
-        track.positions_nm, track.variance_nm2, track.gaps_s, e, d, stiffness
-    )
+    wells = np.array([7.0, stiffness, 3.0])
+    found = harmonic_likelihoods(
+        track.positions_nm, track.variance_nm2, track.gaps_s, e, np.array([1e4, d, 1e7]), wells
+    )[1]
     assert found == pytest.approx(dense(track, d, mean / stiffness), rel=1e-8)
 
 
 def test_a_soft_well_is_none() -> None:
     track = make_track()
-    soft = harmonic_likelihood(
-        track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s, 0.15e6, 1e-4
-    )
+    (soft,) = harmonic_likelihoods(
+        track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s,
+        np.array([0.15e6]), np.array([1e-4]),
+    )  # fmt: skip
     assert soft == pytest.approx(track.likelihood(0.15e6).value, abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("walled", [False, True])
+def test_the_best_well_is_that_of_a_simplex_search(walled: bool, seed: int) -> None:
+    arguments = in_a_well(60.0, 120, seed) if walled else given(make_track(n=120, seed=seed))
+    track, d = gather(**({"exposure_ms": None} | arguments)), 0.15e6
+    soft, stiff = 0.3 / float(track.gaps_s.sum()), 3 / track.interval_s
+    given_ones = track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s
+
+    def lost(theta: np.ndarray) -> float:
+        wells = d * np.exp(theta[:1]), np.exp(theta[1:])
+        return -float(harmonic_likelihoods(*given_ones, *wells)[0])
+
+    rungs = np.linspace(math.log(soft), math.log(stiff), 6)
+    limits = [(-10.0, 10.0), (rungs[0], rungs[-1])]
+    best = min(
+        minimize(lost, (0.0, rung), method="Nelder-Mead", tol=1e-6, bounds=limits).fun
+        for rung in rungs
+    )
+    value, d_there, stiffness = most_likely_well(*given_ones, d, soft, stiff)
+    assert value == pytest.approx(-best, abs=1e-3)
+    assert value == pytest.approx(-lost(np.log([d_there / d, stiffness])), rel=1e-12)
 
 
 def test_drawn_tracks_have_the_covariance() -> None:

@@ -19,6 +19,7 @@ from iscat_analysis.inference.bias import first_order_bias
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.noise import poisson
 from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.inference.settling import first_ground, settle
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.pipeline import fit_stack
@@ -110,9 +111,9 @@ def test_background_takes_nothing_of_particles(
     """
     counts, ground, truth = _movie(_paths(step_nm), noise=False)
     field = _field(counts, pool)
-    start = field.first_ground(follow_power=True)
+    start = first_ground(field, follow_power=True)
     over_median, _, _ = field.fit(start, truth)
-    rows, found, done, _ = field.settle(start, truth, follow_power=True)
+    rows, found, done, _ = settle(field, start, truth, follow_power=True)
     taken = 1 - over_median.theta[:, 3] / truth.theta[:, 3]
     left = rows.theta[:, 3] / truth.theta[:, 3] - 1
     assert done.all()
@@ -125,8 +126,8 @@ def test_fixed_point_is_the_maximum_of_the_multinomial(pool: ThreadPoolExecutor)
     """Its gradient on a row's square, by differences, vanishes within the tolerance of a fit."""
     counts, _, truth = _movie(_paths(40.0), noise=True)
     field = _field(counts, pool)
-    start = field.first_ground(follow_power=True)
-    rows, ground, _, _ = field.settle(start, truth, follow_power=True)
+    start = first_ground(field, follow_power=True)
+    rows, ground, _, _ = settle(field, start, truth, follow_power=True)
     for _ in range(3):  # beyond what is asked of it
         rows, found, _ = field.fit(ground, rows)
         ground = Ground(found.level, ground.power)

@@ -1,0 +1,112 @@
+"""Rows and background together, to the maximum of the likelihood of `MovingField`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.records import BoolArray
+
+MOST_TURNS = 12
+"""Steps at most."""
+
+_SETTLED = 0.02  # step of the background, in its own standard deviations, that is the last one
+_NEAR, _FAR = 0.5, 5.0  # a step below the one after one above the other calls for new rings
+_POWER_TURNS = 3  # over a background that stays
+_POWER_SETTLED = 1e-7
+
+
+def first_ground(field: MovingField, *, follow_power: bool) -> Ground:
+    """Median of the frames, each over its power.
+
+    Parameters
+    ----------
+    field : MovingField
+        The movie.
+    follow_power : bool
+        Whether the power changes from frame to frame.
+
+    Returns
+    -------
+    Ground
+        Wrong where a particle was in more than a fraction of the frames.
+    """
+    power = np.ones(field.frames)
+    if follow_power:
+        power = field.frame_totals / field.frame_totals.mean()
+    scale = (1 / power).astype(np.float32)
+    level = np.empty(field.used.shape)
+
+    def median(row: int) -> None:
+        each = np.ascontiguousarray((field.counts_e[:, row] * scale[:, None]).T)
+        level[row] = np.median(each, axis=1, overwrite_input=True)
+
+    field.share(median, len(level))
+    return Ground(np.maximum(level, 1e-3), power)
+
+
+def settle(
+    field: MovingField,
+    ground: Ground,
+    rows: Rows,
+    *,
+    follow_power: bool,
+    follow_level: bool = True,
+    turns: int = MOST_TURNS,
+    coarse: bool = False,
+) -> tuple[Rows, Ground, BoolArray, float]:
+    """Fit rows and background in turn, to the maximum of their likelihood.
+
+    Parameters
+    ----------
+    field : MovingField
+        The movie.
+    ground : Ground
+        To begin with.
+    rows : Rows
+        Starts.
+    follow_power, follow_level : bool
+        Whether the power and the level are fitted, or stay.
+    turns : int
+        At most.
+    coarse : bool
+        As in `MovingField.fit`.
+
+    Returns
+    -------
+    rows : Rows
+        Estimates.
+    ground : Ground
+        Under them.
+    converged : ndarray of bool
+        Which fits did.
+    change : float
+        Largest change of the background in the last turn [its standard deviations].
+    """
+    sigma = 1 / np.sqrt(np.maximum(field.total_e, 1.0))
+    change = largest = 0.0
+    done = np.ones(len(rows.frame), dtype=bool)
+    for turn in range(turns):
+        rows, found, done = field.fit(ground, rows, coarse=coarse)
+        power = found.power if follow_power else ground.power
+        if not follow_level:
+            steady = bool(np.abs(power - ground.power).max() < _POWER_SETTLED)
+            ground, change = replace(ground, power=power), 0.0
+            if steady or turn + 1 >= _POWER_TURNS:
+                break
+            continue
+        move = np.where(field.used, np.log(found.level / ground.level), 0.0)
+        step = field.where_turns_end(move)
+        change = float(np.abs(step / sigma)[field.used].max(initial=0.0))
+        level = np.where(field.used, ground.level * np.exp(step), found.level)
+        ground = Ground(level, power)
+        largest = max(largest, change)
+        if change < _NEAR and largest > _FAR and not coarse:
+            field.draw_anew()
+            largest = change
+        elif change < _SETTLED:
+            break
+    return rows, ground, done, change
