@@ -193,18 +193,20 @@ def _undetermined(
     root = np.linalg.cholesky(inverse).astype(slopes.dtype)
     felt = np.swapaxes(root, 1, 2) @ slopes
     (product,) = get_blas_funcs(("syrk",), (felt,))
-    taken = np.zeros((weight.size, weight.size))
+    left = np.zeros((weight.size, weight.size), order="F")  # as the products are
     for first in range(0, len(felt), _TOGETHER):
         some = felt[first : first + _TOGETHER].reshape(-1, weight.size)
-        taken += product(1.0, some.T, lower=True)
-    return root @ felt, _factor(np.diag(1 / weight) - taken)
+        left -= product(1.0, some.T, lower=True)
+    left.flat[:: weight.size + 1] += 1 / weight
+    return root @ felt, _factor(left)
 
 
 def _factor(matrix: FloatArray) -> FloatArray | None:
-    """Lower Cholesky factor, None where the matrix is not positive."""
-    scale = np.diag(matrix).max()
+    """Lower Cholesky factor in the place of a matrix, None where that is not positive."""
+    diagonal = matrix.flat[:: len(matrix) + 1]
+    matrix.flat[:: len(matrix) + 1] = diagonal + _SINGULAR * diagonal.max()
     try:
-        return np.asarray(cholesky(matrix + _SINGULAR * scale * np.eye(len(matrix)), lower=True))
+        return np.asarray(cholesky(matrix, lower=True, overwrite_a=True, check_finite=False))
     except np.linalg.LinAlgError:
         return None
 
