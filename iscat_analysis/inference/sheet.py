@@ -44,6 +44,19 @@ class Sheet:
 
 
 def blank(room: NDArray[np.float32], rows: Rows) -> Canvas:
-    """Make a canvas in an array of frames, with nothing drawn on it yet."""
+    """Make a canvas with nothing drawn on it yet.
+
+    Parameters
+    ----------
+    room : ndarray of float32, shape (t, y, x)
+        Where its frames will be; what is there counts for nothing.
+    rows : Rows
+        Particles that will be drawn.
+
+    Returns
+    -------
+    Canvas
+        All of whose frames are to be drawn.
+    """
     nothing = np.zeros(len(room), dtype=bool)
     return Canvas(room, np.zeros_like(rows.theta), np.zeros_like(rows.theta), nothing)
