@@ -7,6 +7,7 @@ another in a profile, in one register, and eight pixels are then exchanged for t
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -65,23 +66,28 @@ def evaluate_bends(profile: FloatArray, f: FloatArray) -> None:
         _with_bends(profile, f, j)
 
 
-def _pixel(code: Code, number: int, channels: int, skipped: int = 0) -> tuple[list[Any], Any]:
-    """Load the powers of some channels at a pixel, and its place in the interval."""
-    profile, f = code.one, code.other
-    place = code.plus(code.first, code.index(number))
-    interval, t = code.parted(code.in_row(f, DISTANCE, place), channels)
-    every = code.length(profile, 2)
-    first, begin = code.times(interval, code.index(POWERS)), code.index(skipped)
-    rows = (code.times(code.plus(first, code.index(k)), every) for k in range(POWERS))
-    places = (code.plus(row, begin) for row in rows)
-    return [code.load(code.at(profile, place), channels) for place in places], t
+def _places(code: Code) -> tuple[list[Any], Any]:
+    """Tell where the powers of eight pixels begin, and their places in their intervals."""
+    intervals, t = code.parted(code.in_row(code.other, DISTANCE, code.first))
+    size = code.times(code.index(POWERS), code.length(code.one, 2))
+    return [code.times(interval, size) for interval in intervals], t
 
 
-def _pair(code: Code, number: int) -> tuple[list[Any], Any]:
-    """Load the powers of four channels at a pixel and at the fourth after it, in one register."""
+def _powers(code: Code, begin: Any, channels: int) -> list[Any]:
+    """Load the powers of some channels."""
+    every = code.length(code.one, 2)
+    places = (code.plus(begin, code.times(code.index(k), every)) for k in range(POWERS))
+    return [code.load(code.at(code.one, place), channels) for place in places]
+
+
+def _pairs(code: Code) -> Iterator[tuple[list[Any], Any]]:
+    """Load powers of four channels, of a pixel and of the fourth after it in one register."""
+    begin, t = _places(code)
     half = LANES // 2
-    (near, t_near), (far, t_far) = (_pixel(code, k, half) for k in (number, number + half))
-    return [code.joined(*both) for both in zip(near, far, strict=True)], code.joined(t_near, t_far)
+    for k in range(half):
+        near, far = _powers(code, begin[k], half), _powers(code, begin[k + half], half)
+        both = zip(near, far, strict=True)
+        yield [code.joined(*pair) for pair in both], code.chosen(t, [k] * half + [k + half] * half)
 
 
 def _store(code: Code, rows: list[Any]) -> None:
@@ -93,12 +99,14 @@ def _store(code: Code, rows: list[Any]) -> None:
 def _write_with_slopes(code: Code, skipped: int = 0) -> None:
     """Horner's rule for eight channels and their slopes, of which four are kept."""
     values, slopes = [], []
-    for pixel in range(LANES):
-        c, t = _pixel(code, pixel, LANES, skipped)
+    begin, places = _places(code)
+    for k in range(LANES):
+        c = _powers(code, code.plus(begin[k], code.index(skipped)), LANES)
+        t = code.chosen(places, [k] * LANES)
         value, slope = code.multiply_add(c[5], t, c[4]), c[5]
-        for k in (3, 2, 1, 0):
+        for power in (3, 2, 1, 0):
             slope = code.multiply_add(slope, t, value)
-            value = code.multiply_add(value, t, c[k])
+            value = code.multiply_add(value, t, c[power])
         values.append(value)
         slopes.append(slope)
     _store(code, code.exchanged(values) + code.exchanged(slopes)[: LANES // 2])
@@ -107,8 +115,7 @@ def _write_with_slopes(code: Code, skipped: int = 0) -> None:
 def _write_values(code: Code) -> None:
     """Horner's rule for four channels."""
     values = []
-    for pixel in range(LANES // 2):
-        c, t = _pair(code, pixel)
+    for c, t in _pairs(code):
         value = c[5]
         for k in (4, 3, 2, 1, 0):
             value = code.multiply_add(value, t, c[k])
@@ -119,8 +126,7 @@ def _write_values(code: Code) -> None:
 def _write_with_bends(code: Code) -> None:
     """Horner's rule for four channels, their slopes and second derivatives."""
     values, slopes, bends = [], [], []
-    for pixel in range(LANES // 2):
-        c, t = _pair(code, pixel)
+    for c, t in _pairs(code):
         value, slope, bend = code.multiply_add(c[5], t, c[4]), c[5], c[5]
         slope, value = code.multiply_add(slope, t, value), code.multiply_add(value, t, c[3])
         for k in (2, 1, 0):

@@ -81,18 +81,23 @@ class Code:
         """Write a register to memory."""
         self._b.store(register, self._b.bitcast(pointer, register.type.as_pointer()), align=8)
 
-    def parted(self, pointer: Any, count: int = LANES) -> tuple[Any, Any]:
-        """Read a number: its whole part, and the rest in all lanes of a register."""
-        number = self._b.load(pointer)
-        whole = self._b.fptosi(number, _INDEX)
-        rest = self._b.fsub(number, self._b.sitofp(whole, _DOUBLE), flags=_FLAGS)
-        return whole, self.everywhere(rest, count)
+    def parted(self, pointer: Any) -> tuple[list[Any], Any]:
+        """Read eight numbers: their whole parts, and a register of the rests."""
+        number = self.load(pointer)
+        whole = self._b.fptosi(number, ir.VectorType(_INDEX, LANES))
+        rest = self._b.fsub(number, self._b.sitofp(whole, number.type), flags=_FLAGS)
+        lanes = (ir.Constant(_LANE, k) for k in range(LANES))
+        return [self._b.extract_element(whole, lane) for lane in lanes], rest
 
-    def everywhere(self, number: Any, count: int = LANES) -> Any:
+    def everywhere(self, number: Any) -> Any:
         """Put a number in all lanes of a register."""
-        nothing = ir.Constant(ir.VectorType(_DOUBLE, count), ir.Undefined)
+        nothing = ir.Constant(ir.VectorType(_DOUBLE, LANES), ir.Undefined)
         one = self._b.insert_element(nothing, number, ir.Constant(_LANE, 0))
-        return self._b.shuffle_vector(one, nothing, _lanes([0] * count))
+        return self.chosen(one, [0] * LANES)
+
+    def chosen(self, x: Any, lanes: list[int]) -> Any:
+        """Give the numbers of some lanes."""
+        return self._b.shuffle_vector(x, x, _lanes(lanes))
 
     def multiply(self, x: Any, y: Any) -> Any:
         """Give x y."""
@@ -117,8 +122,7 @@ class Code:
     def halves(self, x: Any) -> tuple[Any, Any]:
         """Take a register apart."""
         middle = LANES // 2
-        low, high = _lanes(range(middle)), _lanes(range(middle, LANES))
-        return self._b.shuffle_vector(x, x, low), self._b.shuffle_vector(x, x, high)
+        return self.chosen(x, [*range(middle)]), self.chosen(x, [*range(middle, LANES)])
 
     def exchanged(self, rows: list[Any]) -> list[Any]:
         """Transpose eight registers; of four, each half as a square of its own."""
