@@ -283,16 +283,19 @@ def common_amplitudes(
     safe = np.maximum(total, 1e-300)
     amplitude = summed(information * theta[where, 3]) / safe
     bias = summed(information * judged.bias[where, 3]) / safe
-    for _ in range(_STEPS):
+    far = total > 0
+    far[list(shared.together)] = False
+    for _ in range(_STEPS if far.any() else 0):
         theta[where, 3] = amplitude[owner]
         same = replace(rows, theta=theta)
         _, found, _ = field.fit(ground, same, sweeps=0)
         ground = Ground(found.level, ground.power)
         at = field.judge(ground, same, brief=True)
-        score, information = _marginal(at, where, others)
+        score, there = _marginal(at, where, others)
+        information = np.where(far[owner], there, information)
         total = summed(information)
         safe = np.maximum(total, 1e-300)
-        step = summed(score) / (safe * (1 - taken))
+        step = np.where(far, summed(score) / (safe * (1 - taken)), 0.0)
         amplitude = amplitude + step
         if np.all(np.abs(step) * np.sqrt(safe) < _SETTLED):
             break
