@@ -125,7 +125,8 @@ def mass(
     events: Annotated[
         Path,
         typer.Argument(
-            metavar="EVENTS", help="fits.csv, or an event table of Refeyn's, h5 or csv."
+            metavar="EVENTS",
+            help="fits.csv or its folder, or an event table of Refeyn's, h5 or csv.",
         ),
     ],
     *,
@@ -356,7 +357,9 @@ def _print_camera(found: CameraCalibration) -> None:
 def _cells(estimate: Estimate | None) -> list[str]:
     if estimate is None:
         return ["–", "–", "–"]
-    return [f"{value:.5g}" for value in (estimate.value, *estimate.ci95)]
+    low, high = estimate.ci95
+    ends = [f"{low:.5g}", f"{high:.5g}"] if low < high else ["given", "given"]
+    return [f"{estimate.value:.5g}", *ends]
 
 
 def _print_optics(found: OpticsCalibration) -> None:

@@ -64,7 +64,7 @@ def ending_in_time(messages: Messages) -> Iterator[None]:
                     again = signals.read(1)
                     if again and again[0] in _ENDING:
                         break
-        messages.error(f"interrupted by {signal.Signals(number[0]).name}")
+        messages.error(f"interrupted: {signal.Signals(number[0]).name} was received")
         os._exit(INTERRUPTED)
 
     earlier = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
@@ -93,7 +93,7 @@ def termination_interrupts() -> Iterator[None]:
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         del frame
-        raise KeyboardInterrupt(f"by {signal.Signals(number).name}")
+        raise KeyboardInterrupt(f"{signal.Signals(number).name} was received")
 
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     ours = [

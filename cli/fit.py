@@ -229,7 +229,7 @@ def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: 
     from iscat_analysis.records import FREE_PARAMETERS
     from iscat_analysis.report.headline import NOT_A_MASS, as_contrasts, caution, main_quantity
     from iscat_analysis.report.headline import is_uncalibrated as uncalibrated
-    from iscat_analysis.report.numbers import count
+    from iscat_analysis.units import count
 
     if analysis.tracks is not None:
         _print_tracks(analysis, folder)
@@ -257,9 +257,9 @@ def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: 
 
 def _print_tracks(analysis: Analysis, folder: Path) -> None:
     from iscat_analysis.report.headline import main_quantity
-    from iscat_analysis.report.numbers import count
     from iscat_analysis.report.tables import event_table
     from iscat_analysis.report.tracks import track_lines, tracks_headline, tracks_of
+    from iscat_analysis.units import count
 
     tracks = tracks_of(analysis)
     if len(tracks):

@@ -66,7 +66,7 @@ def simulate(
                 {"stack": str(out), "truth": str(table), "events": truth.to_dict("records")},
             )
         else:
-            from iscat_analysis.report.numbers import count
+            from iscat_analysis.units import count
 
             number = len(truth)
             if "track" in truth:  # rows are frames where particles move

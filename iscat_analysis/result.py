@@ -35,11 +35,12 @@ from iscat_analysis.report.headline import (
     main_quantity,
     precision_of,
 )
-from iscat_analysis.report.numbers import UNITS, count, number
+from iscat_analysis.report.numbers import UNITS, number
 from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
 from iscat_analysis.report.posterior import posterior_groups
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.report.tracks import tracks_headline, tracks_of
+from iscat_analysis.units import count
 
 if TYPE_CHECKING:
     from arviz import InferenceData

@@ -1,4 +1,4 @@
-"""Unit conversions used at the borders of the kernels, each defined once."""
+"""Units and their conversions, each defined once; numbers with what they count."""
 
 from __future__ import annotations
 
@@ -48,3 +48,21 @@ def sphere_diameter_nm(mass_kda: float, density_kg_m3: float) -> float:
         Diameter [nm].
     """
     return math.cbrt(mass_kda * KILODALTON_KG / density_kg_m3 * 6 / math.pi) / NM
+
+
+def count(n: int, noun: str) -> str:
+    """Write so many of something, in the plural unless it is one.
+
+    Parameters
+    ----------
+    n : int
+        How many.
+    noun : str
+        Of what.
+
+    Returns
+    -------
+    str
+        "1 event", "2 events".
+    """
+    return f"{n} {noun}{'' if n == 1 else 's'}"

@@ -130,7 +130,8 @@ def length(low_nm: float, high_nm: float) -> AfterValidator:
         if low_nm <= abs(value) <= high_nm:
             return value
         guess = unit_guess(value, max(low_nm, 1e-3 * high_nm), high_nm)
-        raise ValueError(f"{value:g} nm is not between {low_nm:g} and {high_nm:g} nm{guess}")
+        what = f"{value:g} nm is" if value >= 0 else f"the magnitude of {value:g} nm is"
+        raise ValueError(f"{what} not between {low_nm:g} and {high_nm:g} nm{guess}")
 
     return AfterValidator(check)
 

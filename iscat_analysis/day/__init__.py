@@ -28,6 +28,7 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.places import THREADS, open_place
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.mass_action import Model
+from iscat_analysis.units import count
 
 __all__ = ["Batch", "Table", "batch", "read_table"]
 
@@ -234,7 +235,7 @@ def _short(outcome: Outcome) -> str:
     if outcome.state != "done" or outcome.record is None:
         return f"failed: {outcome.why}"
     events = outcome.record["events"]
-    return f"{events} event{'' if events == 1 else 's'}"
+    return count(events, "event")
 
 
 def _result(out: Path, movie: Movie) -> Path:

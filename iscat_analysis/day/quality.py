@@ -12,6 +12,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.day.calibrate import Day
 from iscat_analysis.day.plan import Movie
 from iscat_analysis.records import FloatArray
+from iscat_analysis.units import count
 
 SMALL_P = 0.01
 """A p-value below which a fit is counted as poor."""
@@ -103,7 +104,7 @@ def judge(
     if summary.get("repeats", {}).get("understated"):
         cautions.append("σ is smaller than the measured spread")
     if summary["events"] < FEW and movie.row.role != "blank":
-        cautions.append(f"{summary['events']} events are too few for species")
+        cautions.append(f"{count(summary['events'], 'event')}, too few for species")
     optics, focus = _optics(summary, config, day)
     if optics.startswith(("learned from this", "rejected")):
         cautions.append(f"optics {optics}")
@@ -120,7 +121,7 @@ def judge(
         )
     seen = _standards_seen(movie, summary, day)
     if seen and seen[0] < seen[1]:
-        cautions.append(f"{seen[1] - seen[0]} of {seen[1]} standards are not among the species")
+        cautions.append(f"{seen[0]} of {count(seen[1], 'standard')} among the species")
     precision = summary.get("precision", {}).get("mass_kda", {})
     return {
         "cautions": "; ".join(cautions),

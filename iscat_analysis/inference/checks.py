@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.units import count
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -131,7 +132,9 @@ def pixels_of(
     if not finite.all():
         wrong = int(np.count_nonzero(~finite & ~masked))
         if wrong:
-            raise DataError(f"{name}: is not finite in {wrong} pixels; mask them with masked=…")
+            raise DataError(
+                f"{name}: is not finite in {count(wrong, 'pixel')}; mask them with masked=…"
+            )
         array = np.where(finite, array, 0.0)
     if least is not None and np.any((array < least) & ~masked):
         raise DataError(f"{name} = {float(array.min()):g}: must be at least {least:g}")

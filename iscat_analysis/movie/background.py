@@ -18,6 +18,7 @@ from scipy.ndimage import median_filter, uniform_filter
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress, Windows, silent
+from iscat_analysis.units import count
 
 DEAD, HOT = 0.2, 5.0
 """A pixel below or above these multiples of its neighbourhood's median is masked."""
@@ -256,13 +257,13 @@ def _check_ranges(
     ):
         if span is not None and span[1] > frames:
             raise DataError(
-                f"{stack.name}: has {frames} frames, but the {name} range asks for "
+                f"{stack.name}: has {count(frames, 'frame')}, but the {name} range asks for "
                 f"{span[0]}:{span[1]}; change {key}"
             )
     if after[1] <= after[0]:
         raise DataError(
-            f"{stack.name}: no frame is left after the background; its {frames} frames end "
-            f"at {frames}, set background.frames or fit.frames"
+            f"{stack.name}: no frame is left after the background; they end "
+            f"at {frames}; set background.frames or fit.frames"
         )
     if before is not None and before[0] < after[1] and after[0] < before[1]:
         raise DataError(

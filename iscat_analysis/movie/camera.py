@@ -305,7 +305,7 @@ def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatAr
 
 
 def refuse_ratio(frame: NDArray[Any], where: str, camera: Camera) -> None:
-    """Refuse a frame that was divided by another: floats around a mean of 1.
+    """Refuse a frame that was divided by another: floats around 1, or around 0 as contrasts.
 
     Parameters
     ----------
@@ -325,11 +325,13 @@ def refuse_ratio(frame: NDArray[Any], where: str, camera: Camera) -> None:
     if not np.issubdtype(frame.dtype, np.floating):
         return
     mean, spread = float(frame.mean(dtype=np.float64)), float(frame.std(dtype=np.float64))
-    scaled = mean * float(np.mean(camera.gain_e_per_adu)) >= _RATIO_MOST_E
-    if abs(mean - 1) < _RATIO_TOLERANCE and spread < 1 / 2 and not scaled:
+    gain = float(np.mean(camera.gain_e_per_adu))
+    ratio = abs(mean - 1) < _RATIO_TOLERANCE and spread < 1 / 2 and mean * gain < _RATIO_MOST_E
+    contrast = abs(mean) < spread < _RATIO_TOLERANCE and 0 < spread * gain < 1 and frame.min() < 0
+    if ratio or contrast:
         raise DataError(
-            f"{where} is ratiometric (floats around 1): its shot noise cannot be known any more; "
-            "give the camera's raw counts, which are divided here"
+            f"{where} is ratiometric (floats around {int(ratio)}): its shot noise cannot be known "
+            "any more; give the camera's raw counts, which are divided here"
         )
 
 

@@ -17,6 +17,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.pieces.setups import darkfield_photons, number_in
+from iscat_analysis.units import count
 
 FloatArray = NDArray[np.float64]
 
@@ -171,7 +172,9 @@ def gather(
     for name, array in (("before", background), ("after", events)):
         wrong = int(np.count_nonzero(~np.isfinite(array) & ~out))
         if wrong:
-            raise DataError(f"{name}: is not finite in {wrong} pixels; mask them with masked=…")
+            raise DataError(
+                f"{name}: is not finite in {count(wrong, 'pixel')}; mask them with masked=…"
+            )
     frames = frames_after / max(frames_before, 1)
     ratio = real_array("power_ratio", frames if power_ratio is None else power_ratio)
     if ratio.shape not in ((), events.shape[:1]):

@@ -19,6 +19,7 @@ from iscat_analysis.species import LEAST_EVENTS, Distribution, describe
 from iscat_analysis.species.choices import Choice, Given, Ladder, Number, Searched, Widths
 from iscat_analysis.species.describe import Branch
 from iscat_analysis.species.tables import EventTable, event_table
+from iscat_analysis.units import count
 
 SPECIES_FILES = frozenset({"species.csv", "species.json", "figures"})
 """Everything `find_species` may leave in its folder."""
@@ -130,8 +131,8 @@ def find_species(
         )  # fmt: skip
     if k is not None and table.mass_kda.size < _EVENTS_EACH * k:
         raise DataError(
-            f"{table.name}: {table.mass_kda.size} events are too few for {k} species, which need "
-            f"{_EVENTS_EACH} each; give a smaller `k`"
+            f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few for {k} species, "
+            f"which need {_EVENTS_EACH} each; give a smaller `k`"
         )
     found = describe(
         table.mass_kda,
@@ -145,9 +146,9 @@ def find_species(
         choice=choice,
     )
     if found.events < LEAST_EVENTS:
-        side = "" if branch == "magnitude" else f" {branch}"
+        kind = "event" if branch == "magnitude" else f"{branch} event"
         raise DataError(
-            f"{table.name}: holds {found.events}{side} events, too few for species; "
+            f"{table.name}: holds {count(found.events, kind)}, too few for species; "
             f"{LEAST_EVENTS} are needed"
         )
     notes = (*table.notes, *found.notes, *(() if kinetics is None else kinetics.notes))

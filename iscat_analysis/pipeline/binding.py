@@ -26,6 +26,7 @@ from iscat_analysis.species.equilibrium import EquilibriumFit, fit_equilibrium
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mass_action import LANDING_POWER, Model, landing_logits
 from iscat_analysis.species.tables import EventTable, event_table
+from iscat_analysis.units import count
 
 BINDING_FILES = frozenset({"kd.csv", "kd.json", "figures"})
 """Everything `fit_kd` may leave in its folder."""
@@ -206,8 +207,8 @@ def fit_kd(
     for table in found:
         if table.mass_kda.size < LEAST_EVENTS:
             raise DataError(
-                f"{table.name}: holds {table.mass_kda.size} events, too few; {LEAST_EVENTS} are "
-                f"needed, or leave it out of {name}"
+                f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few; "
+                f"{LEAST_EVENTS} are needed, or leave it out of {name}"
             )
     masses = _monomer(found) if masses_kda is None else tuple(map(float, masses_kda))
     fit = fit_equilibrium(

@@ -329,7 +329,8 @@ def read_contrasts(path: Path) -> pd.DataFrame:
     Parameters
     ----------
     path : Path
-        ``fits.csv`` (its rows with status ok), or what `read_events` takes.
+        ``fits.csv`` (its rows with status ok) or the folder that holds it, or what `read_events`
+        takes.
 
     Returns
     -------
@@ -341,6 +342,7 @@ def read_contrasts(path: Path) -> pd.DataFrame:
     DataError
         The file cannot be read as either.
     """
+    path = path / "fits.csv" if (path / "fits.csv").is_file() else path
     try:
         with path.open("rb") as file:
             first = file.readline(4096)

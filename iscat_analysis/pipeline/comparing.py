@@ -23,6 +23,7 @@ from iscat_analysis.species.comparison import compare
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.tables import EventTable, event_table
 from iscat_analysis.threads import threads
+from iscat_analysis.units import count
 
 COMPARISON_FILES = frozenset({"comparison.csv", "comparison.json", "figures"})
 """Everything `compare_tables` may leave in its folder."""
@@ -184,7 +185,7 @@ def compare_tables(
             )  # fmt: skip
         if one.mass_kda.size < LEAST_EVENTS:
             raise DataError(
-                f"{one.name}: holds {one.mass_kda.size} events, too few to compare; "
+                f"{one.name}: holds {count(one.mass_kda.size, 'event')}, too few to compare; "
                 f"{LEAST_EVENTS} are needed"
             )
         read.append(one)

@@ -18,8 +18,8 @@ from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, first_counts, is_lit
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import Status, Windows
-from iscat_analysis.report.numbers import count
 from iscat_analysis.search.sliding import measure_frames, measure_noise
+from iscat_analysis.units import count
 
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""

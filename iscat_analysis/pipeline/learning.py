@@ -30,6 +30,7 @@ from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.pipeline.microscope import calibrate_sights, goodness, microscopes
 from iscat_analysis.pipeline.sights import bright_sights, reach_nm
 from iscat_analysis.threads import threads
+from iscat_analysis.units import count
 
 REJECTED_P = 1e-3
 """Half of the brightest particles must fit worse than this before the optics are doubted: a few
@@ -85,7 +86,8 @@ def learn_optics(
             sights, others = bright_sights(movie, config, camera, pool)
             if len(sights) < LEAST_TESTED:
                 raise DataError(
-                    f"{movie.name}: shows {len(sights)} bright particles that stand alone, and "
+                    f"{movie.name}: shows {count(len(sights), 'bright particle')} standing "
+                    f"alone, and "
                     f"{LEAST_TESTED} are needed to test the optics, {LEAST_SIGHTS} to learn them"
                 )
             median = _median_p(sights, config)

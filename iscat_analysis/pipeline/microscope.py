@@ -42,6 +42,7 @@ from iscat_analysis.pipeline.sights import (
 )
 from iscat_analysis.records import Mapper, Progress, silent
 from iscat_analysis.threads import threads
+from iscat_analysis.units import count
 
 STEP_FACTORS = (0.5, 2.0)
 """How much smaller or larger than said the steps of a scan may turn out."""
@@ -178,8 +179,8 @@ def calibrate_sights(
     """
     if len(sights) < LEAST_SIGHTS:
         raise DataError(
-            f"{source['movie']}: shows {len(sights)} bright particles that stand alone, and at "
-            f"least {LEAST_SIGHTS} are needed to learn the optics; record more particles, or "
+            f"{source['movie']}: shows {count(len(sights), 'bright particle')} standing alone, and "
+            f"at least {LEAST_SIGHTS} are needed to learn the optics; record more particles, or "
             "brighter ones (20 nm gold, or protein of 400 kDa and more), or more photons per frame"
         )
     configured = settings_of(config)

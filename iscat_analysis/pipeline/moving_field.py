@@ -18,6 +18,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.records import FloatArray, FrameSource, Progress
 from iscat_analysis.search.moving import FrameFilter, Sightings
+from iscat_analysis.units import count
 
 LEAST_FRAMES = 20
 """Frames in a movie at least: fewer leave the background to the particles."""
@@ -112,8 +113,9 @@ def load_field(
     frames, shape = last - first, (movie.shape[1], movie.shape[2])
     if frames < LEAST_FRAMES:
         raise DataError(
-            f"{movie.name}: {frames} frames are too few to tell particles that move from what they "
-            f"move over; {LEAST_FRAMES} are needed, or background.frames without particles"
+            f"{movie.name}: has {count(frames, 'frame')}, too few to tell particles that "
+            f"move from what they move over; {LEAST_FRAMES} are needed, or background.frames "
+            "without particles"
         )
     counts = np.empty((frames, *shape), dtype=np.float32)
     saturated = np.zeros(shape, dtype=bool)

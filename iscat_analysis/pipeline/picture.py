@@ -28,6 +28,7 @@ from iscat_analysis.pipeline.sights import bright_sights, kind_of, reach_nm
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import Mapper, Progress, silent
 from iscat_analysis.threads import threads
+from iscat_analysis.units import count
 
 HELD_OUT_P = 1e-3
 """p-value of the held-out pictures' p-values, below which the template does not describe them."""
@@ -204,8 +205,8 @@ def measure_template(
         progress("particles", len(MARGINS_PX), len(MARGINS_PX))
         if len(alone) < LEAST_SIGHTS:
             raise DataError(
-                f"{movie.path.name}: shows {len(alone)} bright particles without another nearby, "
-                f"and at least {LEAST_SIGHTS} are needed to measure a picture; record more "
+                f"{movie.path.name}: shows {count(len(alone), 'bright particle')} without another "
+                f"nearby, and at least {LEAST_SIGHTS} are needed to measure a picture; record more "
                 "particles, fewer at a time, or brighter ones"
             )
         nominal = forward_model(cut, max(map(reach_nm, alone)) + roi_nm / 10)

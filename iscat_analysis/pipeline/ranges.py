@@ -10,6 +10,7 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.movie.background import Check, measure_windows
 from iscat_analysis.movie.camera import Camera, check_counts
 from iscat_analysis.records import FrameSource, Progress, Windows, silent
+from iscat_analysis.units import count
 
 
 def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, tuple[int, int]]:
@@ -48,7 +49,7 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
     after = fitted_frames(movie, config, before)
     if after[1] <= after[0]:
         raise DataError(
-            f"{movie.name}: has {movie.shape[0]} frames and the background takes "
+            f"{movie.name}: has {count(movie.shape[0], 'frame')} and the background takes "
             f"{start} of them, so none is left to fit; change background.frames"
         )
     return before, after
@@ -81,8 +82,8 @@ def fitted_frames(
     first, last = config.fit.frames or (before[1] if before else 0, movie.shape[0])
     if last > movie.shape[0]:
         raise DataError(
-            f"{movie.name}: has {movie.shape[0]} frames, but fit.frames asks for {first}:{last}; "
-            "change fit.frames"
+            f"{movie.name}: has {count(movie.shape[0], 'frame')}, but fit.frames asks for "
+            f"{first}:{last}; change fit.frames"
         )
     return first, last
 

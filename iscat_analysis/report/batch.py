@@ -27,10 +27,11 @@ from iscat_analysis.report.batch_cells import (
 )
 from iscat_analysis.report.batch_figures import Curve, batch_figures
 from iscat_analysis.report.binding import binding_figure
-from iscat_analysis.report.numbers import count, fixed, number
+from iscat_analysis.report.numbers import fixed, number
 from iscat_analysis.report.page import render_page
 from iscat_analysis.report.style import publish
 from iscat_analysis.schemas import jsonable
+from iscat_analysis.units import count
 
 LONG = 30
 """Rows above which a table scrolls, and can be narrowed."""

@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from iscat_analysis.records import FloatArray
-from iscat_analysis.report.numbers import count, decimals_for, fixed, number
+from iscat_analysis.report.numbers import decimals_for, fixed, number
 from iscat_analysis.report.page import render_page
 from iscat_analysis.report.style import GREY, INK, VERMILLION, new_figure, publish
+from iscat_analysis.units import count
 
 _SOURCES = {
     "dark": "from the dark",

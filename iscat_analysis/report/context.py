@@ -31,8 +31,9 @@ from iscat_analysis.report.headline import (
     quantiles,
     sizes,
 )
-from iscat_analysis.report.numbers import LABELS, UNITS, count, decimals_for, fixed, number, percent
+from iscat_analysis.report.numbers import LABELS, UNITS, decimals_for, fixed, number, percent
 from iscat_analysis.report.spread import counted, species_widths
+from iscat_analysis.units import count
 
 _MODES = {
     "mass": "position and mass, height fixed",

@@ -16,8 +16,8 @@ import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import FloatArray, Status, track_numbers
-from iscat_analysis.report.numbers import count
 from iscat_analysis.report.tables import CSV_DIGITS
+from iscat_analysis.units import count
 
 Layout = Literal["trackpy", "napari", "photomol", "picasso"]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from iscat_analysis.records import Analysis, Clip, Film, FloatArray
-from iscat_analysis.report.numbers import count, number
+from iscat_analysis.report.numbers import number
 from iscat_analysis.report.scales import (
     DIVERGING,
     GREYS,
@@ -23,6 +23,7 @@ from iscat_analysis.report.scales import (
     residual_limit,
     shaded,
 )
+from iscat_analysis.units import count
 
 FILM_BYTES = 3_000_000
 """Films inside the page, at most; those after that are left out."""

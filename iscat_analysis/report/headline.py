@@ -16,8 +16,9 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.records import FREE_PARAMETERS, Analysis, FloatArray, Status
-from iscat_analysis.report.numbers import LABELS, UNITS, count, fixed, number, percent
+from iscat_analysis.report.numbers import LABELS, UNITS, fixed, number, percent
 from iscat_analysis.report.spread import counted, rejection, species_widths
+from iscat_analysis.units import count
 
 MOST_FLAGGED = 0.2
 """Share of flagged rows above which no headline is given."""
@@ -206,9 +207,11 @@ def caution(table: pd.DataFrame) -> str | None:
     if len(flagged) <= MOST_FLAGGED * len(table):
         return None
     commonest = Status(flagged.mode().iloc[0])
+    which = "The only row is" if len(table) == 1 else f"{len(flagged)} of {len(table)} rows are"
+    rest = ": the rest is no fair sample" if len(flagged) < len(table) else ""
     return (
-        f"{len(flagged)} of {count(len(table), 'row')} are flagged, so no median is given: the "
-        f"rest is no fair sample. The commonest reason is {commonest.value}. {commonest.advice}"
+        f"{which} flagged, so no median is given{rest}. The commonest reason is "
+        f"{commonest.value}. {commonest.advice}"
     )
 
 

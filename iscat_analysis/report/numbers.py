@@ -90,21 +90,3 @@ def percent(value: float) -> str:
         With its sign.
     """
     return "—" if not math.isfinite(value) else f"{number(100 * value, 2)} %"
-
-
-def count(n: int, noun: str) -> str:
-    """Write so many of something, in the plural unless it is one.
-
-    Parameters
-    ----------
-    n : int
-        How many.
-    noun : str
-        Of what.
-
-    Returns
-    -------
-    str
-        "1 event", "2 events".
-    """
-    return f"{n} {noun}{'' if n == 1 else 's'}"

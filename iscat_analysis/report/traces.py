@@ -8,8 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from iscat_analysis.records import FloatArray, Trace
-from iscat_analysis.report.numbers import count, number
+from iscat_analysis.report.numbers import number
 from iscat_analysis.report.style import BLUE, GREY, INK, VERMILLION
+from iscat_analysis.units import count
 
 MEANS = 40
 """Means of frames that are shown as dots, about."""

@@ -18,7 +18,8 @@ from iscat_analysis.report.headline import (
     main_quantity,
     spread_lines,
 )
-from iscat_analysis.report.numbers import count, number
+from iscat_analysis.report.numbers import number
+from iscat_analysis.units import count
 
 
 def tracks_of(analysis: Analysis) -> pd.DataFrame:
@@ -96,8 +97,9 @@ def tracks_caution(tracks: pd.DataFrame) -> str | None:
         return None
     commonest = TrackStatus(Counter(flagged).most_common(1)[0][0])
     return (
-        f"{len(flagged)} of {len(judged)} that are long enough are flagged, so no median is given: "
-        f"the rest is no fair sample. The commonest reason is {commonest}. {commonest.advice}"
+        f"{len(flagged)} of {len(judged)} that are long enough are flagged, so no median is given"
+        f"{': the rest is no fair sample' if len(flagged) < len(judged) else ''}. The commonest "
+        f"reason is {commonest}. {commonest.advice}"
     )
 
 

@@ -23,6 +23,7 @@ from iscat_analysis.species.curves import (
 )
 from iscat_analysis.species.events import Efficiency, Events
 from iscat_analysis.species.mixture import Mixture
+from iscat_analysis.units import count
 
 Branch = Literal["magnitude", "landing", "leaving"]
 
@@ -196,10 +197,12 @@ def describe(
         usable &= (mass > 0) == (branch == "landing")
     notes = []
     if branch == "magnitude" and np.count_nonzero(~usable):
-        notes.append(f"{np.count_nonzero(~usable)} events without a mass and an error are left out")
+        left_out = count(int(np.count_nonzero(~usable)), "event")
+        notes.append(f"{left_out} without a mass and an error left out")
     events = Events(np.abs(mass[usable]), sigma[usable], efficiency)
     if events.x.size < LEAST_EVENTS:
-        notes.append(f"{events.x.size} events are too few for species; {LEAST_EVENTS} are needed")
+        held = count(events.x.size, "event")
+        notes.append(f"{held}, too few for species; {LEAST_EVENTS} are needed")
         return _undescribed(events, branch, draws, seed, notes)
 
     choice = Searched(max_species) if choice is None else choice
@@ -391,12 +394,13 @@ def _brief(species: pd.DataFrame, window_frames: int | None) -> list[str]:
     if window_frames is None or known.empty:
         return []
     stays = ", ".join(
-        f"{row.mass_kda:.3g} kDa from {row.stay_frames:.0f} frames" for row in known.itertuples()
+        f"{row.mass_kda:.3g} kDa from {count(round(row.stay_frames), 'frame')}"
+        for row in known.itertuples()
     )
     return [
-        f"efficiencies and corrected counts are of particles that stay {window_frames} frames or "
-        f"longer; briefer visitors are missed more often and appear lighter: every other one is "
-        f"found of {stays}"
+        "efficiencies and corrected counts are of particles that stay "
+        f"{count(window_frames, 'frame')} or longer; briefer visitors are missed more often and "
+        f"appear lighter: every other one is found of {stays}"
     ]
 
 

@@ -31,6 +31,7 @@ from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.movie.hdf5 import SIGNATURE as HDF5
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.species.events import Efficiency, Events
+from iscat_analysis.units import count
 
 UNKNOWN_SIGMA_KDA = 1.0
 """Error of an event whose table has none [kDa]."""
@@ -322,7 +323,7 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
             "or export the table with masses"
         )
     if missing := int(np.count_nonzero(~known)):
-        notes.append(f"{name}: {missing} events without a mass and an error are left out")
+        notes.append(f"{name}: {count(missing, 'event')} without a mass and an error left out")
     rows = good[known]
     window = (
         int(rows["n_after"].max()) if "n_after" in rows and rows["n_after"].notna().any() else 0

@@ -91,6 +91,7 @@ def test_camera_prints_a_table_and_a_verdict(
     assert main(arguments) == 0
     said = capsys.readouterr()
     assert re.search(r"gain \[e/count\] +(1\.9|2\.0)", said.out)
+    assert re.search(r"offset \[counts\] +200 +given +given", said.out)
     assert "shot-noise limited up to" in said.out
     assert main(arguments) == 1  # never over an earlier result
     assert "--overwrite" in capsys.readouterr().err
@@ -132,6 +133,9 @@ def test_mass_from_the_packages_own_table(tmp_path: Path, capsys: Captured) -> N
     assert json.loads((out / "calibration.json").read_text())["dof"] == 1
     page = (out / "calibration.html").read_text(encoding="utf-8")
     assert "line through the standards" in page
+    of_a_folder = [*arguments[:2], str(tmp_path), *arguments[3:], "--out", str(tmp_path / "same")]
+    assert main([*of_a_folder, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["gradient_per_kda"] == found["gradient_per_kda"]
 
 
 def test_a_bright_table_says_so_itself(tmp_path: Path, capsys: Captured) -> None:

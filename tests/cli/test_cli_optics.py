@@ -107,7 +107,7 @@ def test_too_few_particles_are_one_clear_line(tmp_path: Path, capsys: Captured) 
     given = ["calibrate", "optics", str(tmp_path / "m.tif"), "--set", "camera.pixel_size_nm=84.4"]
     assert main(given) == 1
     message = capsys.readouterr().err
-    assert "0 bright particles that stand alone" in message
+    assert "0 bright particles standing alone" in message
     assert "record more" in message
     assert "Traceback" not in message
 

@@ -125,5 +125,5 @@ def test_an_exposure_longer_than_the_interval_ends_with_2(
 def test_a_movie_of_few_frames_is_refused_in_one_line(folder: Path, tmp_path: Path, capsys) -> None:
     assert _fit(folder, tmp_path / "out", "--frames", "0:12", "--quiet") == 1
     printed = capsys.readouterr()
-    assert "12 frames are too few" in printed.err
+    assert "12 frames, too few" in printed.err
     assert printed.err.count("\n") == 1

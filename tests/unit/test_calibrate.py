@@ -10,7 +10,7 @@ import tifffile
 
 from iscat_analysis.config import CameraConfig, parse_config
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts
+from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts, refuse_ratio
 from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain, resolve_metadata
 from iscat_analysis.records import StackMetadata
 
@@ -205,6 +205,9 @@ def test_ratios_are_refused_and_scaled_counts_are_not() -> None:
     ratio = (rng.poisson(1e4, (4, 20, 20)) / rng.poisson(1e4, (4, 20, 20))).astype("f4")
     with pytest.raises(DataError, match=r"frame 5 is ratiometric.*raw counts"):
         check_counts(ratio, 5, "m.tif")
+    with pytest.raises(DataError, match=r"frame 5 is ratiometric \(floats around 0\)"):
+        refuse_ratio(ratio[0] - 1, "frame 5", Camera())
+    refuse_ratio(ratio[0] - 1, "a dark", Camera(gain_e_per_adu=1e4))
     check_counts(ratio, 5, "m.tif", camera=Camera(gain_e_per_adu=1e4))
     check_counts(good("f4") / 10, 5, "m.tif")  # floats around 100
     check_counts(rng.poisson(1.0, (4, 20, 20)), 5, "m.tif")  # dark field, in whole numbers

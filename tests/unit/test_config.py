@@ -101,6 +101,7 @@ IMPOSSIBLE = [
         "needs an interferometric scheme",
     ),
     (["track.free=all"], "track.free"),
+    (["optics.focus_nm=-300000"], "the magnitude of -300000 nm is not between 0 and 100000 nm"),
     (["track.max_step_nm=0.6"], "0.6 nm is not between 1 and 100000 nm"),
     (["track.memory_frames=-1"], "track.memory_frames"),
     (["track.min_frames=0"], "track.min_frames"),

@@ -297,7 +297,7 @@ def test_a_standard_that_is_not_there_is_named(
 def test_a_match_is_refused_by_its_chi_square() -> None:
     """The same distance from the line is too much for errors of 1 %, but not for errors of 5 %."""
     contrast = events(np.random.default_rng(10))
-    with pytest.raises(DataError, match=r"χ² = .* for 1 degrees of freedom"):
+    with pytest.raises(DataError, match=r"χ² = .* for 1 degree of freedom"):
         calibrate_mass(contrast, (66, 146, 420), standards_se_kda=(0.66, 1.46, 4.2))
     assert calibrate_mass(contrast, (66, 146, 420), standards_se_kda=(3.3, 7.3, 21.0)).dof == 1
 

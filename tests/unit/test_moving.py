@@ -344,7 +344,7 @@ def test_too_few_frames_are_refused(tmp_path: Path) -> None:
     movie = tmp_path / "movie.tif"
     counts = np.random.default_rng(1).poisson(1e4, (12, *SHAPE)).astype(np.uint16)
     tifffile.imwrite(movie, counts, photometric="minisblack")
-    with pytest.raises(DataError, match="12 frames are too few"):
+    with pytest.raises(DataError, match="12 frames, too few"):
         fit_stack(movie, _config())
 
 

@@ -262,12 +262,18 @@ def with_flagged(analysis: Analysis, flagged: int) -> Analysis:
     return replace(analysis, table=table)
 
 
+def test_the_only_row_is_one() -> None:
+    analysis = with_flagged(make_analysis(1), 1)
+    assert headline(analysis, event_table(analysis))[0].startswith("The only row is flagged, so")
+
+
 @pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize(("flagged", "silent"), [(0, False), (8, False), (9, True), (40, True)])
 def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: bool) -> None:
     analysis = with_flagged(make_analysis(40), flagged)
     first = headline(analysis, event_table(analysis))[0]
     assert first.startswith(f"{flagged} of 40 rows are flagged") == silent
+    assert ("the rest is no fair sample" in first) == (silent and flagged < 40)
     assert ("Median" in first) != silent
     page = render_report(analysis)
     assert ("Median mass" in page) != silent

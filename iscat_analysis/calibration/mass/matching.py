@@ -13,6 +13,7 @@ from iscat_analysis.calibration.mass.line import Line
 from iscat_analysis.calibration.mass.peaks import ContrastPeak
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import FloatArray
+from iscat_analysis.units import count
 
 LEAST_PROBABILITY = 1e-4
 """A line whose χ² is less probable than this does not go through its standards."""
@@ -89,8 +90,8 @@ def check_match(
     if line.dof and float(chdtrc(line.dof, line.chi2)) < LEAST_PROBABILITY:
         raise DataError(
             f"{start}the nearest line misses {masses[worst]:g} kDa by "
-            f"{100 * abs(off[worst]):.1f} %, with χ² = {line.chi2:.3g} for {line.dof} degrees of "
-            f"freedom; {_advice(peaks, masses)}"
+            f"{100 * abs(off[worst]):.1f} %, with χ² = {line.chi2:.3g} for "
+            f"{count(line.dof, 'degree')} of freedom; {_advice(peaks, masses)}"
         )
     if abs(offset) > OFFSET_SHARE * contrast[0]:
         raise DataError(
