@@ -124,7 +124,7 @@ def _camera(plan: Plan, runner: Runner) -> tuple[dict[str, Any], dict[str, Outco
     if not good:
         return {}, outcomes
     configured_offset = plan.config.camera.offset_adu
-    # Zero, the default, and a map say nothing of the level in the dark: the flats have to.
+    # An offset of zero, the default, or a map gives no dark level: it is measured on the flats.
     known = configured_offset if isinstance(configured_offset, float) else 0.0
     offset = known or None
     out = runner.out / "calibration" / "camera"

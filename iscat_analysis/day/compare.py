@@ -89,7 +89,7 @@ class _Group:
     def with_(self, other: _Group) -> _Group:
         n, m = len(self.rows), len(other.rows)
         mass = (n * self.mass + m * other.mass) / (n + m)
-        # A group is as wide as one of its members: it shall not creep over its neighbours.
+        # A group is at most as wide as one of its members, so that it absorbs no neighbours.
         rows, movies = self.rows + other.rows, self.movies | other.movies
         return _Group(rows, movies, mass, min(self.se, other.se))
 

@@ -25,7 +25,7 @@ holds, masses of the species, remarks, and why there is no K_D."""
 
 @dataclass(frozen=True)
 class Reaction:
-    """What K_D is of.
+    """The reaction whose K_D is fitted.
 
     Attributes
     ----------

@@ -175,7 +175,7 @@ def _outside(masses_kda: FloatArray, day: Day) -> float | None:
         return None
     size = np.abs(masses_kda)
     low, high = min(day.standards_kda), max(day.standards_kda)
-    # A standard's own events scatter about it; a tenth beyond is not beyond.
+    # The events of a standard scatter about its mass: up to a tenth beyond counts as inside.
     return float(np.mean((size < 0.9 * low) | (size > 1.1 * high)))
 
 

@@ -122,13 +122,13 @@ class Runner:
             why = ""
             try:
                 kept = work()
-            except SchedulerError:  # says nothing of this job
+            except SchedulerError:  # the cluster failed, not this job
                 raise
             except IscatError as error:
                 why = str(error)
             except Exception as error:  # noqa: BLE001  (the other movies go on)
                 if isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
-                    raise KeyboardInterrupt from None  # as it looks out of compiled code
+                    raise KeyboardInterrupt from None  # compiled code wraps it in another error
                 why = f"unexpected {type(error).__name__}: {error}"
             state: State = "failed" if why else "done"
             hashes = kept.get("inputs", {})

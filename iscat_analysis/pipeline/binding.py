@@ -284,7 +284,7 @@ def _read_samples(path: Path) -> pd.DataFrame:
 
 
 def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:
-    """Leave out what is no sample; which rows are left."""
+    """Keep the rows that are samples, and give which ones they were."""
     rows = rows.rename(columns=lambda column: str(column).strip())
     kept = np.ones(len(rows), bool)
     if "role" in rows:

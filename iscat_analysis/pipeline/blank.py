@@ -172,7 +172,7 @@ def background_field(
         Relative to the background per unit of power.
     """
     mean = windows.before_e
-    if scene.additive:  # counts may be few, and weights must not follow their chance
+    if scene.additive:  # counts may be few, and weights must not follow their fluctuations
         mean = smooth_background(mean, windows.read_variance_before_e2, windows.masked)
     return empty_field(scene, mean / power, read, ~windows.masked, fits, level=False)
 
@@ -201,7 +201,7 @@ class FrameNoise:
         self._light = light
         self._level = windows.before_e / light
         self._before = self._field.errors(windows.before_e, light, None)
-        # a background that is noisier than its frames' mean counts as less light
+        # A background noisier than the mean of its frames is worth less light than they hold.
         self._worth = light / max(scene.background_variance, _EXACTLY)
         first, last = windows.frames_after
         known = windows.n_before == 0

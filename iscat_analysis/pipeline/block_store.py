@@ -143,7 +143,8 @@ def analyse_block(
         The frames themselves are not kept.
     """
     first, frames = span[0], span[1] - span[0]
-    near = scene.config.track.memory_frames + 1  # of a border, from where a track may go on
+    # Nearer to a border than this a track may go on in the next block.
+    near = scene.config.track.memory_frames + 1
     inner = (near if goes_on[0] else 0, frames - near if goes_on[1] else frames)
     moving = follow(
         scene, movie, camera, span,

@@ -113,7 +113,7 @@ class Reader:
         lit = np.isfinite(light[ahead:])
         for _ in mapper(check, pieces):
             pass
-        if not ahead and begin > self.first:  # a chunk that nothing held precedes
+        if not ahead and begin > self.first:  # the frame before is no longer in memory
             (earlier,) = self._movie.read(begin - 1, begin)
             repeats[0] = np.array_equal(earlier, part[0])
         self._light = np.concatenate([self._light, light[ahead:]])

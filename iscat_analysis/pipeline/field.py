@@ -43,9 +43,9 @@ MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""
 
 _SWEEPS = 2  # fits of everything with everything else in place, after the last round; at least
-_MOST_SWEEPS = 16  # where two fits share one particle they part slowly
+_MOST_SWEEPS = 16  # two fits that share the light of one particle converge slowly
 _SETTLED = 0.1  # change of signal-to-noise ratios from one sweep to the next
-_AS_FOUND = 0.95  # of the threshold; what was found is dropped only where others explain it
+_AS_FOUND = 0.95  # of the threshold: a fit whose final SNR is below it is explained by the others
 _DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
 
 
@@ -101,7 +101,7 @@ def fit_field(
             break
     least = _AS_FOUND * scene.templates.threshold
     kept = [e for e in events if e.snr > least and _wanted(scene, e)]
-    while 0 < len(kept) < len(events):  # what is dropped must leave its neighbours' background too
+    while 0 < len(kept) < len(events):  # a dropped fit no longer belongs to the others' background
         events = _fit_all(scene, windows, [e.candidate for e in kept], kept, pool)
         kept = [e for e in events if e.snr > least and _wanted(scene, e)]
     lobes: list[Fitted] = []
@@ -222,7 +222,7 @@ def _misfit(candidate: Candidate, event: Fitted, scene: Scene, near_px: float) -
     distance = math.hypot(candidate.x_px - here.x_px, candidate.y_px - here.y_px)
     if distance <= near_px:
         return math.inf
-    # in dark field a wrong level of the background reaches farther than the region
+    # In dark field a wrong background level leaves residuals beyond the fitted region.
     reach = (2 if scene.additive else 0.75) * scene.roi_px
     if distance > reach or Status.POOR_FIT not in event.fit.flags:
         return 0.0

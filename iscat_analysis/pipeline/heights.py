@@ -62,7 +62,8 @@ def decide_heights(
     for turn, (heights, gains) in enumerate(ladders):
         places[rank == turn, : heights.shape[1]] = heights
         values[rank == turn, : gains.shape[1]] = gains
-    values[~np.isfinite(values).any(axis=1)] = 0.0  # no fit converged: its neighbours decide
+    # Where no fit converged, the other rows of the track decide.
+    values[~np.isfinite(values).any(axis=1)] = 0.0
     out = rows.theta.copy()
     single = np.flatnonzero(rows.track < 0)
     out[single] = places[single, values[single].argmax(axis=1)]
@@ -102,7 +103,8 @@ def _ladder(
     thetas, gains = [rows.theta[mine]], [gain[mine]]
     for way in (1, -1):
         here = rows.theta.copy()
-        here[mine, 3] = usual[mine]  # in a wrong fringe a fit ends with no mass, and finds none
+        # A fit that has reached zero mass in a wrong fringe would stay there.
+        here[mine, 3] = usual[mine]
         while True:
             here[mine, 2] += way * fringe_nm
             inside = (here[:, 2] > low - fringe_nm / 2) & (here[:, 2] < high + fringe_nm / 2) & mine

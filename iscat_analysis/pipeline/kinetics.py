@@ -167,7 +167,7 @@ def configured_frame_rate(path: Path) -> float | None:
     folder = path if path.is_dir() else path.parent
     try:
         text = (folder / "config.toml").read_text(encoding="utf-8")
-        (folder / "summary.json").stat()  # a result of ours, and no file of another's
+        (folder / "summary.json").stat()  # missing where config.toml is not that of a result
         found = tomllib.loads(text)["camera"]["frame_rate_hz"]
         return float(found) if float(found) > 0 else None
     except (OSError, ValueError, KeyError, TypeError):

@@ -1,6 +1,7 @@
 """Test the configured optics on the brightest particles before a movie is analysed.
 
-Where they do not, the optics are learned from these particles, and the analysis goes on with them.
+Where the fits of these particles reject the configured optics, the optics are learned from the
+same particles, and the analysis goes on with what was learned.
 """
 
 from __future__ import annotations

@@ -205,7 +205,7 @@ class Neighbours:
         return (self.presence(step, after) - self.presence(step, before)) * step.image
 
     def _present(self, step: Step, frames: slice) -> slice:
-        """Those of the frames in which the particle is there; all where it is in none."""
+        """Give those of the frames in which the particle is there; all if it is there in none."""
         turn = min(max(step.at.frame - self._chunk.first, frames.start), frames.stop)
         part = slice(turn, frames.stop) if step.sign > 0 else slice(frames.start, turn)
         return part if part.start < part.stop else frames

@@ -33,8 +33,8 @@ SPECTRUM_FRAMES = 128
 """Background frames on which the spectrum of the noise is measured."""
 
 _GAIN_FRAMES = 64  # on which the gain is judged
-_FEWEST_FRAMES = 8  # in which particles that move leave pixels free
-_FREE = 0.25  # of the pixels at least, that no particle comes near in these frames
+_FEWEST_FRAMES = 8  # on which it is judged beside particles that move
+_FREE = 0.25  # share of the pixels that no particle may come near in the frames judged
 _AWAY = 1.5  # λ/NA from a particle, from where its light changes the variance by some per cent
 
 

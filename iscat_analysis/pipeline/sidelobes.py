@@ -83,14 +83,14 @@ class Sieve:
     def _waiting(self, peaks: Sequence[Peak]) -> list[bool]:
         """Tell which peaks may be nothing but the side lobe of a higher one.
 
-        One that waits casts its shadow too, or its rings would be taken for particles.
+        A peak that waits makes others wait too, or its own rings would be taken for particles.
         """
         table = np.array([(p.frame, p.x_px, p.y_px, abs(p.snr)) for p in peaks])
         blocks = (slice(k, k + _TOGETHER) for k in range(0, len(table), _TOGETHER))
         return [waits for rows in blocks for waits in self._in_shadow(table, rows).tolist()]
 
     def _in_shadow(self, table: FloatArray, rows: slice) -> BoolArray:
-        """Tell which rows an earlier one, that is higher, hides; columns: frame, x, y, height."""
+        """Tell which rows may be lobes of an earlier, higher one; columns: frame, x, y, height."""
         reach = STRIDES * self.stride
         own, higher = table[rows, None], table[None, : rows.stop]
         frames, dx, dy = (np.abs(higher[..., k] - own[..., k]) for k in range(3))
@@ -103,7 +103,7 @@ class Sieve:
         return waits
 
     def _is_residue(self, step: Step, peak: Peak) -> bool:
-        """Whether a peak may be what a fitted step left over: the model is never quite right."""
+        """Whether a peak may be a residual of a fitted step, whose model is never quite right."""
         start = step.start
         distance = math.hypot(start.x_px - peak.x_px, start.y_px - peak.y_px)
         on_top = distance < self.roi_px / 6
@@ -139,7 +139,7 @@ class Sieve:
     def _inside(self, step: Step, peak: Peak) -> float:
         """Give what a peak in a step's fitted region must exceed.
 
-        A window that holds the step only in part sees that part of the misfit.
+        A window that holds only some frames of the step shows only that part of the misfit.
         """
         part = max(1 - abs(step.at.frame - peak.frame) / self.window, 0.0)
         return part * math.sqrt(EXPLAINS * step.excess)

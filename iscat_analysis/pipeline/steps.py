@@ -84,7 +84,7 @@ class _Finished:
     step: Step
     others: tuple[Step, ...]
     task: Task
-    lobe: bool  # found where a known step may have left it over
+    lobe: bool  # found where the fit of a known step may have left a residual
 
 
 class ChunkFitter:
@@ -139,7 +139,7 @@ class ChunkFitter:
         self._sieve = Sieve(chunk.first, self._stride, window, scene.roi_px)
         self._maps: tuple[MapArray, FloatArray] | None = None
         self._doubtful: list[Peak] = []
-        self._near: list[list[Step]] = []  # steps that each of the maps knows of
+        self._near: list[list[Step]] = []  # for each map, the steps that were taken off it
         self.strongest = np.zeros((2, *chunk.shape))
         self.rounds = 0
         self.empty: EmptySpread | None = None  # noise where nothing lands or leaves

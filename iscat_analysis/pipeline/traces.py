@@ -81,7 +81,7 @@ def trace_of(
     event = fitted.event
     fit, windows, region = event.fit, event.windows, event.region
     step, turn = fitted.step, fitted.step.at.frame
-    shown = neighbours.shown(step, region)  # its image of the last sweep, near that of the fit
+    shown = neighbours.shown(step, region)  # as of the last sweep, close to the final fit
     if shown is None or shown[1].shape != region.shape:
         return None
     image = shown[1]

@@ -233,7 +233,7 @@ def track_frames(
             if events and noise is not None:
                 repeats += [noise.look(here, events)] * len(events)
             views += [view_of(number, event) for number, event in enumerate(events)]
-            lines += lines_of(scene, events)  # last: of what an interrupt cuts off, no line is
+            lines += lines_of(scene, events)  # last, so that an interrupted frame has no rows
             progress("track", frame + 1 - first, last - first)
     except KeyboardInterrupt:
         interrupted = True

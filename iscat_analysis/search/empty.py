@@ -30,7 +30,7 @@ FEWEST_PLACES = 60
 _TRIM = 4.0  # robust standard deviations beyond which something else than noise is there
 _KEPT_VARIANCE = 0.998929  # of a normal law inside ±_TRIM standard deviations
 _NORMAL_QUARTILE = 0.6744897501960817
-_LEAST_LEFT = 0.5  # of a variance; less is left only where fits reach, and nothing is looked at
+_LEAST_LEFT = 0.5  # share of a variance; less is left only next to fits, where nothing is measured
 
 
 @dataclass(frozen=True)

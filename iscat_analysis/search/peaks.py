@@ -40,7 +40,7 @@ def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> N
     at = np.argwhere(fields > least)
     last = np.array(fields.shape) - 1
     for offset in product(*(range(-n, n + 1) for n in reach)):
-        beside = np.clip(at + offset, 0, last)  # at an edge, what is nearer to the place itself
+        beside = np.clip(at + offset, 0, last)  # at an edge, the outermost pixel
         at = at[fields[tuple(at.T)] >= fields[tuple(beside.T)]]
     return at
 

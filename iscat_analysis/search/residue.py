@@ -172,10 +172,12 @@ def size_on_ring(
     away2, y, x = away2[y, x], rows[y], columns[x]
     own = (y - yc) ** 2 + (x - xc) ** 2 > _PATCH_PX**2
     for xo, yo in others:
-        if math.hypot(xo - x0, yo - y0) < 2 * far:  # a farther one is nearer to no pixel of it
+        if math.hypot(xo - x0, yo - y0) < 2 * far:  # others are too far to share pixels of the ring
             own &= (y - yo) ** 2 + (x - xo) ** 2 > away2
     y, x = y[own], x[own]
-    if y.size and distance > 2 * _PATCH_PX:  # nearer to it a patch hides a lobe of the misfit
+    if (
+        y.size and distance > 2 * _PATCH_PX
+    ):  # closer in, a patch would cover a whole lobe of the misfit
         k = np.argmax(np.abs(snr[y, x]))
         own = (y - y[k]) ** 2 + (x - x[k]) ** 2 > _PATCH_PX**2
         y, x = y[own], x[own]

@@ -313,9 +313,9 @@ class _Peak:
 def _peaks(
     ranked: FloatArray, best: FloatArray, signed: FloatArray, threshold: float
 ) -> list[_Peak]:
-    """Maxima above the threshold; the field between pixels and heights is what exceeds it.
+    """Find maxima above the threshold, whose height is interpolated between pixels and heights.
 
-    The field that is smooth is the one with its sign.
+    The interpolation is in the signed field, which is smooth; its magnitude has kinks at zero.
     """
     sampled = (best == maximum_filter(best, size=3)) & (best > SAMPLED * threshold)
     row, column = np.nonzero(sampled)

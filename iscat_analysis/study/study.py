@@ -140,7 +140,7 @@ def run_benchmark(
         }
         histograms["ranks"][mode] = _rank_histograms(ranked)
         faintest = make_setting(config, mode, collected=PHOTONS[0], scene=setting.scene)
-        clear = float(faintest.truth[2])  # of the range's ends, for any of the photons
+        clear = float(faintest.truth[2])  # far enough from the ends of the range for all photons
         curves["photons"][mode] = _curve(
             list(PHOTONS),
             [make_setting(config, mode, collected=n, z_nm=clear, scene=setting.scene)
@@ -240,7 +240,7 @@ def _parameters(setting: Setting, found: Trials, ranked: PosteriorRanks) -> dict
         baselines = {}
         for label, other in (("gaussian", found.gauss), ("peak", found.peak)):
             if label == "peak" and name != "mass_kda":
-                continue  # a peak's pixel is no position to compare with
+                continue  # the highest pixel gives a mass only, no position
             miss = other[:, k] - found.truth[:, k]
             finite = miss[np.isfinite(miss)]
             if finite.size >= MIN_TRIALS:
