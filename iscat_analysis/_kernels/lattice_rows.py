@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.lattice import DEGREE, FAST, TAPS
+from iscat_analysis._kernels.mixing import mix, mix_both
 
 if TYPE_CHECKING:
     from iscat_analysis._kernels.image import Lens, Pixels
@@ -62,21 +63,12 @@ def rows_needed(lens: Lens, pixels: Pixels) -> int:
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _blend(nodes: FloatArray, row: int, first: int, w: FloatArray, out: FloatArray) -> None:
-    """Fill `out` (n) with the combination w of TAPS rows of `nodes`, n columns from the first.
-
-    Four rows at a time: against more that might overlap, the compiler gives up on vectors.
-    """
+    """Fill `out` (n) with the combination w of TAPS rows of `nodes`, n columns from the first."""
     last = first + out.size
-    a, b = nodes[row, first:last], nodes[row + 1, first:last]
-    c, d = nodes[row + 2, first:last], nodes[row + 3, first:last]
-    wa, wb, wc, wd = w[0], w[1], w[2], w[3]
-    for j in range(out.size):
-        out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
-    a, b = nodes[row + 4, first:last], nodes[row + 5, first:last]
-    c, d = nodes[row + 6, first:last], nodes[row + 7, first:last]
-    wa, wb, wc, wd = w[4], w[5], w[6], w[7]
-    for j in range(out.size):
-        out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+    for k in range(0, TAPS, 4):
+        a, b = nodes[row + k, first:last], nodes[row + k + 1, first:last]
+        c, d = nodes[row + k + 2, first:last], nodes[row + k + 3, first:last]
+        mix(a, b, c, d, w, k, out)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -91,21 +83,10 @@ def _blend_both(
 ) -> None:
     """Fill `out` and `other` with two combinations of the same rows; see `_blend`."""
     last = first + out.size
-    a, b, c = nodes[row, first:last], nodes[row + 1, first:last], nodes[row + 2, first:last]
-    wa, wb, wc, va, vb, vc = w[0], w[1], w[2], v[0], v[1], v[2]
-    for j in range(out.size):
-        out[j] = wa * a[j] + wb * b[j] + wc * c[j]
-        other[j] = va * a[j] + vb * b[j] + vc * c[j]
-    a, b, c = nodes[row + 3, first:last], nodes[row + 4, first:last], nodes[row + 5, first:last]
-    wa, wb, wc, va, vb, vc = w[3], w[4], w[5], v[3], v[4], v[5]
-    for j in range(out.size):
-        out[j] += wa * a[j] + wb * b[j] + wc * c[j]
-        other[j] += va * a[j] + vb * b[j] + vc * c[j]
-    a, b = nodes[row + 6, first:last], nodes[row + 7, first:last]
-    wa, wb, va, vb = w[6], w[7], v[6], v[7]
-    for j in range(out.size):
-        out[j] += wa * a[j] + wb * b[j]
-        other[j] += va * a[j] + vb * b[j]
+    for k in range(0, TAPS, 4):
+        a, b = nodes[row + k, first:last], nodes[row + k + 1, first:last]
+        c, d = nodes[row + k + 2, first:last], nodes[row + k + 3, first:last]
+        mix_both(a, b, c, d, w, v, k, out, other)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.lattice import FAST, TAPS
 from iscat_analysis._kernels.lattice_rows import BEFORE, taps
+from iscat_analysis._kernels.mixing import mix, mix_both
 
 if TYPE_CHECKING:
     from iscat_analysis._kernels.image import Lens, Pixels
@@ -85,21 +86,12 @@ def _copy(
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _mix(nodes: FloatArray, at: IntArray, w: FloatArray, out: FloatArray) -> None:
-    """Fill `out` with the combination w of what begins at TAPS places of `nodes`.
-
-    Four at a time: against more that might overlap, the compiler gives up on vectors.
-    """
+    """Fill `out` with the combination w of what begins at TAPS places of `nodes`."""
     n = out.size
     for k in range(0, TAPS, 4):
         a, b = nodes[at[k] : at[k] + n], nodes[at[k + 1] : at[k + 1] + n]
         c, d = nodes[at[k + 2] : at[k + 2] + n], nodes[at[k + 3] : at[k + 3] + n]
-        wa, wb, wc, wd = w[k], w[k + 1], w[k + 2], w[k + 3]
-        if k == 0:
-            for j in range(n):
-                out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
-        else:
-            for j in range(n):
-                out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+        mix(a, b, c, d, w, k, out)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -112,16 +104,7 @@ def _mix_both(
     for k in range(0, TAPS, 4):
         a, b = nodes[at[k] : at[k] + n], nodes[at[k + 1] : at[k + 1] + n]
         c, d = nodes[at[k + 2] : at[k + 2] + n], nodes[at[k + 3] : at[k + 3] + n]
-        wa, wb, wc, wd = w[k], w[k + 1], w[k + 2], w[k + 3]
-        va, vb, vc, vd = v[k], v[k + 1], v[k + 2], v[k + 3]
-        if k == 0:
-            for j in range(n):
-                out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
-                other[j] = va * a[j] + vb * b[j] + vc * c[j] + vd * d[j]
-        else:
-            for j in range(n):
-                out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
-                other[j] += va * a[j] + vb * b[j] + vc * c[j] + vd * d[j]
+        mix_both(a, b, c, d, w, v, k, out, other)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
