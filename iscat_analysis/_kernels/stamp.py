@@ -71,7 +71,8 @@ def _copy(
 ) -> None:  # fmt: skip
     """Fill lines of `signal` with P + a Q, of `slope` with P + 2a Q, from every `step`-th row.
 
-    A slope without room is left out.
+    A slope without room is left out.  Numba counts no references here (`_nrt`), as nothing is
+    allocated or handed back: counting took as long as a line of twenty nodes.
     """
     for m in range(signal.size // line):
         p, q = profile[0, row + step * m, first:last], profile[1, row + step * m, first:last]
