@@ -157,7 +157,7 @@ def cut(pixels: Pixels, r0: int, r1: int, c0: int, c1: int) -> Pixels:
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw(
     pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
-    _work: FloatArray, profile: FloatArray, out: FloatArray,
+    profile: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` with the signal of one row."""
     table, lens = table_of(pictures, group), lens_of(pictures, group)
@@ -169,7 +169,7 @@ def draw(
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw_gradient(
     pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
-    _work: FloatArray, profile: FloatArray, out: FloatArray,
+    profile: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (ny, 5, nx) with the signal of one row and its gradient."""
     table, lens = table_of(pictures, group), lens_of(pictures, group)
@@ -213,8 +213,8 @@ def stage(
 @njit(cache=True, nogil=True, error_model="numpy")
 def ready_frame(
     field: Field, near: Pictures, far: Pictures, starts: IntArray, t: int, theta: FloatArray,
-    group: IntArray, canvas: Canvas, near_work: tuple[FloatArray, FloatArray],
-    far_work: tuple[FloatArray, FloatArray], image: FloatArray,
+    group: IntArray, canvas: Canvas, near_profile: FloatArray,
+    far_profile: FloatArray, image: FloatArray,
 ) -> None:  # fmt: skip
     """Bring a frame of the canvas to the rows as they are."""
     total = canvas.total[t]
@@ -235,15 +235,15 @@ def ready_frame(
             if r1 > r0:
                 out = image[: (r1 - r0) * (c1 - c0)].reshape(r1 - r0, c1 - c0)
                 pixels = cut(field.pixels, r0, r1, c0, c1)
-                draw(far, group[r], theta[r], pixels, far_work[0], far_work[1], out)
+                draw(far, group[r], theta[r], pixels, far_profile, out)
                 add(total, r0, c0, 1.0, out)
         elif np.any(theta[r] != canvas.squares[r]):
             r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
             if r1 > r0:
                 out = image[: (r1 - r0) * (c1 - c0)].reshape(r1 - r0, c1 - c0)
                 pixels = cut(field.pixels, r0, r1, c0, c1)
-                draw(near, group[r], canvas.squares[r], pixels, near_work[0], near_work[1], out)
+                draw(near, group[r], canvas.squares[r], pixels, near_profile, out)
                 add(total, r0, c0, -1.0, out)
-                draw(near, group[r], theta[r], pixels, near_work[0], near_work[1], out)
+                draw(near, group[r], theta[r], pixels, near_profile, out)
                 add(total, r0, c0, 1.0, out)
             canvas.squares[r] = theta[r]

@@ -20,7 +20,7 @@ from iscat_analysis._kernels.canvas import (
 )
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.moving import directions
-from iscat_analysis._kernels.scoring import FLOOR, POISSON, image_score, image_value, scratch
+from iscat_analysis._kernels.scoring import FLOOR, POISSON, blank_profile, image_score, image_value
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -134,9 +134,9 @@ def judge_frames(
         Leave out what takes second derivatives: `turned`, `ways` and `bias`.
     """
     rows, columns = light.background.shape
-    near_work = scratch(table_of(near, 0), near.lens, 1)
-    far_work = scratch(table_of(far, 0), far.lens, 1)
-    work = scratch(table_of(near, 0), near.lens, 2)
+    near_profile = blank_profile(table_of(near, 0), near.lens, 1)
+    far_profile = blank_profile(table_of(far, 0), far.lens, 1)
+    profile = blank_profile(table_of(near, 0), near.lens, 2)
     low = near.first_nm
     high = low + near.step_nm * (near.heights.shape[1] - 1)
     index = np.flatnonzero(free[:4])
@@ -148,7 +148,9 @@ def judge_frames(
     pull, known = np.empty(5), np.empty((5, 5))
     ways_here, trial, ahead, behind = np.empty((4, n)), np.empty(5), np.empty(4), np.empty(4)
     for t in range(first, last):
-        ready_frame(field, near, far, starts, t, theta, group, canvas, near_work, far_work, image)
+        ready_frame(
+            field, near, far, starts, t, theta, group, canvas, near_profile, far_profile, image
+        )
         for r in range(starts[t], starts[t + 1]):
             p, f = theta[r], fisher[r]
             f[:], turned[r], ways[r] = 0.0, np.nan, np.nan
@@ -159,7 +161,7 @@ def judge_frames(
             ny, nx = r1 - r0, c1 - c0
             pixels = cut(field.pixels, r0, r1, c0, c1)
             here = g[: 5 * ny * nx].reshape(ny, 5, nx)
-            draw_gradient(near, group[r], p, pixels, work[0], work[1], here)
+            draw_gradient(near, group[r], p, pixels, profile, here)
             data = square[: 4 * ny * nx].reshape(4, ny, nx)
             stage(light, t, canvas.total[t], here, r0, c0, data)
             value = image_value(POISSON, data, 1.0, here)
@@ -184,7 +186,7 @@ def judge_frames(
                     if free[2]:
                         trial[2] = min(max(trial[2], low), high)
                     there = (up if sign == 0 else down)[: 5 * ny * nx].reshape(ny, 5, nx)
-                    draw_gradient(near, group[r], trial, pixels, work[0], work[1], there)
+                    draw_gradient(near, group[r], trial, pixels, profile, there)
                     _score_of(data, there, ahead if sign == 0 else behind)
                 plus = up[: 5 * ny * nx].reshape(ny, 5, nx)
                 minus = down[: 5 * ny * nx].reshape(ny, 5, nx)

@@ -36,11 +36,11 @@ from iscat_analysis._kernels.scoring import (
     CONVERGED,
     POISSON,
     STALLED,
+    blank_profile,
     image_score,
     image_value,
     maximize,
     scoring_step,
-    scratch,
 )
 
 FloatArray = NDArray[np.float64]
@@ -141,16 +141,18 @@ def fit_frames(
         Added to: Σ w (1 + C) over the frames.
     """
     rows, columns = light.background.shape
-    near_work = scratch(table_of(near, 0), near.lens, 1)
-    far_work = scratch(table_of(far, 0), far.lens, 1)
+    near_profile = blank_profile(table_of(near, 0), near.lens, 1)
+    far_profile = blank_profile(table_of(far, 0), far.lens, 1)
     image = np.empty(max(field.drawn, field.side) ** 2)
     square, change = np.empty(4 * field.side**2), np.empty(field.side**2)
     gradients = np.empty(10 * field.side**2)
     step, index = np.empty(5), np.flatnonzero(search.free[:4])
-    slope_work = scratch(table_of(near, 0), near.lens, 2)
+    slope_profile = blank_profile(table_of(near, 0), near.lens, 2)
     fisher = np.empty((5, 5))
     for t in range(first, last):
-        ready_frame(field, near, far, starts, t, theta, group, canvas, near_work, far_work, image)
+        ready_frame(
+            field, near, far, starts, t, theta, group, canvas, near_profile, far_profile, image
+        )
         total = canvas.total[t]
         for _ in range(sweeps):
             for r in range(starts[t], starts[t + 1]):
@@ -162,7 +164,7 @@ def fit_frames(
                 ny, nx = r1 - r0, c1 - c0
                 pixels = cut(field.pixels, r0, r1, c0, c1)
                 both = gradients[: 10 * ny * nx].reshape(2, ny, 5, nx)
-                draw_gradient(near, group[r], p, pixels, slope_work[0], slope_work[1], both[0])
+                draw_gradient(near, group[r], p, pixels, slope_profile, both[0])
                 data = square[: 4 * ny * nx].reshape(4, ny, nx)
                 stage(light, t, total, both[0], r0, c0, data)
                 moved = change[: ny * nx].reshape(ny, nx)
@@ -170,7 +172,7 @@ def fit_frames(
                     for j in range(nx):
                         moved[i, j] = -both[0, i, 0, j]
                 outcome[r], last_one = _climb(
-                    near, group[r], pixels, data, search, p, both, slope_work, fisher, step
+                    near, group[r], pixels, data, search, p, both, slope_profile, fisher, step
                 )
                 here = both[last_one]
                 _add_signal(here, step, moved)
@@ -185,7 +187,7 @@ def fit_frames(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _climb(
     near: Pictures, group: int, pixels: Pixels, data: FloatArray, search: Search, p: FloatArray,
-    both: FloatArray, work: tuple[FloatArray, FloatArray], fisher: FloatArray, step: FloatArray,
+    both: FloatArray, profile: FloatArray, fisher: FloatArray, step: FloatArray,
 ) -> tuple[int, int]:  # fmt: skip
     """Fit one row from p, at which both[0] is drawn.
 
@@ -209,7 +211,7 @@ def _climb(
             break
         if np.isnan(value):
             value = image_value(POISSON, data, 1.0, both[at])
-        draw_gradient(near, group, trial, pixels, work[0], work[1], both[1 - at])
+        draw_gradient(near, group, trial, pixels, profile, both[1 - at])
         there = image_value(POISSON, data, 1.0, both[1 - at])
         if not there > value:
             break
@@ -221,7 +223,7 @@ def _climb(
         table_of(near, group), lens_of(near, group), pixels, POISSON, data, search.free, lower,
         upper, search.max_step, search.tolerance, search.passes, p, score, fisher,
     )  # fmt: skip
-    draw_gradient(near, group, p, pixels, work[0], work[1], both[0])
+    draw_gradient(near, group, p, pixels, profile, both[0])
     step[:] = 0.0
     return outcome, 0
 
@@ -407,7 +409,7 @@ def common_modes(
     """
     rows, columns = light.background.shape
     background, used = light.background, light.used
-    work, profile = scratch(table_of(near, 0), near.lens, 2)
+    profile = blank_profile(table_of(near, 0), near.lens, 2)
     g = np.empty(5 * field.side**2)
     for k in range(frame.size):
         p, w = theta[k], light.power[frame[k]]
@@ -417,7 +419,7 @@ def common_modes(
         ny, nx = r1 - r0, c1 - c0
         here = g[: 5 * ny * nx].reshape(ny, 5, nx)
         pixels = cut(field.pixels, r0, r1, c0, c1)
-        draw_gradient(near, group[k], p, pixels, work, profile, here)
+        draw_gradient(near, group[k], p, pixels, profile, here)
         mine = out[owner[k]]
         for a in range(index.size):
             for i in range(ny):

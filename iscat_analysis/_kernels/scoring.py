@@ -305,12 +305,6 @@ def blank_profile(axial: AxialTable, lens: Lens, orders: int) -> FloatArray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def scratch(axial: AxialTable, lens: Lens, orders: int) -> tuple[FloatArray, FloatArray]:
-    """Work space and profile for the pictures of a canvas, which need no work space any more."""
-    return np.empty((0, 0, 0)), blank_profile(axial, lens, orders)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def picture_at(
     axial: AxialTable,
     lens: Lens,
