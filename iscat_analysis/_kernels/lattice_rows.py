@@ -61,7 +61,7 @@ def rows_needed(lens: Lens, pixels: Pixels) -> int:
     return FIELDS + pixels.offsets.size * 6 * lens.components * rows
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _blend(nodes: FloatArray, row: int, first: int, w: FloatArray, out: FloatArray) -> None:
     """Fill `out` (n) with the combination w of TAPS rows of `nodes`, n columns from the first."""
     last = first + out.size
@@ -71,7 +71,7 @@ def _blend(nodes: FloatArray, row: int, first: int, w: FloatArray, out: FloatArr
         mix(a, b, c, d, w, k, out)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _blend_both(
     nodes: FloatArray,
     row: int,

@@ -85,7 +85,7 @@ def _copy(
                 d[j] = p[j] + 2.0 * a * q[j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _mix(nodes: FloatArray, at: IntArray, w: FloatArray, out: FloatArray) -> None:
     """Fill `out` with the combination w of what begins at TAPS places of `nodes`."""
     n = out.size
@@ -95,7 +95,7 @@ def _mix(nodes: FloatArray, at: IntArray, w: FloatArray, out: FloatArray) -> Non
         mix(a, b, c, d, w, k, out)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _mix_both(
     nodes: FloatArray, at: IntArray, w: FloatArray, v: FloatArray,
     out: FloatArray, other: FloatArray,
