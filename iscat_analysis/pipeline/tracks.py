@@ -135,7 +135,6 @@ def tracks_of(
         correlation=mass_correlation(scene, fits),
         masses=masses,
         seed=scene.config.compute.seed,
-        workers=scene.config.compute.workers,
         progress=progress,
     )
     met = tracks[tracks["nearest_nm"] < setup.near_nm]

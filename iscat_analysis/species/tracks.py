@@ -35,7 +35,6 @@ from iscat_analysis.species.diffusion import Diffusion, fit_diffusion, hydrodyna
 from iscat_analysis.species.displacements import LEAST_POSITIONS
 from iscat_analysis.species.motion import anomalous_test, confinement_test, steadiness_test
 from iscat_analysis.species.refraction import refractive_index
-from iscat_analysis.threads import threads
 
 TESTED_POSITIONS = 300
 """Positions of a track whose motion is tested, from its first: the time of a test grows fast."""
@@ -116,7 +115,6 @@ def describe_tracks(
     correlation: Correlation | None = None,
     masses: pd.DataFrame | None = None,
     seed: int = 1,
-    workers: int = 1,
     progress: Progress = silent,
 ) -> pd.DataFrame:
     """Make the table of tracks.
@@ -134,8 +132,6 @@ def describe_tracks(
         ``crb_mass_kda``, indexed by track.  They take the place of combinations of the frames.
     seed : int
         Of the free tracks that the test of confinement draws.
-    workers : int
-        Threads that test the motion of tracks; the result does not depend on their number.
     progress : Progress
         Told the tracks; an interrupt leaves out the tests of those that remain.
 
@@ -158,31 +154,23 @@ def describe_tracks(
         ]
     )
     nearest = _nearest(fits[numbers.notna()], numbers.dropna())
-    records, tests = [], {}
-    with threads(workers) as pool:
-        for track, rows in groups.items():
-            exact: dict[str, float] = {}
-            if masses is not None and track in masses.index:
-                exact = masses.loc[track].to_dict()
-            record = _record(track, rows, setup, power, correlation, exact)
-            record["nearest_nm"] = nearest.get(track, np.inf)
-            records.append(record)
-            if np.isfinite(record["d_um2_s"]):
-                tests[track] = pool.submit(
-                    _tests, rows, setup, np.random.default_rng([seed, track])
-                )
+    records, tested = [], True
+    for done, (track, rows) in enumerate(groups.items()):
+        exact = masses.loc[track].to_dict() if masses is not None and track in masses.index else {}
+        record = _record(track, rows, setup, power, correlation, exact)
+        record["nearest_nm"] = nearest.get(track, np.inf)
         try:
-            for done, record in enumerate(records):
-                track = record["track"]
-                record |= tests.pop(track).result() if track in tests else {}
-                progress("tracks", done + 1, len(records))
+            if tested:
+                rng = np.random.default_rng([seed, track])
+                record |= _tests(rows, setup, rng) if np.isfinite(record["d_um2_s"]) else {}
+                progress("tracks", done + 1, len(groups))
         except KeyboardInterrupt:
-            pool.shutdown(wait=False, cancel_futures=True)
-    for record in records:
+            tested = False
         status = _remarks(record, setup)
         record["status"] = str(status[0]) if status else str(TrackStatus.OK)
         crossed = ["crosses"] if record["nearest_nm"] < setup.near_nm else []
         record["flags"] = ";".join([*map(str, status), *crossed])
+        records.append(record)
     return _table(records, fits)
 
 
