@@ -30,6 +30,7 @@ from iscat_analysis._kernels.canvas import (
     stage,
     table_of,
 )
+from iscat_analysis._kernels.dense import factorise
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.scoring import (
@@ -46,6 +47,9 @@ from iscat_analysis._kernels.scoring import (
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+_SINGULAR = 1e-9
+"""Pivot of a matrix with ones on its diagonal below which a parameter is not known."""
 
 
 class Search(NamedTuple):
@@ -270,18 +274,12 @@ def directions(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
         if not fisher[index[i], index[i]] > 0.0:
             return False
         scale[i] = 1.0 / np.sqrt(fisher[index[i], index[i]])
-    low = np.zeros((n, n))
+    low = np.empty((n, n))
+    if not factorise(fisher, index, scale, 0.0, low):
+        return False
     for i in range(n):
-        for j in range(i + 1):
-            total = fisher[index[i], index[j]] * scale[i] * scale[j]
-            for k in range(j):
-                total -= low[i, k] * low[j, k]
-            if i == j:
-                if not total > 1e-9:
-                    return False
-                low[i, i] = np.sqrt(total)
-            else:
-                low[i, j] = total / low[j, j]
+        if not low[i, i] ** 2 > _SINGULAR:
+            return False
     out[:] = 0.0
     for k in range(n):  # column k of L⁻ᵀ
         for i in range(k, -1, -1):
