@@ -175,5 +175,5 @@ def species_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
                 str(rung["n"]), (rung["mass_kda"], 1.0), xycoords=("data", "axes fraction"),
                 ha="center", va="bottom", color=INK,
             )  # fmt: skip
-    panels[0].legend()
+    panels[0].legend(loc="best")  # said, because without it Matplotlib warns where that is slow
     yield "species", figure

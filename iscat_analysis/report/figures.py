@@ -221,7 +221,7 @@ def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
         groups, bins=edges.tolist(), stacked=True, color=[BLUE, PURPLE], label=["ok", "flagged"]
     )
     if groups[1].size:
-        axes.legend()
+        figure.legend(loc="outside upper right", ncols=2)
     axes.set(xlabel=label, ylabel="events")
     axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
     return figure
