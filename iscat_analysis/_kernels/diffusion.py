@@ -16,8 +16,11 @@ from iscat_analysis._kernels.lattice import FAST
 
 FloatArray = NDArray[np.float64]
 
-_LOG_2PI = math.log(2.0 * math.pi)
-_TOGETHER = 8  # variances whose product is far from overflow, of which one logarithm is taken
+LOG_2PI = math.log(2.0 * math.pi)
+
+TOGETHER = 8
+"""Variances whose product is far from overflow, of which one logarithm is taken."""
+
 _SPAN = 1e-5  # the lowest of the first ladder's values of D over the highest
 _RUNGS = 25
 _LADDERS = 2  # between the neighbours of the highest rung of the one before
@@ -88,7 +91,7 @@ def displacement_likelihood(
             quad0 += q0
             quad1 += q1
             quad2 += q2
-    value = -0.5 * (total0 + quad0 + axes * n * _LOG_2PI)
+    value = -0.5 * (total0 + quad0 + axes * n * LOG_2PI)
     slope, curvature = -0.5 * (total1 + quad1), -0.5 * (total2 + quad2)
     return value, slope, curvature, -0.5 * total2, total0, total1
 
@@ -122,7 +125,7 @@ def displacement_likelihoods(
     axes, n = steps.shape
     state = np.empty((4, diffusion.size))
     p, z, product, quad = state[0], state[1], state[2], state[3]
-    out = np.full(diffusion.size, -0.5 * axes * n * _LOG_2PI)
+    out = np.full(diffusion.size, -0.5 * axes * n * LOG_2PI)
     for c in range(axes):
         p[:], z[:], product[:], quad[:] = 1.0, 0.0, 1.0, 0.0
         for k in range(n):
@@ -137,7 +140,7 @@ def displacement_likelihoods(
                 p[i] = main + diffusion[i] * turn - band * ratio
                 quad[i] += z[i] * z[i] / p[i]
                 product[i] *= p[i]
-            if k % _TOGETHER == 0 or k == n - 1:
+            if k % TOGETHER == 0 or k == n - 1:
                 for i in range(diffusion.size):
                     out[i] -= 0.5 * math.log(product[i])
                     product[i] = 1.0

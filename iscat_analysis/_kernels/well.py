@@ -11,13 +11,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.diffusion import LOG_2PI, TOGETHER
 from iscat_analysis._kernels.lattice import FAST
 
 FloatArray = NDArray[np.float64]
 
-_LOG_2PI = math.log(2.0 * math.pi)
 _SHORT = 1e-2  # below, a well hardly acts during one exposure and the moments are a series
-_TOGETHER = 8  # variances whose product is far from overflow, of which one logarithm is taken
 _RUNGS = 10  # of the stiffnesses among which the search begins
 _FIRST, _FINER = 0.3, 0.3  # distance of the points that are compared, and what is left of it
 _WIDEST = 10.0  # logarithm of D over that of free diffusion
@@ -77,7 +76,7 @@ def harmonic_likelihoods(
             else:
                 curved = u - 2.0 * left - 0.5 * math.expm1(-2.0 * u)
                 var_mean[i] = 2.0 * width[i] * curved / (u * u)
-    out = np.full(m, -0.5 * axes * (n - 1) * _LOG_2PI)
+    out = np.full(m, -0.5 * axes * (n - 1) * LOG_2PI)
     for c in range(axes):
         place[:], unit[:], spread[:], product[:] = 0.0, 0.0, width, 1.0
         q11[:], q12[:], q22[:], log_determinant[:] = 0.0, 0.0, 0.0, 0.0
@@ -101,7 +100,7 @@ def harmonic_likelihoods(
                 place[i] = decay[i] * before + gain * e1
                 unit[i] = decay[i] * one + gain * e2
                 spread[i] = decay[i] * decay[i] * wide + var_end[i] - gain * gain * s
-            if k % _TOGETHER == 0 or k == n - 1:
+            if k % TOGETHER == 0 or k == n - 1:
                 for i in range(m):
                     log_determinant[i] += math.log(product[i])
                     product[i] = 1.0

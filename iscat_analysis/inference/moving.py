@@ -291,10 +291,8 @@ class MovingField:
     def _signal(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
         """Draw the rows of some frames alone."""
         within = rows.only((rows.frame >= first) & (rows.frame < last))
-        canvas, (near, far) = (
-            blank(np.empty_like(self.counts_e[first:last]), within),
-            self._pictures,
-        )
+        canvas = blank(np.empty_like(self.counts_e[first:last]), within)
+        near, far = self._pictures
         light = self._light(ground)
         part = light._replace(counts=light.counts[first:last], power=light.power[first:last])
         starts = np.searchsorted(within.frame, np.arange(first, last + 1)).astype(np.int64)

@@ -57,7 +57,7 @@ def settle(
     follow_level: bool = True,
     turns: int = MOST_TURNS,
     coarse: bool = False,
-) -> tuple[Rows, Ground, BoolArray, float]:
+) -> tuple[Rows, Ground, BoolArray]:
     """Fit rows and background in turn, to the maximum of their likelihood.
 
     Parameters
@@ -83,18 +83,16 @@ def settle(
         Under them.
     converged : ndarray of bool
         Which fits did.
-    change : float
-        Largest change of the background in the last turn [its standard deviations].
     """
     sigma = 1 / np.sqrt(np.maximum(field.total_e, 1.0))
-    change = largest = 0.0
+    largest = 0.0
     done = np.ones(len(rows.frame), dtype=bool)
     for turn in range(turns):
         rows, found, done = field.fit(ground, rows, coarse=coarse)
         power = found.power if follow_power else ground.power
         if not follow_level:
             steady = bool(np.abs(power - ground.power).max() < _POWER_SETTLED)
-            ground, change = replace(ground, power=power), 0.0
+            ground = replace(ground, power=power)
             if steady or turn + 1 >= _POWER_TURNS:
                 break
             continue
@@ -109,4 +107,4 @@ def settle(
             largest = change
         elif change < _SETTLED:
             break
-    return rows, ground, done, change
+    return rows, ground, done

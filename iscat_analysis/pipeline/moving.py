@@ -163,7 +163,7 @@ def follow(
         if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(scene, rows, found)
-        rows, ground, done, _ = settle(
+        rows, ground, done = settle(
             field,
             ground,
             rows,
@@ -179,7 +179,7 @@ def follow(
             rows = linked(config, rows, mass_places(config, field, ground, rows))
             rows, variances, _ = _moved(config, field, ground, rows)
             field.set_blurs(variances)
-            rows, ground, done, _ = settle(
+            rows, ground, done = settle(
                 field, ground, rows, follow_power=follow_power, follow_level=follow_level,
                 turns=_NEXT_TURNS, coarse=True,
             )  # fmt: skip
@@ -190,7 +190,7 @@ def follow(
     rows = linked(config, rows, mass_places(config, field, ground, rows), inner=inner)
     resolution = config.optics.wavelength_nm / config.optics.na
     for number in range(ROUNDS):
-        rows, ground, done, _ = settle(
+        rows, ground, done = settle(
             field, ground, rows, follow_power=follow_power, follow_level=follow_level,
             turns=_NEXT_TURNS, coarse=True,
         )  # fmt: skip
@@ -214,7 +214,7 @@ def follow(
     for stage in range(2):
         if scene.mode == "joint":
             rows = _in_their_fringes(scene, field, ground, rows)
-        rows, ground, done, _ = settle(
+        rows, ground, done = settle(
             field, ground, rows, follow_power=follow_power, follow_level=follow_level,
             turns=MOST_TURNS if stage else _NEXT_TURNS, coarse=not stage,
         )  # fmt: skip

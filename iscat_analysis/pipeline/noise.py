@@ -191,8 +191,10 @@ def judge_beside(
             free &= np.hypot(x - place[0], y - place[1]) > away
         if free.any() and free.sum() >= _FREE * used.sum():
             counts = movie.read(span[0], span[0] + count)
-            said = judge_counts(camera.to_counts(without(count)), camera, masked=~free).gain_message
-            return said if judge_counts(counts, camera, masked=~free).gain_message else ""
+            if not judge_counts(counts, camera, masked=~free).gain_message:
+                return ""
+            counts = camera.to_counts(without(count))
+            return judge_counts(counts, camera, masked=~free).gain_message
         count //= 2
     return ""
 

@@ -101,7 +101,7 @@ def test_common_mass_and_shared_errors_are_right(
     for _ in range(TRIALS):
         field = _field(model, rng.poisson(mean), pool)
         start = Ground(mean.mean(axis=0), np.ones(FRAMES))
-        rows, ground, done, _ = settle(field, start, truth, follow_power=False)
+        rows, ground, done = settle(field, start, truth, follow_power=False)
         judged = field.judge(ground, rows)
         shared = shared_errors(field, ground, rows, judged)
         found = common_amplitudes(field, ground, rows, judged, done, shared)

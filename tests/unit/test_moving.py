@@ -113,7 +113,7 @@ def test_background_takes_nothing_of_particles(
     field = _field(counts, pool)
     start = first_ground(field, follow_power=True)
     over_median, _, _ = field.fit(start, truth)
-    rows, found, done, _ = settle(field, start, truth, follow_power=True)
+    rows, found, done = settle(field, start, truth, follow_power=True)
     taken = 1 - over_median.theta[:, 3] / truth.theta[:, 3]
     left = rows.theta[:, 3] / truth.theta[:, 3] - 1
     assert done.all()
@@ -127,7 +127,7 @@ def test_fixed_point_is_the_maximum_of_the_multinomial(pool: ThreadPoolExecutor)
     counts, _, truth = _movie(_paths(40.0), noise=True)
     field = _field(counts, pool)
     start = first_ground(field, follow_power=True)
-    rows, ground, _, _ = settle(field, start, truth, follow_power=True)
+    rows, ground, _ = settle(field, start, truth, follow_power=True)
     for _ in range(3):  # beyond what is asked of it
         rows, found, _ = field.fit(ground, rows)
         ground = Ground(found.level, ground.power)
