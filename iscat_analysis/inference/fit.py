@@ -47,8 +47,8 @@ FOLLOWED = 30.0
 """Log-likelihood below the best optimum down to which others are followed to their ends."""
 
 OUTWARD = 3.0
-"""Standard deviations by which the data pull a height beyond the end of its range before the fit is
-said to be at a bound: fewer are chance, and the end of the range is then where it belongs."""
+"""Standard deviations by which the data pull a height beyond the end of its range, or a mass beyond
+the end of a calibration's line, before the fit is said to be at a bound: fewer are chance."""
 
 SCANS_PER_FRINGE = 8
 """Heights scanned per interference fringe before fitting."""
@@ -196,6 +196,8 @@ def fit_particle(
         if (size <= sigma)[particle].all():
             estimate = np.minimum(np.maximum(estimate - bias, box.lower), box.upper)
     x, y, z, amplitude = (float(value) for value in estimate[:4])
+    if box.free[AMPLITUDE] and model.scale.off_line(estimate[AMPLITUDE], sigma[AMPLITUDE], OUTWARD):
+        flags.append(Status.AT_BOUND)
     status, noticed = verdict(flags)
     return FitResult(
         x_nm=x,

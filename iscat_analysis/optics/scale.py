@@ -21,6 +21,11 @@ class MassScale:
     C = L·a + Q·a² of the model at the calibration height equals gradient·m + sign(m)·offset, which
     replaces the model's absolute scale.
 
+    The line goes through no contrast at the mass −offset/gradient.  Where that is positive, each
+    contrast up to the offset belongs to two masses of opposite sign, which differ by twice this
+    mass; `mass` gives the one whose sign the contrast has.  Where it is negative, contrasts below
+    the offset belong to none, and `mass` continues the line, below zero.
+
     Attributes
     ----------
     calibration : Calibration or None
@@ -58,3 +63,34 @@ class MassScale:
             return 1.0
         rise = self.linear + 2 * self.quadratic * amplitude
         return rise / self.calibration.gradient_per_kda
+
+    def off_line(
+        self, amplitude: FloatArray, sigma_kda: FloatArray, errors: float
+    ) -> NDArray[np.bool_]:
+        """Tell whose contrasts are no single mass on the line of a calibration.
+
+        Parameters
+        ----------
+        amplitude : ndarray
+            Amplitudes.
+        sigma_kda : ndarray, same shape
+            Standard deviations of their masses [kDa].
+        errors : float
+            How many of them count as the reach of the data.
+
+        Returns
+        -------
+        ndarray of bool, same shape
+            Where another mass has the same contrast, or would within the reach of the data, and is
+            farther away than one standard deviation; and where no mass has it within that reach.
+        """
+        amplitude, sigma_kda = np.asarray(amplitude, dtype=float), np.asarray(sigma_kda)
+        if self.calibration is None or self.calibration.offset == 0.0:
+            return np.zeros(amplitude.shape, dtype=np.bool_)
+        line = self.calibration
+        contrast = self.linear * amplitude + self.quadratic * amplitude**2
+        size = np.abs(contrast / line.gradient_per_kda)
+        crossing = -line.offset / line.gradient_per_kda
+        if crossing > 0:
+            return (size < crossing + errors * sigma_kda) & (2 * crossing > sigma_kda)
+        return np.asarray(size < -crossing - errors * sigma_kda)

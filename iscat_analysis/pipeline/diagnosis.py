@@ -7,9 +7,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from iscat_analysis.config import Config
 from iscat_analysis.inference.cause import likely_cause
+from iscat_analysis.inference.fit import OUTWARD
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import follow_pattern
@@ -193,3 +195,42 @@ def misfit_warning(config: Config, events: Sequence[Event]) -> str:
         return ""
     cause = likely_cause(config, [(e.likelihood, e.fit.theta, e.fit.box.free) for e in missed])
     return cause.message if cause else ""
+
+
+def line_warning(config: Config, table: pd.DataFrame) -> str:
+    """Say which contrasts the line of the calibration turns into no single mass.
+
+    Parameters
+    ----------
+    config : Config
+        With the calibration.
+    table : pandas.DataFrame
+        Rows of ``fits.csv``.
+
+    Returns
+    -------
+    str
+        One line; empty where there are none.
+    """
+    line = config.calibration
+    if line is None or not line.offset:
+        return ""
+    crossing = -line.offset / line.gradient_per_kda
+    mass, sigma = table["mass_kda"], table["sigma_mass_kda"]
+    if crossing > 0:
+        near = mass.abs() - OUTWARD * sigma < 2 * crossing
+        why = (
+            f"its line is at zero at {crossing:.3g} kDa, so that below {2 * crossing:.3g} kDa two "
+            "masses of opposite sign have one contrast, of which the one with its sign is given"
+        )
+    else:
+        near = mass * table["contrast"] * line.gradient_per_kda < 0
+        why = f"its line has the contrast {line.offset:.3g} without a particle, and they have less"
+    near &= sigma.notna() & table["flags"].fillna("").str.contains(Status.AT_BOUND.value)
+    number = int(near.sum())
+    if not number:
+        return ""
+    return (
+        f"[calibration] does not tell the mass of {count(number, 'fit')}, flagged at_bound: {why}; "
+        "measure it with lighter standards, or set calibration.offset = 0 if its error allows it"
+    )

@@ -9,7 +9,7 @@ from scipy.special import gammainc, gammaincc, ndtr
 
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.inference.common import variances_left
-from iscat_analysis.inference.fit import POOR_FIT_P
+from iscat_analysis.inference.fit import OUTWARD, POOR_FIT_P
 from iscat_analysis.optics.blur import PATH_SPREAD, blurred
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
@@ -84,7 +84,7 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
         "contrast": _contrasts(model, estimate[:, 2], estimate[:, 3]),
         "n_scattered": collected, "snr": np.sqrt(2 * np.maximum(judged.gain, 0.0)),
         "chi2_reduced": judged.chi2 / freedom, "p_value": p_value,
-        "flags": [";".join(flags) for flags in _flags(moving, sigma, p_value, losses)],
+        "flags": [";".join(flags) for flags in _flags(scene, moving, sigma, p_value, losses)],
     }  # fmt: skip
     quantum = _quantum(model, estimate[:, 2], mass, collected, free)
     for k, name in enumerate(PARAMETERS):
@@ -234,21 +234,34 @@ def _p_values(
     return np.asarray(-np.expm1(_TESTS * np.log1p(-least)))
 
 
+def _off_line(scene: Scene, moving: Moving, sigma_kda: FloatArray) -> BoolArray:
+    """Tell whose masses a calibration does not tell: by that of the track where it is known."""
+    track, common, scale = moving.rows.track, moving.common, scene.model.scale
+    own, shared = moving.rows.theta[:, 3], common.amplitude[track]
+    known = np.isfinite(shared)
+    slope = np.array([abs(scale.slope(float(a))) for a in np.where(known, shared, own)])
+    sigma = np.where(known, np.sqrt(common.variance[track]) * slope, sigma_kda)
+    return scale.off_line(np.where(known, shared, own), sigma, OUTWARD)
+
+
 def _flags(
-    moving: Moving, sigma: FloatArray, p_value: FloatArray, losses: FloatArray
+    scene: Scene, moving: Moving, sigma: FloatArray, p_value: FloatArray, losses: FloatArray
 ) -> list[list[Status]]:
     """Gather what is to be remarked on each row."""
     rows, free = moving.rows, np.flatnonzero(moving.field.free[:4])
     lost = ~moving.converged | ~np.isfinite(sigma[:, free]).all(axis=1)
     poor = (p_value < POOR_FIT_P) | (losses > LARGEST_LOSS)
     field = moving.field
+    outside = field.on_wall(rows)
+    if moving.field.free[3]:
+        outside |= _off_line(scene, moving, sigma[:, 3])
     too_bright = np.zeros(len(rows.frame), dtype=np.bool_)
     if field.saturated.any():
         too_bright[:] = [
             saturated_near(field.saturated, x, y, field.pixel_nm) for x, y in rows.theta[:, :2]
         ]
     marks = (
-        (lost, Status.NOT_CONVERGED), (field.on_wall(rows), Status.AT_BOUND),
+        (lost, Status.NOT_CONVERGED), (outside, Status.AT_BOUND),
         (too_bright, Status.SATURATED), (poor, Status.POOR_FIT), (moving.close, Status.TOO_CLOSE),
     )  # fmt: skip
     return [[mark for told, mark in marks if told[i]] for i in range(len(rows.frame))]
