@@ -23,7 +23,8 @@ from scipy.special import ndtr
 from iscat_analysis.records import FloatArray
 
 _HIGHEST = 40.0  # no threshold is larger
-_LOWEST = 2.0  # from where on both terms of N fall as the level rises
+LOWEST = 2.0
+"""Level from which on both terms of N fall as it rises."""
 
 
 def extent(roughness: FloatArray, size: float) -> float:
@@ -144,13 +145,13 @@ class Excursions:
             found *= 1 - min(companions(u, self.ring, self.cell), 1.0) / 2
         return found
 
-    def level(self, alarms: float, *, lowest: float = _LOWEST) -> float:
+    def level(self, alarms: float, *, lowest: float = LOWEST) -> float:
         """Find the level that a number of maxima exceeds; `lowest` where fewer do."""
 
         def excess(u: float) -> float:
             return math.log(self.above(u) / alarms)
 
-        low = max(lowest, _LOWEST if self.volume else 1.0)
+        low = max(lowest, LOWEST if self.volume else 1.0)
         if not self.area > 0 or excess(low) <= 0:
             return lowest
         high = low
@@ -165,7 +166,7 @@ def height_reached(
     volume: float = 0.0,
     *,
     correlation: float = 0.0,
-    lowest: float = _LOWEST,
+    lowest: float = LOWEST,
 ) -> float:
     """Find the level above which noise has a given expected number of maxima.
 

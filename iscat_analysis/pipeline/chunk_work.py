@@ -29,6 +29,7 @@ from iscat_analysis.records import (
     silent,
 )
 from iscat_analysis.search.sliding import STRIDES, Chunk, stride_of
+from iscat_analysis.search.templates import ExcessNoise
 from iscat_analysis.threads import threads
 
 
@@ -52,8 +53,8 @@ class ChunkSetting:
         Frames before and after a step.
     noise : NoiseSpectrum or None
         Of the movie.
-    excess_noise : str
-        What is known of noise beyond the expected.
+    excess_noise : ExcessNoise or None
+        Where the noise is not as expected.
     lines : Lines or None
         What was divided out of the frames.
     """
@@ -65,7 +66,7 @@ class ChunkSetting:
     searches: int
     window: int
     noise: NoiseSpectrum | None
-    excess_noise: str
+    excess_noise: ExcessNoise | None
     lines: Lines | None
 
 
@@ -116,7 +117,7 @@ def analyse_chunk(
     window: int,
     pool: ThreadPoolExecutor,
     posteriors: int,
-    excess_noise: str,
+    excess_noise: ExcessNoise | None,
 ) -> Done:
     """Find and fit every step of a chunk.
 
@@ -134,8 +135,8 @@ def analyse_chunk(
         Runs parts of it.
     posteriors : int
         Events whose posterior is sampled, at most.
-    excess_noise : str
-        What is known of noise beyond the expected.
+    excess_noise : ExcessNoise or None
+        Where the noise is not as expected.
 
     Returns
     -------

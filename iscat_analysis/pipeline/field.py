@@ -37,7 +37,7 @@ from iscat_analysis.records import (
     silent,
 )
 from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, is_hidden
-from iscat_analysis.search.templates import LARGEST_IMAGE, find_particles
+from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, find_particles
 
 MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""
@@ -54,7 +54,7 @@ def fit_field(
     windows: Windows,
     *,
     starts: Sequence[Candidate] = (),
-    excess_noise: str = "",
+    excess_noise: ExcessNoise | None = None,
     pool: ThreadPoolExecutor,
     progress: Progress = silent,
 ) -> tuple[tuple[Event, ...], Windows]:
@@ -68,9 +68,8 @@ def fit_field(
         Sums before and after.
     starts : sequence of Candidate
         Particles known beforehand, fitted first.
-    excess_noise : str
-        What is known of noise beyond the expected; with it a search that a thousand places pass is
-        given up.
+    excess_noise : ExcessNoise, optional
+        With it a search is given up that such noise passes; see `refuse_flood`.
     pool : ThreadPoolExecutor
         Runs the fits; the result does not depend on its size.
     progress : Progress
@@ -167,7 +166,10 @@ def add_signal(scene: Scene, place: PlaceAndMass, region: Region, total: FloatAr
 
 
 def search_field(
-    scene: Scene, windows: Windows, events: Sequence[Fitted] = (), excess_noise: str = ""
+    scene: Scene,
+    windows: Windows,
+    events: Sequence[Fitted] = (),
+    excess_noise: ExcessNoise | None = None,
 ) -> tuple[list[Candidate], list[Candidate]]:
     """Find new particles, and what may be but the side lobe of a known one.
 
@@ -179,7 +181,7 @@ def search_field(
         Sums before and after.
     events : sequence of Fitted
         Particles that are known.
-    excess_noise : str
+    excess_noise : ExcessNoise, optional
         As for `fit_field`.
 
     Returns

@@ -25,9 +25,7 @@ from iscat_analysis.search.sliding import (
     longest_window,
     measure_noise,
 )
-
-EXCESS_NOISE = 1.4
-"""Noise variance over the expected from which a thousand candidates are taken for noise."""
+from iscat_analysis.search.templates import ExcessNoise
 
 SPECTRUM_FRAMES = 128
 """Background frames on which the spectrum of the noise is measured."""
@@ -46,14 +44,14 @@ class Noise:
     ----------
     gain_message : str
         One line where the noise does not agree with the configured gain, else empty.
-    excess : str
-        What is known of noise beyond the expected, else empty.
+    excess : ExcessNoise or None
+        None where the noise is as expected.
     spectrum : NoiseSpectrum or None
         Of the noise between neighbouring frames, where it is not white and of the expected size.
     """
 
     gain_message: str = ""
-    excess: str = ""
+    excess: ExcessNoise | None = None
     spectrum: NoiseSpectrum | None = None
 
     def said(self, name: str) -> Iterator[str]:
@@ -112,7 +110,8 @@ def judge_counts(
         return Noise(spectrum=spectrum)
     gain = allow_for_correlation(gain, spectrum)
     message = gain.message or ""
-    return Noise(message, message if gain.noise_ratio > EXCESS_NOISE else "", spectrum)
+    excess = ExcessNoise(gain.noise_ratio, message) if message and gain.noise_ratio > 1 else None
+    return Noise(message, excess, spectrum)
 
 
 def judge_background(movie: Stack, camera: Camera, windows: Windows, *, still: bool) -> Noise:
@@ -229,14 +228,15 @@ def judge_opening(
     """
     opening, curve, window = judge_window(reader, config, mapper)
     noise = judge_counts(opening, reader.camera, mapper=mapper)
-    excess = noise.excess
-    if not excess and curve.at(window) > EXCESS_NOISE:
-        excess = (
-            f"between averages of {window} frames the noise variance is {curve.at(window):.2g} "
-            "times that of the light; look at the laser, set background.drift_correction = true, "
-            "or lower background.window_frames"
+    if noise.excess is None:
+        ratio = curve.at(window)
+        message = (
+            f"between averages of {window} frames the noise variance is {ratio:.2g} times that of "
+            "the light; look at the laser, set background.drift_correction = true, or lower "
+            "background.window_frames"
         )
-    return replace(noise, excess=excess), curve, window
+        noise = replace(noise, excess=ExcessNoise(ratio, message))
+    return noise, curve, window
 
 
 def judge_window(

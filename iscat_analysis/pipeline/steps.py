@@ -44,7 +44,7 @@ from iscat_analysis.search.sliding import (
     make_filter,
     sliding_maps,
 )
-from iscat_analysis.search.templates import LARGEST_IMAGE, refuse_flood
+from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, refuse_flood
 
 ROUNDS = 6
 """Searches at most; each takes what was found so far off the contrast."""
@@ -102,9 +102,8 @@ class ChunkFitter:
         Runs the fits; the result does not depend on its size.
     pattern : MovingPattern, optional
         Of the same chunk, where its motion is divided out.
-    excess_noise : str
-        What is known of noise beyond the expected; with it a search that a thousand places pass is
-        given up.
+    excess_noise : ExcessNoise, optional
+        With it a search is given up that such noise passes; see `refuse_flood`.
 
     Attributes
     ----------
@@ -123,7 +122,7 @@ class ChunkFitter:
         pool: ThreadPoolExecutor,
         pattern: MovingPattern | None = None,
         *,
-        excess_noise: str = "",
+        excess_noise: ExcessNoise | None = None,
     ) -> None:
         self._excess_noise = excess_noise
         self._scene = scene
@@ -280,8 +279,9 @@ class ChunkFitter:
             self.strongest = np.stack([np.abs(best), best / np.sqrt(frames * matched.norm)])
         peaks = find_steps(chunk, matched, snr, effective, scene.templates.threshold)
         refuse_flood(
-            len(peaks), self._excess_noise, frames=f" in frames {chunk.first}:{chunk.stop}"
-        )
+            len(peaks), scene.templates, self._excess_noise,
+            images=len(snr), frames=f" in frames {chunk.first}:{chunk.stop}",
+        )  # fmt: skip
         fresh, self._doubtful = self._sieve.sift(peaks, steps, snr)
         return [self._begin(peak) for peak in fresh]
 

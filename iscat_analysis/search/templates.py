@@ -21,7 +21,7 @@ from scipy.ndimage import maximum_filter
 from iscat_analysis.config import Detection
 from iscat_analysis.errors import FloodError
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.random_field import Excursions, extent
+from iscat_analysis.inference.random_field import LOWEST, Excursions, extent
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
@@ -47,7 +47,25 @@ LARGEST_IMAGE = 3.5
 """Regions from the centre to the edge of a strong particle's image; the rings go on, faintly."""
 
 FLOOD = 1000
-"""Candidates beyond which a search is given up where there is more noise than expected."""
+"""Candidates beyond which a search is given up where they are noise."""
+
+_NOISE_SHARE = 0.1  # of these that noise must account for; particles have a thousand times as many
+
+
+@dataclass(frozen=True)
+class ExcessNoise:
+    """Noise beyond the expected.
+
+    Attributes
+    ----------
+    ratio : float
+        Its variance over that which is expected.
+    message : str
+        Where it was seen and what to do about it, in one line.
+    """
+
+    ratio: float
+    message: str
 
 
 @dataclass(frozen=True)
@@ -82,6 +100,22 @@ class Templates:
     two_sided: bool
     excursions: Excursions
     noise: NoiseSpectrum | None = None
+
+    def reached_by(self, ratio: float) -> float:
+        """Count the places of an image that noise lifts above the threshold.
+
+        Parameters
+        ----------
+        ratio : float
+            Variance of the noise over that which is expected.
+
+        Returns
+        -------
+        float
+            Expected number.
+        """
+        level = max(self.threshold / math.sqrt(ratio), LOWEST)
+        return self.excursions.above(level) * (2 if self.two_sided else 1)
 
 
 def make_templates(
@@ -215,7 +249,7 @@ def find_particles(
     roi_px: float,
     explained: FloatArray | None = None,
     known: Sequence[tuple[float, float]] = (),
-    excess_noise: str = "",
+    excess_noise: ExcessNoise | None = None,
     cumulants: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[Candidate, ...]:
     """Peaks of the matched filter above the threshold, strongest first.
@@ -237,8 +271,8 @@ def find_particles(
         Signal of particles already known.
     known : sequence of (float, float)
         Where those are, (x, y) [pixels].
-    excess_noise : str
-        What is known of noise beyond the expected.
+    excess_noise : ExcessNoise, optional
+        As for `refuse_flood`.
     cumulants : (ndarray, ndarray), optional
         Third and fourth cumulants of each pixel's counts [e³, e⁴]; without them the noise is
         normal.
@@ -250,8 +284,8 @@ def find_particles(
 
     Raises
     ------
-    DataError
-        There is such noise, and it passes the threshold at a thousand places.
+    FloodError
+        As from `refuse_flood`.
     """
     snr, strength = signal_to_noise(likelihood, templates, explained)
     ranked = np.abs(snr) if templates.two_sided else snr
@@ -267,7 +301,7 @@ def find_particles(
         ranked, signed = ranked / lift, snr / lift
     best = ranked.max(axis=0)
     peaks = sorted(_peaks(ranked, best, signed, templates.threshold), key=lambda p: -p.height)
-    refuse_flood(len(peaks), excess_noise)
+    refuse_flood(len(peaks), templates, excess_noise)
     found: list[Candidate] = []
     for peak in peaks:
         near = (
@@ -345,26 +379,42 @@ def _beside(
     return beside
 
 
-def refuse_flood(candidates: int, excess_noise: str, frames: str = "") -> None:
+def refuse_flood(
+    candidates: int,
+    templates: Templates,
+    excess_noise: ExcessNoise | None,
+    *,
+    images: int = 1,
+    frames: str = "",
+) -> None:
     """Give up a search in which noise passes the threshold; many particles are no reason to.
+
+    The rings of many particles look like noise as well, but normal noise of that variance would
+    hardly pass the threshold.
 
     Parameters
     ----------
     candidates : int
         Places above the threshold.
-    excess_noise : str
-        What is known of noise beyond the expected; empty where there is none.
+    templates : Templates
+        Which know the threshold, and how often noise passes it.
+    excess_noise : ExcessNoise or None
+        None where the noise is as expected.
+    images : int
+        Images in which they are.
     frames : str
-        Of which they are, for the message.
+        Of which these are, for the message.
 
     Raises
     ------
     FloodError
-        There is such noise, and there are more than `FLOOD` places.
+        There are more than `FLOOD` places, and it is such noise that makes them.
     """
-    if excess_noise and candidates > FLOOD:
+    if excess_noise is None or candidates <= FLOOD:
+        return
+    if images * templates.reached_by(excess_noise.ratio) > _NOISE_SHARE * candidates:
         raise FloodError(
-            f"{candidates} places{frames} pass the detection threshold: {excess_noise}"
+            f"{candidates} places{frames} pass the detection threshold: {excess_noise.message}"
         )
 
 

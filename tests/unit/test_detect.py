@@ -12,6 +12,7 @@ import pytest
 from scenes import Light, blank, make_config
 
 from iscat_analysis.config import Config
+from iscat_analysis.errors import FloodError
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.regions import (
@@ -21,7 +22,13 @@ from iscat_analysis.pipeline.regions import (
 )
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.records import Candidate, Windows
-from iscat_analysis.search.templates import find_particles, signal_to_noise
+from iscat_analysis.search.templates import (
+    FLOOD,
+    ExcessNoise,
+    find_particles,
+    refuse_flood,
+    signal_to_noise,
+)
 from iscat_analysis.study.simulate import Movie
 
 FIELD = (96, 96)
@@ -124,6 +131,26 @@ def test_the_threshold_falls_with_the_alarms_allowed() -> None:
     ]
     assert heights == sorted(heights, reverse=True)
     assert 4 < heights[1] < 5
+
+
+def test_places_that_noise_makes_end_a_search_and_others_do_not() -> None:
+    """However many they are: particles and their rings pass the threshold as well."""
+    templates = make_scene(make_config(), (256, 256)).templates
+    wild, mild = ExcessNoise(8.0, "wild"), ExcessNoise(1.5, "mild")
+    many = 2 * FLOOD
+    with pytest.raises(FloodError, match=f"^{many} places in frames 0:9 pass .*: wild$"):
+        refuse_flood(many, templates, wild, images=20, frames=" in frames 0:9")
+    refuse_flood(many, templates, mild, images=20)
+    refuse_flood(many, templates, None, images=20)
+    refuse_flood(FLOOD, templates, wild, images=20)
+
+
+def test_noise_passes_the_threshold_as_often_as_predicted() -> None:
+    """A threshold lower by a factor is to noise what more noise is to the threshold."""
+    config, ratio = make_config(), 1.5
+    predicted = TRIALS * make_scene(config, FIELD).templates.reached_by(ratio)
+    found = _alarms(config, 4e5, 0.0, lower=1 / math.sqrt(ratio))
+    assert abs(found - predicted) < SIGMAS * math.sqrt(predicted)
 
 
 def test_the_ratio_is_of_unit_variance_on_noise() -> None:
