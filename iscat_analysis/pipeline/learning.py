@@ -7,7 +7,7 @@ same particles, and the analysis goes on with what was learned.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from iscat_analysis.calibration.optics import (
     FREE,
     LEAST_SIGHTS,
+    Neighbours,
     OpticsCalibration,
     Settings,
     Sight,
@@ -28,8 +29,14 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.forward import ForwardModel, forward_model
-from iscat_analysis.pipeline.microscope import calibrate_sights, goodness, microscopes
+from iscat_analysis.pipeline.microscope import (
+    calibrate_sights,
+    goodness,
+    microscopes,
+    rings_of,
+)
 from iscat_analysis.pipeline.sights import bright_sights, reach_nm
+from iscat_analysis.records import Mapper
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
 
@@ -91,7 +98,7 @@ def learn_optics(
                     f"alone, and "
                     f"{LEAST_TESTED} are needed to test the optics, {LEAST_SIGHTS} to learn them"
                 )
-            median = _median_p(sights, config)
+            median = _median_p(sights, config, others, pool.map)
             tested = {"tested": len(sights), "median_p": median}
             if optics.calibrate == "auto" and median >= REJECTED_P:
                 return config, tested | {"calibrated": False}
@@ -117,16 +124,30 @@ def learn_optics(
     return learned, summary | {"calibrated": True}
 
 
-def _median_p(sights: list[Sight], config: Config) -> float:
-    """Median p-value of the brightest particles in the configured microscope."""
+def _median_p(
+    sights: list[Sight], config: Config, others: Sequence[Sight] = (), mapper: Mapper = map
+) -> float:
+    """Median p-value of the brightest particles in the configured microscope.
+
+    The rings of neighbours, which take time, are put into the pictures where these fail without.
+    """
     settings = settings_of(config)
     build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
     model = build(settings)
     averages, placed = average_sights(sights[:_TESTED])
     x, y = _centre(averages[0], model, build, settings)
+
+    def median(pictures: Sequence[Sight]) -> tuple[float, Sequence[Sight]]:
+        fitted = maximise(pictures, build, settings, (), mapper=mapper).sights
+        return float(np.median([goodness(sight, model)[1] for sight in fitted])), fitted
+
     moved = [sight.placed(sight.x_nm + x, sight.y_nm + y) for sight in placed]
-    fitted = maximise(with_masses(moved, build, settings), build, settings, ()).sights
-    return float(np.median([goodness(sight, model)[1] for sight in fitted]))
+    found, fitted = median(with_masses(moved, build, settings))
+    if found >= REJECTED_P or not any(sight.neighbours for sight in fitted):
+        return found
+    elsewhere = [other.placed(other.x_nm + x, other.y_nm + y) for other in others]
+    near = Neighbours.fitted(elsewhere, build, rings_of(config, sights[0]), settings, mapper)
+    return max(found, median([near.around(sight) for sight in fitted])[0])
 
 
 def _centre(

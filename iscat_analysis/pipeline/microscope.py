@@ -201,7 +201,7 @@ def calibrate_sights(
         side=int(math.copysign(1, optics.focus_nm)) if optics.focus_nm else 0,
         landing=1,
         others=others,
-        build_wide=microscopes(config, RINGS_NM + sights[0].grid.diagonal_nm),
+        build_wide=rings_of(config, sights[0]),
         mapper=mapper,
     )
     estimate = measured.estimate
@@ -234,6 +234,24 @@ def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], Forward
 
     at_hand = kept(_MODELS_KEPT, model)
     return lambda settings: at_hand(tuple(settings.items()))
+
+
+def rings_of(config: Config, sight: Sight) -> Callable[[Settings], ForwardModel]:
+    """Make models as far as rings of neighbours matter.
+
+    Parameters
+    ----------
+    config : Config
+        What does not change.
+    sight : Sight
+        One of the pictures, for its size.
+
+    Returns
+    -------
+    callable
+        Settings → model.
+    """
+    return microscopes(config, RINGS_NM + sight.grid.diagonal_nm)
 
 
 def goodness(sight: Sight, model: ForwardModel) -> tuple[float, float]:

@@ -6,11 +6,14 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from calibrations import configuration, make_sights
+from scenes import PIXEL_NM, Stack, make_config
 
 from iscat_analysis.config import Config
 from iscat_analysis.movie.camera import camera_from_config
+from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import learning
 from iscat_analysis.pipeline.learning import LEAST_TESTED, _median_p, learn_optics
 
@@ -91,3 +94,29 @@ def test_never_looks_at_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stayed
     assert not summary
     assert not said
+
+
+@pytest.mark.parametrize(("focus_nm", "fits"), [(-300.0, True), (-420.0, False)])
+def test_rings_of_neighbours_do_not_condemn_the_optics(focus_nm: float, *, fits: bool) -> None:
+    """Six bright particles bound at once, 2 µm from each other, each among the rings of all."""
+    config = make_config(background={"frames": [0, 1]}, fit={"frames": [1, 2]})
+    true = make_config(optics={"focus_nm": focus_nm})
+    side, rng = 90, np.random.default_rng(2)
+    grid = PixelGrid.region((0, side), (0, side), PIXEL_NM)
+    model = forward_model(true, grid.diagonal_nm)
+    signal = sum(
+        model.image(grid, x * PIXEL_NM, y * PIXEL_NM, 5.0, 500.0)
+        for x in (19.2, 45.1, 71.4)
+        for y in (28.3, 60.9)
+    )
+    counts = rng.poisson([np.full(grid.shape, 3e7), 3e7 * (1 + signal)]).astype(np.uint32)
+    unsaturated = config.model_copy(
+        update={"camera": config.camera.model_copy(update={"well_depth_e": 1e9})}
+    )
+    camera = camera_from_config(unsaturated.camera, grid.shape, counts.dtype)
+    said: list[str] = []
+    movie: Any = Stack(counts)
+    _, summary = learn_optics(movie, unsaturated, camera, tell=said.append)
+    assert summary["tested"] == 6
+    assert (summary["median_p"] > learning.REJECTED_P) == fits
+    assert bool(said) != fits

@@ -21,6 +21,7 @@ from iscat_analysis.calibration.optics.measure import (
     judge,
     measure_microscope,
 )
+from iscat_analysis.calibration.optics.neighbours import Neighbours
 from iscat_analysis.calibration.optics.pictures import Pictures, make_pictures
 from iscat_analysis.calibration.optics.result import OpticsCalibration, make_result
 from iscat_analysis.calibration.optics.settings import (
@@ -43,6 +44,7 @@ __all__ = [
     "Estimate",
     "Judgement",
     "Measured",
+    "Neighbours",
     "OpticsCalibration",
     "OpticsForecast",
     "Pictures",

@@ -16,6 +16,7 @@ import numpy as np
 
 from iscat_analysis.calibration.optics.estimate import Estimate, maximise
 from iscat_analysis.calibration.optics.hidden import find_hidden
+from iscat_analysis.calibration.optics.neighbours import Neighbours
 from iscat_analysis.calibration.optics.settings import (
     FREE,
     HIGHER,
@@ -51,7 +52,6 @@ CONTAMINATED_P = 1e-4
 """A single picture with a smaller p-value, where most are fine, shows more than one particle."""
 
 _PLACE = ("x_nm", "y_nm")
-_OTHERS_PASSES = 6
 _RUNG_PASSES = 12
 _TOO_FEW = 20.0  # log-likelihood that fewer aberrations lose where still fewer cannot be better
 _CONTAMINATED_SHARE = 0.25  # more than this is the model's fault
@@ -290,24 +290,10 @@ class _Search:
         """Put the rings of all neighbours into what is expected of every picture."""
         if not self.others or self.build_wide is None:
             return best, tuple(held_out)
-        wide = self.build_wide(best.values)
-        others = with_masses(self.others, self.build, best.values)
-        others = self._fit(others, best.values, (), _OTHERS_PASSES).sights
-
-        def clear(sight: Sight) -> Sight:
-            contrast = np.zeros(sight.grid.shape)
-            for number, share in sight.neighbours:
-                other = others[number]
-                place = (other.x_nm, other.y_nm, other.z_nm, other.mass_kda)
-                contrast += share * wide.image(sight.grid, *place)
-            return sight.among(contrast)
-
-        others = self._fit(
-            tuple(self.mapper(clear, others)), best.values, (), _OTHERS_PASSES
-        ).sights
-        self.others = others  # where they are is known the next time
-        fitted = tuple(self.mapper(clear, best.sights))
-        judged = tuple(self.mapper(clear, held_out))
+        near = Neighbours.fitted(self.others, self.build, self.build_wide, best.values, self.mapper)
+        self.others = near.particles  # where they are is known the next time
+        fitted = tuple(self.mapper(near.around, best.sights))
+        judged = tuple(self.mapper(near.around, held_out))
         judged = self._own(judged, best.values) if judged else ()
         return self._fit(fitted, best.values, best.names), judged
 

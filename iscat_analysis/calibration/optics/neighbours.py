@@ -1,0 +1,86 @@
+"""Pictures of particles among the rings of the others that bound at the same time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from iscat_analysis.calibration.optics.estimate import maximise
+from iscat_analysis.calibration.optics.sights import Build, Microscope, Settings, Sight
+from iscat_analysis.calibration.optics.starts import with_masses
+from iscat_analysis.records import Mapper
+
+_PASSES = 6
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Particles with the rings that they make in one microscope.
+
+    Attributes
+    ----------
+    particles : tuple of Sight
+        What `Sight.neighbours` counts, fitted.
+    wide : Microscope
+        The microscope, as far as rings matter.
+    """
+
+    particles: tuple[Sight, ...]
+    wide: Microscope
+
+    @classmethod
+    def fitted(
+        cls,
+        others: Sequence[Sight],
+        build: Build,
+        build_wide: Build,
+        settings: Settings,
+        mapper: Mapper = map,
+    ) -> Neighbours:
+        """Fit them, and once more among each other's rings.
+
+        Parameters
+        ----------
+        others : sequence of Sight
+            Every particle that `Sight.neighbours` counts.
+        build, build_wide : callable
+            Make the microscope as far as the pictures and as far as rings matter.
+        settings : mapping
+            Which microscope.
+        mapper : callable
+            `map`, or the one of a pool.
+
+        Returns
+        -------
+        Neighbours
+            Where they are and how bright.
+        """
+
+        def own(sights: Sequence[Sight]) -> tuple[Sight, ...]:
+            return maximise(sights, build, settings, (), passes=_PASSES, mapper=mapper).sights
+
+        first = cls(own(with_masses(others, build, settings)), build_wide(settings))
+        among = tuple(mapper(first.around, first.particles))
+        return cls(own(among), first.wide)
+
+    def around(self, sight: Sight) -> Sight:
+        """Put their rings into what is expected of a picture.
+
+        Parameters
+        ----------
+        sight : Sight
+            A picture, which says whose rings reach into it.
+
+        Returns
+        -------
+        Sight
+            The picture among them.
+        """
+        contrast = np.zeros(sight.grid.shape)
+        for number, share in sight.neighbours:
+            other = self.particles[number]
+            place = (other.x_nm, other.y_nm, other.z_nm, other.mass_kda)
+            contrast += share * self.wide.image(sight.grid, *place)
+        return sight.among(contrast)
