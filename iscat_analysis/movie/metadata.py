@@ -7,7 +7,7 @@ noise itself.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from iscat_analysis.config import Config, plausible_pixel
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.shaking import MOST_EXPLAINED, Shaking, measure_shaking
 from iscat_analysis.records import BoolArray, FloatArray, StackMetadata
 
 _DISAGREEMENT = 0.01  # relative, between configuration and metadata
@@ -104,6 +105,10 @@ class GainDiagnosis:
         Its standard error [e/count].
     n_frames, n_pixels : int
         What was used.
+    noise_counts : float
+        Standard deviation of a frame's noise [counts]; infinite where counts are no integers.
+    shaking : Shaking or None
+        What motion of the fixed pattern explains of an excess, where there is one.
     """
 
     noise_ratio: float
@@ -113,6 +118,8 @@ class GainDiagnosis:
     gain_se: float
     n_frames: int
     n_pixels: int
+    noise_counts: float = math.inf
+    shaking: Shaking | None = None
 
     @property
     def off(self) -> bool:
@@ -124,13 +131,25 @@ class GainDiagnosis:
         """One sentence for the user where the gain is off; else None."""
         if not self.off:
             return None
+        said = (
+            f"the noise variance is {self.noise_ratio:.3g} ± {self.noise_ratio_se:.1g} times what "
+            f"camera.gain_e_per_adu = {self.configured_gain:.4g} predicts"
+        )
+        if self.noise_counts < 1:
+            return (
+                f"{said}, but the noise is smaller than a count ({self.noise_counts:.2g}) and "
+                "rounding hides it: record or export the movie with more bits"
+            )
+        if self.shaking is not None and self.shaking.share > MOST_EXPLAINED:
+            return (
+                f"{said}; the gain is not the cause: the fixed pattern shakes by "
+                f"{self.shaking.rms_px:.2g} pixels from frame to frame, which explains "
+                f"{min(self.shaking.share, 1.0):.0%} of what is too much: damp vibrations of the "
+                "stage and the beam"
+            )
         # Noise that grows with the light itself can only add, so only an excess has two causes.
         cause = "unless the light itself is noisy, " if self.noise_ratio > 1 else ""
-        return (
-            f"the noise variance is {self.noise_ratio:.3g} ± {self.noise_ratio_se:.1g} times what "
-            f"camera.gain_e_per_adu = {self.configured_gain:.4g} predicts; {cause}"
-            f"set camera.gain_e_per_adu = {self.gain_e_per_adu:.4g}"
-        )
+        return f"{said}; {cause}set camera.gain_e_per_adu = {self.gain_e_per_adu:.4g}"
 
 
 def diagnose_gain(
@@ -226,7 +245,9 @@ def diagnose_gain(
     ratio_se = float(np.sqrt(np.sum((excess - ratio * expected) ** 2)) / expected.sum())
     gain = np.broadcast_to(camera.gain_e_per_adu, counts.shape[1:])[used][kept]
     configured = float(gain.mean())
-    return GainDiagnosis(
+    whole = np.issubdtype(counts.dtype, np.integer)
+    per_count = np.sqrt(np.sum(excess) / (shot * len(excess))) / configured
+    found = GainDiagnosis(
         noise_ratio=ratio,
         noise_ratio_se=ratio_se,
         configured_gain=configured,
@@ -234,7 +255,11 @@ def diagnose_gain(
         gain_se=configured * ratio_se / ratio**2,
         n_frames=n_frames,
         n_pixels=int(np.count_nonzero(kept)),
+        noise_counts=float(per_count) if whole else math.inf,
     )
+    if not found.off or ratio < 1:
+        return found
+    return replace(found, shaking=measure_shaking(counts, camera, masked=~used))
 
 
 def _without_outliers(ratios: FloatArray, n_frames: int) -> BoolArray:

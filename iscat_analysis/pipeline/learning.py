@@ -35,8 +35,10 @@ from iscat_analysis.pipeline.microscope import (
     microscopes,
     rings_of,
 )
+from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, judge_counts
 from iscat_analysis.pipeline.sights import bright_sights, reach_nm
 from iscat_analysis.records import Mapper
+from iscat_analysis.search.sliding import measure_frames
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
 
@@ -48,6 +50,7 @@ LEAST_TESTED = 4
 """Bright particles without which the optics are not even tested."""
 
 _TESTED = 24
+_NOISE = "its noise is not what the camera's numbers predict; the analysis goes on as configured"
 _STARTS_NM = tuple(range(-400, 401, 100))  # along each axis; rings are some 200 nm apart
 _FITTED = 3  # of these starts
 
@@ -75,6 +78,11 @@ def learn_optics(
         it was.
     summary : dict
         What ``summary.json`` says of it; empty where nothing was tested.
+
+    Raises
+    ------
+    DataError
+        The frames are impossible, for the analysis too.
     """
     optics = config.optics
     suited = optics.scheme != "darkfield" and optics.convention == "exact"
@@ -89,9 +97,9 @@ def learn_optics(
     ):
         return config, {}
     tested: dict[str, Any] = {}
-    try:
-        with threads(config.compute.workers) as pool:
-            sights, others = bright_sights(movie, config, camera, pool)
+    with threads(config.compute.workers) as pool:
+        sights, others = bright_sights(movie, config, camera, pool)
+        try:
             if len(sights) < LEAST_TESTED:
                 raise DataError(
                     f"{movie.name}: shows {count(len(sights), 'bright particle')} standing "
@@ -102,6 +110,9 @@ def learn_optics(
             tested = {"tested": len(sights), "median_p": median}
             if optics.calibrate == "auto" and median >= REJECTED_P:
                 return config, tested | {"calibrated": False}
+            if optics.calibrate == "auto" and _noise_differs(movie, config, camera):
+                tell(f"the optics cannot be tested on this movie: {_NOISE}")
+                return config, tested | {"calibrated": False, "reason": _NOISE}
             found = calibrate_sights(
                 sights,
                 others,
@@ -110,9 +121,9 @@ def learn_optics(
                 {"movie": movie.name},
                 mapper=pool.map,
             )
-    except DataError as error:
-        tell(f"{_verdict(tested)}: {error}; the analysis goes on as configured")
-        return config, tested | {"calibrated": False, "reason": str(error)}
+        except DataError as error:
+            tell(f"{_verdict(tested)}: {error}; the analysis goes on as configured")
+            return config, tested | {"calibrated": False, "reason": str(error)}
     summary = tested | _told(found)
     learned, why = _usable(found, config)
     if learned is None:
@@ -148,6 +159,14 @@ def _median_p(
     elsewhere = [other.placed(other.x_nm + x, other.y_nm + y) for other in others]
     near = Neighbours.fitted(elsewhere, build, rings_of(config, sights[0]), settings, mapper)
     return max(found, median([near.around(sight) for sight in fitted])[0])
+
+
+def _noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
+    """Whether the first frames have another noise than p-values rest on."""
+    first, last = config.background.recorded or config.fit.frames or (0, movie.shape[0])
+    counts = movie.read(first, min(last, first + SPECTRUM_FRAMES, movie.shape[0]))
+    light, repeats = measure_frames(counts, camera)
+    return bool(judge_counts(counts[np.isfinite(light) & ~repeats], camera).gain_message)
 
 
 def _centre(

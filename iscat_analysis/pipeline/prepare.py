@@ -7,14 +7,17 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from iscat_analysis.config import Config
-from iscat_analysis.errors import ConfigError
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_ratio
 from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pipeline.diagnosis import judge_lines
 from iscat_analysis.pipeline.learning import learn_optics
+from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES
 from iscat_analysis.pipeline.ranges import fitted_frames, tracked_frames
 from iscat_analysis.pipeline.recognise import (
     as_landing,
@@ -113,6 +116,8 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         )
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
+    if way != "sliding":  # windows that slide pass over frames that repeat
+        _refuse_still(movie, config.background.recorded or span)
     digest = beside(movie.sha256)
     summary: dict[str, Any] = {}
     lines = judge_lines(movie, config, camera)
@@ -156,6 +161,16 @@ def _with_photons(config: Config, run: Run) -> Config:
     )
     particle = config.particle.model_copy(update={"photons_per_frame": photons})
     return config.model_copy(update={"particle": particle})
+
+
+def _refuse_still(movie: Stack, frames: tuple[int, int]) -> None:
+    """Refuse frames that are all the same: they have no noise, by which everything is judged."""
+    first, last = frames[0], min(frames[1], frames[0] + SPECTRUM_FRAMES, movie.shape[0])
+    counts = movie.read(first, max(first, last))
+    if len(counts) > 1 and np.array_equal(counts, np.broadcast_to(counts[0], counts.shape)):
+        raise DataError(
+            f"{movie.name}: frames {first} to {last - 1} are all the same; export the movie again"
+        )
 
 
 def _refuse_what_only_slides(run: Run, name: str) -> None:

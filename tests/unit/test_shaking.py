@@ -1,0 +1,95 @@
+"""Noise that is not the gain's: a pattern that shakes, and counts that are too coarse."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from scenes import make_config
+from scipy.ndimage import gaussian_filter, shift
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie import open_stack
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.metadata import diagnose_gain
+from iscat_analysis.movie.shaking import measure_shaking
+from iscat_analysis.pipeline import analyse
+
+SHAPE = (48, 56)
+LEVEL_E = 1e5
+FRAMES = 40
+
+
+def _pattern(rng: np.random.Generator) -> np.ndarray:
+    rough = gaussian_filter(rng.standard_normal(SHAPE), 3.0, mode="wrap")
+    return np.asarray(LEVEL_E * (1 + 0.1 * rough / rough.std()))
+
+
+def _movie(shaking_px: float, *, noise: float = 0.0, seed: int = 1) -> np.ndarray:
+    """Frames of one pattern, moved at random, with extra noise of each pixel [√e]."""
+    rng = np.random.default_rng(seed)
+    pattern = _pattern(rng)
+    frames = []
+    for dy, dx in shaking_px * rng.standard_normal((FRAMES, 2)):
+        light = shift(pattern, (dy, dx), order=3, mode="nearest")
+        light *= 1 + 0.01 * rng.standard_normal()
+        light += noise * np.sqrt(light) * rng.standard_normal(SHAPE)
+        frames.append(rng.poisson(light))
+    return np.array(frames).astype(np.uint32)
+
+
+@pytest.mark.parametrize("rms_px", [0.05, 0.1])
+def test_a_pattern_that_shakes_is_no_wrong_gain(rms_px: float) -> None:
+    counts, camera = _movie(rms_px), Camera(well_depth_e=1e9)
+    found = measure_shaking(counts, camera)
+    assert found is not None
+    assert found.share > 0.9
+    assert found.rms_px == pytest.approx(rms_px, rel=0.25)  # 78 numbers: 8 %
+    message = diagnose_gain(counts, camera).message
+    assert message is not None
+    assert "the fixed pattern shakes by" in message
+    assert "set camera.gain" not in message
+
+
+def test_noise_of_single_pixels_is_no_shaking() -> None:
+    """The control: twice the variance, in every pixel on its own."""
+    counts, camera = _movie(0.0, noise=1.0), Camera(well_depth_e=1e9)
+    found = measure_shaking(counts, camera)
+    assert found is not None
+    assert abs(found.share) < 0.05
+    message = diagnose_gain(counts, camera).message
+    assert message is not None
+    assert message.endswith("set camera.gain_e_per_adu = 0.5") or "= 0.4" in message
+
+
+def test_without_noise_beyond_the_light_nothing_shakes() -> None:
+    rng = np.random.default_rng(3)
+    camera = Camera(gain_e_per_adu=0.5, well_depth_e=1e9)
+    assert measure_shaking(rng.poisson(1e4, (20, *SHAPE)), camera) is None
+    assert measure_shaking(np.full((20, *SHAPE), 1000), camera) is None
+    assert measure_shaking(np.zeros((20, *SHAPE)), camera) is None
+
+
+@pytest.mark.parametrize("gain", [1024.0, 4.0])
+def test_counts_that_are_too_coarse_are_no_wrong_gain(gain: float) -> None:
+    """Of 8 bits: noise of 0.3 counts, which rounding hides, whatever gain was configured."""
+    counts = (_movie(0.0) // 1024).astype(np.uint8)
+    message = diagnose_gain(counts, Camera(gain_e_per_adu=gain, well_depth_e=1e9)).message
+    assert message is not None
+    assert "record or export the movie with more bits" in message
+    assert "set camera.gain" not in message
+
+
+@pytest.mark.parametrize("mode", ["mass", "track"])
+def test_frames_that_are_all_the_same_are_refused(tmp_path: Path, mode: str) -> None:
+    config = make_config(
+        fit={"mode": mode, "frames": None}, background={"frames": [0, 20]},
+        camera={"frame_rate_hz": 100.0},
+    )  # fmt: skip
+    path, counts = tmp_path / "still.tif", np.full((40, 32, 32), 900, dtype=np.uint16)
+    tifffile.imwrite(path, counts, photometric="minisblack")
+    said = "still.tif: frames 0 to 19 are all the same; export the movie again"
+    with open_stack(path) as movie, pytest.raises(DataError, match=said):
+        analyse(movie, config)
