@@ -127,6 +127,11 @@ class GainDiagnosis:
         return abs(self.noise_ratio - 1) > _GAIN_TOLERANCE + _GAIN_SIGMAS * self.noise_ratio_se
 
     @property
+    def shakes(self) -> bool:
+        """Whether motion of the fixed pattern explains most of an excess."""
+        return self.off and self.shaking is not None and self.shaking.share > MOST_EXPLAINED
+
+    @property
     def message(self) -> str | None:
         """One sentence for the user where the gain is off; else None."""
         if not self.off:
@@ -140,7 +145,7 @@ class GainDiagnosis:
                 f"{said}, but the noise is smaller than a count ({self.noise_counts:.2g}) and "
                 "rounding hides it: record or export the movie with more bits"
             )
-        if self.shaking is not None and self.shaking.share > MOST_EXPLAINED:
+        if self.shaking is not None and self.shakes:
             return (
                 f"{said}; the gain is not the cause: the fixed pattern shakes by "
                 f"{self.shaking.rms_px:.2g} pixels from frame to frame, which explains "

@@ -232,7 +232,7 @@ def _slow(found: Achieved, sliding: bool) -> str:
             f"it grows with the time since the background, as {name}: take background frames "
             "nearer to the others (background.frames), or fewer of these (fit.frames)"
         )
-    remedy = ", or average fewer"
+    remedy = ": average fewer"
     if found.drifts and sliding:
         remedy = ": set background.drift_correction = true, or average fewer"
     elif found.drifts:  # the correction is for windows that slide

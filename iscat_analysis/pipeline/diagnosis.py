@@ -10,12 +10,14 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.config import Config
+from iscat_analysis.errors import DataError
 from iscat_analysis.inference.cause import likely_cause
 from iscat_analysis.inference.fit import OUTWARD
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import follow_pattern
 from iscat_analysis.movie.lines import Lines, find_lines
+from iscat_analysis.movie.metadata import diagnose_gain
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, first_counts, is_lit
 from iscat_analysis.pipeline.ways import way_of
@@ -26,11 +28,17 @@ from iscat_analysis.units import count
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""
 
+FLAT = 0.05
+"""Variance of the steps along z over that in the plane, below which particles move in a plane:
+near the coverslip those that do not have less along z too, but not so much less."""
+
 _BRIGHTEST = 8  # isolated particles on which the model is judged
 _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
 _NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
 _LONGEST = 100  # average of the noise curve
 _SMALLEST_PX = 32  # side of a field in which a pattern is followed
+_ENOUGH_STEPS = 30
+_NORMAL = (0.4549, 1.3863)  # medians of χ² with one and two degrees of freedom
 _SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
 
 
@@ -234,3 +242,66 @@ def line_warning(config: Config, table: pd.DataFrame) -> str:
         f"[calibration] does not tell the mass of {count(number, 'fit')}, flagged at_bound: {why}; "
         "measure it with lighter standards, or set calibration.offset = 0 if its error allows it"
     )
+
+
+def plane_warning(config: Config, table: pd.DataFrame) -> str:
+    """Say that particles whose height was fitted in every frame do not move along z.
+
+    Parameters
+    ----------
+    config : Config
+        In mode ``track``.
+    table : pandas.DataFrame
+        Rows of ``fits.csv``.
+
+    Returns
+    -------
+    str
+        One line; empty where they do, or too few steps tell.
+    """
+    if config.track.free != "joint":
+        return ""
+    good = table[table["status"] == Status.OK.value].sort_values(["track", "frame"])
+    step = good[["track", "frame", "x_nm", "y_nm", "z_nm"]].diff()
+    next_ones = (step["track"] == 0) & (step["frame"] == 1)
+    if next_ones.sum() < _ENOUGH_STEPS:
+        return ""
+    noise = float((good["sigma_x_nm"] ** 2 + good["sigma_y_nm"] ** 2).median())
+    step = step[next_ones]
+    along = float((step["z_nm"] ** 2).median()) / _NORMAL[0]  # outliers change fringes
+    across = float((step["x_nm"] ** 2 + step["y_nm"] ** 2).median()) / _NORMAL[1] - noise
+    if along >= FLAT * across:
+        return ""
+    return (
+        f"the particles move by {math.sqrt(across):.2g} nm from frame to frame along x and y but "
+        f'by {math.sqrt(along):.2g} nm along z, as on a membrane: set track.free = "mass" and '
+        f'particle.height_nm = {good["z_nm"].median():.3g}; with track.free = "joint" pictures '
+        "are blurred along z as well, and masses come out too large"
+    )
+
+
+def shaking_warning(movie: Stack, camera: Camera, frames: tuple[int, int]) -> str:
+    """Say that the fixed pattern shakes, where that is most of the noise beyond the light's.
+
+    Particles that move add noise too, but not along the gradient of the mean of all frames.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    camera : Camera
+        Counts → photoelectrons.
+    frames : (int, int)
+        Half-open range of frames, of which the first are looked at.
+
+    Returns
+    -------
+    str
+        One line; empty where it stands still.
+    """
+    counts = movie.read(frames[0], min(frames[1], frames[0] + SPECTRUM_FRAMES))
+    try:
+        found = diagnose_gain(counts, camera)
+    except DataError:  # too dark to tell
+        return ""
+    return (found.message or "") if found.shakes else ""

@@ -11,7 +11,7 @@ import pandas as pd
 from iscat_analysis.config import config_to_toml
 from iscat_analysis.movie.stack import printable
 from iscat_analysis.pipeline.achieved import spread_verdict
-from iscat_analysis.pipeline.diagnosis import line_warning
+from iscat_analysis.pipeline.diagnosis import line_warning, plane_warning
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.results import Found
 from iscat_analysis.pipeline.rows import reported_rows
@@ -94,6 +94,9 @@ def gather(
             masses=followed.masses, tell=run.tell, progress=progress,
         )  # fmt: skip
         further |= said
+        flat = plane_warning(config, table)
+        if flat:
+            run.tell(flat)
         backgrounds = followed.parts or (followed.windows,)
         films = make_films(scene, ready.steady, ready.camera, backgrounds, table, tracks)
         run.clock.lap("tracks")

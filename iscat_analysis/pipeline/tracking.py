@@ -19,7 +19,7 @@ from iscat_analysis.pieces.regions import lines_from, numbered
 from iscat_analysis.pipeline.blank import FrameNoise
 from iscat_analysis.pipeline.block_store import Block, BlockStore, analyse_block
 from iscat_analysis.pipeline.blocks import Plan, plan_blocks
-from iscat_analysis.pipeline.diagnosis import pixel_warnings
+from iscat_analysis.pipeline.diagnosis import pixel_warnings, shaking_warning
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.joining import join_blocks
@@ -68,6 +68,9 @@ def find_moving(ready: Prepared, run: Run) -> Found:
     plan = plan_blocks(movie, config, camera, check=check)
     if message := plan.message(movie.name):
         run.tell(message)
+    shaken = shaking_warning(movie, camera, (first, last))
+    if shaken:
+        run.tell(f"{movie.name}: {shaken}")
     run.clock.lap("background")
     identity = movie.identity if run.partial else ""
     store = BlockStore(run.partial, config, identity, ready.shape, (first, last), camera)
@@ -77,7 +80,7 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         )
     joined = join_blocks(config, blocks, camera)
     windows = joined.followed.windows
-    if blocks[0].gain_message:
+    if blocks[0].gain_message and not shaken:
         run.tell(blocks[0].gain_message)
     for text in pixel_warnings(*windows.left_out):
         run.tell(text)

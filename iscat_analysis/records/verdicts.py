@@ -27,9 +27,9 @@ class Status(StrEnum):
 _ADVICE = {
     Status.OK: "The fit converged, inside its bounds, and agrees with the data.",
     Status.NOT_CONVERGED: "The fit did not settle: check the optics, or enlarge fit.roi_nm.",
-    Status.AT_BOUND: "The data pull a parameter beyond its bound: widen fit.z_range_nm; where that "
-    "begins at 0, the coverslip, check optics.focus_nm and the indices; with a calibration.offset, "
-    "lighter standards tell how contrast depends on mass there; or leave the event out.",
+    Status.AT_BOUND: "The data pull a parameter beyond its bound: a height (widen fit.z_range_nm; "
+    "at the coverslip check optics.focus_nm and the indices), a place (no particle there, or "
+    "optics that do not fit), or a mass (below a calibration.offset).",
     Status.AMBIGUOUS_Z: "Another height explains the data almost as well: use more frames, "
     "another focus, or a narrower fit.z_range_nm.",
     Status.POOR_FIT: "The model does not describe the data: check focus, NA, gain and neighbours.",
