@@ -40,6 +40,8 @@ _SMALLEST_PX = 32  # side of a field in which a pattern is followed
 _ENOUGH_STEPS = 30
 _NORMAL = (0.4549, 1.3863)  # medians of χ² with one and two degrees of freedom
 _SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
+_FEWEST_TURNED = 5  # particles of the other sign that make it worth a line,
+_NEARLY_ALL = 0.9  # and their share
 
 
 def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
@@ -241,6 +243,35 @@ def line_warning(config: Config, table: pd.DataFrame) -> str:
     return (
         f"[calibration] does not tell the mass of {count(number, 'fit')}, flagged at_bound: {why}; "
         "measure it with lighter standards, or set calibration.offset = 0 if its error allows it"
+    )
+
+
+def sign_warning(config: Config, table: pd.DataFrame) -> str:
+    """Say that nearly all particles change the light the other way than the model has it.
+
+    Parameters
+    ----------
+    config : Config
+        Of the movie.
+    table : pandas.DataFrame
+        Rows of ``fits.csv``.
+
+    Returns
+    -------
+    str
+        One line; empty where they do not, or are too few to tell.
+    """
+    mass = table.loc[table["status"] == Status.OK.value, "mass_kda"].dropna()
+    turned = int((mass < 0).sum())
+    if turned < _FEWEST_TURNED or turned < _NEARLY_ALL * len(mass):
+        return ""
+    brightens = float(table.loc[mass.index, "contrast"].median()) > 0
+    seen, other = ("brighten", "darken") if brightens else ("darken", "brighten")
+    by = "the configured optics" if config.calibration is None else "calibration.gradient_per_kda"
+    return (
+        f"{turned} of {count(len(mass), 'particle')} have a negative mass, which is that of "
+        f"particles that leave: they {seen} the image, and by {by} those that land {other} it; if "
+        "they land, correct that sign, or optics.focus_nm"
     )
 
 

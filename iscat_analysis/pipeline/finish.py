@@ -11,7 +11,7 @@ import pandas as pd
 from iscat_analysis.config import config_to_toml
 from iscat_analysis.movie.stack import printable
 from iscat_analysis.pipeline.achieved import spread_verdict
-from iscat_analysis.pipeline.diagnosis import line_warning, plane_warning
+from iscat_analysis.pipeline.diagnosis import line_warning, plane_warning, sign_warning
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.results import Found
 from iscat_analysis.pipeline.rows import reported_rows
@@ -68,9 +68,9 @@ def gather(
         further[found.heading] = found.summary
     further |= extra
     table, achieved = reported_rows(found)
-    off_line = line_warning(config, table)
-    if off_line:
-        run.tell(off_line)
+    for doubt in (line_warning(config, table), sign_warning(config, table)):
+        if doubt:
+            run.tell(doubt)
     scaled = config.fit.sigma == "measured"
     if found.repeats:
         verdict = spread_verdict(

@@ -1,10 +1,11 @@
-"""A line between contrast and mass that does not go through zero, and what it cannot tell."""
+"""A line between contrast and mass: what it cannot tell off zero, and when its sign is doubted."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import tifffile
 from scenes import make_config
@@ -14,6 +15,7 @@ from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.pipeline import analyse
+from iscat_analysis.pipeline.diagnosis import sign_warning
 from iscat_analysis.records import Analysis
 
 GRADIENT = -3.1e-5
@@ -118,3 +120,28 @@ def test_the_user_is_told_of_contrasts_below_the_line(tmp_path: Path) -> None:
     near = off.table["x_px"] < 36
     assert off.table["status"].tolist() == ["at_bound" if left else "ok" for left in near]
     assert any("they have less" in text for text in off.summary["warnings"])
+
+
+def _signed(negative: int, positive: int, *, flagged: int = 0, contrast: float = 5e-3) -> str:
+    """Ask of particles with masses of either sign, and some whose fits are poor."""
+    mass = [-200.0] * negative + [200.0] * (positive + flagged)
+    table = pd.DataFrame({
+        "mass_kda": mass,
+        "contrast": [contrast * -np.sign(m) for m in mass],
+        "status": ["ok"] * (negative + positive) + ["poor_fit"] * flagged,
+    })  # fmt: skip
+    return sign_warning(make_config(), table)
+
+
+def test_nearly_all_particles_of_the_other_sign_are_told() -> None:
+    told = _signed(9, 1, flagged=30)
+    assert told.startswith("9 of 10 particles have a negative mass")
+    assert "they brighten the image, and by calibration.gradient_per_kda" in told
+    assert "they darken the image" in _signed(9, 1, contrast=-5e-3)
+
+
+def test_particles_that_may_leave_are_not_told() -> None:
+    """As many may leave as land, and few are all of one sign by chance."""
+    assert not _signed(8, 2)
+    assert not _signed(4, 0)
+    assert not _signed(0, 0)
