@@ -2,13 +2,14 @@
 
 What the fits of several particles leave over is regressed, in standard deviations, on the change
 that each parameter of the microscope makes to the picture, with the directions of the fit (place,
-height, mass and level) taken out.  The parameter that explains most of χ² is named.  It is a hint:
-a linear step towards another microscope, one parameter at a time.
+height, mass and level) taken out; once for a small step of the parameter, and once for the step
+that this asks for.  The parameter that explains most of χ² is named.  It is a hint: a step towards
+another microscope, one parameter at a time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,8 +17,9 @@ import numpy as np
 
 from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
-from iscat_analysis.optics.forward import ForwardModel, forward_model
+from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import BoolArray, FloatArray
 
 WORTH_NAMING = 0.3
@@ -26,6 +28,7 @@ WORTH_NAMING = 0.3
 _STEPS: Mapping[str, Mapping[str, float]] = {
     "focus": {"focus_nm": 20.0},
     "numerical aperture": {"na": 0.005},
+    "wavelength": {"wavelength_nm": 2.0},
     "reference phase": {"reference_phase_deg": 5.0},
     "spherical aberration": {"z11": 5.0},
     "astigmatism": {"z5": 5.0, "z6": 5.0},
@@ -42,9 +45,16 @@ _OTHERS: Mapping[str, Mapping[str, Any]] = {
     'emission = "dong2021"': {"emission": "dong2021"},
     'emission = "reciprocal"': {"emission": "reciprocal"},
 }  # fmt: skip
+_PIXEL = "camera.pixel_size_nm"
+_TURNED = "polarisation, as if turned by 90° (or the movie transposed)"
 _UNITS = {
     "focus": "nm", "reference phase": "degrees", "spherical aberration": "nm rms",
+    "wavelength": "nm", _PIXEL: "%", "numerical aperture": "",
 }  # fmt: skip
+_WHOLE = (_TURNED, *(name for name in _OTHERS if "mask" not in name))  # there or not
+_STRETCH = 30.0  # per cent, farther than which no pixel size is tried
+
+_Picture = Callable[[PixelGrid, float, float, float, float], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -74,11 +84,15 @@ class Cause:
     @property
     def message(self) -> str:
         """One line for the user."""
-        by = "" if self.step is None else f", off by about {self.step:+.2g} {self.unit}".rstrip()
+        by = (
+            ""
+            if self.step is None
+            else f", off by about {float(f'{self.step:.2g}'):+g} {self.unit}".rstrip()
+        )
         return (
             f"the model does not describe the brightest particles ({self.events} looked at): what "
-            f"it leaves over looks most like a wrong {self.name}{by} ({self.share:.0%} of it, to "
-            "first order); correct [optics], or calibrate them"
+            f"it leaves over looks most like a wrong {self.name}{by} ({self.share:.0%} of it); "
+            "correct it, or calibrate the optics"
         )
 
 
@@ -101,12 +115,44 @@ def likely_cause(
     """
     if not fits or config.optics.scheme == "darkfield" or config.optics.convention != "exact":
         return None
+    left = [_Left.of(*fit) for fit in fits]
+    excess = sum(each.excess for each in left)
+    if excess <= 0:
+        return None
     reach = fits[0][0].model.reach_nm
-    models = {name: _neighbours(config, name, reach) for name in (*_STEPS, *_OTHERS)}
-    sizes = {name: len(others) for name, others in models.items() if others}
-    sums = {name: (np.zeros(k), np.zeros((k, k))) for name, k in sizes.items()}
-    excess = 0.0
-    for likelihood, theta, free in fits:
+    best: Cause | None = None
+    for name in (*_STEPS, _PIXEL, _TURNED, *_OTHERS):
+        changes = _neighbours(config, name, reach)
+        if not changes:
+            continue
+        share, step = _explained(left, changes, excess, whole=name in _WHOLE)
+        if len(changes) == 1 and name not in (_TURNED, *_OTHERS) and share > WORTH_NAMING:
+            try:  # far from a first order: the same, as far away as it seems
+                there = _neighbours(config, name, reach, float(step[0]))
+                share, step = _explained(left, there, excess)
+            except ConfigError:  # no microscope is there
+                pass
+        if share > WORTH_NAMING and (best is None or share > best.share):
+            size = float(step[0]) if name in _UNITS else None
+            best = Cause(name, min(share, 1.0), size, _UNITS.get(name, ""), len(fits))
+    return best
+
+
+@dataclass(frozen=True)
+class _Left:
+    """What one fit left over, in standard deviations, without the directions of the fit."""
+
+    grid: PixelGrid
+    place: tuple[float, float, float, float]
+    signal: FloatArray
+    used: BoolArray
+    root: FloatArray
+    fitted: FloatArray
+    rest: FloatArray
+    excess: float
+
+    @classmethod
+    def of(cls, likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> _Left:
         residual = likelihood.residuals(theta)
         used = np.isfinite(residual)
         signal = likelihood.signal(theta)
@@ -120,38 +166,72 @@ def likely_cause(
             columns.append(level[used] * root)
         fitted, _ = np.linalg.qr(np.stack(columns, axis=1))
         rest = residual[used]
-        excess += float(rest @ rest) - rest.size
-        rest = rest - fitted @ (fitted.T @ rest)
         mass = float(likelihood.model.scale.mass(theta[3]))
-        place = (float(theta[0]), float(theta[1]), float(theta[2]), mass)
-        for name in sums:
-            change = np.stack([
-                (other.image(likelihood.grid, *place) - signal)[used] * root / step
-                for step, other in models[name]
-            ], axis=1)  # fmt: skip
-            change -= fitted @ (fitted.T @ change)
-            sums[name][0][:] += change.T @ rest
-            sums[name][1][:] += change.T @ change
-    best: Cause | None = None
-    for name, (slope, curvature) in sums.items():
-        step = np.linalg.lstsq(curvature, slope, rcond=1e-9)[0]
-        share = float(slope @ step) / max(excess, 1e-300)
-        if excess > 0 and share > WORTH_NAMING and (best is None or share > best.share):
-            size = float(step[0]) if name in _STEPS and step.size == 1 else None
-            best = Cause(name, min(share, 1.0), size, _UNITS.get(name, ""), len(fits))
-    return best
+        return cls(
+            grid=likelihood.grid,
+            place=(float(theta[0]), float(theta[1]), float(theta[2]), mass),
+            signal=signal, used=used, root=root, fitted=fitted,
+            rest=rest - fitted @ (fitted.T @ rest), excess=float(rest @ rest) - rest.size,
+        )  # fmt: skip
+
+    def change(self, step: float, picture: _Picture) -> FloatArray:
+        """Give the change of the picture per unit of a step."""
+        change = (picture(self.grid, *self.place) - self.signal)[self.used] * self.root / step
+        return np.asarray(change - self.fitted @ (self.fitted.T @ change))
 
 
-def _neighbours(config: Config, name: str, reach_nm: float) -> list[tuple[float, ForwardModel]]:
-    """Give the microscopes that differ in one respect, and by how much; none where it is so."""
+def _explained(
+    left: Sequence[_Left],
+    changes: Sequence[tuple[float, _Picture]],
+    excess: float,
+    *,
+    whole: bool = False,
+) -> tuple[float, FloatArray]:
+    """Share of χ² in excess that changes of the microscope explain, and how much of each.
+
+    `whole` changes are there or not: just one of them is taken.
+    """
+    slope, curvature = np.zeros(len(changes)), np.zeros((len(changes), len(changes)))
+    for each in left:
+        change = np.stack([each.change(*one) for one in changes], axis=1)
+        slope += change.T @ each.rest
+        curvature += change.T @ change
+    step = np.asarray(np.linalg.lstsq(curvature, slope, rcond=1e-9)[0], dtype=np.float64)
+    if whole:
+        step = np.ones(len(changes))
+    return float(2 * slope @ step - step @ curvature @ step) / excess, step
+
+
+def _neighbours(
+    config: Config, name: str, reach_nm: float, far: float | None = None
+) -> list[tuple[float, _Picture]]:
+    """Give the microscopes that differ in one respect, and by how much; none where it is so.
+
+    They are `far` away where that is given, else as in `_STEPS`.
+    """
     optics = config.optics
+    if name == _PIXEL:
+        percent = 1.0 if far is None else max(min(far, _STRETCH), -_STRETCH)
+        larger = 1 + percent / 100
+        model = forward_model(config, reach_nm * max(1.01 * larger, 1.0))
+
+        def stretched(grid: PixelGrid, x: float, y: float, z: float, mass: float) -> FloatArray:
+            across, down = larger * (grid.x_nm - x), larger * (grid.y_nm - y)
+            return model.image(PixelGrid(across, down, grid.pixel_nm), 0.0, 0.0, z, mass)
+
+        return [(percent, stretched)]
+    updates: list[tuple[float, dict[str, Any]]]
     if name in _STEPS:
-        updates: list[tuple[float, dict[str, Any]]] = [
+        steps = {key: step if far is None else far for key, step in _STEPS[name].items()}
+        updates = [
             (step, {key: getattr(optics, key) + step})
             if hasattr(optics, key)
             else (step, {"aberrations_nm": _further(optics.aberrations_nm, key, step)})
-            for key, step in _STEPS[name].items()
+            for key, step in steps.items()
         ]
+    elif name == _TURNED:
+        other = {"polarization_deg": (optics.polarization_deg + 90.0) % 180.0}
+        updates = [] if optics.polarization == "circular" else [(1.0, other)]
     else:
         other = dict(_OTHERS[name])
         same = all(getattr(optics, key) == value for key, value in other.items())
@@ -161,7 +241,7 @@ def _neighbours(config: Config, name: str, reach_nm: float) -> list[tuple[float,
             step,
             forward_model(
                 config.model_copy(update={"optics": optics.model_copy(update=update)}), reach_nm
-            ),
+            ).image,
         )
         for step, update in updates
     ]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
@@ -37,11 +38,51 @@ _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
 _NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
 _LONGEST = 100  # average of the noise curve
 _SMALLEST_PX = 32  # side of a field in which a pattern is followed
+_SWAPPED = 10.0  # times less change along the axis of time than along both of space
+_LOOKED_AT = 96  # frames, rows and columns in which axes are judged
 _ENOUGH_STEPS = 30
 _NORMAL = (0.4549, 1.3863)  # medians of χ² with one and two degrees of freedom
 _SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
 _FEWEST_TURNED = 5  # particles of the other sign that make it worth a line,
 _NEARLY_ALL = 0.9  # and their share
+
+
+def axes_warning(name: str, counts: NDArray[Any]) -> str:
+    """Say that time seems to run along the rows or columns of the frames.
+
+    What changes least from one to the next, in proportion to their means, are frames: light on a
+    pixel repeats but for its noise, and neighbouring pixels have different light.
+
+    Parameters
+    ----------
+    name : str
+        Of the movie.
+    counts : ndarray, shape (t, y, x)
+        Some of its frames.
+
+    Returns
+    -------
+    str
+        One line; empty where frames differ less than neighbouring pixels, or these hardly differ.
+    """
+    middle = tuple(slice(max(n - _LOOKED_AT, 0) // 2, (n + _LOOKED_AT) // 2) for n in counts.shape)
+    part = counts[middle].astype(np.float64)
+    changes = []
+    for axis in range(3):
+        lines = np.moveaxis(part, axis, 0)
+        mean = lines.mean(axis=(1, 2))
+        lit = mean > 0
+        steps = np.diff(lines[lit] / mean[lit, None, None], axis=0)
+        changes.append(float(np.mean(steps**2)) if lit.sum() > 1 else math.nan)
+    for axis, lines_of in ((1, "rows"), (2, "columns")):
+        others = min(changes[0], changes[3 - axis])
+        if _SWAPPED * changes[axis] < others:
+            return (
+                f"{name}: frames differ more from each other than neighbouring {lines_of} of one "
+                f"frame do ({math.sqrt(others / changes[axis]):.0f} times), as if time ran along "
+                f"its {lines_of}: the axes must be (t, y, x); export it again in this order"
+            )
+    return ""
 
 
 def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
@@ -15,9 +16,8 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_ratio
 from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.movie.metadata import resolve_metadata
-from iscat_analysis.pipeline.diagnosis import judge_lines
+from iscat_analysis.pipeline.diagnosis import axes_warning, judge_lines
 from iscat_analysis.pipeline.learning import learn_optics
-from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES
 from iscat_analysis.pipeline.ranges import fitted_frames, tracked_frames
 from iscat_analysis.pipeline.recognise import (
     as_landing,
@@ -30,6 +30,8 @@ from iscat_analysis.pipeline.tracks import judge_times
 from iscat_analysis.pipeline.ways import Way, way_of, way_said
 from iscat_analysis.search.changes import Changes
 from iscat_analysis.threads import beside
+
+_OPENING = 64  # frames that are looked at before anything else
 
 
 @dataclass(frozen=True)
@@ -116,9 +118,15 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         )
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
+    start, stop = config.background.recorded or span
+    stop = min(stop, start + _OPENING, movie.shape[0])
+    opening = movie.read(start, max(start, stop))
     if way != "sliding":  # windows that slide pass over frames that repeat
-        _refuse_still(movie, config.background.recorded or span)
+        _refuse_still(opening, f"{movie.name}: frames {start} to {stop - 1}")
     digest = beside(movie.sha256)
+    swapped = axes_warning(movie.name, opening)
+    if swapped:
+        run.tell(swapped)
     summary: dict[str, Any] = {}
     lines = judge_lines(movie, config, camera)
     steady = movie
@@ -163,14 +171,10 @@ def _with_photons(config: Config, run: Run) -> Config:
     return config.model_copy(update={"particle": particle})
 
 
-def _refuse_still(movie: Stack, frames: tuple[int, int]) -> None:
+def _refuse_still(counts: NDArray[Any], name: str) -> None:
     """Refuse frames that are all the same: they have no noise, by which everything is judged."""
-    first, last = frames[0], min(frames[1], frames[0] + SPECTRUM_FRAMES, movie.shape[0])
-    counts = movie.read(first, max(first, last))
-    if len(counts) > 1 and np.array_equal(counts, np.broadcast_to(counts[0], counts.shape)):
-        raise DataError(
-            f"{movie.name}: frames {first} to {last - 1} are all the same; export the movie again"
-        )
+    if len(counts) > 1 and all(np.array_equal(frame, counts[0]) for frame in counts[1:]):
+        raise DataError(f"{name} are all the same; export the movie again")
 
 
 def _refuse_what_only_slides(run: Run, name: str) -> None:

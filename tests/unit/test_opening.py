@@ -1,4 +1,4 @@
-"""Noise that is not the gain's: a pattern that shakes, and counts that are too coarse."""
+"""What the first frames say: a pattern that shakes, coarse counts, no noise, axes in disorder."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.metadata import diagnose_gain
 from iscat_analysis.movie.shaking import measure_shaking
 from iscat_analysis.pipeline import analyse
+from iscat_analysis.pipeline.diagnosis import axes_warning
 
 SHAPE = (48, 56)
 LEVEL_E = 1e5
@@ -80,6 +81,25 @@ def test_counts_that_are_too_coarse_are_no_wrong_gain(gain: float) -> None:
     assert message is not None
     assert "record or export the movie with more bits" in message
     assert "set camera.gain" not in message
+
+
+@pytest.mark.parametrize(("order", "lines"), [((1, 2, 0), "columns"), ((1, 0, 2), "rows")])
+def test_axes_in_another_order_are_told(order: tuple[int, int, int], lines: str) -> None:
+    counts = _movie(0.05)
+    said = axes_warning("m.npy", np.transpose(counts, order))
+    assert said.startswith(f"m.npy: frames differ more from each other than neighbouring {lines} ")
+    assert "the axes must be (t, y, x)" in said
+
+
+def test_axes_in_order_are_not_told() -> None:
+    """Nor are movies without a pattern, whose columns flicker, or that are dark in part."""
+    rng = np.random.default_rng(2)
+    even = rng.poisson(1e4, (30, *SHAPE))
+    flicker = even * (1 + 0.02 * rng.standard_normal((30, 1, SHAPE[1])))
+    border = _movie(0.05)
+    border[:, :10] = 0
+    for counts in (_movie(0.05), _movie(0.5), even, flicker, border, np.zeros((30, *SHAPE))):
+        assert axes_warning("m.npy", counts) == ""
 
 
 @pytest.mark.parametrize("mode", ["mass", "track"])

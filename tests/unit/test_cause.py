@@ -1,0 +1,81 @@
+"""What a wrong number of the microscope leaves over names that number."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import PIXEL_NM, make_config
+
+from iscat_analysis.inference import noise
+from iscat_analysis.inference.cause import Cause, likely_cause
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.records import Candidate
+
+SIDE = 32
+LIGHT = 2e7
+
+
+def _cause(
+    seen: dict[str, Any], *, stretch: float = 1.0, turned: bool = False, count: int = 4
+) -> Cause | None:
+    """Fit bright particles of another microscope, in pixels of another size, or transposed."""
+    config, rng = make_config(), np.random.default_rng(4)
+    grid = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM)
+    true = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM * stretch)
+    other = forward_model(make_config(optics=seen), true.diagonal_nm)
+    model = forward_model(config, grid.diagonal_nm)
+    fits = []
+    for x, y in rng.uniform(15.0, 17.0, (count, 2)):
+        place = (x * true.pixel_nm, y * true.pixel_nm, 5.0, 1000.0)
+        after = LIGHT * (1 + other.image(true, *place))
+        counts = rng.poisson([np.full(grid.shape, LIGHT), after.T if turned else after])
+        likelihood = noise.conditional(model, grid, *counts.astype(float), 1.0)
+        start = Candidate(y, x, 5.0, 1000.0, 10.0) if turned else Candidate(x, y, 5.0, 1000.0, 10.0)
+        fit = fit_particle(likelihood, start, "mass", (0, 1000), level=False)
+        fits.append((likelihood, fit.theta, fit.box.free))
+    return likely_cause(config, fits)
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "off"),
+    [
+        ("focus", "focus_nm", 60.0),
+        ("focus", "focus_nm", -150.0),
+        ("wavelength", "wavelength_nm", 45.0),
+        ("spherical aberration", "z11", 25.0),
+    ],
+)
+def test_the_wrong_number_is_named_with_its_error(name: str, key: str, off: float) -> None:
+    usual = {"focus_nm": -300.0, "wavelength_nm": 525.0}
+    seen = {"aberrations_nm": {key: off}} if key == "z11" else {key: usual[key] + off}
+    cause = _cause(seen)
+    assert cause is not None
+    assert cause.name == name
+    assert cause.step == pytest.approx(off, rel=0.35)  # neither is of first order
+    assert f"off by about {math.copysign(1, off):+g}"[:-1] in cause.message
+
+
+@pytest.mark.parametrize("stretch", [0.95, 1.03, 1.1])
+def test_a_wrong_pixel_size_is_named(stretch: float) -> None:
+    cause = _cause({}, stretch=stretch)
+    assert cause is not None
+    assert cause.name == "camera.pixel_size_nm"
+    assert cause.step == pytest.approx(100 * (stretch - 1), rel=0.35)
+
+
+def test_a_transposed_movie_is_named() -> None:
+    cause = _cause({}, turned=True)
+    assert cause is not None
+    assert "turned by 90° (or the movie transposed)" in cause.message
+    circular = _cause({"polarization": "circular", "analyzer": True})
+    assert circular is not None
+    assert "circular" in circular.message
+
+
+def test_nothing_is_named_where_all_is_right() -> None:
+    assert _cause({}) is None
+    assert likely_cause(make_config(), []) is None
