@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -21,6 +23,8 @@ GRACE_S = 1.5
 
 WRITING_GRACE_S = 30.0
 """The same while results are being written, which a second signal cuts short."""
+
+_AFTER_S = 0.05  # until the callback has returned: what is raised in its wake is lost as well
 
 
 @contextmanager
@@ -109,3 +113,45 @@ def termination_interrupts() -> Iterator[None]:
     finally:
         for number in ours:
             signal.signal(number, signal.SIG_DFL)
+
+
+@contextmanager
+def interrupts_kept() -> Iterator[list[BaseException]]:
+    """Raise again an interrupt that a callback of compiled code swallowed.
+
+    Python can only print what is raised where compiled code called it: the compiler's look into its
+    cache, for one.  The interrupt would be lost, or end as an error of whoever made the call.
+
+    Yields
+    ------
+    list of BaseException
+        What was swallowed.
+    """
+    earlier = sys.unraisablehook
+    swallowed: list[BaseException] = []
+    again: list[threading.Timer] = []
+
+    def hook(told: sys.UnraisableHookArgs) -> None:
+        if not isinstance(told.exc_value, KeyboardInterrupt):
+            earlier(told)
+            return
+        swallowed.append(told.exc_value)
+        again.append(threading.Timer(_AFTER_S, _interrupt_main))
+        again[-1].daemon = True
+        again[-1].start()
+
+    sys.unraisablehook = hook
+    try:
+        yield swallowed
+    finally:
+        for timer in again:
+            timer.cancel()
+        sys.unraisablehook = earlier
+
+
+def _interrupt_main() -> None:
+    """Interrupt the main thread, also where it waits for the operating system."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    else:
+        _thread.interrupt_main()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import pytest
 import typer
 
 from iscat_analysis.errors import ConfigError
+from iscat_cli import INTERRUPTED
 from iscat_cli.console import Messages, failures
 
 SECONDS = 2.0
@@ -123,3 +125,29 @@ def test_impossible_lengths_end_at_once_and_small(setting: str, expected: str) -
     assert done.returncode == 2
     assert expected in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_an_interrupt_in_a_callback_of_compiled_code_is_one(
+    capsys: pytest.CaptureFixture[str], *, late: bool
+) -> None:
+    """Python prints and forgets it there; the compiler then misses what it had asked for."""
+
+    @ctypes.CFUNCTYPE(None)
+    def callback() -> None:
+        raise KeyboardInterrupt
+
+    def run() -> None:
+        with failures(Messages("iscat", quiet=False), debug=False):
+            callback()
+            if not late:
+                time.sleep(5)
+            raise RuntimeError("no compiled object yet")
+
+    with pytest.raises(typer.Exit) as ended:
+        run()
+    assert ended.value.exit_code == INTERRUPTED
+    said = capsys.readouterr().err
+    assert "interrupted" in said
+    assert "Traceback" not in said
+    assert "no compiled object" not in said
