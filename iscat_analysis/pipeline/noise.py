@@ -231,9 +231,9 @@ def judge_opening(
     if noise.excess is None:
         ratio = curve.at(window)
         message = (
-            f"between averages of {window} frames the noise variance is {ratio:.2g} times that of "
-            "the light; look at the laser, set background.drift_correction = true, or lower "
-            "background.window_frames"
+            f"averages of {window} frames differ by {ratio:.2g} times the variance of the light: "
+            "by drift or the laser (set background.drift_correction = true), or by the rings of "
+            "many bright particles; lower background.window_frames, which helps against all"
         )
         noise = replace(noise, excess=ExcessNoise(ratio, message))
     return noise, curve, window

@@ -15,6 +15,9 @@ from iscat_analysis.records import FloatArray
 JUMP = 0.1
 """Relative change of the light from one frame to the next that is reported."""
 
+LOST = 0.05
+"""Share of the frames that may be left out without a word on what is missed by it."""
+
 
 def frame_warnings(
     name: str,
@@ -50,9 +53,12 @@ def frame_warnings(
     missing = merged.repeats() + first
     if missing.size:
         verb = "is" if missing.size == 1 else "are"
+        share = missing.size / light.size
+        lost = f"; {share:.0%} of the movie, with what lands there, is lost" if share > LOST else ""
         yield (
             f"{name}: {_frames(missing)} {verb} zero throughout, not finite or the same as the "
             "frame before (dropped or stuck in the camera); left out, the other frames are used"
+            f"{lost}"
         )
     known = np.flatnonzero(np.isfinite(light))
     change = light[known][1:] / light[known][:-1] - 1
