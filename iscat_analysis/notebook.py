@@ -20,7 +20,7 @@ from iscat_analysis.config import Config, configure
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.pipeline.calibrations import optics_calibration
-from iscat_analysis.pipeline.microscope import calibrate_movie
+from iscat_analysis.pipeline.learning import calibrate_movie
 from iscat_analysis.places import THREADS, open_place
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.report import check_output

@@ -19,7 +19,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.optics.measured import sha256_of
-from iscat_analysis.pipeline.microscope import calibrate_movie
+from iscat_analysis.pipeline.learning import calibrate_movie
 from iscat_analysis.pipeline.picture import MeasuredPicture, measure_template
 from iscat_analysis.records import Progress, Status, silent
 from iscat_analysis.report import atomic_folder, check_output

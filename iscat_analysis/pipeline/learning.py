@@ -1,14 +1,16 @@
-"""Test the configured optics on the brightest particles before a movie is analysed.
+"""The optics of a movie, learned from its brightest particles.
 
-Where the fits of these particles reject the configured optics, the optics are learned from the
-same particles, and the analysis goes on with what was learned.
+Before a movie is analysed the configured optics are tested on these; where their fits reject them,
+the optics are learned, and the analysis goes on with what was learned.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -20,24 +22,30 @@ from iscat_analysis.calibration.optics import (
     OpticsCalibration,
     Settings,
     Sight,
+    free_groups,
     maximise,
     settings_of,
 )
 from iscat_analysis.calibration.optics.starts import average_sights, with_masses
 from iscat_analysis.config import Config
-from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.optics.forward import ForwardModel, forward_model
+from iscat_analysis.movie.camera import Camera, camera_from_config
+from iscat_analysis.movie.metadata import resolve_metadata
+from iscat_analysis.optics.forward import ForwardModel
+from iscat_analysis.pipeline.crowded import learn_in_field, seen_in_field
 from iscat_analysis.pipeline.microscope import (
     calibrate_sights,
     goodness,
     microscopes,
+    refuse_uncalibratable,
     rings_of,
+    with_sign,
 )
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, judge_counts
-from iscat_analysis.pipeline.sights import bright_sights, reach_nm
-from iscat_analysis.records import Mapper
+from iscat_analysis.pipeline.sights import bright_sights, kind_of, reach_nm, scan_sights
+from iscat_analysis.pipeline.ways import way_of
+from iscat_analysis.records import Mapper, Progress, silent
 from iscat_analysis.search.sliding import measure_frames
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
@@ -99,7 +107,10 @@ def learn_optics(
     tested: dict[str, Any] = {}
     with threads(config.compute.workers) as pool:
         sights, others = bright_sights(movie, config, camera, pool)
+        alone, source = len(sights), {"movie": movie.name}
         try:
+            if alone < LEAST_TESTED and way_of(config) == "fixed":
+                sights, others = seen_in_field(movie, config, camera, pool)
             if len(sights) < LEAST_TESTED:
                 raise DataError(
                     f"{movie.name}: shows {count(len(sights), 'bright particle')} standing "
@@ -113,13 +124,8 @@ def learn_optics(
             if optics.calibrate == "auto" and _noise_differs(movie, config, camera):
                 tell(f"the optics cannot be tested on this movie: {_NOISE}")
                 return config, tested | {"calibrated": False, "reason": _NOISE}
-            found = calibrate_sights(
-                sights,
-                others,
-                config,
-                tuple(FREE),
-                {"movie": movie.name},
-                mapper=pool.map,
+            found = _learned(
+                sights[:alone], others, movie, config, camera, tuple(FREE), source, pool
             )
         except DataError as error:
             tell(f"{_verdict(tested)}: {error}; the analysis goes on as configured")
@@ -133,6 +139,93 @@ def learn_optics(
     for note in found.notes:
         tell(note)
     return learned, summary | {"calibrated": True}
+
+
+def calibrate_movie(
+    movie: Stack,
+    config: Config,
+    *,
+    free: str | Sequence[str] | None = None,
+    focus_step_nm: float | None = None,
+    progress: Progress = silent,
+    notify: Callable[[str], None] | None = None,
+) -> OpticsCalibration:
+    """Measure the optics of an open movie.
+
+    Parameters
+    ----------
+    movie : Stack
+        A landing movie, one with frames before the particles bound, or a scan of the focus.
+    config : Config
+        The microscope as far as it is known; `iscat_analysis.pipeline.analyse` reads it likewise.
+    free : str or sequence of str, optional
+        What may change: some of ``focus, na, phase, mask, zernike, polarization``; default all.
+    focus_step_nm : float, optional
+        The movie is a scan of immobile particles, and from frame to frame the focus rises by about
+        this [nm]; where the focus is free, the step is measured too.
+    progress : Progress
+        Told how far it is.
+    notify : callable
+        Told what the user should know, one line at a time.
+
+    Returns
+    -------
+    OpticsCalibration
+        What was found; `OpticsCalibration.accepted` says whether it may be used.
+
+    Raises
+    ------
+    DataError
+        The movie shows too few bright, isolated particles.
+    ConfigError
+        The configuration cannot be calibrated.
+    """
+    groups = free_groups(free)
+    config, notes = resolve_metadata(config, movie.metadata)
+    for note in notes:
+        if notify is not None:
+            notify(note)
+    refuse_uncalibratable(config)
+    camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
+    with threads(config.compute.workers) as pool:
+        progress("particles", 0, 1)
+        if focus_step_nm is not None:
+            others: list[Sight] = []
+            sights = scan_sights(movie, config, camera)
+        else:
+            sights, others = bright_sights(movie, config, camera, pool)
+        progress("particles", 1, 1)
+        source = {
+            "movie": movie.path.name,
+            "sha256": movie.sha256(),
+            "kind": kind_of(config) if focus_step_nm is None else "scan of the focus",
+            "version": version("iscat-analysis"),
+        }  # fmt: skip
+        if focus_step_nm is None:
+            return _learned(sights, others, movie, config, camera, groups, source, pool)
+        return calibrate_sights(
+            sights, others, config, groups, source,
+            focus_step_nm=focus_step_nm, mapper=pool.map,
+        )  # fmt: skip
+
+
+def _learned(
+    sights: Sequence[Sight],
+    others: Sequence[Sight],
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    groups: Sequence[str],
+    source: Mapping[str, str],
+    pool: ThreadPoolExecutor,
+) -> OpticsCalibration:
+    """Learn the optics from particles that stand alone, or where these do not suffice from all."""
+    crowded = way_of(config) == "fixed"
+    if len(sights) >= LEAST_SIGHTS or not crowded:
+        found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
+        if found.accepted or not crowded:
+            return found
+    return learn_in_field(movie, config, camera, groups, source, pool)
 
 
 def _median_p(
@@ -212,23 +305,7 @@ def _told(found: OpticsCalibration) -> dict[str, Any]:
 
 
 def _usable(found: OpticsCalibration, config: Config) -> tuple[Config | None, str]:
-    """Give the configuration with the learned optics, or why there is none.
-
-    A line between contrast and mass fixes the sign of the contrast, and with it the reference phase
-    of two that differ by half a turn.
-    """
+    """Give the configuration with the learned optics, or why there is none."""
     if not found.accepted:
         return None, "; ".join(found.measured.refusals)
-    phase = found.config.optics.reference_phase_deg
-    reason = ""
-    for turned in (phase, (phase + 360) % 360 - 180):
-        update = {"reference_phase_deg": turned, "calibrate": "never"}
-        optics = found.config.optics.model_copy(update=update)
-        learned = config.model_copy(update={"optics": optics})
-        try:
-            forward_model(learned, 1000.0)
-        except ConfigError as error:
-            reason = str(error)
-        else:
-            return learned, ""
-    return None, reason
+    return with_sign(config.model_copy(update={"optics": found.config.optics}))

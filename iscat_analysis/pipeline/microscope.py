@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from iscat_analysis.calibration.optics import (
     Settings,
     Sight,
     build_microscope,
-    free_groups,
     make_pictures,
     make_result,
     measure_microscope,
@@ -28,92 +26,19 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.movie.metadata import resolve_metadata
-from iscat_analysis.movie.stack import Stack
-from iscat_analysis.optics.forward import ForwardModel
+from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.kept import kept
 from iscat_analysis.pipeline.sights import (
     RINGS_NM,
-    bright_sights,
-    kind_of,
     reach_nm,
-    scan_sights,
 )
-from iscat_analysis.records import Mapper, Progress, silent
-from iscat_analysis.threads import threads
+from iscat_analysis.records import Mapper
 from iscat_analysis.units import count
 
 STEP_FACTORS = (0.5, 2.0)
 """How much smaller or larger than said the steps of a scan may turn out."""
 
 _MODELS_KEPT = 24
-
-
-def calibrate_movie(
-    movie: Stack,
-    config: Config,
-    *,
-    free: str | Sequence[str] | None = None,
-    focus_step_nm: float | None = None,
-    progress: Progress = silent,
-    notify: Callable[[str], None] | None = None,
-) -> OpticsCalibration:
-    """Measure the optics of an open movie.
-
-    Parameters
-    ----------
-    movie : Stack
-        A landing movie, one with frames before the particles bound, or a scan of the focus.
-    config : Config
-        The microscope as far as it is known; `iscat_analysis.pipeline.analyse` reads it likewise.
-    free : str or sequence of str, optional
-        What may change: some of ``focus, na, phase, mask, zernike, polarization``; default all.
-    focus_step_nm : float, optional
-        The movie is a scan of immobile particles, and from frame to frame the focus rises by about
-        this [nm]; where the focus is free, the step is measured too.
-    progress : Progress
-        Told how far it is.
-    notify : callable
-        Told what the user should know, one line at a time.
-
-    Returns
-    -------
-    OpticsCalibration
-        What was found; `OpticsCalibration.accepted` says whether it may be used.
-
-    Raises
-    ------
-    DataError
-        The movie shows too few bright, isolated particles.
-    ConfigError
-        The configuration cannot be calibrated.
-    """
-    groups = free_groups(free)
-    config, notes = resolve_metadata(config, movie.metadata)
-    for note in notes:
-        if notify is not None:
-            notify(note)
-    refuse_uncalibratable(config)
-    camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
-    with threads(config.compute.workers) as pool:
-        progress("particles", 0, 1)
-        if focus_step_nm is not None:
-            others: list[Sight] = []
-            sights = scan_sights(movie, config, camera)
-        else:
-            sights, others = bright_sights(movie, config, camera, pool)
-        progress("particles", 1, 1)
-        source = {
-            "movie": movie.path.name,
-            "sha256": movie.sha256(),
-            "kind": kind_of(config) if focus_step_nm is None else "scan of the focus",
-            "version": version("iscat-analysis"),
-        }  # fmt: skip
-        return calibrate_sights(
-            sights, others, config, groups, source,
-            focus_step_nm=focus_step_nm, mapper=pool.map,
-        )  # fmt: skip
 
 
 def refuse_uncalibratable(config: Config) -> None:
@@ -146,6 +71,7 @@ def calibrate_sights(
     source: Mapping[str, str],
     *,
     focus_step_nm: float | None = None,
+    least: int = LEAST_SIGHTS,
     mapper: Mapper = map,
 ) -> OpticsCalibration:
     """Measure the optics from pictures.
@@ -164,6 +90,8 @@ def calibrate_sights(
         Where the pictures came from.
     focus_step_nm : float, optional
         Of a scan: rise of the focus from frame to frame, from which the search starts [nm].
+    least : int
+        Pictures needed.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -177,7 +105,7 @@ def calibrate_sights(
     DataError
         There are too few pictures.
     """
-    if len(sights) < LEAST_SIGHTS:
+    if len(sights) < least:
         raise DataError(
             f"{source['movie']}: shows {count(len(sights), 'bright particle')} standing alone, and "
             f"at least {LEAST_SIGHTS} are needed to learn the optics; record more particles, or "
@@ -272,3 +200,35 @@ def goodness(sight: Sight, model: ForwardModel) -> tuple[float, float]:
     theta = np.array([sight.x_nm, sight.y_nm, sight.z_nm, sight.mass_kda, sight.level])
     likelihood = Likelihood(model, sight.grid, sight.kind, sight.data)
     return goodness_of_fit(likelihood, theta, np.array([True, True, False, True, True]))
+
+
+def with_sign(config: Config) -> tuple[Config | None, str]:
+    """Give learned optics the sign of contrast that the calibration of masses has.
+
+    A line between contrast and mass fixes that sign, and with it the reference phase of two that
+    differ by half a turn.
+
+    Parameters
+    ----------
+    config : Config
+        With the learned optics.
+
+    Returns
+    -------
+    config : Config or None
+        With one of both phases, and ``calibrate = "never"``; None where neither has that sign.
+    reason : str
+        Why there is none.
+    """
+    phase = config.optics.reference_phase_deg
+    reason = ""
+    for turned in (phase, (phase + 360) % 360 - 180):
+        update = {"reference_phase_deg": turned, "calibrate": "never"}
+        learned = config.model_copy(update={"optics": config.optics.model_copy(update=update)})
+        try:
+            forward_model(learned, 1000.0)
+        except ConfigError as error:
+            reason = str(error)
+        else:
+            return learned, ""
+    return None, reason

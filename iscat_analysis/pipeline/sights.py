@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from iscat_analysis.calibration.optics import (
     FAINTEST,
@@ -30,6 +31,7 @@ from iscat_analysis.pipeline.chunks import Reader, counts_budget, plan_chunks
 from iscat_analysis.pipeline.noise import judge_window
 from iscat_analysis.pipeline.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.pipeline.ways import way_of
+from iscat_analysis.records import FloatArray
 from iscat_analysis.search.bright import (
     ALONE_NM,
     BrightStep,
@@ -189,7 +191,14 @@ def _without_repeats(steps: Iterable[BrightStep]) -> list[BrightStep]:
     return kept
 
 
-def bound_sights(movie: Stack, config: Config, camera: Camera) -> tuple[list[Sight], list[Sight]]:
+def bound_sights(
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    *,
+    alone_nm: float = APART_NM,
+    known_nm: FloatArray | None = None,
+) -> tuple[list[Sight], list[Sight]]:
     """Find bright particles that bound between two ranges of frames.
 
     Parameters
@@ -200,13 +209,17 @@ def bound_sights(movie: Stack, config: Config, camera: Camera) -> tuple[list[Sig
         Resolved, with background frames or a known level.
     camera : Camera
         Counts → photoelectrons.
+    alone_nm : float
+        Distance from a particle within which there is no other [nm].
+    known_nm : ndarray, shape (n, 2), optional
+        Where all particles are, x and y, so that none is looked for [nm].
 
     Returns
     -------
     sights : list of Sight
         At most `MOST_SIGHTS`, the brightest first.
     others : list of Sight
-        Every bright particle, on small regions.
+        Every bright particle, or all that are known, on small regions.
     """
     before, after = frame_ranges(movie, config)
     windows = measured_windows(movie, config, camera, before, after)
@@ -219,9 +232,11 @@ def bound_sights(movie: Stack, config: Config, camera: Camera) -> tuple[list[Sig
     model = build_microscope(config, 1000.0, settings_of(config))
 
     def cut_out(row: int, column: int, side: int) -> Sight:
-        region = _region(row, column, side)
-        grid = PixelGrid.region(*region, _pixel_nm(config))
-        cut = slice(*region[0]), slice(*region[1])
+        (top, bottom), (left, right) = _region(row, column, side)
+        rows = max(top, 0), min(bottom, used.shape[0])
+        columns = max(left, 0), min(right, used.shape[1])
+        grid = PixelGrid.region(rows, columns, _pixel_nm(config))
+        cut = slice(*rows), slice(*columns)
         if windows.n_before:
             likelihood = conditional(
                 model, grid, windows.before_e[cut], windows.after_e[cut], ratio,
@@ -238,19 +253,35 @@ def bound_sights(movie: Stack, config: Config, camera: Camera) -> tuple[list[Sig
         return _centred(likelihood, config, frame=after[0])
 
     pixel = _pixel_nm(config)
-    sights, others = (
-        [
-            cut_out(row, column, side)
-            for row, column in find_bright_places(
-                energy, pixel_nm=pixel, alone_nm=alone_nm, roi_px=side
-            )
-        ]
-        for alone_nm, side in ((APART_NM, _roi_px(config)), (0.0, round(OTHERS_NM / pixel)))
-    )
+    sides = _roi_px(config), round(OTHERS_NM / pixel)
+    least_nm = SAME_NM
+    if known_nm is None:
+        sights, others = (
+            [
+                cut_out(row, column, side)
+                for row, column in find_bright_places(
+                    energy, pixel_nm=pixel, alone_nm=apart_nm, roi_px=side
+                )
+            ]
+            for apart_nm, side in zip((alone_nm, 0.0), sides, strict=True)
+        )
+    else:
+        least_nm = 0.0
+        room = (sides[0] // 2 + 1) * pixel
+        far = np.array(used.shape[::-1]) * pixel - room
+        inside = ((known_nm >= room) & (known_nm < far)).all(axis=1)
+        lonely = (cdist(known_nm, known_nm) < alone_nm).sum(axis=1) == 1
+        sights, others = (
+            [
+                cut_out(round(y / pixel), round(x / pixel), side).placed(x, y)
+                for x, y in known_nm[chosen].tolist()
+            ]
+            for chosen, side in zip((inside & lonely, slice(None)), sides, strict=True)
+        )
 
     def with_neighbours(sight: Sight) -> Sight:
         apart = [math.hypot(sight.x_nm - o.x_nm, sight.y_nm - o.y_nm) for o in others]
-        near = [(k, 1.0) for k, d in enumerate(apart) if SAME_NM < d < RINGS_NM]
+        near = [(k, 1.0) for k, d in enumerate(apart) if least_nm < d < RINGS_NM]
         return replace(sight, neighbours=tuple(near))
 
     return _bright(map(with_neighbours, sights)), [with_neighbours(o) for o in others]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from instruments import PEAK_PER_KDA, Instrument, InstrumentMovie, draw_landings
+import pytest
+from instruments import PEAK_PER_KDA, Instrument, InstrumentMovie, Landings, draw_landings
 
 import iscat_analysis as ia
 
@@ -46,3 +47,61 @@ def test_many_particles_at_a_time_are_not_taken_for_noise() -> None:
     assert ok.sum() >= 45
     assert abs(pulls.mean()) < SIGMAS / math.sqrt(ok.sum())
     assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * ok.sum())
+
+
+@pytest.fixture(scope="module")
+def bound() -> tuple[Landings, np.ndarray]:
+    """Particles that bound in one frame, and the counts; spherical aberration of 20 nm."""
+    shape = (300, 150, 150)
+    landings = draw_landings(shape, 24, seed=3, frame=150, apart_px=14.0)
+    microscope = Instrument(emission="reciprocal", aberrations_nm={11: 20.0})
+    return landings, InstrumentMovie(microscope, shape, landings, seed=3, level_e=2e5).counts
+
+
+def _analysed(counts: np.ndarray, calibrate: str) -> ia.Result:
+    return ia.fit_movie(
+        counts,
+        background=(0, 150),
+        frames=(150, 300),
+        settings={
+            "camera.pixel_size_nm": 84.0,
+            "camera.gain_e_per_adu": 4.0,
+            "optics.focus_nm": -300.0,
+            "optics.calibrate": calibrate,
+            "calibration.gradient_per_kda": -PEAK_PER_KDA,
+            "posterior.enabled": False,
+            "detection.false_alarms_per_movie": 1e-3,
+        },
+    )
+
+
+def test_optics_are_learned_from_particles_that_do_not_stand_alone(
+    bound: tuple[Landings, np.ndarray],
+) -> None:
+    """Of 24 within 160 µm² fewer are alone than it takes; all are used, each among the others."""
+    landings, counts = bound
+    result = _analysed(counts, "auto")
+    learned = result.summary["optics"]
+    assert learned["calibrated"]
+    assert learned["tested"] < 12
+    rows = {row["parameter"]: row for row in learned["parameters"]}
+    for name, truth in (("focus_nm", -300.0), ("na", 1.42), ("z11", 20.0)):
+        assert abs(rows[name]["value"] - truth) < SIGMAS * rows[name]["sigma"]
+    found = result.table
+    apart = np.hypot(
+        found["x_px"].to_numpy()[:, None] - landings.x_px,
+        found["y_px"].to_numpy()[:, None] - landings.y_px,
+    )
+    assert (apart < 1).any(axis=1).all()
+    assert (apart < 1).any(axis=0).all()
+    assert (found["status"] == "ok").mean() > 0.9
+    truth = landings.mass_kda[apart.argmin(axis=1)]
+    pulls = (found["mass_kda"] - truth) / found["sigma_mass_kda"]
+    assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * len(pulls))
+
+
+def test_the_same_particles_through_the_configured_optics_are_not_described(
+    bound: tuple[Landings, np.ndarray],
+) -> None:
+    """Control."""
+    assert not (_analysed(bound[1], "never").table["status"] == "ok").any()

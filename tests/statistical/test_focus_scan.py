@@ -12,7 +12,8 @@ from iscat_analysis.calibration.optics import OpticsCalibration, settings_of
 from iscat_analysis.calibration.optics.estimate import optics_limits
 from iscat_analysis.calibration.optics.measure import measure_microscope
 from iscat_analysis.calibration.optics.starts import _strengths
-from iscat_analysis.pipeline.microscope import calibrate_movie, goodness
+from iscat_analysis.pipeline.learning import calibrate_movie
+from iscat_analysis.pipeline.microscope import goodness
 
 SIGMAS = 4.0
 PIXEL_NM = 84.0
