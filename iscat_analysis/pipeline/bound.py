@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import zip_longest
 from typing import Any
 
@@ -16,6 +17,7 @@ from iscat_analysis.pipeline.diagnosis import (
     examine_background,
     misfit_warning,
     pixel_warnings,
+    repeats_warning,
 )
 from iscat_analysis.pipeline.events import Event, posterior_of
 from iscat_analysis.pipeline.field import add_signal, fit_field
@@ -28,8 +30,23 @@ from iscat_analysis.pipeline.results import Compared, Found, table_of, view_of
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.pipeline.tracking import track_frames
-from iscat_analysis.records import FloatArray, PosteriorResult, Progress, Windows
+from iscat_analysis.records import (
+    FREE_PARAMETERS,
+    FloatArray,
+    PosteriorResult,
+    Progress,
+    Status,
+    Windows,
+    verdict,
+)
 from iscat_analysis.threads import threads
+from iscat_analysis.units import count
+
+CHANGES = 4.0
+"""Spread of the mass between parts of an event's frames over that of its light, beyond which it is
+no constant particle: with 4 degrees of freedom or more by chance once in 10¹²."""
+
+_LEAST_DEGREES = 4
 
 
 def find_bound(ready: Prepared, run: Run) -> Found:
@@ -87,6 +104,9 @@ def _background(ready: Prepared, run: Run) -> tuple[Scene, Windows, Noise, dict[
         )
     for text in (*noise.said(movie.name), *pixel_warnings(*windows.left_out)):
         run.tell(text)
+    repeated = repeats_warning(movie, windows)
+    if repeated:
+        run.tell(repeated)
     summary: dict[str, Any] = {}
     if not scene.additive:
         summary = examine_background(movie, camera, windows)
@@ -138,6 +158,14 @@ def _together(
     if cause:
         run.tell(cause)
     repeats, empty = field_repeats(scene, ready.steady, ready.camera, windows, events)
+    if scene.config.fit.sigma != "measured":
+        events, changing = _with_changes(scene.mode, events, repeats)
+        if changing:
+            run.tell(
+                f"the mass of {count(changing, 'event')} changes within the frames by more than "
+                f"{CHANGES:g} times its error, flagged poor_fit: they land, leave or move there; "
+                "let background.frames end before they land and fit.frames begin after"
+            )
     run.clock.lap("repeats")
     chains: list[PosteriorResult] = []
     interrupted = False
@@ -159,6 +187,22 @@ def _together(
         empty=empty,
         interrupted=interrupted,
     )
+
+
+def _with_changes(
+    mode: str, events: Sequence[Event], repeats: Sequence[FloatArray]
+) -> tuple[tuple[Event, ...], int]:
+    """Flag events whose mass differs between parts of their frames, and count them."""
+    if "mass_kda" not in FREE_PARAMETERS[mode]:
+        return tuple(events), 0
+    column, changing = FREE_PARAMETERS[mode].index("mass_kda"), 0
+    judged = list(events)
+    for number, (event, own) in enumerate(zip(events, repeats, strict=True)):
+        squares, degrees = own[0, column], own[0, -1]
+        if degrees >= _LEAST_DEGREES and squares > CHANGES**2 * degrees:
+            changing += 1
+            judged[number] = replace(event, flags=verdict([*event.flags, Status.POOR_FIT])[1])
+    return tuple(judged), changing
 
 
 def _sampled(

@@ -67,6 +67,9 @@ def axes_warning(name: str, counts: NDArray[Any]) -> str:
     """
     middle = tuple(slice(max(n - _LOOKED_AT, 0) // 2, (n + _LOOKED_AT) // 2) for n in counts.shape)
     part = counts[middle].astype(np.float64)
+    part = part[np.isfinite(part).all(axis=(1, 2))]
+    if len(part) < 2:
+        return ""
     changes = []
     for axis in range(3):
         lines = np.moveaxis(part, axis, 0)
@@ -148,6 +151,40 @@ def pixel_warnings(defects: int, saturated: int) -> Iterator[str]:
 
 def _be(number: int) -> str:
     return "is" if number == 1 else "are"
+
+
+def repeats_warning(movie: Stack, windows: Windows) -> str:
+    """Say which frames repeat the one before them, which the sums count as frames of their own.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    windows : Windows
+        The sums, with the light of each of their frames.
+
+    Returns
+    -------
+    str
+        One line; empty where there are none.
+    """
+    numbers = np.concatenate([np.arange(*windows.frames_before), np.arange(*windows.frames_after)])
+    same = (np.diff(windows.power) == 0) & (np.diff(numbers) == 1)
+    found = [n for n in numbers[1:][same].tolist() if _repeats(movie, n)]
+    if not found:
+        return ""
+    shown = ", ".join(map(str, found[:4])) + (f" and {len(found) - 4} more" * (len(found) > 4))
+    return (
+        f"{movie.name}: {'frames' if len(found) > 1 else 'frame'} {shown} of {numbers.size} "
+        f"{'repeat' if len(found) > 1 else 'repeats'} the frame before (stuck in the camera), so "
+        "that there is less light than it seems and σ is too small: record or export the movie "
+        "without them"
+    )
+
+
+def _repeats(movie: Stack, number: int) -> bool:
+    pair = movie.read(number - 1, number + 1)
+    return np.array_equal(pair[0], pair[1])
 
 
 def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[str, Any]:

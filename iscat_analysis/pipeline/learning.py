@@ -59,6 +59,7 @@ LEAST_TESTED = 4
 
 _TESTED = 24
 _NOISE = "its noise is not what the camera's numbers predict; the analysis goes on as configured"
+_STUCK = 0.02  # share of frames that repeat another, which sums of frames count
 _STARTS_NM = tuple(range(-400, 401, 100))  # along each axis; rings are some 200 nm apart
 _FITTED = 3  # of these starts
 
@@ -255,11 +256,12 @@ def _median_p(
 
 
 def _noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
-    """Whether the first frames have another noise than p-values rest on."""
+    """Whether the first frames have another noise than p-values rest on, or repeat each other."""
     first, last = config.background.recorded or config.fit.frames or (0, movie.shape[0])
     counts = movie.read(first, min(last, first + SPECTRUM_FRAMES, movie.shape[0]))
     light, repeats = measure_frames(counts, camera)
-    return bool(judge_counts(counts[np.isfinite(light) & ~repeats], camera).gain_message)
+    stuck = way_of(config) != "sliding" and repeats.mean() > _STUCK
+    return bool(stuck or judge_counts(counts[np.isfinite(light) & ~repeats], camera).gain_message)
 
 
 def _centre(

@@ -23,6 +23,7 @@ from iscat_analysis.search.sliding import (
     NoiseCurve,
     choose_window,
     longest_window,
+    measure_frames,
     measure_noise,
 )
 from iscat_analysis.search.templates import ExcessNoise
@@ -138,7 +139,8 @@ def judge_background(movie: Stack, camera: Camera, windows: Windows, *, still: b
     if frames < 2 or not is_lit(windows):
         return Noise()
     counts = first_counts(movie, windows, SPECTRUM_FRAMES)
-    return judge_counts(counts, camera, masked=windows.masked)
+    repeats = measure_frames(counts, camera)[1]
+    return judge_counts(counts[~repeats], camera, masked=windows.masked)
 
 
 def judge_beside(

@@ -98,7 +98,11 @@ def test_axes_in_order_are_not_told() -> None:
     flicker = even * (1 + 0.02 * rng.standard_normal((30, 1, SHAPE[1])))
     border = _movie(0.05)
     border[:, :10] = 0
-    for counts in (_movie(0.05), _movie(0.5), even, flicker, border, np.zeros((30, *SHAPE))):
+    broken = flicker.copy()
+    broken[3, 4, 5], broken[7, 8, 9] = np.inf, np.nan
+    lost = np.full((30, *SHAPE), np.nan)
+    dark = np.zeros((30, *SHAPE))
+    for counts in (_movie(0.05), _movie(0.5), even, flicker, border, dark, broken, lost):
         assert axes_warning("m.npy", counts) == ""
 
 
