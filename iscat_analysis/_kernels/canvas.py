@@ -18,6 +18,7 @@ from iscat_analysis._kernels.image import Lens, Pixels, signal_gradient, signal_
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.radial import AxialTable
 from iscat_analysis._kernels.scoring import picture_at, span
+from iscat_analysis._kernels.stamp import stamp_gradient, stamp_signal
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -37,6 +38,8 @@ class Pictures(NamedTuple):
         What turns a profile into a signal, but for its window.
     windows : ndarray, shape (groups or 1, degree + 1, TAPS)
         Those of the blurs.
+    nodes : ndarray of float32, shape (2, n, n)
+        The samples of a picture at one height once more, from which it is drawn; none along z.
     """
 
     heights: FloatArray
@@ -45,6 +48,7 @@ class Pictures(NamedTuple):
     kappa: float
     lens: Lens
     windows: FloatArray
+    nodes: NDArray[np.float32]
 
 
 class Light(NamedTuple):
@@ -161,6 +165,9 @@ def draw(
 ) -> None:  # fmt: skip
     """Fill `out` with the signal of one row."""
     table, lens = table_of(pictures, group), lens_of(pictures, group)
+    if lens.fine:
+        stamp_signal(pictures.nodes, lens, pixels, theta[0], theta[1], theta[3], out)
+        return
     start, stop = span(lens, pixels, theta, table.heights.shape[3])
     picture = picture_at(table, lens, theta[2], start, stop, profile)
     signal_image(picture, lens, pixels, theta[0], theta[1], theta[3], out)
@@ -173,6 +180,9 @@ def draw_gradient(
 ) -> None:  # fmt: skip
     """Fill `out` (ny, 5, nx) with the signal of one row and its gradient."""
     table, lens = table_of(pictures, group), lens_of(pictures, group)
+    if lens.fine:
+        stamp_gradient(pictures.nodes, lens, pixels, theta[0], theta[1], theta[3], out)
+        return
     start, stop = span(lens, pixels, theta, table.heights.shape[3])
     picture = picture_at(table, lens, theta[2], start, stop, profile)
     signal_gradient(picture, lens, pixels, theta[0], theta[1], theta[3], out)

@@ -81,7 +81,7 @@ class Search(NamedTuple):
 
 
 class Response(NamedTuple):
-    """How the rows follow the background of their squares.
+    """How the rows follow the background of their squares; without room for slopes, left alone.
 
     Attributes
     ----------
@@ -114,6 +114,8 @@ def fit_frames(
     canvas: Canvas,
     response: Response,
     outcome: IntArray,
+    information: FloatArray,
+    gain: FloatArray,
     expected: FloatArray,
     stretch: FloatArray,
 ) -> None:
@@ -139,6 +141,10 @@ def fit_frames(
         Filled by the last fit of each row.
     outcome : ndarray of int, shape (rows,)
         Filled with how the last fit ended.
+    information : ndarray, shape (rows, 4, 4)
+        Filled with the expected information in (x, y, z, a) of the last fit.
+    gain : ndarray, shape (rows,)
+        Filled with its log-likelihood over that without the particle, the others in place.
     expected : ndarray, shape (t,)
         Filled with the photoelectrons expected in the used pixels at power 1.
     stretch : ndarray, shape (y, x)
@@ -163,7 +169,7 @@ def fit_frames(
                 p = theta[r]
                 r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
                 if r1 <= r0:
-                    outcome[r] = STALLED
+                    outcome[r], information[r], gain[r] = STALLED, 0.0, 0.0
                     continue
                 ny, nx = r1 - r0, c1 - c0
                 pixels = cut(field.pixels, r0, r1, c0, c1)
@@ -175,14 +181,15 @@ def fit_frames(
                 for i in range(ny):
                     for j in range(nx):
                         moved[i, j] = -both[0, i, 0, j]
-                outcome[r], last_one = _climb(
+                outcome[r], last_one, gain[r] = _climb(
                     near, group[r], pixels, data, search, p, both, slope_profile, fisher, step
                 )
                 here = both[last_one]
                 _add_signal(here, step, moved)
                 add(total, r0, c0, 1.0, moved)
                 canvas.squares[r] = p
-                if _invert(fisher, index, response.inverse[r]):
+                information[r] = fisher[:4, :4]
+                if response.slopes.size and _invert(fisher, index, response.inverse[r]):
                     response.squares[r] = r0, r1, c0, c1
                     _keep_slopes(data[2], here, index, response.slopes[r])
         expected[t] = _add_stretch(light, t, total, stretch)
@@ -192,14 +199,15 @@ def fit_frames(
 def _climb(
     near: Pictures, group: int, pixels: Pixels, data: FloatArray, search: Search, p: FloatArray,
     both: FloatArray, profile: FloatArray, fisher: FloatArray, step: FloatArray,
-) -> tuple[int, int]:  # fmt: skip
+) -> tuple[int, int, float]:  # fmt: skip
     """Fit one row from p, at which both[0] is drawn.
 
     As long as they lie inside the box and improve, the steps of Fisher scoring are taken as they
     are: every picture is drawn once.  `maximize` takes over where they do not.
 
-    Returns how the fit ended and which of `both` holds the picture at the estimate minus `step`,
-    which the last step leaves so small that the gradient tells the rest.
+    Returns how the fit ended, which of `both` holds the picture at the estimate minus `step`, which
+    the last step leaves so small that the gradient tells the rest, and the log-likelihood over that
+    without the particle.
     """
     lower, upper, trial, score = np.empty(5), np.empty(5), np.empty(5), np.empty(5)
     for i in range(5):
@@ -208,13 +216,13 @@ def _climb(
     at, value = 0, np.nan
     for _ in range(search.passes):
         gain = _step(search, data, both[at], p, lower, upper, score, fisher, step, trial)
-        if gain < search.tolerance:
-            p[:] = trial
-            return CONVERGED, at
         if gain == np.inf:
             break
         if np.isnan(value):
             value = image_value(POISSON, data, 1.0, both[at])
+        if gain < search.tolerance:
+            p[:] = trial
+            return CONVERGED, at, value + gain
         draw_gradient(near, group, trial, pixels, profile, both[1 - at])
         there = image_value(POISSON, data, 1.0, both[1 - at])
         if not there > value:
@@ -223,13 +231,13 @@ def _climb(
     for i in range(5):
         if search.free[i]:
             p[i] = min(max(p[i], lower[i]), upper[i])
-    _, _, outcome = maximize(
+    value, _, outcome = maximize(
         table_of(near, group), lens_of(near, group), pixels, POISSON, data, search.free, lower,
         upper, search.max_step, search.tolerance, search.passes, p, score, fisher,
     )  # fmt: skip
     draw_gradient(near, group, p, pixels, profile, both[0])
     step[:] = 0.0
-    return outcome, 0
+    return outcome, 0, value
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -320,6 +328,23 @@ def _keep_slopes(
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _shift(response: Response, r: int, move: FloatArray, step: FloatArray) -> None:
+    """Fill `step` (k) with F⁻¹ G move: how far back a row goes as the background moves."""
+    k = step.size
+    r0, r1, c0, c1 = response.squares[r]
+    nx = c1 - c0
+    step[:] = 0.0
+    for a in range(k if r1 > r0 else 0):
+        felt = np.float32(0.0)
+        for i in range(r1 - r0):
+            slope, here = response.slopes[r, a, i * nx : (i + 1) * nx], move[r0 + i, c0:c1]
+            for j in range(nx):
+                felt += slope[j] * np.float32(here[j])
+        for b in range(k):
+            step[b] += response.inverse[r, a, b] * felt
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def follow_rows(
     response: Response, first: int, last: int, move: FloatArray, out: FloatArray
 ) -> None:
@@ -337,26 +362,40 @@ def follow_rows(
         Σ Gᵀ F⁻¹ G move is added to it [e].
     """
     k = response.slopes.shape[1]
-    felt, step = np.empty(k), np.empty(k)
+    step = np.empty(k)
     for r in range(first, last):
         r0, r1, c0, c1 = response.squares[r]
         nx = c1 - c0
-        for a in range(k):
-            total = np.float32(0.0)
-            for i in range(r1 - r0):
-                slope, here = response.slopes[r, a, i * nx : (i + 1) * nx], move[r0 + i, c0:c1]
-                for j in range(nx):
-                    total += slope[j] * np.float32(here[j])
-            felt[a] = total
-        for a in range(k):
-            step[a] = 0.0
-            for b in range(k):
-                step[a] += response.inverse[r, a, b] * felt[b]
+        _shift(response, r, move, step)
         for a in range(k):
             for i in range(r1 - r0):
                 slope, here = response.slopes[r, a, i * nx : (i + 1) * nx], out[r0 + i, c0:c1]
                 for j in range(nx):
                     here[j] += step[a] * slope[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def shift_rows(response: Response, move: FloatArray, search: Search, theta: FloatArray) -> None:
+    """Let all rows follow a change of the logarithm of the background, to first order.
+
+    Parameters
+    ----------
+    response : Response
+        From `fit_frames`.
+    move : ndarray, shape (y, x)
+        Change.
+    search : Search
+        Free parameters and their bounds.
+    theta : ndarray, shape (rows, 5)
+        Moved.
+    """
+    index = np.flatnonzero(search.free[:4])
+    step = np.empty(index.size)
+    for r in range(theta.shape[0]):
+        _shift(response, r, move, step)
+        for a in range(index.size):
+            i = index[a]
+            theta[r, i] = min(max(theta[r, i] - step[a], search.lower[i]), search.upper[i])
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, get_blas_funcs, solve_triangular
+from scipy.linalg import solve_triangular
 
 from iscat_analysis.inference.modes import lost, patterns, pixels_of
 from iscat_analysis.inference.moving import MovingField
@@ -43,8 +43,9 @@ MOST_PIXELS = 1800
 _SINGULAR = 1e-9
 _TOGETHER = 128  # rows whose products are added in single precision
 _DOUBTFUL = 2.5  # logarithm of the largest pivot over the least, where 1e-7 may count
-_STEPS = 4  # of Newton's method; each leaves the square of the error before
-_SETTLED = 0.01  # standard deviations
+_STEPS = 4  # of Newton's method
+_SETTLED = 0.3  # standard deviations; what a step leaves is a fiftieth of it
+_AT_ONCE = 128  # unknowns of a triangular system that are solved without products
 
 
 @dataclass(frozen=True)
@@ -177,38 +178,51 @@ def _all_pixels(
         unknown = np.broadcast_to(np.diag(np.full(index.size, np.inf)), inverse.shape)
         return unknown, np.full_like(own, np.inf)
     every = follows.reshape(-1, follows.shape[2])
-    root = solve_triangular(left.astype(every.dtype), every.T, lower=True, overwrite_b=True)
-    root = root.T.reshape(follows.shape)
+    _forward(left.astype(every.dtype), every.T)
+    root = follows
     extra = (root @ np.swapaxes(root, 1, 2)).astype(np.float64)
     return extra, own + (root[:, -1] @ root[:, -1].T).astype(np.float64)
 
 
 def _undetermined(
     slopes: NDArray[Any], weight: FloatArray, inverse: FloatArray
-) -> tuple[NDArray[Any], FloatArray | None]:
+) -> tuple[NDArray[Any], NDArray[Any] | None]:
     """Give F⁻¹ G, shape (n, free, pixels), and the lower factor of M.
 
     The products are of the precision of the slopes.
     """
     root = np.linalg.cholesky(inverse).astype(slopes.dtype)
     felt = np.swapaxes(root, 1, 2) @ slopes
-    (product,) = get_blas_funcs(("syrk",), (felt,))
-    left = np.zeros((weight.size, weight.size), order="F")  # as the products are
+    left = np.zeros((weight.size, weight.size))
     for first in range(0, len(felt), _TOGETHER):
         some = felt[first : first + _TOGETHER].reshape(-1, weight.size)
-        left -= product(1.0, some.T, lower=True)
+        left -= some.T @ some
     left.flat[:: weight.size + 1] += 1 / weight
     return root @ felt, _factor(left)
 
 
-def _factor(matrix: FloatArray) -> FloatArray | None:
-    """Lower Cholesky factor in the place of a matrix, None where that is not positive."""
+def _factor(matrix: FloatArray) -> NDArray[Any] | None:
+    """Lower Cholesky factor of a matrix, None where that is not positive."""
     diagonal = matrix.flat[:: len(matrix) + 1]
     matrix.flat[:: len(matrix) + 1] = diagonal + _SINGULAR * diagonal.max()
     try:
-        return np.asarray(cholesky(matrix, lower=True, overwrite_a=True, check_finite=False))
+        return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
         return None
+
+
+def _forward(lower: NDArray[Any], right: NDArray[Any]) -> None:
+    """Solve a lower triangular system in the place of its right sides, shape (n, m).
+
+    By halves, whose products let other threads run, as the solver of SciPy does not.
+    """
+    if len(lower) <= _AT_ONCE:
+        right[:] = solve_triangular(lower, right, lower=True, check_finite=False)
+        return
+    half = len(lower) // 2
+    _forward(lower[:half, :half], right[:half])
+    right[half:] -= lower[half:, :half] @ right[:half]
+    _forward(lower[half:, half:], right[half:])
 
 
 def _common_modes(

@@ -31,6 +31,7 @@ from iscat_analysis._kernels.moving import (
     Search,
     common_modes,
     fit_frames,
+    shift_rows,
 )
 from iscat_analysis._kernels.scoring import CONVERGED
 from iscat_analysis.inference.fit import window_nm
@@ -116,6 +117,7 @@ class MovingField:
         if z_range_nm is not None:  # the rings tell one fringe from the next, and reach far
             self._coarse = self._whole
         self._canvas: Sheet | None = None
+        self._slopes = np.empty(0, dtype=np.float32)
         self.free = np.array([True, True, z_range_nm is not None, True, False])
         reach = window_nm(pixel_nm)
         half = pixel_nm / 2 + _BEYOND * wavelength / near.optics.na
@@ -142,6 +144,11 @@ class MovingField:
             z_range_nm=z_range_nm,
         )  # fmt: skip
         self._pictures = self._book.of(np.zeros(1))
+
+    @cached_property
+    def _room(self) -> NDArray[np.float32]:
+        """Of the canvas, shape (t, y, x)."""
+        return np.empty_like(self.counts_e)
 
     @cached_property
     def total_e(self) -> FloatArray:
@@ -202,6 +209,7 @@ class MovingField:
         theta = rows.theta.copy()
         starts = rows.starts(self.frames)
         outcome = np.full(len(theta), CONVERGED, dtype=np.int64)
+        fisher, gain = np.empty((len(theta), 4, 4)), np.empty(len(theta))
         canvas = self._canvas_for(rows, coarse=coarse)
         field = self._coarse if coarse else self._whole
         search = self._search if sweeps > 1 else self._search._replace(tolerance=_PASSING)
@@ -213,7 +221,7 @@ class MovingField:
             fit_frames(
                 light, field, near, far, search, starts, first,
                 min(first + _BLOCK, self.frames), sweeps, theta, rows.group, canvas, response,
-                outcome, expected, stretch,
+                outcome, fisher, gain, expected, stretch,
             )  # fmt: skip
             return stretch
 
@@ -223,7 +231,7 @@ class MovingField:
         level = np.where(stretch > 0, self.total_e / np.where(stretch > 0, stretch, 1.0), 1.0)
         totals = self.frame_totals
         power = np.where(expected > 0, totals / np.where(expected > 0, expected, 1.0), 1.0)
-        fitted = replace(rows, theta=theta) if sweeps else rows
+        fitted = _fitted(rows, theta, fisher, gain) if sweeps else rows
         self._canvas = Sheet(fitted, canvas, coarse)
         return fitted, Ground(np.maximum(level, 1e-3), power / power.mean()), outcome == CONVERGED
 
@@ -241,6 +249,25 @@ class MovingField:
             As from `newton_step`.
         """
         return newton_step(move, self._response, self.total_e, self.used, self._pool)
+
+    def followed(self, rows: Rows, step: FloatArray) -> Rows:
+        """Let the rows of the last fit follow a step of the background, to first order.
+
+        Parameters
+        ----------
+        rows : Rows
+            From `fit`.
+        step : ndarray, shape (y, x)
+            Change of the logarithm of the background.
+
+        Returns
+        -------
+        Rows
+            Where the next fit would find them.
+        """
+        theta = rows.theta.copy()
+        shift_rows(self._response, step, self._search, theta)
+        return replace(rows, theta=theta)
 
     def draw_anew(self) -> None:
         """Draw all rings where their particles are, at the next pass."""
@@ -300,13 +327,11 @@ class MovingField:
         fit_frames(
             part, self._coarse, near, far, self._search, starts, 0, last - first, 0, within.theta,
             within.group, canvas, self._response_of(n, 0), np.zeros(n, dtype=np.int64),
-            np.zeros(last - first), np.zeros(self.used.shape),
+            within.fisher, within.snr, np.zeros(last - first), np.zeros(self.used.shape),
         )  # fmt: skip
         return canvas.total
 
-    def judge(
-        self, ground: Ground, rows: Rows, *, brief: bool = False, coarse: bool = False
-    ) -> Judged:
+    def judge(self, ground: Ground, rows: Rows, *, brief: bool = False) -> Judged:
         """Say what the likelihood knows of every row.
 
         Parameters
@@ -317,8 +342,6 @@ class MovingField:
             Particles, at their estimates.
         brief : bool
             Leave out observed information and bias, which take most of the time.
-        coarse : bool
-            As in `fit`.
 
         Returns
         -------
@@ -330,14 +353,13 @@ class MovingField:
         near, far = self._pictures
         starts = rows.starts(self.frames)
         fisher, turned, ways = np.empty((3, n, 4, 4))
-        field = self._coarse if coarse else self._whole
         bias, score = np.empty((2, n, 4))
         numbers = np.empty((n, 5))
-        canvas = self._canvas_for(rows, coarse=coarse)
+        canvas = self._canvas_for(rows, coarse=False)
 
         def block(first: int) -> FloatArray:
             judge_frames(
-                light, field, near, far, self.free, starts, first,
+                light, self._whole, near, far, self.free, starts, first,
                 min(first + _BLOCK, self.frames), rows.theta, rows.group, canvas, fisher, turned,
                 ways, bias, score, numbers, brief,
             )  # fmt: skip
@@ -368,9 +390,7 @@ class MovingField:
         within = (places >= -0.5) & (places < np.array([columns, rows]) - 0.5)
         return np.asarray(within.all(axis=-1))
 
-    def refit(
-        self, ground: Ground, rows: Rows, *, sweeps: int
-    ) -> tuple[Rows, BoolArray, FloatArray]:
+    def refit(self, ground: Ground, rows: Rows, *, sweeps: int) -> tuple[Rows, BoolArray]:
         """Fit all particles of a few frames, the smaller square of each.
 
         Parameters
@@ -388,8 +408,6 @@ class MovingField:
             Estimates.
         converged : ndarray of bool, shape (n,)
             Which fits did.
-        snr : ndarray, shape (n,)
-            √(2 Δℓ) of each, the others in place.
         """
         light = self._light(ground)
         near, far = self._pictures
@@ -399,20 +417,13 @@ class MovingField:
         theta, n = rows.theta.copy(), len(frame)
         canvas = blank(np.empty_like(light.counts), rows)
         outcome = np.zeros(n, dtype=np.int64)
-        expected, stretch = np.zeros(times.size), np.zeros(self.used.shape)
-        fisher, turned, ways = np.zeros((3, n, 4, 4))
-        bias, score = np.zeros((2, n, 4))
-        numbers = np.zeros((n, 5))
+        fisher, gain = np.empty((n, 4, 4)), np.empty(n)
         fit_frames(
             light, self._coarse, near, far, self._search, starts, 0, times.size, sweeps, theta,
-            rows.group, canvas, self._response_of(n, self._coarse.side), outcome, expected, stretch,
+            rows.group, canvas, self._response_of(n, 0), outcome, fisher, gain,
+            np.zeros(times.size), np.zeros(self.used.shape),
         )  # fmt: skip
-        judge_frames(
-            light, self._coarse, near, far, self.free, starts, 0, times.size, theta, rows.group,
-            canvas, fisher, turned, ways, bias, score, numbers, True,
-        )  # fmt: skip
-        snr = np.sqrt(2 * np.maximum(numbers[:, 0], 0.0))
-        return replace(rows, theta=theta), outcome == CONVERGED, snr
+        return _fitted(rows, theta, fisher, gain), outcome == CONVERGED
 
     def add_modes(
         self, ground: Ground, rows: Rows, corner: tuple[int, int], owner: IntArray,
@@ -456,25 +467,6 @@ class MovingField:
         near[:, 3] &= rows.theta[:, 3] >= search.upper[3]  # no mass is the end of none
         return np.asarray((near & self.free).any(axis=1))
 
-    def snr_of(self, ground: Ground, rows: Rows) -> FloatArray:
-        """Give the signal-to-noise ratio of every row, √(2 Δℓ).
-
-        Parameters
-        ----------
-        ground : Ground
-            Background.
-        rows : Rows
-            Particles, at their estimates.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            At least 0.
-        """
-        return np.asarray(
-            np.sqrt(2 * np.maximum(self.judge(ground, rows, brief=True, coarse=True).gain, 0.0))
-        )
-
     def _light(self, ground: Ground) -> Light:
         return Light(self.counts_e, ground.power, ground.level, self.read_e2, self.used)
 
@@ -490,18 +482,25 @@ class MovingField:
         """Give the canvas, with the frames marked in which it holds other rows than these."""
         last = self._canvas
         if last is None or last.coarse != coarse:
-            room = last.canvas.total if last else np.empty_like(self.counts_e)
-            canvas = blank(room, rows)
+            canvas = blank(self._room, rows)
         else:
             canvas = last.moved(rows, self.frames)
         self._canvas = Sheet(rows, canvas, coarse)
         return canvas
 
     def _response_of(self, rows: int, side: int) -> Response:
-        """Room for a response."""
+        """Room for a response, in the place of the one before."""
         free = int(self.free[:4].sum())
+        size = rows * free * side**2
+        if self._slopes.size < size:  # new memory is cleared first, which takes as long as a fit
+            self._slopes = np.empty(size, dtype=np.float32)
         return Response(
             np.zeros((rows, 4), dtype=np.int64),
-            np.empty((rows, free, side**2), dtype=np.float32),
+            self._slopes[:size].reshape(rows, free, side**2),
             np.empty((rows, free, free)),
         )
+
+
+def _fitted(rows: Rows, theta: FloatArray, fisher: FloatArray, gain: FloatArray) -> Rows:
+    """Rows at their estimates, with what the fit knows of them."""
+    return replace(rows, theta=theta, fisher=fisher, snr=np.sqrt(2 * np.maximum(gain, 0.0)))

@@ -74,7 +74,10 @@ class PictureBook:
     def _one_height(self) -> Pictures:
         """Sharp picture at the fixed height."""
         lens, samples = sample_picture(self._far, self._pixel_nm, self._half_px)
-        return Pictures(samples.reshape(1, 1, 1, 2, -1), 0.0, 1.0, 0.0, lens, lens.window[None])
+        return Pictures(
+            samples.reshape(1, 1, 1, 2, -1), 0.0, 1.0, 0.0, lens, lens.window[None],
+            samples.astype(np.float32),
+        )  # fmt: skip
 
 
 def _along_z(
@@ -87,5 +90,6 @@ def _along_z(
     heights = np.stack([table.heights for table in tables])
     one = tables[0]
     return Pictures(
-        heights, one.first_nm, one.step_nm, one.kappa, model.lens, model.lens.window[None]
-    )
+        heights, one.first_nm, one.step_nm, one.kappa, model.lens, model.lens.window[None],
+        np.zeros((2, 0, 0), dtype=np.float32),
+    )  # fmt: skip

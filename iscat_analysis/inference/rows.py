@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,39 +26,68 @@ class Rows:
         x, y, z [nm], amplitude, 0.
     group : ndarray of int, shape (n,)
         Number of the blur.
+    fisher : ndarray, shape (n, 4, 4)
+        Expected information in (x, y, z, a) that the last fit of each found; NaN before the first.
+    snr : ndarray, shape (n,)
+        Signal-to-noise ratio √(2 Δℓ) of that fit, the others of its frame in place.
     """
 
     frame: IntArray
     track: IntArray
     theta: FloatArray
     group: IntArray
+    fisher: FloatArray
+    snr: FloatArray
 
     @classmethod
     def of(
         cls, frame: IntArray, track: IntArray, theta: FloatArray, group: IntArray | None = None
     ) -> Rows:
-        """Put rows into the order of their frames."""
-        order = np.lexsort((track, frame))
-        blur = np.zeros(len(frame), dtype=np.int64) if group is None else group
-        return cls(frame[order], track[order], np.ascontiguousarray(theta[order]), blur[order])
+        """Put rows, none of them fitted yet, into the order of their frames."""
+        n = len(frame)
+        blur = np.zeros(n, dtype=np.int64) if group is None else group
+        unknown = np.full((n, 4, 4), np.nan), np.full(n, np.nan)
+        return cls(frame, track, theta, blur, *unknown).in_order()
+
+    def in_order(self) -> Rows:
+        """Put them into the order of their frames, and in a frame of their tracks."""
+        return self.only(np.lexsort((self.track, self.frame)))
 
     def joined(self, frame: IntArray, track: IntArray, theta: FloatArray, group: IntArray) -> Rows:
-        """Add rows."""
-        return Rows.of(
-            np.concatenate([self.frame, frame]),
-            np.concatenate([self.track, track]),
-            np.concatenate([self.theta, theta]),
-            np.concatenate([self.group, group]),
-        )
+        """Add rows that are not fitted yet."""
+        more = Rows.of(frame, track, theta, group)
+        both = ([getattr(rows, part.name) for rows in (self, more)] for part in fields(self))
+        return Rows(*map(np.concatenate, both)).in_order()
+
+    def recalling(self, old: Rows) -> Rows:
+        """Give rows that are the same in others what these know of their fits.
+
+        Parameters
+        ----------
+        old : Rows
+            In the order of frames and tracks.
+
+        Returns
+        -------
+        Rows
+            Where neither the track nor θ has changed, with their informations.
+        """
+        many = int(max(self.track.max(initial=0), old.track.max(initial=0))) + 1
+        keys, sought = old.frame * many + old.track, self.frame * many + self.track
+        where = np.minimum(np.searchsorted(keys, sought), len(keys) - 1)
+        same = (keys[where] == sought) & (old.theta[where] == self.theta).all(axis=1)
+        fisher, snr = self.fisher.copy(), self.snr.copy()
+        fisher[same], snr[same] = old.fisher[where[same]], old.snr[where[same]]
+        return replace(self, fisher=fisher, snr=snr)
 
     def starts(self, frames: int) -> IntArray:
         """First row of each frame, and the number of rows."""
         first: IntArray = np.searchsorted(self.frame, np.arange(frames + 1)).astype(np.int64)
         return first
 
-    def only(self, kept: BoolArray) -> Rows:
+    def only(self, kept: BoolArray | IntArray) -> Rows:
         """Take some of the rows."""
-        return Rows(self.frame[kept], self.track[kept], self.theta[kept], self.group[kept])
+        return Rows(*(getattr(self, part.name)[kept] for part in fields(self)))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from iscat_analysis.records import BoolArray
 MOST_TURNS = 12
 """Steps at most."""
 
-_SETTLED = 0.02  # step of the background, in its own standard deviations, that is the last one
+_SETTLED = 0.1  # step of the background, in its own standard deviations, that is the last one
 _NEAR, _FAR = 0.5, 5.0  # a step below the one after one above the other calls for new rings
 _POWER_TURNS = 3  # over a background that stays
 _POWER_SETTLED = 1e-7
@@ -86,7 +86,7 @@ def settle(
     """
     sigma = 1 / np.sqrt(np.maximum(field.total_e, 1.0))
     largest = 0.0
-    done = np.ones(len(rows.frame), dtype=bool)
+    done, step = np.ones(len(rows.frame), dtype=bool), np.zeros(field.used.shape)
     for turn in range(turns):
         rows, found, done = field.fit(ground, rows, coarse=coarse)
         power = found.power if follow_power else ground.power
@@ -107,4 +107,6 @@ def settle(
             largest = change
         elif change < _SETTLED:
             break
+    if follow_level:
+        rows = field.followed(rows, step)
     return rows, ground, done

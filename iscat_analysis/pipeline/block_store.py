@@ -166,7 +166,7 @@ def analyse_block(
     return Block(
         span=span,
         rows=replace(rows, frame=rows.frame + first),
-        error=typical_error(moving.judged) if len(rows.frame) else 0.0,
+        error=typical_error(moving.judged.fisher) if len(rows.frame) else 0.0,
         table=table,
         inside=inside,
         masses=common_masses(scene, moving),
@@ -252,7 +252,7 @@ class BlockStore(Shelf):
             masses = pd.DataFrame(data["masses"], columns=names)
             return Block(
                 span=span,
-                rows=Rows(data["frame"], data["track"], data["theta"], data["group"]),
+                rows=Rows.of(data["frame"], data["track"], data["theta"], data["group"]),
                 error=float(data["error"]),
                 table=table,
                 inside=data["inside"],

@@ -92,12 +92,13 @@ def extended(
         if not proposed:
             break
         trial = _starts(frames, proposed, typical, blur, meeting)
-        fitted, done, snr = field.refit(ground, trial, sweeps=_SWEEPS)
+        fitted, done = field.refit(ground, trial, sweeps=_SWEEPS)
+        good = done & (fitted.snr > LEAST_SNR)
         ends = []
         for t, new in proposed.items():
             of_frame = np.flatnonzero(fitted.frame == t)
             found = {int(fitted.track[i]): fitted.theta[i] for i in of_frame}
-            sure = {int(fitted.track[i]): bool(done[i]) and snr[i] > LEAST_SNR for i in of_frame}
+            sure = {int(fitted.track[i]): bool(good[i]) for i in of_frame}
             kept = []
             for k, end in new.items():
                 theta, last = found[k], frames[end.frame][k]
@@ -118,7 +119,7 @@ def extended(
     frame = np.array([t for t, found in enumerate(frames) for _ in found], dtype=np.int64)
     track = np.array([k for found in frames for k in found], dtype=np.int64)
     theta = np.array([theta for found in frames for theta in found.values()])
-    return Rows.of(frame, track, theta, blur[track]), added
+    return Rows.of(frame, track, theta, blur[track]).recalling(rows), added
 
 
 def _starts(

@@ -184,8 +184,8 @@ class _Meeting(NamedTuple):
 
 def _meetings(rows: Rows, near_nm: float) -> Iterator[_Meeting]:
     """Give the meetings of every pair of tracks."""
-    for one, two in combinations(np.unique(rows.track).tolist(), 2):
-        mine, other = rows.only(rows.track == one), rows.only(rows.track == two)
+    each = [(k, rows.only(rows.track == k)) for k in np.unique(rows.track).tolist()]
+    for (one, mine), (two, other) in combinations(each, 2):
         frames, i, j = np.intersect1d(mine.frame, other.frame, return_indices=True)
         apart = np.hypot(*(mine.theta[i, :2] - other.theta[j, :2]).T)
         near = np.flatnonzero(apart < near_nm)

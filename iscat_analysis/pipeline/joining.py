@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import pairwise
 
 import numpy as np
@@ -116,8 +117,7 @@ def join_tracks(config: Config, blocks: Sequence[Block]) -> list[IntArray]:
     rows = [
         replace(b.rows, track=n[b.rows.track]) for n, b in zip(numbers, blocks, strict=True)
     ]  # fmt: skip
-    whole = Rows(*(np.concatenate([getattr(r, name) for r in rows])
-                   for name in ("frame", "track", "theta", "group")))  # fmt: skip
+    whole = reduce(_both, rows)
     if not len(whole.frame):
         return numbers
     bridged = replace(whole, track=bridge(config, whole))
@@ -135,8 +135,7 @@ def _met(config: Config, one: Block, two: Block) -> list[tuple[int, int]]:
     begins = begins.only(begins.frame <= border + memory)
     if not len(ends.frame) or not len(begins.frame):
         return []
-    both = Rows(*(np.concatenate([getattr(ends, name), getattr(begins, name)])
-                  for name in ("frame", "track", "theta", "group")))  # fmt: skip
+    both = _both(ends, begins)
     side = np.repeat([0, 1], [len(ends.frame), len(begins.frame)])
     places = with_mass(config, both, np.hypot(one.error, two.error) / np.sqrt(2))
     track = link(side, places, reach_nm=config.track.max_step_nm, memory=0)
@@ -153,8 +152,12 @@ def _ends(rows: Rows, which: int) -> Rows:
     order = np.lexsort((rows.frame, rows.track))
     edges = np.flatnonzero(np.diff(rows.track[order], prepend=-1, append=-1))
     chosen = order[edges[:-1] if which == 0 else edges[1:] - 1]
-    rows = typical(rows)
-    return Rows(rows.frame[chosen], rows.track[chosen], rows.theta[chosen], rows.group[chosen])
+    return typical(rows).only(chosen)
+
+
+def _both(one: Rows, two: Rows) -> Rows:
+    """Join rows, the ones before the others."""
+    return one.joined(two.frame, two.track, two.theta, two.group)
 
 
 def combine_masses(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
 from iscat_analysis.inference.moving import MovingField
-from iscat_analysis.inference.rows import Ground, Judged, Rows
+from iscat_analysis.inference.rows import Judged, Rows
 from iscat_analysis.pipeline.extension import LEAST_SHARE
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import BoolArray, FloatArray
@@ -84,7 +84,7 @@ def _least(config: Config, rows: Rows, inner: tuple[int, int] | None) -> IntArra
     return least
 
 
-def mass_places(config: Config, field: MovingField, ground: Ground, rows: Rows) -> FloatArray:
+def mass_places(config: Config, rows: Rows) -> FloatArray:
     """Places by which rows are linked: x, y, and the mass as a length.
 
     A step of the mass by its own error counts as much as one of `_STEP` of the farthest that a
@@ -94,12 +94,8 @@ def mass_places(config: Config, field: MovingField, ground: Ground, rows: Rows) 
     ----------
     config : Config
         Its ``[track]``.
-    field : MovingField
-        The movie.
-    ground : Ground
-        The background.
     rows : Rows
-        Particles.
+        Particles, fitted but for a few.
 
     Returns
     -------
@@ -108,9 +104,7 @@ def mass_places(config: Config, field: MovingField, ground: Ground, rows: Rows) 
     """
     if not len(rows.frame):
         return rows.theta[:, :2]
-    return with_mass(
-        config, rows, typical_error(field.judge(ground, rows, brief=True, coarse=True))
-    )
+    return with_mass(config, rows, typical_error(rows.fisher))
 
 
 def with_mass(config: Config, rows: Rows, error: float) -> FloatArray:
@@ -156,20 +150,20 @@ def mass_error(config: Config, rows: Rows, error: float) -> float:
     return error
 
 
-def typical_error(judged: Judged) -> float:
+def typical_error(fisher: FloatArray) -> float:
     """Give the error of an amplitude in one frame, at known places.
 
     Parameters
     ----------
-    judged : Judged
-        Of all rows.
+    fisher : ndarray, shape (n, 4, 4)
+        Information of all rows in (x, y, z, a); NaN where it is not known.
 
     Returns
     -------
     float
         1/√F, F the median information.
     """
-    return 1 / math.sqrt(max(float(np.median(judged.fisher[:, 3, 3])), 1e-300))
+    return 1 / math.sqrt(max(float(np.nanmedian(fisher[:, 3, 3])), 1e-300))
 
 
 def typical(rows: Rows) -> Rows:
@@ -195,7 +189,6 @@ def typical(rows: Rows) -> Rows:
 def alone(
     scene: Scene,
     field: MovingField,
-    ground: Ground,
     rows: Rows,
     *,
     inner: tuple[int, int] | None = None,
@@ -208,10 +201,8 @@ def alone(
         Configuration and threshold.
     field : MovingField
         The movie.
-    ground : Ground
-        The background.
     rows : Rows
-        Particles with their tracks.
+        Particles with their tracks, fitted but for a few.
     inner : (int, int), optional
         As in `linked`.
 
@@ -226,9 +217,11 @@ def alone(
     near = crowded(rows, field, _BESIDE * config.optics.wavelength_nm / config.optics.na)
     tracks = int(rows.track.max(initial=0)) + 1
     free = np.bincount(rows.track[~near], minlength=tracks)
-    snr = np.where(rows.theta[:, 3] > 0, field.snr_of(ground, rows), 0.0)
-    median = np.array([np.median(snr[rows.track == k]) for k in range(tracks)])
-    kept = (free >= _least(config, rows, inner)) & (median > AS_FOUND * scene.templates.threshold)
+    fitted = rows.only(np.isfinite(rows.snr))
+    snr = np.where(fitted.theta[:, 3] > 0, fitted.snr, 0.0)
+    seen = snr > AS_FOUND * scene.templates.threshold
+    fits, sights = (np.bincount(fitted.track, w, minlength=tracks) for w in (None, seen))
+    kept = (free >= _least(config, rows, inner)) & (2 * sights > fits)
     return numbered(rows.only(kept[rows.track]))
 
 
@@ -385,9 +378,12 @@ def bridge(config: Config, rows: Rows) -> IntArray:
         Track of each row.
     """
     reach = config.optics.wavelength_nm / config.optics.na
-    again = link(rows.frame, rows.theta[:, :2], reach_nm=reach, memory=_BRIDGE_FRAMES)
-    track = rows.track.copy()
-    order = np.lexsort((rows.frame, again))
+    track, again = rows.track.copy(), np.full(len(rows.frame), -1)
+    first, last = (rows.track[np.isin(rows.frame, t)] for t in (rows.frame[:1], rows.frame[-1:]))
+    ended = np.flatnonzero(~np.isin(rows.track, first) | ~np.isin(rows.track, last))
+    some = rows.only(ended)
+    again[ended] = link(some.frame, some.theta[:, :2], reach_nm=reach, memory=_BRIDGE_FRAMES)
+    order = ended[np.lexsort((some.frame, again[ended]))]
     for i, j in pairwise(order.tolist()):
         if again[i] != again[j] or track[i] == track[j]:
             continue
@@ -425,4 +421,4 @@ def numbered(rows: Rows) -> Rows:
     order = np.lexsort((rows.theta[first, 0], rows.theta[first, 1], rows.frame[first]))
     numbers[rows.track[first[order]]] = np.arange(first.size)
     track = numbers[rows.track] if len(rows.track) else rows.track
-    return Rows.of(rows.frame, track, rows.theta, rows.group)
+    return replace(rows, track=track).in_order()

@@ -350,7 +350,7 @@ class MovingSearch:
             with threads(self._config.compute.workers) as pool:
                 found = search_frames(
                     _with_threshold(scene, threshold), field, ground, rows,
-                    snr=np.zeros(0), pool=pool, frames=(here, here + 1),
+                    pool=pool, frames=(here, here + 1),
                 )  # fmt: skip
             mass = np.asarray(scene.model.scale.mass(found.strength))
             each = zip(found.x_px, found.y_px, found.snr, found.z_nm, mass, strict=True)

@@ -52,7 +52,7 @@ from iscat_analysis.species import fit_diffusion
 ROUNDS = 8
 """Searches of the whole movie; each sees what the fits so far leave over."""
 
-_FIRST_TURNS = 2  # of background and particles between two searches
+_FIRST_TURNS = 1  # of background and particles between two searches
 _NEXT_TURNS = 2  # between two extensions of the tracks
 _LEAST_POSITIONS = 4  # of a track whose D is fitted
 _USELESS = 300.0  # times the median error of a track: such a place says nothing
@@ -154,11 +154,11 @@ def follow(
     follow_level = config.background.method != "median"
     ground = first_ground(field, follow_power=follow_power)
     nothing = np.zeros(0, dtype=np.int64)
-    rows, snr = Rows.of(nothing, nothing, np.zeros((0, 5))), np.zeros(0)
+    rows = Rows.of(nothing, nothing, np.zeros((0, 5)))
     total = ROUNDS + 3
     for number in range(ROUNDS):
         progress("track", number, total)
-        found = search_frames(scene, field, ground, rows, snr, pool)
+        found = search_frames(scene, field, ground, rows, pool)
         before = len(rows.frame)
         if number and len(found.frame) <= _FEW * before:
             break
@@ -174,20 +174,20 @@ def follow(
         )
         if scene.mode == "joint" and number < _FIRST_HEIGHTS:
             rows = _in_their_fringes(scene, field, ground, rows)
-        rows, snr = _credible(scene, field, ground, rows, done)
+            rows, _, done = field.fit(ground, rows, coarse=True)
+        rows = _credible(scene, field, rows, done)
         if scene.mode == "joint" and number == 0:  # sharp pictures leave over of gold what is seen
-            rows = linked(config, rows, mass_places(config, field, ground, rows))
-            rows, variances, _ = _moved(config, field, ground, rows)
+            rows = linked(config, rows, mass_places(config, rows))
+            rows, variances, _ = _moved(config, field, rows)
             field.set_blurs(variances)
             rows, ground, done = settle(
                 field, ground, rows, follow_power=follow_power, follow_level=follow_level,
                 turns=_NEXT_TURNS, coarse=True,
             )  # fmt: skip
-            snr = field.snr_of(ground, rows)
         if number and len(rows.frame) <= (1 + _FEW) * before:
             break
     progress("track", ROUNDS, total)
-    rows = linked(config, rows, mass_places(config, field, ground, rows), inner=inner)
+    rows = linked(config, rows, mass_places(config, rows), inner=inner)
     resolution = config.optics.wavelength_nm / config.optics.na
     for number in range(ROUNDS):
         rows, ground, done = settle(
@@ -198,10 +198,8 @@ def follow(
         rows, added = extended(
             field, ground, rows, resolution_nm=resolution, reach_nm=config.track.max_step_nm
         )
-        rows = linked(
-            config, rows, mass_places(config, field, ground, rows), bridged=True, inner=inner
-        )
-        rows = alone(scene, field, ground, rows, inner=inner)
+        rows = linked(config, rows, mass_places(config, rows), bridged=True, inner=inner)
+        rows = alone(scene, field, rows, inner=inner)
         if number < _HELD_ROUNDS and follow_level:
             rows, tried = held(config, field, rows)
             added += tried
@@ -210,7 +208,7 @@ def follow(
         ground = replace(ground, level=found_ground.level) if follow_level else ground
         if added <= _FEW * len(rows.frame):
             break
-    rows = _told_apart(config, field, ground, trimmed(rows))
+    rows = _told_apart(config, trimmed(rows))
     for stage in range(2):
         if scene.mode == "joint":
             rows = _in_their_fringes(scene, field, ground, rows)
@@ -220,7 +218,7 @@ def follow(
         )  # fmt: skip
         progress("track", ROUNDS + 1 + stage, total)
         if stage == 0:
-            rows, variances, diffusion = _moved(config, field, ground, rows)
+            rows, variances, diffusion = _moved(config, field, rows)
             field.set_blurs(variances)
     judged = field.judge(ground, rows)
     shared = shared_errors(field, ground, rows, judged)
@@ -245,13 +243,13 @@ def _in_their_fringes(scene: Scene, field: MovingField, ground: Ground, rows: Ro
     )  # fmt: skip
 
 
-def _told_apart(config: Config, field: MovingField, ground: Ground, rows: Rows) -> Rows:
+def _told_apart(config: Config, rows: Rows) -> Rows:
     """Give particles that met their own numbers again."""
     if not len(rows.frame):
         return rows
-    error = typical_error(field.judge(ground, rows, brief=True, coarse=True))
+    error = mass_error(config, rows, typical_error(rows.fisher))
     resolution = config.optics.wavelength_nm / config.optics.na
-    told = identified(rows, near_nm=resolution, error=mass_error(config, rows, error))
+    told = identified(rows, near_nm=resolution, error=error)
     return numbered(told)
 
 
@@ -267,42 +265,34 @@ def _joined(scene: Scene, rows: Rows, found: Sightings) -> Rows:
     return unknown.joined(found.frame, np.full(n, -1), theta, np.full(n, blur, dtype=np.int64))
 
 
-def _credible(
-    scene: Scene, field: MovingField, ground: Ground, rows: Rows, done: BoolArray
-) -> tuple[Rows, FloatArray]:
-    """Keep the rows that a particle explains, each particle once; give their SNRs as well."""
-    if not len(rows.frame):
-        return rows, np.zeros(0)
-    snr = field.snr_of(ground, rows)
-    kept = done & (rows.theta[:, 3] > 0) & (snr > AS_FOUND * scene.templates.threshold)
+def _credible(scene: Scene, field: MovingField, rows: Rows, done: BoolArray) -> Rows:
+    """Keep the rows that a particle explains, each particle once."""
+    kept = done & (rows.theta[:, 3] > 0) & (rows.snr > AS_FOUND * scene.templates.threshold)
     near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na)
     starts = rows.starts(field.frames)
     for t in np.unique(rows.frame[crowded(rows, field, near)]):
-        order = starts[t] + np.argsort(-snr[starts[t] : starts[t + 1]])
+        order = starts[t] + np.argsort(-rows.snr[starts[t] : starts[t + 1]])
         for i, a in enumerate(order):
             for b in order[:i]:
                 apart = np.hypot(*(rows.theta[a, :2] - rows.theta[b, :2]))
                 if kept[a] and kept[b] and apart < near:
                     kept[a] = False
-    return rows.only(kept), snr[kept]
+    return rows.only(kept)
 
 
-def _moved(
-    config: Config, field: MovingField, ground: Ground, rows: Rows
-) -> tuple[Rows, FloatArray, FloatArray]:
+def _moved(config: Config, field: MovingField, rows: Rows) -> tuple[Rows, FloatArray, FloatArray]:
     """Give tracks their blurs, with the variances that these number and the D they are made of."""
-    judged = field.judge(ground, rows, brief=True)
-    diffusion = _diffusion(config, field, rows, judged)
+    diffusion = _diffusion(config, field, rows)
     _, exposure = exposure_of(config)
     return *blurred_rows(rows, diffusion, exposure), diffusion
 
 
-def _diffusion(config: Config, field: MovingField, rows: Rows, judged: Judged) -> FloatArray:
+def _diffusion(config: Config, field: MovingField, rows: Rows) -> FloatArray:
     """D of every track and its standard error [µm²/s]; 0 where a track is too short to tell."""
     tracks = int(rows.track.max(initial=-1)) + 1
     out = np.zeros((tracks, 2))
     index = np.flatnonzero(field.free[:4])
-    sigma = np.sqrt(variances_left(judged.fisher, index))
+    sigma = np.sqrt(variances_left(rows.fisher, index))
     axes = [0, 1]
     rate, exposure = exposure_of(config)
     for k in range(tracks):

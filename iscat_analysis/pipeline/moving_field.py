@@ -16,7 +16,7 @@ from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.scene import Scene, make_scene
-from iscat_analysis.records import FloatArray, FrameSource, Progress
+from iscat_analysis.records import FrameSource, Progress
 from iscat_analysis.search.moving import FrameFilter, Sightings
 from iscat_analysis.units import count
 
@@ -27,7 +27,7 @@ RING_SLOPE = 1.7
 """Distance of the outer rings of a particle over its height, tan 60°: within it, what is much
 fainter than the particle may be what the model leaves over of them."""
 
-_BLOCK = 64  # frames that are searched at a time
+_BLOCK = 16  # frames that are read or searched at a time; what more of them need is slow to clear
 
 
 def exposure_of(config: Config) -> tuple[float, float]:
@@ -143,7 +143,6 @@ def search_frames(
     field: MovingField,
     ground: Ground,
     rows: Rows,
-    snr: FloatArray,
     pool: ThreadPoolExecutor,
     frames: tuple[int, int] | None = None,
 ) -> Sightings:
@@ -159,8 +158,6 @@ def search_frames(
         The light without particles.
     rows : Rows
         Particles that are known.
-    snr : ndarray, shape (n,)
-        Their signal-to-noise ratios.
     pool : ThreadPoolExecutor
         Runs blocks of frames; the result does not depend on its size.
     frames : (int, int), optional
@@ -182,7 +179,7 @@ def search_frames(
         field.draw(ground, rows)
     starts = rows.starts(field.frames)
     pixel = field.pixel_nm
-    places = np.column_stack([rows.theta[:, :2] / pixel, snr])
+    places = np.column_stack([rows.theta[:, :2] / pixel, rows.snr])
 
     def block(first: int) -> Sightings:
         last = min(first + _BLOCK, end)

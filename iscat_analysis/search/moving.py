@@ -8,8 +8,12 @@ is not theirs alone yet: the sign of the contrast is the model's.
 
 from __future__ import annotations
 
+import gc
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -224,9 +228,7 @@ def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int
     tracks = np.zeros(len(frame), dtype=np.int64)
     if not len(frame):
         return tracks
-    import trackpy
-
-    logging.getLogger("trackpy").setLevel(logging.WARNING)  # it reports every frame
+    trackpy = _trackpy()
     frames = np.arange(frame[0], frame[-1] + 1)
     edges = np.searchsorted(frame, np.append(frames, frames[-1] + 1))
     spans = [slice(a, b) for a, b in pairwise(edges)]
@@ -236,8 +238,9 @@ def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int
         memory=memory,
     )
     try:
-        for span, (_, numbers) in zip(spans, linked, strict=True):
-            tracks[span] = numbers
+        with _uncollected():
+            for span, (_, numbers) in zip(spans, linked, strict=True):
+                tracks[span] = numbers
     except trackpy.SubnetOversizeException as trouble:
         raise DataError(
             f"too many particles are within track.max_step_nm = {reach_nm:g} of each other to tell "
@@ -245,6 +248,31 @@ def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int
             "fewer particles or more frames a second"
         ) from trouble
     return tracks
+
+
+@cache
+def _trackpy() -> Any:
+    """Import trackpy, silenced, which reports every frame, and let it keep what it compiles."""
+    import trackpy
+    from trackpy.linking import subnetlinker
+
+    logging.getLogger("trackpy").setLevel(logging.WARNING)
+    compiled = getattr(subnetlinker, "_numba_subnet_norecur", None)
+    if compiled is not None:
+        compiled.enable_caching()
+    return trackpy
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Look for no garbage among many small objects, all of which are needed until the end."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 def gaps(frame: IntArray, track: IntArray) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
