@@ -61,18 +61,15 @@ class Light(NamedTuple):
     power : ndarray, shape (t,)
         Power of each frame, 1 on average.
     background : ndarray, shape (y, x)
-        Photoelectrons at power 1 [e].
+        Photoelectrons at power 1; 0 in pixels that are not used [e].
     read : ndarray, shape (y, x)
-        Variance of the read noise [e²].
-    used : ndarray of bool, shape (y, x)
-        Pixels that may be used.
+        Variance of the read noise; 0 there too [e²].
     """
 
     counts: NDArray[np.float32]
     power: FloatArray
     background: FloatArray
     read: FloatArray
-    used: BoolArray
 
 
 class Field(NamedTuple):
@@ -188,7 +185,7 @@ def draw_gradient(
     signal_gradient(picture, lens, pixels, theta[0], theta[1], theta[3], out)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def add(total: NDArray[np.float32], r0: int, c0: int, sign: float, image: FloatArray) -> None:
     """Add an image, times a sign, to the part of a frame that begins at (r0, c0)."""
     for i in range(image.shape[0]):
@@ -196,7 +193,7 @@ def add(total: NDArray[np.float32], r0: int, c0: int, sign: float, image: FloatA
             total[r0 + i, c0 + j] += np.float32(sign * image[i, j])
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def stage(
     light: Light, t: int, total: NDArray[np.float32], own: FloatArray, r0: int, c0: int,
     data: FloatArray,
@@ -205,19 +202,19 @@ def stage(
 
     `own` (ny, 5, nx) begins with the particle's own signal.
     """
-    used, background, read, counts = light.used, light.background, light.read, light.counts
+    background, read, counts = light.background, light.read, light.counts
     w = light.power[t]
     for i in range(data.shape[1]):
         r = r0 + i
         for j in range(data.shape[2]):
-            level = w * background[r, c0 + j] if used[r, c0 + j] else 0.0
+            level = w * background[r, c0 + j]
             data[2, i, j] = level
             data[1, i, j] = level * (1.0 + total[r, c0 + j] - own[i, 0, j])
         for j in range(data.shape[2]):
-            noise = read[r, c0 + j] if used[r, c0 + j] else 0.0
-            seen = counts[t, r, c0 + j] if used[r, c0 + j] else 0.0
-            data[0, i, j] = seen + noise
-            data[3, i, j] = noise
+            data[3, i, j] = read[r, c0 + j]
+        for j in range(data.shape[2]):
+            seen = counts[t, r, c0 + j] if data[2, i, j] > 0.0 else 0.0
+            data[0, i, j] = seen + data[3, i, j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -30,7 +30,7 @@ PART = 0.5
 """Steps, in standard deviations, over which second derivatives are taken as differences."""
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _score_of(data: FloatArray, g: FloatArray, score: FloatArray) -> None:
     """Fill the four scores of a square whose signal and gradient are g (ny, 5, nx)."""
     score[:] = 0.0
@@ -51,7 +51,7 @@ def _score_of(data: FloatArray, g: FloatArray, score: FloatArray) -> None:
         score[3] += s3
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _add_curvature(
     data: FloatArray, here: FloatArray, plus: FloatArray, minus: FloatArray, bias: FloatArray
 ) -> None:
@@ -74,7 +74,7 @@ def _add_curvature(
         bias[3] -= 0.5 * b3 / PART**2
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _left_over(data: FloatArray, here: FloatArray) -> tuple[float, float, float, float]:
     """χ², pixels, largest residual and light of a square."""
     chi2 = used = worst = light = 0.0

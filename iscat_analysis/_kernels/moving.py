@@ -263,7 +263,7 @@ def _step(
     return gain
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _add_signal(here: FloatArray, step: FloatArray, out: FloatArray) -> None:
     """Add the signal after a small step to `out`."""
     dx, dy, dz, da = step[0], step[1], step[2], step[3]
@@ -314,7 +314,7 @@ def _invert(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _keep_slopes(
     level: FloatArray, gradient: FloatArray, index: IntArray, out: NDArray[np.float32]
 ) -> None:
@@ -327,7 +327,7 @@ def _keep_slopes(
                 out[k, i * nx + j] = level[i, j] * gradient[i, parameter, j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _shift(response: Response, r: int, move: FloatArray, step: FloatArray) -> None:
     """Fill `step` (k) with F⁻¹ G move: how far back a row goes as the background moves."""
     k = step.size
@@ -398,16 +398,16 @@ def shift_rows(response: Response, move: FloatArray, search: Search, theta: Floa
             theta[r, i] = min(max(theta[r, i] - step[a], search.lower[i]), search.upper[i])
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _add_stretch(light: Light, t: int, total: NDArray[np.float32], stretch: FloatArray) -> float:
     """Add w (1 + C) of a frame to `stretch`; return what the used pixels expect at power 1."""
     amount, w = 0.0, light.power[t]
-    background, used = light.background, light.used
+    background = light.background
     for i in range(stretch.shape[0]):
         for j in range(stretch.shape[1]):
             stretch[i, j] += w * (1.0 + total[i, j])
         for j in range(stretch.shape[1]):
-            amount += background[i, j] * (1.0 + total[i, j]) if used[i, j] else 0.0
+            amount += background[i, j] * (1.0 + total[i, j])
     return amount
 
 
@@ -445,7 +445,7 @@ def common_modes(
         Σ w B ∂C is added to it [e per unit].
     """
     rows, columns = light.background.shape
-    background, used = light.background, light.used
+    background = light.background
     profile = blank_profile(table_of(near, 0), near.lens, 2)
     g = np.empty(5 * field.side**2)
     for k in range(frame.size):
@@ -461,5 +461,5 @@ def common_modes(
         for a in range(index.size):
             for i in range(ny):
                 for j in range(nx):
-                    level = w * background[r0 + i, c0 + j] if used[r0 + i, c0 + j] else 0.0
+                    level = w * background[r0 + i, c0 + j]
                     mine[a, r0 - top + i, c0 - left + j] += level * here[i, 1 + index[a], j]

@@ -60,7 +60,7 @@ def _twice_artanh(w: float) -> float:
     return 2.0 * w * (1.0 + w2 * tail)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _some_value(
     kind: int, data: FloatArray, first: int, last: int, level: float, s: FloatArray
 ) -> float:
@@ -114,7 +114,7 @@ def signal_value(kind: int, data: FloatArray, level: float, s: FloatArray) -> fl
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _add_score(
     kind: int, data: FloatArray, first: int, last: int, level: float, g: FloatArray,
     sums: FloatArray,

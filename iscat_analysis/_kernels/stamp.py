@@ -77,8 +77,8 @@ def _copy(
 ) -> None:  # fmt: skip
     """Fill lines of `signal` with P + a Q, of `slope` with P + 2a Q, from every `step`-th row.
 
-    A slope without room is left out.  Numba counts no references here (`_nrt`), as nothing is
-    allocated or handed back: counting took as long as a line of twenty nodes.
+    A slope without room is left out.  Numba counts no references here and below (`_nrt`), as
+    nothing is allocated or handed back: counting took as long as a line of twenty nodes.
     """
     twice = a + a
     for m in range(signal.size // line):
@@ -115,14 +115,15 @@ def _mix_both(
         mix_both(a, b, c, d, w, v, k, out, other)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _make_strip(
     profile: AnyFloatArray, lens: Lens, row: int, rows: int, columns: int,
-    gradient: bool, w: AnyFloatArray,
+    gradient: bool, at: IntArray, w: AnyFloatArray,
 ) -> int:  # fmt: skip
     """Make a strip: P + a Q of its pixels, and with `gradient` ∂/∂x and ∂/∂y of it and P + 2a Q.
 
-    Returns where in the work space it begins; each of its images is `STRIP` lines long.
+    `at` (TAPS) is work space too.  Returns where in the other it begins; each of its images is
+    `STRIP` lines long.
     """
     fine = lens.fine
     line, block, made, strip = _sizes(lens, columns)
@@ -131,7 +132,6 @@ def _make_strip(
     per_phase = profile.shape[2] // fine
     nodes = w[_WEIGHTS : _WEIGHTS + 2 * fine * block]
     sums = w[_WEIGHTS + 2 * fine * block :]
-    at = np.empty(TAPS, dtype=np.int64)
     for k in range(TAPS):
         at[k] = k % fine * block + k // fine * line
     more, used = line - columns, rows * line
@@ -168,43 +168,59 @@ def _make_strip(
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def stamp_gradient(
     profile: AnyFloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
     out: FloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (ny, 5, nx) with signal and gradient of an image; ∂s/∂z is 0."""
-    rows, n = pixels.y.size, pixels.x.size
-    line, _, _, strip = _sizes(lens, n)
     f = _begin(profile, lens, pixels, x_p, y_p, amplitude)
+    _fill_gradient(profile, lens, amplitude, np.empty(TAPS, dtype=np.int64), f, out)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+def _fill_gradient(
+    profile: AnyFloatArray, lens: Lens, amplitude: float, at: IntArray, f: AnyFloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    rows, n = out.shape[0], out.shape[2]
+    line, _, _, strip = _sizes(lens, n)
     for row in range(rows):
         if row % STRIP == 0:
-            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, True, f)
-        s, x = f[begin : begin + n], f[begin + strip : begin + strip + n]
-        y = f[begin + 2 * strip : begin + 2 * strip + n]
-        d = f[begin + 3 * strip : begin + 3 * strip + n]
-        begin += line
+            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, True, at, f)
         here = out[row]
+        for k in range(3):  # one after the other: among ten arrays the compiler gives up on vectors
+            made, image = f[begin + k * strip : begin + k * strip + n], here[k]
+            factor = -amplitude if k else amplitude
+            for j in range(n):
+                image[j] = factor * made[j]
+        made, image = f[begin + 3 * strip : begin + 3 * strip + n], here[4]
         for j in range(n):
-            here[0, j] = amplitude * s[j]
-            here[1, j] = -amplitude * x[j]
-            here[2, j] = -amplitude * y[j]
-            here[3, j] = 0.0
-            here[4, j] = d[j]
+            image[j] = made[j]
+        here[3] = 0.0
+        begin += line
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def stamp_signal(
     profile: AnyFloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
     out: FloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (ny, nx) with the signal of an image."""
-    rows, n = pixels.y.size, pixels.x.size
-    line = _sizes(lens, n)[0]
     f = _begin(profile, lens, pixels, x_p, y_p, amplitude)
+    _fill_signal(profile, lens, amplitude, np.empty(TAPS, dtype=np.int64), f, out)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+def _fill_signal(
+    profile: AnyFloatArray, lens: Lens, amplitude: float, at: IntArray, f: AnyFloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    rows, n = out.shape
+    line = _sizes(lens, n)[0]
     for row in range(rows):
         if row % STRIP == 0:
-            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, False, f)
+            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, False, at, f)
         s, here = f[begin : begin + n], out[row]
         begin += line
         for j in range(n):

@@ -468,7 +468,8 @@ class MovingField:
         return np.asarray((near & self.free).any(axis=1))
 
     def _light(self, ground: Ground) -> Light:
-        return Light(self.counts_e, ground.power, ground.level, self.read_e2, self.used)
+        level, read = (np.where(self.used, part, 0.0) for part in (ground.level, self.read_e2))
+        return Light(self.counts_e, ground.power, level, read)
 
     def _sum_of(self, block: Callable[[int], FloatArray]) -> FloatArray:
         """Run blocks of frames and add what they give, in their order."""

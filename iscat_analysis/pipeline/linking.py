@@ -69,7 +69,8 @@ def linked(
     if bridged:
         rows = replace(rows, track=bridge(config, rows))
     missed, before, after, share = gaps(rows.frame, rows.track)
-    between = (1 - share)[:, None] * rows.theta[before] + share[:, None] * rows.theta[after]
+    steps = rows.theta[after] - rows.theta[before]  # a height that is fixed stays what it is
+    between = rows.theta[before] + share[:, None] * steps
     return numbered(rows.joined(missed, rows.track[before], between, rows.group[before]))
 
 

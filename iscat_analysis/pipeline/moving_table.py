@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -75,7 +77,7 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     sigma, crb = np.hypot(sigma, own), np.hypot(crb, own)
     freedom = np.maximum(judged.pixels - index.size, 1)
     p_value = _p_values(judged.chi2, freedom, judged.worst, judged.pixels)
-    collected = judged.level / pixel**2 * _areas(model, estimate[:, 2], mass)
+    collected = judged.level / pixel**2 * _areas(model, estimate[:, 2], estimate[:, 3])
     columns: dict[str, object] = {
         "track": rows.track, "frame": rows.frame + first_frame,
         "n_before": np.full(n, field.frames), "n_after": np.ones(n, dtype=int),
@@ -131,15 +133,20 @@ def table_of_tracks(
     if parted:
         names = ("track", "mass_kda", "crb_mass_kda")
         off = unlike(*(table[name].to_numpy() for name in names))
-    judged = []
-    for text, shared in zip(table["flags"], off, strict=True):
-        own = [Status(flag) for flag in text.split(";") if flag]
-        judged.append(verdict([*own, Status.TOO_CLOSE] if shared else own))
+    pairs = zip(table["flags"], off.tolist(), strict=True)
+    judged = [_verdict(text, shared) for text, shared in pairs]
     table = table.assign(
         status=[str(status) for status, _ in judged],
         flags=[";".join(str(flag) for flag in flags) for _, flags in judged],
     )
     return table[[*EVENT_COLUMNS, "track"]]
+
+
+@cache
+def _verdict(flags: str, shared: bool) -> tuple[Status, tuple[Status, ...]]:
+    """Judge the remarks on a row, one of which may be that its mass is shared."""
+    own = [Status(flag) for flag in flags.split(";") if flag]
+    return verdict([*own, Status.TOO_CLOSE] if shared else own)
 
 
 def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
@@ -286,13 +293,13 @@ def _heights(z_nm: FloatArray) -> FloatArray:
     return np.array([low]) if low == high else np.linspace(low, high, _HEIGHTS)
 
 
-def _areas(model: ForwardModel, z_nm: FloatArray, mass_kda: FloatArray) -> FloatArray:
+def _areas(model: ForwardModel, z_nm: FloatArray, amplitude: FloatArray) -> FloatArray:
     """Give the collected light as an area of background [nm²]."""
     heights = _heights(z_nm)
     nominal = model.material.mass_kda
     unit = [collected_area_nm2(model, float(z), nominal) for z in heights]
-    scale = [model.scale.amplitude(float(m)) / model.scale.amplitude(nominal) for m in mass_kda]
-    return np.asarray(np.interp(z_nm, heights, unit) * np.array(scale) ** 2)
+    scale = amplitude / model.scale.amplitude(nominal)
+    return np.asarray(np.interp(z_nm, heights, unit) * scale**2)
 
 
 def _quantum(

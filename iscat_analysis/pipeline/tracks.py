@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -404,10 +405,19 @@ def _film(
         )
         single = add_frames(here, camera, movie.read(frame, frame + 1), frame)
         if scene.config.background.power_normalization:
-            single = start_power(single)
+            single = _at_its_power(scene, here, single)
         pictures.append(_picture(scene, single, region, seen.get(frame, ())))
     contrast, model, residual = (np.array(part) for part in zip(*pictures, strict=True))
     return Film(track, tuple(shown["frame"].astype(int)), why, contrast, model, residual)
+
+
+def _at_its_power(scene: Scene, windows: Windows, single: Windows) -> Windows:
+    """Give a frame its power: what was learnt with the tracks, or what its pixels say."""
+    if way_of(scene.config) != "tracks":
+        return start_power(single)
+    before, after = np.split(windows.power, [windows.n_before])
+    frame = single.frames_after[0] - windows.frames_after[0]
+    return replace(single, power_ratio=float(after[frame] / before.sum()))
 
 
 def _square(scene: Scene, windows: Windows, rows: pd.DataFrame) -> Region:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import LinAlgError, cho_solve, cholesky
+from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 from scipy.special import chdtrc
 
@@ -146,15 +146,21 @@ def anomalous_test(
     if not free > 0:
         return AnomalousTest(1.0, 0.0, math.nan, math.nan, 0.0)
     lags = _Lags.of(track)
+    unit = 1 / math.sqrt(track.steps_nm.size)  # of ln D and the exponent: about their errors
+
+    def at(theta: FloatArray) -> tuple[float, float]:
+        return free * math.exp(unit * theta[0]), 1 + unit * float(theta[1])
 
     def lost(theta: FloatArray) -> float:
-        return -_dense(track, free * math.exp(theta[0]) * _covariance(track, lags, float(theta[1])))
+        d, exponent = at(theta)
+        return -_dense(track, d * _covariance(track, lags, exponent))
 
     found = minimize(
-        lost, [0.0, 1.0], method="L-BFGS-B", jac="2-point", bounds=[(-20.0, 20.0), _EXPONENTS],
-        options={"ftol": 1e-9, "finite_diff_rel_step": _PART},
+        lost, [0.0, 0.0], method="L-BFGS-B",
+        bounds=[(-20.0 / unit, 20.0 / unit), [(end - 1) / unit for end in _EXPONENTS]],
+        options={"ftol": 1e-9, "eps": _PART / unit},
     )  # fmt: skip
-    d, exponent = free * math.exp(found.x[0]), float(found.x[1])
+    d, exponent = at(found.x)
     ratio = max(2 * (-float(found.fun) - track.likelihood(free).value), 0.0)
     return AnomalousTest(
         p_value=float(chdtrc(1, ratio)),
@@ -349,11 +355,11 @@ def _dense(track: Displacements, motion: FloatArray) -> float:
     value = 0.0
     for axis, steps in enumerate(track.steps_nm):
         try:
-            factor = cholesky(_with_errors(track, motion, axis), lower=True)
+            factor = cholesky(_with_errors(track, motion, axis), lower=True, check_finite=False)
         except LinAlgError:
             return -math.inf
-        inside = float(steps @ cho_solve((factor, True), steps))
-        value -= inside / 2 + float(np.log(np.diag(factor)).sum())
+        white = solve_triangular(factor, steps, lower=True, check_finite=False)
+        value -= float(white @ white) / 2 + float(np.log(np.diag(factor)).sum())
     return value - track.steps_nm.size * math.log(2 * math.pi) / 2
 
 
