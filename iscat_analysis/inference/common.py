@@ -14,6 +14,9 @@ information M = N − Σ_t G_tᵀ F_t⁻¹ G_t, and a row the covariance
 
     F_t⁻¹ + F_t⁻¹ G_t M⁻¹ G_tᵀ F_t⁻¹.
 
+With F_t⁻¹ = R_t R_tᵀ and K = Rᵀ G N⁻¹ Gᵀ R of all rows together, which is smaller than M for a
+short track, what is added is R ((1 − K)⁻¹ − 1) Rᵀ (Woodbury).
+
 A mass that is common to the frames keeps Σ_t J_t − cᵀ M⁻¹ c, with M, c and J_t those that are left
 when the places alone follow.  M couples all pixels of a track.  Where it covers so many that it
 moved far (`MOST_PIXELS`), only the errors common to all frames are kept: with F = Σ_t F_t and
@@ -45,6 +48,7 @@ _TOGETHER = 128  # rows whose products are added in single precision
 _DOUBTFUL = 2.5  # logarithm of the largest pivot over the least, where 1e-7 may count
 _STEPS = 4  # of Newton's method
 _SETTLED = 0.3  # standard deviations; what a step leaves is a fiftieth of it
+_SHORT = 0.5  # unknowns of a track over its pixels, below which the matrix of these is larger
 _AT_ONCE = 128  # unknowns of a triangular system that are solved without products
 
 
@@ -170,18 +174,44 @@ def _all_pixels(
     slopes = changes.reshape(*changes.shape[:2], -1)
     if pixels.size < weight.size:
         slopes = slopes[:, :, pixels]
+    if slopes.shape[0] * slopes.shape[1] < _SHORT * pixels.size:
+        return _of_a_short_one(slopes, weight.flat[pixels], inverse)
     follows, left = _undetermined(slopes, weight.flat[pixels], inverse)
     if left is None or np.ptp(np.log(left.diagonal())) > _DOUBTFUL:
         follows, left = _undetermined(slopes.astype(np.float64), weight.flat[pixels], inverse)
-    own = np.diag(inverse[:, -1, -1])
     if left is None:
-        unknown = np.broadcast_to(np.diag(np.full(index.size, np.inf)), inverse.shape)
-        return unknown, np.full_like(own, np.inf)
+        return _unknown(inverse)
+    own = np.diag(inverse[:, -1, -1])
     every = follows.reshape(-1, follows.shape[2])
     _forward(left.astype(every.dtype), every.T)
     root = follows
     extra = (root @ np.swapaxes(root, 1, 2)).astype(np.float64)
     return extra, own + (root[:, -1] @ root[:, -1].T).astype(np.float64)
+
+
+def _of_a_short_one(
+    slopes: NDArray[np.float32], weight: FloatArray, inverse: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Give the same of a track with fewer unknowns than pixels."""
+    n, free, _ = slopes.shape
+    root = np.linalg.cholesky(inverse)
+    felt = (np.swapaxes(root, 1, 2) @ slopes * np.sqrt(weight)).reshape(n * free, -1)
+    factor = _factor(np.eye(n * free) - felt @ felt.T)
+    if factor is None:
+        return _unknown(inverse)
+    half = np.linalg.inv(factor)
+    more = (half.T @ half - np.eye(n * free)).reshape(n, free, n, free)
+    each = np.arange(n)
+    extra = root @ more[each, :, each] @ np.swapaxes(root, 1, 2)
+    amplitudes = np.einsum("ia,iajb,jb->ij", root[:, -1], more, root[:, -1], optimize=True)
+    return extra, np.diag(inverse[:, -1, -1]) + amplitudes
+
+
+def _unknown(inverse: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Covariances where the background takes all that was known."""
+    diagonal = np.diag(np.full(inverse.shape[1], np.inf))
+    every = np.diag(inverse[:, -1, -1])
+    return np.broadcast_to(diagonal, inverse.shape), np.full_like(every, np.inf)
 
 
 def _undetermined(

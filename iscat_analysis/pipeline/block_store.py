@@ -175,7 +175,7 @@ def analyse_block(
         ),
         level=moving.ground.level,
         power=moving.ground.power,
-        total_e=field.counts_e.sum(axis=0, dtype=np.float64),
+        total_e=field.total_e,
         used=field.used,
         saturated=field.saturated,
         gain_message=gain_message,

@@ -59,6 +59,7 @@ _USELESS = 300.0  # times the median error of a track: such a place says nothing
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
 _FEW = 5e-3  # of all rows: a search that adds no more is the last
+_FULL, _SAMPLED = 2, 4  # searches of all frames, after which one of so many tells whether to go on
 _FIRST_HEIGHTS = 1  # searches after which every row is put into its fringe
 _HELD_ROUNDS = 2  # in which slow particles are tried where they were not seen
 
@@ -158,8 +159,12 @@ def follow(
     total = ROUNDS + 3
     for number in range(ROUNDS):
         progress("track", number, total)
-        found = search_frames(scene, field, ground, rows, pool)
         before = len(rows.frame)
+        if number >= _FULL:
+            some = search_frames(scene, field, ground, rows, pool, every=_SAMPLED)
+            if len(some.frame) <= _FEW * before / _SAMPLED:
+                break
+        found = search_frames(scene, field, ground, rows, pool)
         if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(scene, rows, found)

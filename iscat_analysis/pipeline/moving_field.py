@@ -145,6 +145,8 @@ def search_frames(
     rows: Rows,
     pool: ThreadPoolExecutor,
     frames: tuple[int, int] | None = None,
+    *,
+    every: int = 1,
 ) -> Sightings:
     """Find candidates in what the rows leave over.
 
@@ -162,6 +164,8 @@ def search_frames(
         Runs blocks of frames; the result does not depend on its size.
     frames : (int, int), optional
         Which of the field's frames, half-open; default all.
+    every : int
+        Of blocks of frames, the first of so many is searched.
 
     Returns
     -------
@@ -189,7 +193,7 @@ def search_frames(
         )
 
     begin, end = frames or (0, field.frames)
-    parts = list(pool.map(block, range(begin, end, _BLOCK)))
+    parts = list(pool.map(block, range(begin, end, every * _BLOCK)))
     return Sightings(
         *(np.concatenate([getattr(part, name) for part in parts])
           for name in ("frame", "x_px", "y_px", "z_nm", "strength", "snr"))

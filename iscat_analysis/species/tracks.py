@@ -157,12 +157,13 @@ def describe_tracks(
     records, tested = [], True
     for done, (track, rows) in enumerate(groups.items()):
         exact = masses.loc[track].to_dict() if masses is not None and track in masses.index else {}
-        record = _record(track, rows, setup, power, correlation, exact)
+        placed = _placed(rows)
+        record = _record(track, rows, placed, setup, power, correlation, exact)
         record["nearest_nm"] = nearest.get(track, np.inf)
         try:
             if tested:
                 rng = np.random.default_rng([seed, track])
-                record |= _tests(rows, setup, rng) if np.isfinite(record["d_um2_s"]) else {}
+                record |= _tests(placed, setup, rng) if np.isfinite(record["d_um2_s"]) else {}
                 progress("tracks", done + 1, len(groups))
         except KeyboardInterrupt:
             tested = False
@@ -193,13 +194,14 @@ def _placed(rows: pd.DataFrame) -> pd.DataFrame:
 def _record(
     track: int,
     rows: pd.DataFrame,
+    placed: pd.DataFrame,
     setup: TrackSetup,
     power: float,
     correlation: Correlation | None,
     exact: Mapping[str, float],
 ) -> dict[str, Any]:
     """Describe one track, but for the tests of its motion."""
-    good, placed = _massive(rows), _placed(rows)
+    good = _massive(rows)
     record: dict[str, Any] = dict.fromkeys(TRACK_COLUMNS, np.nan)
     record |= {
         "track": track,
@@ -256,10 +258,10 @@ def _diffusion(placed: pd.DataFrame, setup: TrackSetup) -> Diffusion | None:
         return None
     room = _room(placed, setup)[:-1]
     gaps_s = np.diff(placed["frame"].to_numpy(float)) / setup.frame_rate_hz
-    counted, found = np.ones(room.size, dtype=bool), None
+    counted, found, positions = np.ones(room.size, dtype=bool), None, _positions(placed)
     for _ in range(_LOOKS):
         found = fit_diffusion(
-            *_positions(placed),
+            *positions,
             frame_rate_hz=setup.frame_rate_hz,
             exposure_ms=setup.exposure_ms,
             counted=counted,
@@ -318,10 +320,10 @@ def _size(record: Mapping[str, Any], setup: TrackSetup) -> dict[str, float]:
     return size
 
 
-def _tests(rows: pd.DataFrame, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:
+def _tests(placed: pd.DataFrame, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:
     """Ask whether the motion is free, two tests of the first positions of a long track."""
-    placed = _placed(rows)
-    track = _positions(placed.iloc[:TESTED_POSITIONS])
+    whole = _positions(placed)
+    track = tuple(part[:TESTED_POSITIONS] for part in whole)
     times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
     walls = confinement_test(*track, **times, resamples=_FIRST_LOOK, enough=_ENOUGH, rng=rng)
     if walls.p_value <= _DOUBT:
@@ -333,7 +335,7 @@ def _tests(rows: pd.DataFrame, setup: TrackSetup, rng: np.random.Generator) -> d
         "exponent": power.exponent,
         "sigma_exponent": power.sigma_exponent,
         "p_anomalous": power.p_value,
-        "p_steady": steadiness_test(*_positions(placed), **times),
+        "p_steady": steadiness_test(*whole, **times),
     }
 
 

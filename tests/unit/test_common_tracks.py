@@ -137,9 +137,35 @@ def test_a_particle_that_hardly_moves_is_worked_out_in_double_precision(
         (mine, covariance) = shared_errors(field, ground, truth, judged).together[0]
         return float(1 / math.sqrt(np.linalg.solve(covariance, np.ones(mine.size)).sum()))
 
+    with monkeypatch.context() as patch:
+        patch.setattr(common, "_SINGULAR", 0.0)  # which is added to either matrix
+        by_rows = amplitude_error(usual)
+        patch.setattr(common, "_SHORT", 0.0)
+        assert by_rows == pytest.approx(amplitude_error(-1.0), rel=1e-6)
+    monkeypatch.setattr(common, "_SHORT", 0.0)
     exact = amplitude_error(-1.0)
     assert amplitude_error(usual) == pytest.approx(exact, rel=1e-2)
     assert amplitude_error(math.inf) != pytest.approx(exact, rel=0.1)
+
+
+def test_short_tracks_are_worked_out_by_their_rows(
+    model: ForwardModel, pool: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which is the same as by their pixels, but for the rounding of single precision."""
+    path = np.cumsum(np.random.default_rng(4).normal(0.0, 60.0, (1, FRAMES, 2)), axis=1) + 1250.0
+    mean, truth = _expected(model, path)
+    field, ground = _field(model, mean, pool), Ground(_level(), np.ones(FRAMES))
+    judged = field.judge(ground, truth)
+    found = []
+    for short in (0.0, math.inf):
+        monkeypatch.setattr(common, "_SHORT", short)
+        shared = shared_errors(field, ground, truth, judged)
+        found.append((shared.covariance, shared.together[0][1]))
+    for one, two in zip(*found, strict=True):
+        scale = np.sqrt(np.abs(np.diagonal(one, axis1=-2, axis2=-1)))
+        scale = scale[..., :, None] * scale[..., None, :] + 1e-300
+        assert np.abs((two - one) / scale).max() < 1e-3
+        assert np.abs(one).max() > 0
 
 
 def test_tracks_go_on_through_a_meeting(model: ForwardModel, pool: ThreadPoolExecutor) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -197,6 +198,67 @@ def test_rows_are_fitted_by_the_one_likelihood(pool: ThreadPoolExecutor) -> None
         assert judged.gain[row] == pytest.approx(gain, rel=1e-4)
 
 
+def test_rows_know_what_their_last_fit_saw(pool: ThreadPoolExecutor) -> None:
+    """Information and signal-to-noise ratio of a fit are those of a judgement without another.
+
+    But for what the neighbour moves afterwards, whose rings reach into the square.
+    """
+    counts, ground, truth = _movie(_paths(40.0), noise=True)
+    field = _field(counts, pool, READ_E2)
+    assert np.isnan(truth.snr).all()
+    rows, _, _ = field.fit(ground, truth, sweeps=3)
+    judged = field.judge(ground, rows, brief=True)
+    error = np.sqrt(judged.fisher[:, 3, 3] / rows.fisher[:, 3, 3])
+    assert np.abs(error - 1).max() < 1e-3
+    difference = np.abs(rows.snr / np.sqrt(2 * judged.gain) - 1)
+    assert np.median(difference) < 1e-3
+    assert difference.max() < 0.03
+    few, done = field.refit(ground, truth.only(truth.frame < 3), sweeps=3)
+    assert done.all()
+    smaller = few.snr / rows.snr[:6]  # in a quarter of the pixels
+    assert np.all((smaller > 0.7) & (smaller < 1.0))
+
+
+def test_only_rows_that_are_the_same_recall_their_fits(pool: ThreadPoolExecutor) -> None:
+    counts, ground, truth = _movie(_paths(40.0), noise=True)
+    fitted, _, _ = _field(counts, pool).fit(ground, truth)
+    theta = fitted.theta.copy()
+    theta[7, 0] += 1e-9
+    track = np.where(np.arange(len(theta)) == 4, 2, fitted.track)
+    again = Rows.of(fitted.frame, track, theta).joined(
+        np.array([5]), np.array([3]), theta[:1], np.array([0])
+    )
+    recalled = again.recalling(fitted)
+    new = np.isnan(recalled.snr)
+    assert new.sum() == 3
+    assert set(zip(recalled.frame[new], recalled.track[new], strict=True)) == {
+        (2, 2), (3, 1), (5, 3),
+    }  # fmt: skip
+    kept = recalled.only(~new)
+    same = np.isin(np.arange(len(theta)), [4, 7], invert=True)
+    assert np.array_equal(kept.snr, fitted.snr[same])
+    assert np.array_equal(kept.fisher, fitted.fisher[same])
+
+
+def test_rows_follow_a_step_of_their_background(pool: ThreadPoolExecutor) -> None:
+    """To first order, expected information for observed, as a fit over the new one moves them."""
+    counts, ground, truth = _movie(_paths(40.0), noise=True)
+    field = _field(counts, pool)
+    for _ in range(3):
+        truth, _, _ = field.fit(ground, truth)
+    step = 1e-3 * np.random.default_rng(2).standard_normal(SHAPE)  # two thirds of a frame's noise
+    foreseen = field.followed(truth, step).theta - truth.theta
+    field = _field(counts, pool)
+    rows = truth
+    for _ in range(3):
+        rows, _, _ = field.fit(replace(ground, level=ground.level * np.exp(step)), rows, sweeps=2)
+    moved = rows.theta - truth.theta
+    index = np.array([0, 1, 3])
+    error = np.sqrt(np.mean((moved - foreseen)[:, index] ** 2, axis=0))
+    assert np.all(error < 0.25 * np.sqrt(np.mean(moved[:, index] ** 2, axis=0)))
+    assert np.all(foreseen[:, [2, 4]] == 0)
+
+
 def test_residuals_are_of_the_rows_that_are_asked_for(pool: ThreadPoolExecutor) -> None:
     """Whatever the canvas holds: rows drawn together, alone, or moved by a fit in between."""
     counts, ground, rows = _movie(_paths(30.0), noise=True)
@@ -297,11 +359,13 @@ def test_blur_is_that_of_a_brownian_path() -> None:
 
 
 def test_links_survive_gaps() -> None:
+    """And garbage is looked for again after them."""
     frame = np.array([0, 0, 1, 1, 2, 4, 4, 5])
     places = np.array([[0.0, 0], [900, 0], [50, 0], [950, 0], [940, 0], [60, 0], [930, 0], [0, 0]])
     track = link(frame, places, reach_nm=200.0, memory=3)
     assert track[0] == track[2] == track[5] == track[7]
     assert track[1] == track[3] == track[4] == track[6]
+    assert gc.isenabled()
     missed, before, after, share = gaps(frame, track)
     assert sorted(zip(missed.tolist(), track[before].tolist(), strict=True)) == sorted(
         [(2, track[0]), (3, track[0]), (3, track[1])]
