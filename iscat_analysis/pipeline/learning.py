@@ -45,7 +45,7 @@ from iscat_analysis.pipeline.microscope import (
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, judge_counts
 from iscat_analysis.pipeline.sights import bright_sights, kind_of, reach_nm, scan_sights
 from iscat_analysis.pipeline.ways import way_of
-from iscat_analysis.records import Mapper, Progress, silent
+from iscat_analysis.records import FREE_PARAMETERS, Mapper, Progress, silent
 from iscat_analysis.search.sliding import measure_frames
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
@@ -99,7 +99,7 @@ def learn_optics(
     measured = config.background.method != "known"
     if (
         optics.calibrate == "never"
-        or (optics.calibrate == "auto" and optics.file is not None)
+        or (optics.calibrate == "auto" and (optics.file is not None or _at_heights(config)))
         or not suited
         or not measured
         or config.fit.mode == "track"
@@ -140,6 +140,11 @@ def learn_optics(
     for note in found.notes:
         tell(note)
     return learned, summary | {"calibrated": True}
+
+
+def _at_heights(config: Config) -> bool:
+    """Whether heights are fitted, so that particles need not be at ``particle.height_nm``."""
+    return "z_nm" in FREE_PARAMETERS[config.fit.mode]
 
 
 def calibrate_movie(

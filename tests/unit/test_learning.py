@@ -132,3 +132,21 @@ def test_neither_rings_of_neighbours_nor_the_gain_condemn_the_optics(
     assert summary["calibrated"] is False
     assert len(said) == bool(said_first)
     assert not said or said[0].startswith(said_first)
+
+
+@pytest.mark.parametrize("mode", ["joint", "localize"])
+def test_particles_at_heights_of_their_own_do_not_condemn_the_optics(
+    monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    """The test takes them for particles at particle.height_nm, which these modes do not."""
+    config = _config("auto")
+    free = config.model_copy(update={"fit": config.fit.model_copy(update={"mode": mode})})
+    sights, _, _ = make_sights({"focus_nm": -450.0}, 8, seed=3)
+    monkeypatch.setattr(learning, "_noise_differs", lambda *_: False)
+    monkeypatch.setattr(learning, "bright_sights", lambda *_: (sights, []))
+    camera = camera_from_config(config.camera, (64, 64), "uint16")
+    said: list[str] = []
+    assert learn_optics(MOVIE, free, camera, tell=said.append) == (free, {})
+    assert not said
+    learn_optics(MOVIE, config, camera, tell=said.append)  # the control: one height for all
+    assert len(said) == 1
