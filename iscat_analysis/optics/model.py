@@ -467,9 +467,13 @@ class ForwardModel:
         float
             Peak contrast, or the peak of |E_sca|² in dark field.
         """
-        if height == "exact" or not isinstance(self.wave, RadialField):
+        if height == "exact" or isinstance(self.wave, MeasuredField):
             return sum(self.wave.peak(z_nm, amplitude, self.rho))
-        profile = np.empty((self.wave.table.shape[3] - 1, POWERS, 4))
+        if isinstance(self.wave, RadialField):
+            profile = np.empty((self.wave.table.shape[3] - 1, POWERS, 4))
+        else:
+            nodes = 2 * self.wave.half + 1
+            profile = np.empty((3 * self.axial_table.heights.shape[2], nodes, nodes))
         profile_between(self.axial_table, z_nm, profile)
         return sum(self.wave.peak(z_nm, amplitude, self.rho, profile))
 

@@ -293,12 +293,21 @@ class LatticeField:
 
         return kept(_HEIGHTS_KEPT, at)
 
-    def peak(self, z_nm: float, amplitude: float, rho: float) -> tuple[float, float]:
+    def peak(
+        self, z_nm: float, amplitude: float, rho: float, profile: FloatArray | None = None
+    ) -> tuple[float, float]:
         """Parts of the signal of largest magnitude that are linear and quadratic in a.
 
-        The largest on a fine grid, then Newton's method.
+        The largest on a fine grid, then Newton's method; from a profile at that height where one is
+        given, else exactly.
         """
-        grid, along, power = self._plane(z_nm)
+        exact = profile is None
+        if profile is None:
+            profile = self.profile(z_nm, 3)
+            along, power = self._plane(z_nm)
+        else:
+            along, power = self._parts(profile, self._grid)
+        grid = self._grid
         signal = 2 * rho * amplitude * along + amplitude**2 * power
         row, column = np.unravel_index(np.argmax(np.abs(signal)), signal.shape)
         x, y = float(grid.x[column]), float(grid.y[row])
@@ -306,7 +315,6 @@ class LatticeField:
         point, one = np.zeros(1), np.ones(1)
         out = np.empty((1, ROWS, 1))
         if 0 < row < grid.y.size - 1 and 0 < column < grid.x.size - 1:
-            profile = self.profile(z_nm, 3)
             for _ in range(_NEWTON):
                 pixels = Pixels(np.array([x]), np.array([y]), point, one)
                 signal_hessian(profile, lens, pixels, 0.0, 0.0, amplitude, out)
@@ -317,26 +325,31 @@ class LatticeField:
                     x + float(np.clip(move[0], -step, step)),
                     y + float(np.clip(move[1], -step, step)),
                 )
-        field = self.components(np.array([x]), np.array([y]), z_nm)[:, 0]
-        return (
-            2 * rho * amplitude * float(field[0].real),
-            amplitude**2 * float(np.sum(np.abs(field) ** 2)),
-        )
+        if exact:
+            field = self.components(np.array([x]), np.array([y]), z_nm)[:, 0]
+            re, square = float(field[0].real), float(np.sum(np.abs(field) ** 2))
+        else:
+            at_top = self._parts(profile, Pixels(np.array([x]), np.array([y]), point, one))
+            re, square = (float(part[0, 0]) for part in at_top)
+        return 2 * rho * amplitude * re, amplitude**2 * square
 
     @cached_property
-    def _plane(self) -> Callable[[float], tuple[Pixels, FloatArray, FloatArray]]:
+    def _grid(self) -> Pixels:
+        """Points on which the largest signal is looked for."""
         half = int(self.reach_nm / math.sqrt(2) / (self.step_nm * _PEAK_STEP))
         axis = self.step_nm * _PEAK_STEP * np.arange(-half, half + 1, dtype=np.float64)
-        pixels = Pixels(axis, axis, np.zeros(1), np.ones(1))
+        return Pixels(axis, axis, np.zeros(1), np.ones(1))
 
-        def at(z_nm: float) -> tuple[Pixels, FloatArray, FloatArray]:
-            profile, lens = self.profile(z_nm, 3), self.lens(1.0)
-            above, below = np.empty((2, axis.size, axis.size))
-            signal_image(profile, lens, pixels, 0.0, 0.0, 1.0, above)
-            signal_image(profile, lens, pixels, 0.0, 0.0, -1.0, below)
-            return pixels, (above - below) / 4, (above + below) / 2
+    @cached_property
+    def _plane(self) -> Callable[[float], tuple[FloatArray, FloatArray]]:
+        return kept(_HEIGHTS_KEPT, lambda z_nm: self._parts(self.profile(z_nm, 3), self._grid))
 
-        return kept(_HEIGHTS_KEPT, at)
+    def _parts(self, profile: FloatArray, pixels: Pixels) -> tuple[FloatArray, FloatArray]:
+        """Re e_u and |e|² at points, from a profile."""
+        above, below = np.empty((2, pixels.y.size, pixels.x.size))
+        for sign, out in ((1.0, above), (-1.0, below)):
+            signal_image(profile, self.lens(1.0), pixels, 0.0, 0.0, sign, out)
+        return (above - below) / 4, (above + below) / 2
 
 
 Field = RadialField | LatticeField | MeasuredField

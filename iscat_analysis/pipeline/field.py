@@ -252,17 +252,34 @@ def _fit_all(
         shape = (windows.after_e.shape[0], windows.after_e.shape[1])
         taken = scene.lines.taken(total_signal(scene, shape, events))
 
-    def one(index: int) -> Fitted | None:
-        start = candidates[index]
-        if "mass_kda" not in free:
-            start = replace(start, mass_kda=nominal)
-        if "z_nm" not in free:
-            start = replace(start, z_nm=height)
-        region = region_around(scene.roi_px, windows.after_e.shape, start)
-        others = np.zeros(region.shape)
-        for number, event in enumerate(events):
+    starts = [
+        replace(
+            start,
+            mass_kda=start.mass_kda if "mass_kda" in free else nominal,
+            z_nm=start.z_nm if "z_nm" in free else height,
+        )
+        for start in candidates
+    ]
+    regions = [region_around(scene.roi_px, windows.after_e.shape, start) for start in starts]
+    beside = [np.zeros(region.shape) for region in regions]
+
+    def drawn(number: int) -> list[tuple[int, FloatArray]]:
+        """Draw an event in the regions that it reaches; its field at its height is made once."""
+        images = []
+        for index, region in enumerate(regions):
+            image = np.zeros(region.shape)
             if number != first + index:
-                add_signal(scene, event.place, region, others)
+                add_signal(scene, events[number].place, region, image)
+            if image.any():
+                images.append((index, image))
+        return images
+
+    for images in pool.map(drawn, range(len(events))):
+        for index, image in images:
+            beside[index] += image
+
+    def one(index: int) -> Fitted | None:
+        start, region, others = starts[index], regions[index], beside[index]
         if taken is not None:
             others = (1 + others) / taken[region.slices] - 1
         likelihood = region_likelihood(scene, windows, region, others)
