@@ -282,7 +282,7 @@ def _contrasts(model: ForwardModel, z_nm: FloatArray, amplitude: FloatArray) -> 
         share = amplitude / middle
         return np.asarray(linear * share + quadratic * share**2)
     pairs = zip(z_nm.tolist(), amplitude.tolist(), strict=True)
-    return np.array([model.amplitude_contrast(z, a) for z, a in pairs])
+    return np.array([model.amplitude_contrast(z, a, "between") for z, a in pairs])
 
 
 def _heights(z_nm: FloatArray) -> FloatArray:

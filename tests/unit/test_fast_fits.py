@@ -355,7 +355,8 @@ def test_what_has_no_picture_takes_the_field() -> None:
 @pytest.mark.parametrize("optics", [
     {}, {"analyzer": True}, {"polarization": "circular"},
     {"polarization": "circular", "analyzer": True}, {"scheme": "darkfield"},
-    {"aberrations_nm": {"z5": 12.0, "z7": -9.0}}, {"aberrations_nm": {"z5": 12.0}, "analyzer": True},
+    {"aberrations_nm": {"z5": 12.0, "z7": -9.0}},
+    {"aberrations_nm": {"z5": 12.0}, "analyzer": True},
 ])  # fmt: skip
 def test_largest_contrast(optics: dict[str, object]) -> None:
     model = forward_model(make_config(calibrated=False, optics=optics), 1500.0)
