@@ -26,13 +26,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.canvas import Canvas, Field, Light
 from iscat_analysis._kernels.judging import judge_frames
-from iscat_analysis._kernels.moving import (
-    Response,
-    Search,
-    common_modes,
-    fit_frames,
-    shift_rows,
-)
+from iscat_analysis._kernels.moving import Response, Search, common_modes, fit_frames, shift_rows
 from iscat_analysis._kernels.scoring import CONVERGED
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.newton import newton_step
@@ -231,7 +225,7 @@ class MovingField:
         level = np.where(stretch > 0, self.total_e / np.where(stretch > 0, stretch, 1.0), 1.0)
         totals = self.frame_totals
         power = np.where(expected > 0, totals / np.where(expected > 0, expected, 1.0), 1.0)
-        fitted = _fitted(rows, theta, fisher, gain) if sweeps else rows
+        fitted = rows.fitted(theta, fisher, gain) if sweeps else rows
         self._canvas = Sheet(fitted, canvas, coarse)
         return fitted, Ground(np.maximum(level, 1e-3), power / power.mean()), outcome == CONVERGED
 
@@ -423,7 +417,7 @@ class MovingField:
             rows.group, canvas, self._response_of(n, 0), outcome, fisher, gain,
             np.zeros(times.size), np.zeros(self.used.shape),
         )  # fmt: skip
-        return _fitted(rows, theta, fisher, gain), outcome == CONVERGED
+        return rows.fitted(theta, fisher, gain), outcome == CONVERGED
 
     def add_modes(
         self, ground: Ground, rows: Rows, corner: tuple[int, int], owner: IntArray,
@@ -500,8 +494,3 @@ class MovingField:
             self._slopes[:size].reshape(rows, free, side**2),
             np.empty((rows, free, free)),
         )
-
-
-def _fitted(rows: Rows, theta: FloatArray, fisher: FloatArray, gain: FloatArray) -> Rows:
-    """Rows at their estimates, with what the fit knows of them."""
-    return replace(rows, theta=theta, fisher=fisher, snr=np.sqrt(2 * np.maximum(gain, 0.0)))

@@ -59,6 +59,10 @@ class Rows:
         both = ([getattr(rows, part.name) for rows in (self, more)] for part in fields(self))
         return Rows(*map(np.concatenate, both)).in_order()
 
+    def fitted(self, theta: FloatArray, fisher: FloatArray, gain: FloatArray) -> Rows:
+        """Put rows at their estimates, with their informations and gains in log-likelihood."""
+        return replace(self, theta=theta, fisher=fisher, snr=np.sqrt(2 * np.maximum(gain, 0.0)))
+
     def recalling(self, old: Rows) -> Rows:
         """Give rows that are the same in others what these know of their fits.
 
