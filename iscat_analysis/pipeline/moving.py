@@ -52,7 +52,7 @@ from iscat_analysis.species import fit_diffusion
 ROUNDS = 8
 """Searches of the whole movie; each sees what the fits so far leave over."""
 
-_FIRST_TURNS = 1  # of background and particles between two searches
+_FIRST_TURNS = 2  # of background and particles between two searches; one loses what hardly moves
 _NEXT_TURNS = 2  # between two extensions of the tracks
 _LEAST_POSITIONS = 4  # of a track whose D is fitted
 _USELESS = 300.0  # times the median error of a track: such a place says nothing

@@ -114,13 +114,14 @@ def test_particles_that_go_everywhere_leave_nothing_to_judge(wandering: Counts) 
 
 
 def test_tracks_near_saturated_pixels_are_flagged() -> None:
-    counts, y, x = _movie(moves=True), 21, 19
+    counts, y, x = _movie(moves=True), 17, 19
     counts[20, y, x] = np.iinfo(np.uint16).max
     found = _analysed(counts, _config("track", GAIN))
     table = found.table
     near = np.hypot(table["x_px"] - x, table["y_px"] - y) * PIXEL_NM < SATURATION_NM
     assert 0 < near.sum() < len(table)
     assert (table["flags"].str.contains("saturated") == near).all()
+    assert table["frame"].tolist() == list(range(FRAMES))  # one track, of what hardly moves
     assert any("1 pixel is saturated" in text for text in found.warnings)
     assert found.summary["masked_pixels"] == 1
 
