@@ -43,9 +43,10 @@ from iscat_analysis.pipeline.microscope import (
     with_sign,
 )
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, judge_counts
+from iscat_analysis.pipeline.ranges import frame_ranges, measured_windows
 from iscat_analysis.pipeline.sights import bright_sights, kind_of, reach_nm, scan_sights
 from iscat_analysis.pipeline.ways import way_of
-from iscat_analysis.records import FREE_PARAMETERS, Mapper, Progress, silent
+from iscat_analysis.records import FREE_PARAMETERS, Mapper, Progress, Windows, silent
 from iscat_analysis.search.sliding import measure_frames
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
@@ -111,7 +112,7 @@ def learn_optics(
         alone, source = len(sights), {"movie": movie.name}
         try:
             if alone < LEAST_TESTED and way_of(config) == "fixed":
-                sights, others = seen_in_field(movie, config, camera, pool)
+                sights, others = seen_in_field(_summed(movie, config, camera), config, pool)
             if len(sights) < LEAST_TESTED:
                 raise DataError(
                     f"{movie.name}: shows {count(len(sights), 'bright particle')} standing "
@@ -231,7 +232,12 @@ def _learned(
         found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
         if found.accepted or not crowded:
             return found
-    return learn_in_field(movie, config, camera, groups, source, pool)
+    return learn_in_field(_summed(movie, config, camera), config, groups, source, pool)
+
+
+def _summed(movie: Stack, config: Config, camera: Camera) -> Windows:
+    """Sum the frames before and after particles bound."""
+    return measured_windows(movie, config, camera, *frame_ranges(movie, config))
 
 
 def _median_p(

@@ -6,7 +6,7 @@ No microscope takes part in finding them: not where they are, and not what they 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ from iscat_analysis.pipeline.chunks import Reader, counts_budget, plan_chunks
 from iscat_analysis.pipeline.noise import judge_window
 from iscat_analysis.pipeline.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.pipeline.ways import way_of
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.bright import (
     ALONE_NM,
     BrightStep,
@@ -54,6 +54,7 @@ OTHERS_NM = 1700.0
 SAME_NM = 800.0
 """Nearer than this, and at the same time, two steps are one."""
 
+_KNOWN_APART_NM = (APART_NM, 1600.0, 1300.0, 1000.0, 700.0)
 _SHIFT_NM = 450.0  # how far a particle may lie from the centre of its picture
 
 
@@ -82,7 +83,8 @@ def bright_sights(
     """
     if way_of(config) == "sliding":
         return landing_sights(movie, config, camera, pool)
-    return bound_sights(movie, config, camera)
+    windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
+    return bright_places(windows, config)
 
 
 def kind_of(config: Config) -> str:
@@ -191,50 +193,102 @@ def _without_repeats(steps: Iterable[BrightStep]) -> list[BrightStep]:
     return kept
 
 
-def bound_sights(
-    movie: Stack,
-    config: Config,
-    camera: Camera,
-    *,
-    alone_nm: float = APART_NM,
-    known_nm: FloatArray | None = None,
+def bright_places(
+    windows: Windows, config: Config, alone_nm: float = APART_NM
 ) -> tuple[list[Sight], list[Sight]]:
     """Find bright particles that bound between two ranges of frames.
 
     Parameters
     ----------
-    movie : Stack
-        The movie.
+    windows : Windows
+        The sums before and after.
     config : Config
-        Resolved, with background frames or a known level.
-    camera : Camera
-        Counts → photoelectrons.
+        Resolved.
     alone_nm : float
         Distance from a particle within which there is no other [nm].
-    known_nm : ndarray, shape (n, 2), optional
-        Where all particles are, x and y, so that none is looked for [nm].
 
     Returns
     -------
     sights : list of Sight
         At most `MOST_SIGHTS`, the brightest first.
     others : list of Sight
-        Every bright particle, or all that are known, on small regions.
+        Every bright particle, on small regions.
     """
-    before, after = frame_ranges(movie, config)
-    windows = measured_windows(movie, config, camera, before, after)
     ratio = windows.power_ratio
     # the noise of a known background is none
     noise_before = windows.before_e + windows.read_variance_before_e2 if windows.n_before else 0.0
     variance = windows.after_e + windows.read_variance_after_e2 + ratio**2 * noise_before
     used = ~windows.masked & (windows.before_e > 0) & (windows.after_e > 0)
     energy = energy_of(windows.after_e - ratio * windows.before_e, variance, used, _spot_px(config))
+    pixel, cut_out = _pixel_nm(config), _cutter(windows, config)
+    sights, others = (
+        [
+            cut_out(row, column, side)
+            for row, column in find_bright_places(
+                energy, pixel_nm=pixel, alone_nm=apart_nm, roi_px=side
+            )
+        ]
+        for apart_nm, side in ((alone_nm, _roi_px(config)), (0.0, round(OTHERS_NM / pixel)))
+    )
+    sights, others = (
+        [_among(sight, others, SAME_NM) for sight in some] for some in (sights, others)
+    )
+    return _bright(sights), others
+
+
+def known_places(
+    windows: Windows, config: Config, known_nm: FloatArray, least: int
+) -> tuple[list[Sight], list[Sight]]:
+    """Cut out particles that are known, those that are farthest from others.
+
+    Parameters
+    ----------
+    windows : Windows
+        The sums before and after.
+    config : Config
+        Resolved.
+    known_nm : ndarray, shape (n, 2)
+        Where all particles are, x and y [nm].
+    least : int
+        Pictures wanted: the distance from others is the largest that leaves so many.
+
+    Returns
+    -------
+    sights : list of Sight
+        At most `MOST_SIGHTS`, the brightest first.
+    others : list of Sight
+        Every particle, on small regions.
+    """
+    pixel, cut_out = _pixel_nm(config), _cutter(windows, config)
+
+    def cut(chosen: FloatArray, side: int) -> list[Sight]:
+        places = chosen.tolist()
+        return [cut_out(round(y / pixel), round(x / pixel), side).placed(x, y) for x, y in places]
+
+    others = cut(known_nm, round(OTHERS_NM / pixel))
+    room = (_roi_px(config) // 2 + 1) * pixel
+    far = np.array(windows.after_e.shape[::-1]) * pixel - room
+    inside = ((known_nm >= room) & (known_nm < far)).all(axis=1)
+    apart = cdist(known_nm, known_nm)
+    np.fill_diagonal(apart, np.inf)
+    nearest = apart.min(axis=1, initial=np.inf)[inside]
+    seen = [_among(sight, others, 0.0) for sight in cut(known_nm[inside], _roi_px(config))]
+    for alone_nm in _KNOWN_APART_NM:
+        sights = _bright(s for s, d in zip(seen, nearest, strict=True) if d >= alone_nm)
+        if len(sights) >= least:
+            break
+    return sights, [_among(other, others, 0.0) for other in others]
+
+
+def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], Sight]:
+    """Give what cuts a square out of the field, as far as it goes."""
     model = build_microscope(config, 1000.0, settings_of(config))
+    shape, ratio = windows.after_e.shape, windows.power_ratio
 
     def cut_out(row: int, column: int, side: int) -> Sight:
         (top, bottom), (left, right) = _region(row, column, side)
-        rows = max(top, 0), min(bottom, used.shape[0])
-        columns = max(left, 0), min(right, used.shape[1])
+        rows = max(top, 0), min(bottom, shape[0])
+        columns = max(left, 0), min(right, shape[1])
         grid = PixelGrid.region(rows, columns, _pixel_nm(config))
         cut = slice(*rows), slice(*columns)
         if windows.n_before:
@@ -250,41 +304,16 @@ def bound_sights(
                 model, grid, windows.after_e[cut], level, level,
                 extra_variance_e2=windows.read_variance_after_e2[cut], masked=windows.masked[cut],
             )  # fmt: skip
-        return _centred(likelihood, config, frame=after[0])
+        return _centred(likelihood, config, frame=windows.frames_after[0])
 
-    pixel = _pixel_nm(config)
-    sides = _roi_px(config), round(OTHERS_NM / pixel)
-    least_nm = SAME_NM
-    if known_nm is None:
-        sights, others = (
-            [
-                cut_out(row, column, side)
-                for row, column in find_bright_places(
-                    energy, pixel_nm=pixel, alone_nm=apart_nm, roi_px=side
-                )
-            ]
-            for apart_nm, side in zip((alone_nm, 0.0), sides, strict=True)
-        )
-    else:
-        least_nm = 0.0
-        room = (sides[0] // 2 + 1) * pixel
-        far = np.array(used.shape[::-1]) * pixel - room
-        inside = ((known_nm >= room) & (known_nm < far)).all(axis=1)
-        lonely = (cdist(known_nm, known_nm) < alone_nm).sum(axis=1) == 1
-        sights, others = (
-            [
-                cut_out(round(y / pixel), round(x / pixel), side).placed(x, y)
-                for x, y in known_nm[chosen].tolist()
-            ]
-            for chosen, side in zip((inside & lonely, slice(None)), sides, strict=True)
-        )
+    return cut_out
 
-    def with_neighbours(sight: Sight) -> Sight:
-        apart = [math.hypot(sight.x_nm - o.x_nm, sight.y_nm - o.y_nm) for o in others]
-        near = [(k, 1.0) for k, d in enumerate(apart) if least_nm < d < RINGS_NM]
-        return replace(sight, neighbours=tuple(near))
 
-    return _bright(map(with_neighbours, sights)), [with_neighbours(o) for o in others]
+def _among(sight: Sight, others: Sequence[Sight], least_nm: float) -> Sight:
+    """Tell a sight which of the others are near, but not so near that they are the same."""
+    apart = [math.hypot(sight.x_nm - o.x_nm, sight.y_nm - o.y_nm) for o in others]
+    near = [(k, 1.0) for k, d in enumerate(apart) if least_nm < d < RINGS_NM]
+    return replace(sight, neighbours=tuple(near))
 
 
 def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
