@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.ndimage import binary_dilation, distance_transform_edt
+from scipy.ndimage import binary_dilation, distance_transform_edt, median_filter
 
 from iscat_analysis._kernels.drift import extend, mismatch, shift_equations
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
@@ -35,6 +35,7 @@ _CLIP = 4.0  # robust standard deviations beyond which a pixel does not count
 _SETTLED_PX = 1e-5
 _POOR = 3.0  # mismatch over shot noise that asks for another start: the stage has jumped
 _PATTERN = 1.0  # least squared gradient of the pattern over that of its noise
+_SPIKE = 6.0  # robust standard deviations of a pixel from the median of those around it
 _PEAK = 8.0  # least peak of a phase correlation over the noise of one of random phases
 
 
@@ -300,11 +301,14 @@ def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, 
     C. D. Kuglin and D. C. Hines, Proc. IEEE Conf. Cybernetics and Society, 163 (1975).  Below a
     pixel the phase of the cross-spectrum is fitted by a plane, weighted by its strength.  Of two
     images of nothing but noise the phases are random, and the highest of N points of their
-    correlation is at some 5/√N: a peak that is no higher says nothing of a shift.
+    correlation is at some 5/√N: a peak that is no higher says nothing of a shift.  All
+    frequencies count alike, so that two pixels that blink would make such a peak: they are left
+    out.
     """
     rows, columns = reference_e.shape
     taper = np.outer(np.hanning(rows), np.hanning(columns))
-    one, two = (fft.rfft2(taper * (image / image.mean() - 1)) for image in (reference_e, later_e))
+    smooth = _without_spikes(reference_e), _without_spikes(later_e)
+    one, two = (fft.rfft2(taper * (image / image.mean() - 1)) for image in smooth)
     cross = two * np.conj(one)
     magnitude = np.abs(cross)
     if not magnitude.max() > 0:
@@ -322,3 +326,10 @@ def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, 
     b = np.array([np.sum(weight * u * angle) for u in (fy, fx)])
     dy, dx = np.linalg.lstsq(a, -b / (2 * np.pi), rcond=None)[0]
     return float(y + dy), float(x + dx)
+
+
+def _without_spikes(image: FloatArray) -> FloatArray:
+    """Put the median of those around in the place of pixels that stand out of them."""
+    around = median_filter(image, size=3)
+    out = np.abs(image - around)
+    return np.where(out > _SPIKE * 1.4826 * np.median(out), around, image)

@@ -10,6 +10,7 @@ steadily changes by S_j/2 each time, which is neither.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,6 +28,7 @@ STAYS, UNDONE = 0.15, -0.5
 """Bounds of what the neighbouring differences come to, as parts of a change: beyond the first, and
 beyond noise, it does not stay, for rings of others make less; below the second it is undone."""
 
+_SHARED = 0.5  # of the picture's share beside its centre, which the pixels there have at least
 _QUIET = 4.0  # standard deviations of noise
 _SPOT = 0.21  # standard deviation of a spot, in wavelengths over NA
 _NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
@@ -79,7 +81,8 @@ def find_changes(blocks: Sequence[NDArray[np.floating]], spot_px: float) -> Chan
     noise = _NORMAL * _median_deviation(lag)
     change = smooth[3:-1] - smooth[1:-3]
     size = np.abs(change)
-    found = tuple(maxima(size, max(CLEAR * noise, 0.0), _BESIDE).T)
+    peaks = maxima(size, max(CLEAR * noise, 0.0), _BESIDE)
+    found = tuple(peaks[_of_spots(blocks, peaks, spot_px)].T)
     if not found[0].size:
         return Changes(0, float("nan"), float("nan"))
     before, after = (part[found] / change[found] for part in (lag[: len(change)], lag[3:]))
@@ -87,6 +90,22 @@ def find_changes(blocks: Sequence[NDArray[np.floating]], spot_px: float) -> Chan
     staying = np.maximum(np.abs(before), np.abs(after)) < quiet
     undone = np.minimum(before, after) < UNDONE
     return Changes(found[0].size, float(staying.mean()), float(undone.mean()))
+
+
+def _of_spots(
+    blocks: Sequence[NDArray[np.floating]], peaks: NDArray[np.int64], spot_px: float
+) -> NDArray[np.bool_]:
+    """Tell changes whose neighbouring pixels change as well from pixels that blink."""
+    least = _SHARED * math.exp(-0.5 / spot_px**2)
+    real = np.ones(len(peaks), dtype=np.bool_)
+    rows, columns = blocks[0].shape
+    for number, (t, y, x) in enumerate(peaks.tolist()):
+        if 0 < y < rows - 1 and 0 < x < columns - 1:
+            part = slice(y - 1, y + 2), slice(x - 1, x + 2)
+            change = blocks[t + 3][part] - blocks[t + 1][part]
+            beside = (change[0, 1] + change[2, 1] + change[1, 0] + change[1, 2]) / 4
+            real[number] = beside * np.sign(change[1, 1]) > least * abs(change[1, 1])
+    return real
 
 
 def _median_deviation(values: NDArray[np.floating]) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.movie.background import find_defects
@@ -69,6 +70,16 @@ def test_images_of_noise_alone_have_no_shift(n: int) -> None:
     for _ in range(30):
         one, two = 1 + 1e-3 * rng.standard_normal((2, n, n))
         assert np.isnan(measure_drift(one, two)).all()
+
+
+def test_pixels_that_blink_are_no_pattern_that_moves() -> None:
+    rng = np.random.default_rng(7)
+    rough = gaussian_filter(rng.standard_normal((128, 128)), 3.0, mode="wrap")
+    light = 1 + 0.05 * rough / rough.std()
+    images = [light + 3e-4 * rng.standard_normal(light.shape) for _ in range(2)]
+    images[0][40, 50] *= 1.1
+    images[1][54, 40] *= 1.1
+    assert np.hypot(*measure_drift(images[0], images[1])) < 0.02
 
 
 def _window_pulls(way: Trajectory, rate: tuple[float, float]) -> np.ndarray:

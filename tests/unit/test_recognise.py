@@ -137,3 +137,14 @@ def test_what_is_wrong_with_a_moving_movie_is_said_all_the_same() -> None:
             },
         )  # fmt: skip
     assert not isinstance(raised.value, FloodError)
+
+
+def test_pixels_that_blink_are_no_particles_that_move() -> None:
+    rng = np.random.default_rng(4)
+    blocks = np.zeros((BLOCKS, SIDE, SIDE))
+    for y, x in rng.integers(0, SIDE, (20, 2)):
+        lit = np.cumsum(rng.random(BLOCKS * BLOCK) < 0.01) % 2
+        blocks[:, y, x] += 0.03 * lit.reshape(BLOCKS, BLOCK).mean(axis=1)
+    changes = find_changes(list(_noisy(blocks, rng)), SPOT)
+    assert not as_moving(changes, "movie")
+    assert changes.number <= 5  # at the border neighbours are missing
