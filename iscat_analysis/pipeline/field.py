@@ -1,8 +1,10 @@
 """Detection and fitting over a whole field, in turns.
 
 What the fits explain is taken off the image before it is searched again, so a side lobe never
-counts as a particle and a faint neighbour is not lost.  Every fit sees its neighbours' signal as
-part of its background, and the laser power is estimated again with all particles accounted for.
+counts as a particle and a faint neighbour is not lost.  What a poor fit leaves over conceals its
+neighbours; where it is they that it lacks, they are tried together.  Every fit sees its neighbours'
+signal as part of its background, and the laser power is estimated again with all particles
+accounted for.
 """
 
 from __future__ import annotations
@@ -44,6 +46,7 @@ MAX_ROUNDS = 8
 
 _SWEEPS = 2  # fits of everything with everything else in place, after the last round; at least
 _MOST_SWEEPS = 16  # two fits that share the light of one particle converge slowly
+_TRIED = 0.1  # share of the χ² in excess that a particle explains which is tried among others
 _SETTLED = 0.1  # change of signal-to-noise ratios from one sweep to the next
 _AS_FOUND = 0.95  # of the threshold: a fit whose final SNR is below it is explained by the others
 _DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
@@ -92,12 +95,17 @@ def fit_field(
             break
         events = _fit_all(scene, windows, [*(e.candidate for e in events), *fresh], events, pool)
         windows = _refined(scene, windows, events)
-    for sweep in range(_MOST_SWEEPS if events else 0):
-        last = _without_doubles(events, scene)
-        events = _fit_all(scene, windows, [e.candidate for e in last], last, pool)
-        windows = _refined(scene, windows, events)
-        if sweep + 1 >= _SWEEPS and _is_settled(last, events, scene.roi_px / 2):
-            break
+    events, windows = _settled(scene, windows, events, pool)
+    trial = None if starts else _with_concealed(scene, windows, events, excess_noise, pool)
+    if trial is not None:
+        events, windows = trial
+        fresh, doubtful = search_field(scene, windows, events, excess_noise)
+        if fresh:  # what was too faint to be told while its neighbours were not described
+            events = _fit_all(
+                scene, windows, [*(e.candidate for e in events), *fresh], events, pool
+            )
+            events, windows = _settled(scene, windows, events, pool)
+            _, doubtful = search_field(scene, windows, events, excess_noise)
     least = _AS_FOUND * scene.templates.threshold
     kept = [e for e in events if e.snr > least and _wanted(scene, e)]
     while 0 < len(kept) < len(events):  # a dropped fit no longer belongs to the others' background
@@ -110,6 +118,76 @@ def fit_field(
     judged = _judged(scene, windows, kept, lobes)
     progress("detect", MAX_ROUNDS, MAX_ROUNDS)
     return tuple(sorted(judged, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
+
+
+def _settled(
+    scene: Scene, windows: Windows, events: list[Fitted], pool: ThreadPoolExecutor
+) -> tuple[list[Fitted], Windows]:
+    """Fit everything with everything else in place, until fits near each other hardly change."""
+    for sweep in range(_MOST_SWEEPS if events else 0):
+        last = _without_doubles(events, scene)
+        events = _fit_all(scene, windows, [e.candidate for e in last], last, pool)
+        windows = _refined(scene, windows, events)
+        if sweep + 1 >= _SWEEPS and _is_settled(last, events, scene.roi_px / 2):
+            break
+    return events, windows
+
+
+def _with_concealed(
+    scene: Scene,
+    windows: Windows,
+    known: list[Fitted],
+    excess_noise: ExcessNoise | None,
+    pool: ThreadPoolExecutor,
+) -> tuple[list[Fitted], Windows] | None:
+    """Add the particles that poor fits conceal, where it is their absence that makes these poor.
+
+    Of several particles that are missing around a known one, each explains but a part of what its
+    fit leaves over, and none is told from a misfit.  So candidates that explain some of it are
+    tried together.  Those stay that explain most of what is left with all the others in place.
+
+    Returns
+    -------
+    (list of Fitted, Windows) or None
+        All particles, and the windows with the power that goes with them; None where none is added.
+    """
+    trial, power = known, windows
+    for _ in range(MAX_ROUNDS):
+        if not any(Status.POOR_FIT in event.fit.flags for event in trial):
+            break
+        fresh, _ = search_field(scene, power, trial, excess_noise, explains=_TRIED)
+        if not fresh:
+            break
+        both = _fit_all(scene, power, [*(e.candidate for e in trial), *fresh], trial, pool)
+        trial = _fit_all(scene, power, [e.candidate for e in both], both, pool)
+        power = _refined(scene, power, trial)
+    while len(trial) > len(known):
+        trial, power = _settled(scene, power, trial, pool)
+        kept = _tenable(scene, trial, known)
+        if len(kept) == len(trial):
+            return (trial, power) if len(trial) > len(known) else None
+        trial = kept
+    return None
+
+
+def _tenable(scene: Scene, trial: Sequence[Fitted], known: Sequence[Fitted]) -> list[Fitted]:
+    """Leave out the added ones that explain less than what is left, the worst of each place."""
+    places, earlier = (
+        np.array([(e.candidate.x_px, e.candidate.y_px) for e in events])
+        for events in (trial, known)
+    )
+    apart = np.hypot(*(places[:, None] - places).T)
+    near = apart <= _reach_px(scene)
+    added = np.ones(len(trial), dtype=bool)
+    added[np.hypot(*(earlier[:, None] - places).T).argmin(axis=0)] = False
+    left = np.array([_chi2_left(event) for event in trial])
+    snr2 = np.array([event.snr**2 for event in trial])
+    # without this one as much more would be left
+    most = np.where(near, left, 0.0).max(axis=1)
+    share = np.where(added, snr2 / np.maximum(snr2 + most, 1e-300), 1.0)
+    worst = np.where(near, share, 1.0).min(axis=1)
+    leave = (share < EXPLAINS) & (share <= worst)
+    return [event for event, out in zip(trial, leave, strict=True) if not out]
 
 
 def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Fitted]) -> FloatArray:
@@ -170,6 +248,8 @@ def search_field(
     windows: Windows,
     events: Sequence[Fitted] = (),
     excess_noise: ExcessNoise | None = None,
+    *,
+    explains: float = EXPLAINS,
 ) -> tuple[list[Candidate], list[Candidate]]:
     """Find new particles, and what may be but the side lobe of a known one.
 
@@ -183,6 +263,8 @@ def search_field(
         Particles that are known.
     excess_noise : ExcessNoise, optional
         As for `fit_field`.
+    explains : float
+        Share of the χ² in excess of a poor fit that a particle near it must explain.
 
     Returns
     -------
@@ -207,7 +289,7 @@ def search_field(
     doubtful: list[Candidate] = []
     for candidate in found:
         size = max(
-            (_misfit(candidate, event, scene, near) for event in events),
+            (_misfit(candidate, event, scene, near, explains) for event in events),
             default=0.0,
         )
         size = max(size, EXCEEDS * candidate.beside)
@@ -218,17 +300,31 @@ def search_field(
     return fresh, doubtful
 
 
-def _misfit(candidate: Candidate, event: Fitted, scene: Scene, near_px: float) -> float:
+def _misfit(
+    candidate: Candidate, event: Fitted, scene: Scene, near_px: float, explains: float
+) -> float:
     """Signal-to-noise ratio that a candidate must exceed not to be what a fit left over."""
     here = event.candidate
     distance = math.hypot(candidate.x_px - here.x_px, candidate.y_px - here.y_px)
     if distance <= near_px:
         return math.inf
+    return math.sqrt(explains * _excess(event)) if distance <= _reach_px(scene) else 0.0
+
+
+def _reach_px(scene: Scene) -> float:
+    """How far from a particle a poor fit leaves something over [pixels]."""
     # In dark field a wrong background level leaves residuals beyond the fitted region.
-    reach = (2 if scene.additive else 0.75) * scene.roi_px
-    if distance > reach or Status.POOR_FIT not in event.fit.flags:
-        return 0.0
-    return math.sqrt(EXPLAINS * max(event.fit.chi2_reduced - 1, 0.0) * event.likelihood.n_pixels)
+    return (2 if scene.additive else 0.75) * scene.roi_px
+
+
+def _excess(event: Fitted) -> float:
+    """Give the χ² that a poor fit leaves over."""
+    return _chi2_left(event) if Status.POOR_FIT in event.fit.flags else 0.0
+
+
+def _chi2_left(event: Fitted) -> float:
+    """Give the χ² of a fit above its expectation, which may be noise."""
+    return max(0.0, event.fit.chi2_reduced - 1) * event.likelihood.n_pixels
 
 
 def _fit_all(

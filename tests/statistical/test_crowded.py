@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from instruments import PEAK_PER_KDA, Instrument, InstrumentMovie, Landings, draw_landings
 
 import iscat_analysis as ia
+from iscat_analysis.config import load_config
+from iscat_analysis.movie.background import measure_windows
+from iscat_analysis.movie.camera import camera_from_config
+from iscat_analysis.pipeline import field
+from iscat_analysis.pipeline.events import Event
+from iscat_analysis.pipeline.scene import make_scene
 
 SIGMAS = 4.0
 
@@ -105,3 +112,70 @@ def test_the_same_particles_through_the_configured_optics_are_not_described(
 ) -> None:
     """Control."""
     assert not (_analysed(bound[1], "never").table["status"] == "ok").any()
+
+
+def _fitted(instrument: Instrument, landings: Landings) -> tuple[list[Event], np.ndarray]:
+    """Give what is found in one frame after one, of 2e7 photoelectrons; distances to the truth."""
+    shape = (2, 160, 160)
+    movie = InstrumentMovie(
+        instrument, shape, landings, seed=3, level_e=2e7, gain_e_per_adu=1000.0
+    )  # fmt: skip
+    config = load_config(
+        None,
+        [
+            "camera.pixel_size_nm=84.0",
+            "camera.gain_e_per_adu=1000.0",
+            "optics.focus_nm=-300.0",
+            f"calibration.gradient_per_kda={-PEAK_PER_KDA}",
+            "background.method=fixed",
+            "background.frames=[0,1]",
+            "detection.false_alarms_per_movie=1e-3",
+        ],
+    )
+    scene = make_scene(config, shape[1:])
+    camera = camera_from_config(config.camera, shape[1:], movie.dtype)
+    windows = measure_windows(movie, camera, (0, 1), (1, 2))
+    with ThreadPoolExecutor(1) as pool:
+        events, _ = field.fit_field(scene, windows, pool=pool)
+    found = [e for e in events if "sidelobe" not in e.flags]
+    places = np.array([(e.candidate.x_px, e.candidate.y_px) for e in found])
+    apart = np.hypot(places[:, :1] - landings.x_px, places[:, 1:] - landings.y_px)
+    return found, apart
+
+
+def test_particles_that_poor_fits_conceal_are_found_together() -> None:
+    """Of several that are missing around a known one, none explains most of what it leaves over."""
+    landings = draw_landings((2, 160, 160), 60, seed=3, frame=1, apart_px=14.0)
+    found, apart = _fitted(Instrument(emission="reciprocal"), landings)
+    assert len(found) == 60
+    assert (apart < 2).sum() == 60
+    assert sum(not e.flags for e in found) >= 58
+    truth = landings.mass_kda[apart.argmin(axis=1)]
+    pulls = np.array(
+        [(e.fit.mass_kda - m) / e.fit.sigma[3] for e, m in zip(found, truth, strict=True)]
+    )
+    assert abs(pulls.mean()) < SIGMAS / math.sqrt(60)
+    assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * 60)
+
+
+def test_particles_tried_one_by_one_stay_concealed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Control."""
+    monkeypatch.setattr(field, "_with_concealed", lambda *_: None)
+    landings = draw_landings((2, 160, 160), 60, seed=3, frame=1, apart_px=14.0)
+    found, _ = _fitted(Instrument(emission="reciprocal"), landings)
+    assert sum(not e.flags for e in found) < 50
+
+
+@pytest.mark.parametrize("nm", [-12.0, 8.0])
+def test_nothing_is_found_together_in_what_a_wrong_model_leaves_over(
+    nm: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spherical aberration makes fits poor, and no absent particle does."""
+    landings = draw_landings((2, 160, 160), 30, seed=101, frame=1, apart_px=14.0)
+    microscope = Instrument(emission="reciprocal", aberrations_nm={11: nm})
+    found, apart = _fitted(microscope, landings)
+    assert sum("poor_fit" in e.flags for e in found) >= 10
+    false = apart.min(axis=1) > 3
+    assert all(e.flags for e, off in zip(found, false, strict=True) if off)
+    monkeypatch.setattr(field, "_with_concealed", lambda *_: None)
+    assert false.sum() <= (_fitted(microscope, landings)[1].min(axis=1) > 3).sum()
