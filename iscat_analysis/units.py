@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 NM = 1e-9
 """One nanometre in metres."""
@@ -66,3 +67,23 @@ def count(n: int, noun: str) -> str:
         "1 event", "2 events".
     """
     return f"{n} {noun}{'' if n == 1 else 's'}"
+
+
+def listed(items: Iterable[object], most: int) -> str:
+    """Write the first few things, and how many more there are.
+
+    Parameters
+    ----------
+    items : iterable
+        Things.
+    most : int
+        How many are written out.
+
+    Returns
+    -------
+    str
+        "1, 2", "1, 2, 3 and 5 more".
+    """
+    words = [str(item) for item in items]
+    more = f" and {len(words) - most} more" if len(words) > most else ""
+    return ", ".join(words[:most]) + more

@@ -1,0 +1,57 @@
+"""Some frames of a movie, as if it held no others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.records import FrameSource
+
+S = TypeVar("S", bound=FrameSource)
+
+
+@dataclass(frozen=True, eq=False)
+class KeptFrames(Generic[S]):
+    """Some frames of a stack.
+
+    Attributes
+    ----------
+    source : FrameSource
+        The stack.
+    frames : ndarray of int
+        Which, rising.
+    """
+
+    source: S
+    frames: NDArray[np.int64]
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return self.source.name
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+        return self.frames.size, *self.source.shape[1:]
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames by their place among those kept.
+
+        Parameters
+        ----------
+        start, stop : int
+            Half-open range.
+
+        Returns
+        -------
+        ndarray, shape (stop − start, y, x)
+            As stored [counts].
+        """
+        wanted = self.frames[start:stop]
+        runs = np.split(wanted, np.flatnonzero(np.diff(wanted) > 1) + 1)
+        parts = [self.source.read(int(run[0]), int(run[-1]) + 1) for run in runs if run.size]
+        return np.concatenate(parts) if parts else self.source.read(0, 0)

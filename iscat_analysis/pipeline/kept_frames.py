@@ -1,0 +1,157 @@
+"""Frames that the camera dropped or repeated are left out of a movie in which particles move.
+
+A frame that repeats the one before shows particles that stand still, and counts its light twice; a
+frame without light shows nothing.  The others keep their numbers, so that a particle's step over
+what is left out is one of several frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.movie import Stack
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.kept import KeptFrames
+from iscat_analysis.pipeline.results import Compared, Found
+from iscat_analysis.records import BoolArray, FloatArray, StackMetadata, Windows
+from iscat_analysis.search.sliding import measure_frames
+from iscat_analysis.units import listed
+
+MANY = 0.05
+"""Share of the frames that may be left out without a word on what that means."""
+
+_READ = 64  # frames at a time
+_NAMED = 4
+
+IntArray = NDArray[np.int64]
+
+
+class _Frames(KeptFrames[Stack]):
+    """Attributes as those of `iscat_analysis.movie.lines.SteadyFrames`."""
+
+    notes: ClassVar[tuple[str, ...]] = ()
+    metadata: ClassVar[StackMetadata] = StackMetadata()
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored counts."""
+        return self.source.dtype
+
+    def close(self) -> None:
+        """Do nothing: the movie has an owner."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What is left of a movie.
+
+    Attributes
+    ----------
+    movie : Stack
+        Of the frames that are kept, where any was left out; else the movie itself.
+    span : (int, int)
+        Half-open range of its frames to be analysed.
+    numbers : ndarray of int, shape (n,), or None
+        Of these frames in the movie; None where all are kept.
+    message : str
+        Which were left out; empty where all are kept.
+    """
+
+    movie: Stack
+    span: tuple[int, int]
+    numbers: IntArray | None = None
+    message: str = ""
+
+    def put_back(self, found: Found) -> Found:
+        """Give frames the numbers that they have in the movie.
+
+        Parameters
+        ----------
+        found : Found
+            What was found in the frames that were kept.
+
+        Returns
+        -------
+        Found
+            The same, frame by frame of the movie.
+        """
+        if self.numbers is None or found.followed is None:
+            return found
+        numbers, followed = self.numbers, found.followed
+        windows = _renumbered(followed.windows, numbers)
+        after = windows.power[windows.n_before :]
+        power = np.tile(np.where(after > 0, after, np.nan), 2)
+        return replace(
+            found,
+            fits=found.fits.assign(frame=numbers[found.fits["frame"].to_numpy(dtype=np.int64)]),
+            compared=replace(Compared.of(windows), power=power),
+            followed=replace(
+                followed,
+                windows=windows,
+                parts=tuple(_renumbered(part, numbers) for part in followed.parts),
+            ),
+        )
+
+
+def keep_frames(movie: Stack, camera: Camera, span: tuple[int, int]) -> Kept:
+    """Leave out frames that show nothing new.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    camera : Camera
+        Counts → photoelectrons.
+    span : (int, int)
+        Half-open range of frames to be analysed.
+
+    Returns
+    -------
+    Kept
+        The others.
+    """
+    good = _good(movie, camera, span)
+    if good.all() or not good.any():
+        return Kept(movie, span)
+    numbers = span[0] + np.flatnonzero(good)
+    seen = movie.seen_as(_Frames(movie, numbers))
+    missing, share = span[0] + np.flatnonzero(~good), float(np.mean(~good))
+    many, is_, same = ("s", "are", "repeat") if len(missing) > 1 else ("", "is", "repeats")
+    message = (
+        f"{movie.name}: frame{many} {listed(missing, _NAMED)} {is_} zero throughout or {same} the "
+        "one before (dropped or stuck in the camera); left out, and steps over them count as "
+        "several frames"
+    )
+    if share > MANY:
+        message += (
+            f"; {share:.0%} of the frames: if the file holds each of the camera's several times, D "
+            "is too small by as much; export it with each once, at the camera's own rate"
+        )
+    return Kept(seen, (0, len(numbers)), numbers, message)
+
+
+def _good(movie: Stack, camera: Camera, span: tuple[int, int]) -> BoolArray:
+    """Tell which frames have light and are not those before them."""
+    good = np.ones(span[1] - span[0], dtype=bool)
+    for start in range(*span, _READ):
+        begin, stop = max(start - 1, span[0]), min(start + _READ, span[1])
+        light, repeats = measure_frames(movie.read(begin, stop), camera)
+        fine = ~repeats & ~np.isneginf(light)
+        good[start - span[0] : stop - span[0]] = fine[start - begin :]
+    return good
+
+
+def _renumbered(windows: Windows, numbers: IntArray) -> Windows:
+    """Give a range of kept frames its numbers in the movie, without light in those left out."""
+    first, last = windows.frames_after
+    kept = numbers[first:last]
+    span = int(kept[0]), int(kept[-1]) + 1
+    before, after = np.split(windows.power, 2)
+    power: FloatArray = np.zeros(span[1] - span[0])
+    power[kept - span[0]] = after
+    both = np.concatenate([before, power])
+    return replace(windows, frames_before=span, frames_after=span, power=both)
