@@ -68,6 +68,7 @@ def ending_in_time(messages: Messages) -> Iterator[None]:
                     again = signals.read(1)
                     if again and again[0] in _ENDING:
                         break
+        _discard_unfinished()
         messages.error(f"interrupted: {signal.Signals(number[0]).name} was received")
         os._exit(INTERRUPTED)
 
@@ -79,6 +80,13 @@ def ending_in_time(messages: Messages) -> Iterator[None]:
         signal.set_wakeup_fd(earlier)
         ended.set()
         os.close(writer)
+
+
+def _discard_unfinished() -> None:
+    """Remove half-written files, which there are only where the library was imported."""
+    files = sys.modules.get("iscat_analysis.files")
+    if files is not None:
+        files.discard_unfinished()
 
 
 _ENDING = {

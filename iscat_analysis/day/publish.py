@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,6 +23,7 @@ from iscat_analysis.day.gather import (
 )
 from iscat_analysis.day.plan import Plan
 from iscat_analysis.day.state import write_whole
+from iscat_analysis.files import whole_file
 from iscat_analysis.report.batch import batch_page, summary_line
 from iscat_analysis.report.batch_figures import Curve
 from iscat_analysis.report.output import atomic_folder
@@ -73,12 +73,8 @@ def publish_day(
         page = _page(plan, day, found, movies, species, shifted, series, failed, folder)
     write_whole(out / "batch.html", page)
     own = movies[list(movies.columns[len(MOVIE_COLUMNS) :])]
-    building = out / f".events.{os.getpid()}.tmp"
-    try:
-        write_events(found, own, building)
-        building.replace(out / "events.parquet")
-    finally:
-        building.unlink(missing_ok=True)
+    with whole_file(out / "events.parquet") as partial:
+        write_events(found, own, partial)
 
 
 def _figure_files(folder: Path) -> set[str]:

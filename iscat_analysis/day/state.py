@@ -20,6 +20,7 @@ from typing import Any
 
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import DataError
+from iscat_analysis.files import whole_file
 from iscat_analysis.movie.addresses import fingerprint, split_address
 from iscat_analysis.movie.folders import files_of
 
@@ -183,12 +184,8 @@ def write_whole(path: Path, content: str) -> None:
     content : str
         In UTF-8.
     """
-    building = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        building.write_text(content, encoding="utf-8")
-        building.replace(path)
-    finally:
-        building.unlink(missing_ok=True)
+    with whole_file(path) as partial:
+        partial.write_text(content, encoding="utf-8")
 
 
 def key_of(config: Config, *further: Any) -> str:

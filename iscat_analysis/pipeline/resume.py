@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.config import Config, config_to_toml
+from iscat_analysis.files import whole_file
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pipeline.merging import Done
@@ -105,10 +106,8 @@ class Shelf:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             table.to_parquet(table_path, index=False)
-            building = path.with_suffix(".tmp")
-            with building.open("wb") as file:
+            with whole_file(path) as partial, partial.open("wb") as file:
                 np.savez(file, **arrays)
-            building.replace(path)
         except OSError:
             self._folder = None
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -15,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.files import whole_file
 from iscat_analysis.records import FloatArray, Status, track_numbers
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.units import count
@@ -225,10 +224,12 @@ def export_result(
         path.parent.mkdir(parents=True, exist_ok=True)
         if layout == "picasso":
             locs, info = to_picasso(fits, tracked=tracked), _metadata(folder, fits)
-            _replacing(beside, lambda partial: _write_yaml(partial, info))
-            _replacing(path, lambda partial: _write_locs(partial, locs, info))
+            with whole_file(beside) as partial_yaml, whole_file(path) as partial:
+                _write_yaml(partial_yaml, info)
+                _write_locs(partial, locs, info)
         else:
-            _replacing(path, lambda partial: _write(partial, fits, layout, tracked, folder))
+            with whole_file(path) as partial:
+                _write(partial, fits, layout, tracked, folder)
     except OSError as error:
         named = path if error.filename is None else error.filename
         raise DataError(f"{named}: cannot be read or written ({error.strerror})") from None
@@ -258,16 +259,6 @@ def _write(partial: Path, fits: pd.DataFrame, layout: Layout, tracked: bool, fol
     else:
         table = to_trackpy(fits) if tracked else _trackpy(_events(fits))
     table.to_csv(partial, index=False, float_format=f"%.{CSV_DIGITS}g")
-
-
-def _replacing(path: Path, write: Callable[[Path], None]) -> None:
-    """Put a file in place once it is whole."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        write(partial)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _write_locs(path: Path, locs: pd.DataFrame, info: dict[str, Any]) -> None:

@@ -15,7 +15,6 @@ the exposure, and what two fields make of each other where they meet from their 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +28,7 @@ from scipy.ndimage import gaussian_filter
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.files import whole_file
 from iscat_analysis.movie.camera import camera_from_config, read_map
 from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid, forward_model
@@ -120,28 +120,22 @@ def write_stack(
         raise DataError(f"{found}: exists already; give another name, or pass `overwrite`")
     movie = Movie(config, config.simulation.seed if seed is None else seed)
     shape = (config.simulation.frames, *config.simulation.shape)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    partial_truth = path.with_name(f"{truth_path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        tifffile.imwrite(
-            partial,
-            _counted(movie.frames(config.compute.workers), shape[0], progress),
-            shape=shape,
-            dtype=np.uint16,
-            photometric="minisblack",
-            bigtiff=2 * math.prod(shape) > 2**31,
-            ome=True,
-            metadata=_metadata(config),
-        )
-        movie.truth.to_csv(partial_truth, index=False, float_format="%.10g")
-        partial.replace(path)
-        partial_truth.replace(truth_path)
+        with whole_file(truth_path) as partial_truth, whole_file(path) as partial:
+            tifffile.imwrite(
+                partial,
+                _counted(movie.frames(config.compute.workers), shape[0], progress),
+                shape=shape,
+                dtype=np.uint16,
+                photometric="minisblack",
+                bigtiff=2 * math.prod(shape) > 2**31,
+                ome=True,
+                metadata=_metadata(config),
+            )
+            movie.truth.to_csv(partial_truth, index=False, float_format="%.10g")
     except OSError as error:
         raise DataError(f"{path}: cannot be written ({error.strerror or error})") from None
-    finally:
-        partial.unlink(missing_ok=True)
-        partial_truth.unlink(missing_ok=True)
     return movie.truth
 
 

@@ -380,6 +380,47 @@ def test_progress_does_not_hide_the_one_error(movie: Path, tmp_path: Path) -> No
     assert movie.exists()
 
 
+_DEAF = """
+import itertools, sys, time
+import iscat_cli
+from iscat_analysis.study import simulate
+
+def deaf(frames, *_):
+    yield from itertools.islice(frames, 2)
+    while True:
+        try:
+            print("deaf", file=sys.stderr, flush=True)
+            time.sleep(60)
+        except KeyboardInterrupt:
+            pass
+
+simulate._counted = deaf
+sys.exit(iscat_cli.main())
+"""
+
+
+def test_ctrl_c_that_goes_unanswered(tmp_path: Path) -> None:
+    """A process that does not answer an interrupt is ended, and leaves no partial movie."""
+    setup = _simulation(tmp_path, "[camera]\npixel_size_nm = 84.4\n[simulation]\nframes = 60\n")
+    left = _listing(tmp_path)
+    command = ["simulate", "--config", str(setup), "--out", str(tmp_path / "movie.tif")]
+    process = subprocess.Popen(
+        [sys.executable, "-c", _DEAF, *command], stderr=subprocess.PIPE, text=True, cwd=tmp_path
+    )
+    try:
+        for line in process.stderr:
+            if "deaf" in line:
+                break
+        assert list(tmp_path.glob("movie.tif.*.partial"))
+        process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=120)[1]
+    finally:
+        process.kill()
+    assert process.returncode == INTERRUPTED
+    assert "interrupted: SIGINT was received" in said
+    assert _listing(tmp_path) == left
+
+
 @pytest.mark.parametrize("stage", ["simulate", "posterior"])
 def test_ctrl_c_midway(stage: str, tmp_path: Path) -> None:
     """An interrupt leaves no partial movie and no partial results, and says so in one line."""
