@@ -8,6 +8,7 @@ are: nothing is expanded, and nothing is taken from the package.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +60,8 @@ def wander(
     pixel_nm: float = 84.0,
     gain_e_per_adu: float = 20.0,
     drift_nm_per_frame: tuple[float, float] = (0.0, 0.0),
+    stage_nm: FloatArray | None = None,
+    led: Callable[[FloatArray], FloatArray] | None = None,
 ) -> Wanderers:
     """Record particles that diffuse during the whole of every frame.
 
@@ -80,6 +83,12 @@ def wander(
     drift_nm_per_frame : (float, float)
         Velocity of the pattern of the light along x and y; what leaves the field on one side enters
         it on the other.
+    stage_nm : ndarray, shape (frames, 2), optional
+        Where the stage is in every frame, along x and y: particles and the pattern of the light
+        move with it, and the truth holds what the camera sees.
+    led : callable, optional
+        Takes the places x, y of every particle in every part of a frame, shape (particles, frames,
+        parts, 2) [nm], and gives others.
 
     Returns
     -------
@@ -88,7 +97,8 @@ def wander(
     """
     rng = np.random.default_rng(seed)
     frames, rows, columns = shape
-    walk, truth = _paths(rng, shape, species, frame_rate_hz, pixel_nm)
+    stage = np.zeros((frames, 2)) if stage_nm is None else stage_nm
+    walk, truth = _paths(rng, shape, species, frame_rate_hz, pixel_nm, led, stage)
     mass = np.array([row[0] for row in species for _ in range(row[2])])
 
     reach = max(rows, columns) + math.ceil(MARGIN_PX) + 1
@@ -105,16 +115,16 @@ def wander(
 
     rough = gaussian_filter(rng.standard_normal((rows, columns)), 3.0, mode="wrap")
     light = level_e * (1 + speckle * rough / rough.std())
-    drifts = any(drift_nm_per_frame)
-    pattern, vx, vy = rfft2(light), *(v / pixel_nm for v in drift_nm_per_frame)
-    turn = -2j * np.pi * (fftfreq(rows)[:, None] * vy + rfftfreq(columns) * vx)
+    shift = (stage + np.outer(np.arange(frames), drift_nm_per_frame)) / pixel_nm
+    drifts, pattern = bool(shift.any()), rfft2(light)
     amplitude = _calibrated(pictures, mass)
     weights = np.repeat(amplitude, PARTS) / PARTS
     squares = np.repeat(amplitude**2, PARTS) / PARTS
     counts = np.empty(shape, dtype=np.uint16)
     for t in range(frames):
         if drifts:
-            light = irfft2(pattern * np.exp(turn * t), s=(rows, columns))
+            turn = fftfreq(rows)[:, None] * shift[t, 1] + rfftfreq(columns) * shift[t, 0]
+            light = irfft2(pattern * np.exp(-2j * np.pi * turn), s=(rows, columns))
         places = walk[:, t].reshape(-1, 2) / pixel_nm
         along = np.exp(-1j * np.outer(places[:, 0], kx))
         across = np.exp(-1j * np.outer(ky, places[:, 1]))
@@ -146,6 +156,8 @@ def _paths(
     species: tuple[tuple[float, float, int], ...],
     frame_rate_hz: float,
     pixel_nm: float,
+    led: Callable[[FloatArray], FloatArray] | None,
+    stage_nm: FloatArray,
 ) -> tuple[FloatArray, pd.DataFrame]:
     """Places x, y of every particle in every part of a frame [nm], and the truth."""
     frames, rows, columns = shape
@@ -158,6 +170,7 @@ def _paths(
     walk += rng.uniform(0, size, (mass.size, 1, 2))
     walk = low + size - np.abs(walk % (2 * size) - size)  # between walls that reflect
     walk = walk.reshape(mass.size, frames, PARTS, 2)
+    walk = (walk if led is None else led(walk)) + stage_nm[:, None]
     mean = walk.mean(axis=2)
     inside = ((mean >= 0) & (mean <= field)).all(axis=2)
     track, frame = (k.ravel() for k in np.indices(inside.shape))

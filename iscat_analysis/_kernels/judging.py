@@ -18,8 +18,8 @@ from iscat_analysis._kernels.canvas import (
     stage,
     table_of,
 )
+from iscat_analysis._kernels.dense import factorise
 from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.moving import directions
 from iscat_analysis._kernels.scoring import FLOOR, POISSON, blank_profile, image_score, image_value
 
 FloatArray = NDArray[np.float64]
@@ -28,6 +28,9 @@ BoolArray = NDArray[np.bool_]
 
 PART = 0.5
 """Steps, in standard deviations, over which second derivatives are taken as differences."""
+
+_SINGULAR = 1e-9
+"""Pivot of a matrix with ones on its diagonal below which a parameter is not known."""
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
@@ -173,7 +176,7 @@ def judge_frames(
             chi2, used, worst, amount = _left_over(data, here)
             numbers[r, 0], numbers[r, 1], numbers[r, 2] = value, chi2, used
             numbers[r, 3], numbers[r, 4] = worst, amount / max(used, 1.0)
-            if brief or not directions(f, index, ways_here):
+            if brief or not _directions(f, index, ways_here):
                 continue
             if PART * np.abs(ways_here[:2]).max() > field.pixel_nm:  # as good as singular
                 continue
@@ -194,3 +197,28 @@ def judge_frames(
                 for a in range(4):
                     turned[r, a, k] = -(ahead[a] - behind[a]) / (2 * PART)
                     ways[r, a, k] = ways_here[a, k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _directions(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
+    """Fill the columns of `out` (4, n) with V, V Vᵀ the inverse of F on the free parameters."""
+    n = index.size
+    scale = np.empty(n)
+    for i in range(n):
+        if not fisher[index[i], index[i]] > 0.0:
+            return False
+        scale[i] = 1.0 / np.sqrt(fisher[index[i], index[i]])
+    low = np.empty((n, n))
+    if not factorise(fisher, index, scale, 0.0, low):
+        return False
+    for i in range(n):
+        if not low[i, i] ** 2 > _SINGULAR:
+            return False
+    out[:] = 0.0
+    for k in range(n):  # column k of L⁻ᵀ
+        for i in range(k, -1, -1):
+            total = 1.0 if i == k else 0.0
+            for j in range(i + 1, k + 1):
+                total -= low[j, i] * out[index[j], k] / scale[j]
+            out[index[i], k] = total / low[i, i] * scale[i]
+    return True

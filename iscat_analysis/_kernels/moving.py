@@ -30,7 +30,7 @@ from iscat_analysis._kernels.canvas import (
     stage,
     table_of,
 )
-from iscat_analysis._kernels.dense import factorise
+from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.scoring import (
@@ -47,9 +47,6 @@ from iscat_analysis._kernels.scoring import (
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-
-_SINGULAR = 1e-9
-"""Pivot of a matrix with ones on its diagonal below which a parameter is not known."""
 
 
 class Search(NamedTuple):
@@ -80,24 +77,6 @@ class Search(NamedTuple):
     passes: int
 
 
-class Response(NamedTuple):
-    """How the rows follow the background of their squares; without room for slopes, left alone.
-
-    Attributes
-    ----------
-    squares : ndarray of int, shape (rows, 4)
-        First and last row and column of each, half-open; all 0 where a row does not follow.
-    slopes : ndarray of float32, shape (rows, k, side²)
-        w B ∂C for each free parameter [e per unit].
-    inverse : ndarray, shape (rows, k, k)
-        Inverse information on these parameters.
-    """
-
-    squares: IntArray
-    slopes: NDArray[np.float32]
-    inverse: FloatArray
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def fit_frames(
     light: Light,
@@ -112,7 +91,7 @@ def fit_frames(
     theta: FloatArray,
     group: IntArray,
     canvas: Canvas,
-    response: Response,
+    slopes: Slopes,
     outcome: IntArray,
     information: FloatArray,
     gain: FloatArray,
@@ -137,7 +116,7 @@ def fit_frames(
         Number of each row's picture.
     canvas : Canvas
         Brought to the estimates.
-    response : Response
+    slopes : Slopes
         Filled by the last fit of each row.
     outcome : ndarray of int, shape (rows,)
         Filled with how the last fit ended.
@@ -189,9 +168,9 @@ def fit_frames(
                 add(total, r0, c0, 1.0, moved)
                 canvas.squares[r] = p
                 information[r] = fisher[:4, :4]
-                if response.slopes.size and _invert(fisher, index, response.inverse[r]):
-                    response.squares[r] = r0, r1, c0, c1
-                    _keep_slopes(data[2], here, index, response.slopes[r])
+                if slopes.values.size:
+                    slopes.squares[r] = r0, r1, c0, c1
+                    keep_slopes(data[2], here, index, slopes.values[r])
         expected[t] = _add_stretch(light, t, total, stretch)
 
 
@@ -236,6 +215,7 @@ def _climb(
         upper, search.max_step, search.tolerance, search.passes, p, score, fisher,
     )  # fmt: skip
     draw_gradient(near, group, p, pixels, profile, both[0])
+    image_score(POISSON, data, 1.0, both[0], score, fisher)
     step[:] = 0.0
     return outcome, 0, value
 
@@ -271,131 +251,6 @@ def _add_signal(here: FloatArray, step: FloatArray, out: FloatArray) -> None:
         for j in range(out.shape[1]):
             sideways = dx * here[i, 1, j] + dy * here[i, 2, j]
             out[i, j] += here[i, 0, j] + sideways + dz * here[i, 3, j] + da * here[i, 4, j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def directions(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
-    """Fill the columns of `out` (4, n) with V, V Vᵀ the inverse of F on the free parameters."""
-    n = index.size
-    scale = np.empty(n)
-    for i in range(n):
-        if not fisher[index[i], index[i]] > 0.0:
-            return False
-        scale[i] = 1.0 / np.sqrt(fisher[index[i], index[i]])
-    low = np.empty((n, n))
-    if not factorise(fisher, index, scale, 0.0, low):
-        return False
-    for i in range(n):
-        if not low[i, i] ** 2 > _SINGULAR:
-            return False
-    out[:] = 0.0
-    for k in range(n):  # column k of L⁻ᵀ
-        for i in range(k, -1, -1):
-            total = 1.0 if i == k else 0.0
-            for j in range(i + 1, k + 1):
-                total -= low[j, i] * out[index[j], k] / scale[j]
-            out[index[i], k] = total / low[i, i] * scale[i]
-    return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _invert(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
-    """Fill `out` with the inverse information on some parameters; tell whether there is one."""
-    n = index.size
-    ways = np.empty((4, n))
-    if not directions(fisher, index, ways):
-        return False
-    for i in range(n):
-        for j in range(n):
-            total = 0.0
-            for k in range(n):
-                total += ways[index[i], k] * ways[index[j], k]
-            out[i, j] = total
-    return True
-
-
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
-def _keep_slopes(
-    level: FloatArray, gradient: FloatArray, index: IntArray, out: NDArray[np.float32]
-) -> None:
-    """Fill `out` (k, pixels) with level × gradient of the free parameters."""
-    ny, nx = level.shape
-    for k in range(index.size):
-        parameter = 1 + index[k]
-        for i in range(ny):
-            for j in range(nx):
-                out[k, i * nx + j] = level[i, j] * gradient[i, parameter, j]
-
-
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
-def _shift(response: Response, r: int, move: FloatArray, step: FloatArray) -> None:
-    """Fill `step` (k) with F⁻¹ G move: how far back a row goes as the background moves."""
-    k = step.size
-    r0, r1, c0, c1 = response.squares[r]
-    nx = c1 - c0
-    step[:] = 0.0
-    for a in range(k if r1 > r0 else 0):
-        felt = np.float32(0.0)
-        for i in range(r1 - r0):
-            slope, here = response.slopes[r, a, i * nx : (i + 1) * nx], move[r0 + i, c0:c1]
-            for j in range(nx):
-                felt += slope[j] * np.float32(here[j])
-        for b in range(k):
-            step[b] += response.inverse[r, a, b] * felt
-
-
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def follow_rows(
-    response: Response, first: int, last: int, move: FloatArray, out: FloatArray
-) -> None:
-    """Add what rows first…last − 1 take up of a change of the logarithm of the background.
-
-    Parameters
-    ----------
-    response : Response
-        From `fit_frames`.
-    first, last : int
-        Rows.
-    move : ndarray, shape (y, x)
-        Change.
-    out : ndarray, shape (y, x)
-        Σ Gᵀ F⁻¹ G move is added to it [e].
-    """
-    k = response.slopes.shape[1]
-    step = np.empty(k)
-    for r in range(first, last):
-        r0, r1, c0, c1 = response.squares[r]
-        nx = c1 - c0
-        _shift(response, r, move, step)
-        for a in range(k):
-            for i in range(r1 - r0):
-                slope, here = response.slopes[r, a, i * nx : (i + 1) * nx], out[r0 + i, c0:c1]
-                for j in range(nx):
-                    here[j] += step[a] * slope[j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def shift_rows(response: Response, move: FloatArray, search: Search, theta: FloatArray) -> None:
-    """Let all rows follow a change of the logarithm of the background, to first order.
-
-    Parameters
-    ----------
-    response : Response
-        From `fit_frames`.
-    move : ndarray, shape (y, x)
-        Change.
-    search : Search
-        Free parameters and their bounds.
-    theta : ndarray, shape (rows, 5)
-        Moved.
-    """
-    index = np.flatnonzero(search.free[:4])
-    step = np.empty(index.size)
-    for r in range(theta.shape[0]):
-        _shift(response, r, move, step)
-        for a in range(index.size):
-            i = index[a]
-            theta[r, i] = min(max(theta[r, i] - step[a], search.lower[i]), search.upper[i])
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)

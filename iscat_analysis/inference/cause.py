@@ -34,6 +34,11 @@ _STEPS: Mapping[str, Mapping[str, float]] = {
     "astigmatism": {"z5": 5.0, "z6": 5.0},
     "coma": {"z7": 5.0, "z8": 5.0},
 }  # small enough for a first order, and for what a table of the field resolves
+_FAR: Mapping[str, Sequence[float]] = {
+    "numerical aperture": (-0.15, -0.12, -0.09, -0.06, -0.03, 0.03, 0.06, 0.09, 0.12, 0.15)
+}
+"""Steps that are tried whole: beside the critical angle a first order says little."""
+
 _OTHERS: Mapping[str, Mapping[str, Any]] = {
     "polarisation, as if circular light passed an analyser": {
         "polarization": "circular", "analyzer": True,
@@ -42,16 +47,17 @@ _OTHERS: Mapping[str, Mapping[str, Any]] = {
         "polarization": "linear", "analyzer": False,
     },
     "mask in the pupil": {"mask_na": 0.6, "attenuation": 0.3},
-    'emission = "dong2021"': {"emission": "dong2021"},
-    'emission = "reciprocal"': {"emission": "reciprocal"},
+    'emission, as if it were "dong2021"': {"emission": "dong2021"},
+    'emission, as if it were "reciprocal"': {"emission": "reciprocal"},
 }  # fmt: skip
-_PIXEL = "camera.pixel_size_nm"
+PIXEL = "camera.pixel_size_nm"
 _TURNED = "polarisation, as if turned by 90° (or the movie transposed)"
 _UNITS = {
     "focus": "nm", "reference phase": "degrees", "spherical aberration": "nm rms",
-    "wavelength": "nm", _PIXEL: "%", "numerical aperture": "",
+    "wavelength": "nm", PIXEL: "%", "numerical aperture": "",
 }  # fmt: skip
 _WHOLE = (_TURNED, *(name for name in _OTHERS if "mask" not in name))  # there or not
+_WHOLE_STEP = 0.5  # of one that is tried whole, which the residuals ask for at least
 _STRETCH = 30.0  # per cent, farther than which no pixel size is tried
 
 _Picture = Callable[[PixelGrid, float, float, float, float], FloatArray]
@@ -82,17 +88,21 @@ class Cause:
     events: int
 
     @property
-    def message(self) -> str:
-        """One line for the user."""
+    def likeness(self) -> str:
+        """What the residuals look most like."""
         by = (
             ""
             if self.step is None
             else f", off by about {float(f'{self.step:.2g}'):+g} {self.unit}".rstrip()
         )
+        return f"a wrong {self.name}{by} ({self.share:.0%} of it)"
+
+    @property
+    def message(self) -> str:
+        """One line for the user."""
         return (
             f"the model does not describe the brightest particles ({self.events} looked at): what "
-            f"it leaves over looks most like a wrong {self.name}{by} ({self.share:.0%} of it); "
-            "correct it, or calibrate the optics"
+            f"it leaves over looks most like {self.likeness}; correct it, or calibrate the optics"
         )
 
 
@@ -120,8 +130,9 @@ def likely_cause(
     if excess <= 0:
         return None
     reach = fits[0][0].model.reach_nm
+    least_index = min(config.optics.n_immersion, config.optics.n_glass)
     best: Cause | None = None
-    for name in (*_STEPS, _PIXEL, _TURNED, *_OTHERS):
+    for name in (*_STEPS, PIXEL, _TURNED, *_OTHERS):
         changes = _neighbours(config, name, reach)
         if not changes:
             continue
@@ -132,6 +143,12 @@ def likely_cause(
                 share, step = _explained(left, there, excess)
             except ConfigError:  # no microscope is there
                 pass
+        for far in _FAR.get(name, ()):
+            if not 0 < config.optics.na + far < least_index:
+                continue
+            larger, asked = _explained(left, _neighbours(config, name, reach, far), excess)
+            if larger > share and _WHOLE_STEP < asked[0] / far < 1 / _WHOLE_STEP:
+                share, step = larger, asked
         if share > WORTH_NAMING and (best is None or share > best.share):
             size = float(step[0]) if name in _UNITS else None
             best = Cause(name, min(share, 1.0), size, _UNITS.get(name, ""), len(fits))
@@ -210,7 +227,7 @@ def _neighbours(
     They are `far` away where that is given, else as in `_STEPS`.
     """
     optics = config.optics
-    if name == _PIXEL:
+    if name == PIXEL:
         percent = 1.0 if far is None else max(min(far, _STRETCH), -_STRETCH)
         larger = 1 + percent / 100
         model = forward_model(config, reach_nm * max(1.01 * larger, 1.0))

@@ -25,11 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.canvas import Canvas, Field, Light
+from iscat_analysis._kernels.following import Slopes
 from iscat_analysis._kernels.judging import judge_frames
-from iscat_analysis._kernels.moving import Response, Search, common_modes, fit_frames, shift_rows
+from iscat_analysis._kernels.moving import Search, common_modes, fit_frames
 from iscat_analysis._kernels.scoring import CONVERGED
 from iscat_analysis.inference.fit import window_nm
-from iscat_analysis.inference.newton import newton_step
+from iscat_analysis.inference.newton import Response
 from iscat_analysis.inference.pictures import PictureBook
 from iscat_analysis.inference.rows import Ground, Judged, Rows
 from iscat_analysis.inference.sheet import Sheet, blank
@@ -51,7 +52,7 @@ _PASSES = 40
 _SLACK = np.array([0.1, 0.1, 0.01, 0.05])
 """How far particles may go from their rings: pixels, wavelengths, relative."""
 _ANY = 1e300
-_BEYOND = 0.5  # resolutions λ/NA outside the field, from where a particle is still seen
+_BEYOND = 1.0  # resolutions λ/NA outside the field, from where a particle is still seen
 
 
 class MovingField:
@@ -111,7 +112,7 @@ class MovingField:
         if z_range_nm is not None:  # the rings tell one fringe from the next, and reach far
             self._coarse = self._whole
         self._canvas: Sheet | None = None
-        self._slopes = np.empty(0, dtype=np.float32)
+        self._room_of_slopes = np.empty(0, dtype=np.float32)
         self.free = np.array([True, True, z_range_nm is not None, True, False])
         reach = window_nm(pixel_nm)
         half = pixel_nm / 2 + _BEYOND * wavelength / near.optics.na
@@ -207,21 +208,22 @@ class MovingField:
         canvas = self._canvas_for(rows, coarse=coarse)
         field = self._coarse if coarse else self._whole
         search = self._search if sweeps > 1 else self._search._replace(tolerance=_PASSING)
-        response = self._response_of(len(theta), field.side if sweeps else 0)
+        slopes = self._slopes_of(len(theta), field.side if sweeps else 0)
         expected = np.zeros(self.frames)
 
         def block(first: int) -> FloatArray:
             stretch = np.zeros(self.used.shape)
             fit_frames(
                 light, field, near, far, search, starts, first,
-                min(first + _BLOCK, self.frames), sweeps, theta, rows.group, canvas, response,
+                min(first + _BLOCK, self.frames), sweeps, theta, rows.group, canvas, slopes,
                 outcome, fisher, gain, expected, stretch,
             )  # fmt: skip
             return stretch
 
         stretch = self._sum_of(block)
         if sweeps:
-            self._response = response
+            own = fisher[:, self.free[:4]][:, :, self.free[:4]]
+            self._response = Response(slopes, starts, light, canvas.total, own, self._pool)
         level = np.where(stretch > 0, self.total_e / np.where(stretch > 0, stretch, 1.0), 1.0)
         totals = self.frame_totals
         power = np.where(expected > 0, totals / np.where(expected > 0, expected, 1.0), 1.0)
@@ -229,20 +231,22 @@ class MovingField:
         self._canvas = Sheet(fitted, canvas, coarse)
         return fitted, Ground(np.maximum(level, 1e-3), power / power.mean()), outcome == CONVERGED
 
-    def where_turns_end(self, move: FloatArray) -> FloatArray:
+    def where_turns_end(self, move: FloatArray, damping: float) -> FloatArray:
         """Give the step of the background whose first turn, with the last fit, is `move`.
 
         Parameters
         ----------
         move : ndarray, shape (y, x)
             Change of the logarithm of the background.
+        damping : float
+            As in `Response.step`.
 
         Returns
         -------
         ndarray, shape (y, x)
-            As from `newton_step`.
+            As from `Response.step`.
         """
-        return newton_step(move, self._response, self.total_e, self.used, self._pool)
+        return self._response.step(move, self.total_e, self.used, damping)
 
     def followed(self, rows: Rows, step: FloatArray) -> Rows:
         """Let the rows of the last fit follow a step of the background, to first order.
@@ -259,8 +263,9 @@ class MovingField:
         Rows
             Where the next fit would find them.
         """
-        theta = rows.theta.copy()
-        shift_rows(self._response, step, self._search, theta)
+        search = self._search
+        walls = search.lower, search.upper
+        theta = self._response.followed(rows.theta, step, self.free, walls)
         return replace(rows, theta=theta)
 
     def draw_anew(self) -> None:
@@ -320,7 +325,7 @@ class MovingField:
         n = len(within.frame)
         fit_frames(
             part, self._coarse, near, far, self._search, starts, 0, last - first, 0, within.theta,
-            within.group, canvas, self._response_of(n, 0), np.zeros(n, dtype=np.int64),
+            within.group, canvas, self._slopes_of(n, 0), np.zeros(n, dtype=np.int64),
             within.fisher, within.snr, np.zeros(last - first), np.zeros(self.used.shape),
         )  # fmt: skip
         return canvas.total
@@ -414,7 +419,7 @@ class MovingField:
         fisher, gain = np.empty((n, 4, 4)), np.empty(n)
         fit_frames(
             light, self._coarse, near, far, self._search, starts, 0, times.size, sweeps, theta,
-            rows.group, canvas, self._response_of(n, 0), outcome, fisher, gain,
+            rows.group, canvas, self._slopes_of(n, 0), outcome, fisher, gain,
             np.zeros(times.size), np.zeros(self.used.shape),
         )  # fmt: skip
         return rows.fitted(theta, fisher, gain), outcome == CONVERGED
@@ -483,14 +488,11 @@ class MovingField:
         self._canvas = Sheet(rows, canvas, coarse)
         return canvas
 
-    def _response_of(self, rows: int, side: int) -> Response:
-        """Room for a response, in the place of the one before."""
+    def _slopes_of(self, rows: int, side: int) -> Slopes:
+        """Room for slopes, in the place of those before."""
         free = int(self.free[:4].sum())
         size = rows * free * side**2
-        if self._slopes.size < size:  # new memory is cleared first, which takes as long as a fit
-            self._slopes = np.empty(size, dtype=np.float32)
-        return Response(
-            np.zeros((rows, 4), dtype=np.int64),
-            self._slopes[:size].reshape(rows, free, side**2),
-            np.empty((rows, free, free)),
-        )
+        if self._room_of_slopes.size < size:  # new memory is cleared first, as long as a fit takes
+            self._room_of_slopes = np.empty(size, dtype=np.float32)
+        values = self._room_of_slopes[:size].reshape(rows, free, side**2)
+        return Slopes(np.zeros((rows, 4), dtype=np.int64), values)

@@ -2,75 +2,160 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, cg
 
-from iscat_analysis._kernels.moving import Response, follow_rows
+from iscat_analysis._kernels.canvas import Light
+from iscat_analysis._kernels.following import (
+    Clusters,
+    Slopes,
+    find_clusters,
+    follow_rows,
+    join_rows,
+    shift_rows,
+)
 from iscat_analysis.records import BoolArray, FloatArray
 
-_PARTS = 8  # of the rows, that threads take in turn
+_PARTS = 8  # of the clusters, that threads take in turn
 _RESIDUE = 0.02  # of a step that is left to the next
 _MOST_STEPS = 40  # of the conjugate gradients
 _FARTHEST = 0.05  # step of the logarithm of the background
 
+T = TypeVar("T")
 
-def newton_step(
-    move: FloatArray,
-    response: Response,
-    total: FloatArray,
-    used: BoolArray,
-    pool: ThreadPoolExecutor,
-) -> FloatArray:
-    """Tell where turns of background and rows would end.
 
-    The rows follow the background and the background them: what a step δ leaves over is
-    move − δ + N⁻¹ Σ Gᵀ F⁻¹ G δ.  It vanishes where M δ = N move; the conjugate gradients that
-    solve it see M only by what it does to an image.
+class Response:
+    """How rows follow the background, those that overlap together.
 
     Parameters
     ----------
-    move : ndarray, shape (y, x)
-        What one turn changes of the logarithm of the background.
-    response : Response
-        How the rows follow.
-    total : ndarray, shape (y, x)
-        N, photoelectrons of all frames.
-    used : ndarray of bool, shape (y, x)
-        Pixels that may be used.
+    slopes : Slopes
+        Of the last fit.
+    starts : ndarray of int, shape (t + 1,)
+        First row of each frame.
+    light : Light
+        The movie.
+    totals : ndarray of float32, shape (t, y, x)
+        Signal of all rows of each frame.
+    information : ndarray, shape (rows, k, k)
+        On the free parameters of each row alone.
     pool : ThreadPoolExecutor
-        Runs parts of the rows; the result does not depend on its size.
-
-    Returns
-    -------
-    ndarray, shape (y, x)
-        Change of the logarithm of the background.
+        Runs parts of the clusters; the results do not depend on its size.
     """
-    counts = np.where(used, total, 0.0)
-    rows = len(response.squares)
-    share = max(rows // _PARTS, 1)
 
-    def part(first: int, image: FloatArray) -> FloatArray:
-        out = np.zeros(used.shape)
-        follow_rows(response, first, min(first + share, rows), image, out)
+    def __init__(
+        self,
+        slopes: Slopes,
+        starts: NDArray[np.int64],
+        light: Light,
+        totals: NDArray[np.float32],
+        information: FloatArray,
+        pool: ThreadPoolExecutor,
+    ) -> None:
+        self._slopes, self._pool = slopes, pool
+        owner = np.empty(starts[-1], dtype=np.int64)
+        find_clusters(slopes.squares, starts, owner)
+        rows = np.argsort(owner, kind="stable")
+        firsts, count = np.unique(owner, return_counts=True)
+        edges = np.append(0, np.cumsum(count))
+        corners = np.append(0, np.cumsum((slopes.values.shape[1] * count) ** 2))
+        frame = np.searchsorted(starts, firsts, side="right") - 1
+        self._clusters = Clusters(rows, edges, frame, corners, np.empty(corners[-1]))
+        self._share(
+            lambda a, b: join_rows(slopes, self._clusters, light, totals, information, a, b)
+        )
+
+    def _share(self, task: Callable[[int, int], T]) -> list[T]:
+        """Run a task for parts of the clusters, half-open ranges, several at a time."""
+        edges = np.linspace(0, len(self._clusters.frame), _PARTS + 1).astype(int).tolist()
+        return list(self._pool.map(lambda part: task(*part), pairwise(edges)))
+
+    def step(
+        self, move: FloatArray, total: FloatArray, used: BoolArray, damping: float
+    ) -> FloatArray:
+        """Tell where turns of background and rows would end.
+
+        The rows follow the background and the background them: what a step δ leaves over is
+        move − δ + N⁻¹ Σ Gᵀ F⁻¹ G δ.  It vanishes where M δ = N move; the conjugate gradients that
+        solve it see M only by what it does to an image.
+
+        Parameters
+        ----------
+        move : ndarray, shape (y, x)
+            What one turn changes of the logarithm of the background.
+        total : ndarray, shape (y, x)
+            N, photoelectrons of all frames.
+        used : ndarray of bool, shape (y, x)
+            Pixels that may be used.
+        damping : float
+            What is added to M, in units of N: how far a step may go where the rows take up nearly
+            all that the background determines, as those of a particle that hardly moves.
+
+        Returns
+        -------
+        ndarray, shape (y, x)
+            Change of the logarithm of the background.
+        """
+        counts = np.where(used, total, 0.0)
+
+        def undetermined(step: FloatArray) -> FloatArray:
+            image = step.reshape(used.shape)
+
+            def taken(first: int, last: int) -> FloatArray:
+                out = np.zeros(used.shape)
+                follow_rows(self._slopes, self._clusters, first, last, image, out)
+                return out
+
+            out = (1 + damping) * counts * image
+            for part in self._share(taken):
+                out -= part
+            return np.where(used, out, image).ravel()
+
+        weight = np.where(used, np.maximum(counts, 1.0), 1.0).ravel()
+        square = (move.size, move.size)
+        step, _ = cg(
+            LinearOperator(square, undetermined, dtype=np.float64),
+            (counts * move).ravel(),
+            x0=move.ravel(),
+            rtol=_RESIDUE,
+            maxiter=_MOST_STEPS,
+            M=LinearOperator(square, lambda v: v.ravel() / weight, dtype=np.float64),
+        )
+        return np.asarray(np.clip(step.reshape(move.shape), -_FARTHEST, _FARTHEST))
+
+    def followed(
+        self,
+        theta: FloatArray,
+        step: FloatArray,
+        free: BoolArray,
+        walls: tuple[FloatArray, FloatArray],
+    ) -> FloatArray:
+        """Let rows follow a step of the background, to first order.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (rows, 5)
+            Of the last fit.
+        step : ndarray, shape (y, x)
+            Change of the logarithm of the background.
+        free : ndarray of bool, shape (5,)
+            Fitted parameters.
+        walls : (ndarray, ndarray)
+            Bounds of the parameters, shape (5,) each.
+
+        Returns
+        -------
+        ndarray, shape (rows, 5)
+            Where the next fit would find them.
+        """
+        out, index = theta.copy(), np.flatnonzero(free[:4])
+        self._share(
+            lambda a, b: shift_rows(self._slopes, self._clusters, a, b, step, index, *walls, out)
+        )
         return out
-
-    def undetermined(step: FloatArray) -> FloatArray:
-        image = step.reshape(used.shape)
-        out = counts * image
-        for taken in pool.map(partial(part, image=image), range(0, rows, share)):
-            out -= taken
-        return np.where(used, out, image).ravel()
-
-    weight = np.where(used, np.maximum(counts, 1.0), 1.0).ravel()
-    step, _ = cg(
-        LinearOperator((move.size, move.size), undetermined, dtype=np.float64),
-        (counts * move).ravel(),
-        x0=move.ravel(),
-        rtol=_RESIDUE,
-        maxiter=_MOST_STEPS,
-        M=LinearOperator((move.size, move.size), lambda v: v.ravel() / weight, dtype=np.float64),
-    )
-    return np.asarray(np.clip(step.reshape(move.shape), -_FARTHEST, _FARTHEST))

@@ -15,12 +15,15 @@ MOST_TURNS = 12
 
 _SETTLED = 0.1  # step of the background, in its own standard deviations, that is the last one
 _NEAR, _FAR = 0.5, 5.0  # a step below the one after one above the other calls for new rings
+_MEDIAN_FRAMES = 400  # that suffice: particles are found over it, and fitted over a better one
+_DAMPING = 0.01  # of Newton's step, at first
+_STIFFER, _SOFTER = 10.0, 0.25  # by what it changes where the turns grow, or shrink fast
 _POWER_TURNS = 3  # over a background that stays
 _POWER_SETTLED = 1e-7
 
 
 def first_ground(field: MovingField, *, follow_power: bool) -> Ground:
-    """Median of the frames, each over its power.
+    """Median of frames, each over its power; of a long movie, of some that are spread over it.
 
     Parameters
     ----------
@@ -37,11 +40,12 @@ def first_ground(field: MovingField, *, follow_power: bool) -> Ground:
     power = np.ones(field.frames)
     if follow_power:
         power = field.frame_totals / field.frame_totals.mean()
-    scale = (1 / power).astype(np.float32)
+    some = slice(None, None, max(field.frames // _MEDIAN_FRAMES, 1))
+    scale = (1 / power[some]).astype(np.float32)
     level = np.empty(field.used.shape)
 
     def median(row: int) -> None:
-        each = np.ascontiguousarray((field.counts_e[:, row] * scale[:, None]).T)
+        each = np.ascontiguousarray((field.counts_e[some, row] * scale[:, None]).T)
         level[row] = np.median(each, axis=1, overwrite_input=True)
 
     field.share(median, len(level))
@@ -85,7 +89,7 @@ def settle(
         Which fits did.
     """
     sigma = 1 / np.sqrt(np.maximum(field.total_e, 1.0))
-    largest = 0.0
+    largest, length, damping = 0.0, np.inf, _DAMPING
     done, step = np.ones(len(rows.frame), dtype=bool), np.zeros(field.used.shape)
     for turn in range(turns):
         rows, found, done = field.fit(ground, rows, coarse=coarse)
@@ -97,7 +101,9 @@ def settle(
                 break
             continue
         move = np.where(field.used, np.log(found.level / ground.level), 0.0)
-        step = field.where_turns_end(move)
+        last, length = length, float(np.linalg.norm(move / sigma))
+        damping *= _STIFFER if length > last else _SOFTER if length < last / 2 else 1.0
+        step = field.where_turns_end(move, damping)
         change = float(np.abs(step / sigma)[field.used].max(initial=0.0))
         level = np.where(field.used, ground.level * np.exp(step), found.level)
         ground = Ground(level, power)

@@ -15,6 +15,7 @@ from iscat_analysis._kernels.canvas import box_of
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.movie.camera import Camera
+from iscat_analysis.pipeline.aligned import Aligned, align
 from iscat_analysis.pipeline.linking import typical_error
 from iscat_analysis.pipeline.moving import follow
 from iscat_analysis.pipeline.moving_table import common_masses, moving_table
@@ -54,6 +55,8 @@ class Block:
         Pixels that were used, and those that were not because they were too bright in some frame.
     gain_message : str
         What the noise says of the gain; empty where they agree, and in all blocks but the first.
+    aligned : Aligned or None
+        Pictures of the brightest tracks; None in all blocks but the first.
     """
 
     span: tuple[int, int]
@@ -69,6 +72,7 @@ class Block:
     used: BoolArray
     saturated: BoolArray
     gain_message: str = ""
+    aligned: Aligned | None = None
 
     @property
     def frames(self) -> int:
@@ -179,6 +183,7 @@ def analyse_block(
         used=field.used,
         saturated=field.saturated,
         gain_message=gain_message,
+        aligned=None if goes_on[0] else align(scene, moving),
     )
 
 
@@ -264,6 +269,7 @@ class BlockStore(Shelf):
                 used=data["used"],
                 saturated=data["saturated"],
                 gain_message=str(data["gain_message"]),
+                aligned=Aligned.unpacked(data),
             )
         except (ValueError, KeyError):
             return None
@@ -291,5 +297,6 @@ class BlockStore(Shelf):
             "level": block.level, "power": block.power, "total_e": block.total_e,
             "used": block.used, "saturated": block.saturated,
             "gain_message": np.array(block.gain_message),
+            **({} if block.aligned is None else block.aligned.packed()),
         }  # fmt: skip
         self.write(number, block.table, arrays)

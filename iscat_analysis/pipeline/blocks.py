@@ -127,6 +127,7 @@ def plan_blocks(
     camera: Camera,
     *,
     check: Callable[[NDArray[Any], int], None],
+    span: tuple[int, int] | None = None,
 ) -> Plan:
     """Divide a movie into blocks of frames that have a background each.
 
@@ -140,6 +141,8 @@ def plan_blocks(
         Counts → photoelectrons.
     check : callable
         Refuses impossible counts.
+    span : (int, int), optional
+        Half-open range of frames; default ``fit.frames``, or all.
 
     Returns
     -------
@@ -151,7 +154,7 @@ def plan_blocks(
     DataError
         The frames are not there, or a block does not fit into the memory.
     """
-    first, last = fitted_frames(movie, config)
+    first, last = span or fitted_frames(movie, config)
     frames, pixels = last - first, movie.shape[1] * movie.shape[2]
     room = int(config.compute.memory_limit_mb * 1e6) // (BYTES * pixels)
     given = None if config.track.block_frames == "auto" else config.track.block_frames
@@ -252,7 +255,7 @@ def follow_light(
             raw = movie.read(start, min(start + _READ, high))
             check(raw, start)
             saturated |= camera.saturated(raw).any(axis=0)
-            total += camera.to_electrons(raw).sum(axis=0)
+            total += len(raw) * camera.to_electrons(raw.mean(axis=0))
     read = np.broadcast_to(camera.read_variance_e2(shape), shape)
     usable = ~(saturated | find_defects(sums.sum(axis=0), (last - first) * read))
     light = sums[:, usable].mean(axis=1) if usable.any() else np.zeros(count)

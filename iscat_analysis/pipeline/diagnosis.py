@@ -24,7 +24,7 @@ from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, first_counts, is_lit
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import Status, Windows
 from iscat_analysis.search.sliding import measure_frames, measure_noise
-from iscat_analysis.units import count
+from iscat_analysis.units import count, listed
 
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""
@@ -173,12 +173,11 @@ def repeats_warning(movie: Stack, windows: Windows) -> str:
     found = [n for n in numbers[1:][same].tolist() if _repeats(movie, n)]
     if not found:
         return ""
-    shown = ", ".join(map(str, found[:4])) + (f" and {len(found) - 4} more" * (len(found) > 4))
     return (
-        f"{movie.name}: {'frames' if len(found) > 1 else 'frame'} {shown} of {numbers.size} "
-        f"{'repeat' if len(found) > 1 else 'repeats'} the frame before (stuck in the camera), so "
-        "that there is less light than it seems and σ is too small: record or export the movie "
-        "without them"
+        f"{movie.name}: {'frames' if len(found) > 1 else 'frame'} {listed(found, 4)} of "
+        f"{numbers.size} {'repeat' if len(found) > 1 else 'repeats'} the frame before "
+        "(stuck in the camera), so that there is less light than it seems and σ is too small: "
+        "record or export the movie without them"
     )
 
 

@@ -17,6 +17,7 @@ from iscat_analysis.pipeline.results import Found
 from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.summary import summary_of
+from iscat_analysis.pipeline.together import warnings_of
 from iscat_analysis.pipeline.tracks import make_films, tracks_of
 from iscat_analysis.places import versions
 from iscat_analysis.records import Analysis, Film, Provenance, silent
@@ -66,6 +67,8 @@ def gather(
     further = {**ready.summary}
     if found.summary:
         further[found.heading] = found.summary
+    if found.optics:
+        further["optics"] = found.optics
     further |= extra
     table, achieved = reported_rows(found)
     for doubt in (line_warning(config, table), sign_warning(config, table)):
@@ -94,6 +97,8 @@ def gather(
             masses=followed.masses, tell=run.tell, progress=progress,
         )  # fmt: skip
         further |= said
+        for text in warnings_of(table, config.camera.frame_rate_hz):
+            run.tell(text)
         flat = plane_warning(config, table)
         if flat:
             run.tell(flat)

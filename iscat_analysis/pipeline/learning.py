@@ -132,12 +132,49 @@ def learn_optics(
         except DataError as error:
             tell(f"{_verdict(tested)}: {error}; the analysis goes on as configured")
             return config, tested | {"calibrated": False, "reason": str(error)}
-    summary = tested | _told(found)
-    learned, why = _usable(found, config)
+    return taken(found, config, tested, _verdict(tested), tell=tell)
+
+
+def taken(
+    found: OpticsCalibration,
+    config: Config,
+    tested: Mapping[str, Any],
+    verdict: str,
+    *,
+    pictures_of: str = "particles",
+    tell: Callable[[str], None],
+) -> tuple[Config, dict[str, Any]]:
+    """Take what was learned, where it may be used, and say so.
+
+    Parameters
+    ----------
+    found : OpticsCalibration
+        What was learned.
+    config : Config
+        As configured.
+    tested : mapping
+        What ``summary.json`` says of the test.
+    verdict : str
+        What the test found, for where nothing is taken.
+    pictures_of : str
+        What was looked at, in the plural.
+    tell : callable
+        Told what the user should know.
+
+    Returns
+    -------
+    config : Config
+        With the learned optics and ``calibrate = "never"``, or as it was.
+    summary : dict
+        What ``summary.json`` says.
+    """
+    summary = {**tested, **_told(found)}
+    learned, why = usable(found, config)
     if learned is None:
-        tell(f"{_verdict(tested)}: {why}; the analysis goes on as configured")
+        tell(f"{verdict}: {why}; the analysis goes on as configured")
         return config, summary | {"calibrated": False, "reason": why}
-    tell(f"optics learned from the movie, instead of the configured ones: {found.headline()}")
+    headline = found.headline(pictures_of)
+    tell(f"optics learned from the movie, instead of the configured ones: {headline}")
     for note in found.notes:
         tell(note)
     return learned, summary | {"calibrated": True}
@@ -317,8 +354,23 @@ def _told(found: OpticsCalibration) -> dict[str, Any]:
     }
 
 
-def _usable(found: OpticsCalibration, config: Config) -> tuple[Config | None, str]:
-    """Give the configuration with the learned optics, or why there is none."""
+def usable(found: OpticsCalibration, config: Config) -> tuple[Config | None, str]:
+    """Give the configuration with the learned optics, or why there is none.
+
+    Parameters
+    ----------
+    found : OpticsCalibration
+        What was learned.
+    config : Config
+        As configured.
+
+    Returns
+    -------
+    config : Config or None
+        With the learned optics and ``calibrate = "never"``.
+    reason : str
+        Why there is none.
+    """
     if not found.accepted:
         return None, "; ".join(found.measured.refusals)
     return with_sign(config.model_copy(update={"optics": found.config.optics}))

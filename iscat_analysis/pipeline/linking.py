@@ -8,8 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from iscat_analysis.config import Config
+from iscat_analysis.errors import DataError
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Judged, Rows
 from iscat_analysis.pipeline.extension import LEAST_SHARE
@@ -27,6 +29,7 @@ _STEP = 0.1  # of the farthest that a particle goes: what an error of the mass c
 _UNSURE = 0.25  # of the mass, where z is free
 _BESIDE = 0.75  # resolutions λ/NA within which two rows may be one particle
 _BRIDGE_FRAMES = 100  # that a slow particle may hide
+_MEETING = 5  # frames before and after two were crowded, in which one of them may be hidden
 
 IntArray = NDArray[np.int64]
 
@@ -59,7 +62,18 @@ def linked(
     -------
     Rows
         With tracks of `track.min_frames` and more, numbered by first frame and place.
+
+    Raises
+    ------
+    DataError
+        Particles and background did not settle.
     """
+    if not np.isfinite(places).all():
+        raise DataError(
+            "the light under the particles cannot be told from them: it changes from frame to "
+            "frame, as where the stage drifts or vibrates; record a steadier movie, or analyse "
+            "fewer frames (fit.frames), in which it stands still"
+        )
     track = link(
         rows.frame, places,
         reach_nm=config.track.max_step_nm, memory=config.track.memory_frames,
@@ -189,7 +203,6 @@ def typical(rows: Rows) -> Rows:
 
 def alone(
     scene: Scene,
-    field: MovingField,
     rows: Rows,
     *,
     inner: tuple[int, int] | None = None,
@@ -200,8 +213,6 @@ def alone(
     ----------
     scene : Scene
         Configuration and threshold.
-    field : MovingField
-        The movie.
     rows : Rows
         Particles with their tracks, fitted but for a few.
     inner : (int, int), optional
@@ -215,15 +226,34 @@ def alone(
     config = scene.config
     if not len(rows.frame):
         return rows
-    near = crowded(rows, field, _BESIDE * config.optics.wavelength_nm / config.optics.na)
+    near = crowded(rows, _BESIDE * config.optics.wavelength_nm / config.optics.na)
     tracks = int(rows.track.max(initial=0)) + 1
     free = np.bincount(rows.track[~near], minlength=tracks)
+    kept = (free >= _least(config, rows, inner)) & seen(scene, rows)
+    return numbered(rows.only(kept[rows.track]))
+
+
+def seen(scene: Scene, rows: Rows) -> BoolArray:
+    """Tell which tracks are seen in most of the frames in which they are fitted.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its threshold.
+    rows : Rows
+        Particles with their tracks, fitted but for a few.
+
+    Returns
+    -------
+    ndarray of bool, shape (tracks,)
+        True for each that is.
+    """
     fitted = rows.only(np.isfinite(rows.snr))
     snr = np.where(fitted.theta[:, 3] > 0, fitted.snr, 0.0)
-    seen = snr > AS_FOUND * scene.templates.threshold
-    fits, sights = (np.bincount(fitted.track, w, minlength=tracks) for w in (None, seen))
-    kept = (free >= _least(config, rows, inner)) & (2 * sights > fits)
-    return numbered(rows.only(kept[rows.track]))
+    plain = snr > AS_FOUND * scene.templates.threshold
+    tracks = int(rows.track.max(initial=-1)) + 1
+    fits, sights = (np.bincount(fitted.track, w, minlength=tracks) for w in (None, plain))
+    return np.asarray(2 * sights > fits)
 
 
 def held(config: Config, field: MovingField, rows: Rows) -> tuple[Rows, int]:
@@ -332,15 +362,13 @@ def unlike(track: IntArray, mass: FloatArray, error: FloatArray) -> BoolArray:
     return out
 
 
-def crowded(rows: Rows, field: MovingField, limit_nm: float) -> BoolArray:
+def crowded(rows: Rows, limit_nm: float) -> BoolArray:
     """Tell which rows have another particle of their frame nearer than a limit.
 
     Parameters
     ----------
     rows : Rows
         Particles.
-    field : MovingField
-        The movie.
     limit_nm : float
         Distance [nm].
 
@@ -350,14 +378,39 @@ def crowded(rows: Rows, field: MovingField, limit_nm: float) -> BoolArray:
         True for both of a pair.
     """
     out = np.zeros(len(rows.frame), dtype=bool)
-    starts = rows.starts(field.frames)
-    for t in np.flatnonzero(np.diff(starts) > 1):
-        span = slice(starts[t], starts[t + 1])
-        places = rows.theta[span, :2]
-        apart = np.hypot(*(places[:, None] - places).T)
-        np.fill_diagonal(apart, np.inf)
-        out[span] = apart.min(axis=0) < limit_nm
+    apart = (2 * limit_nm + 1) * rows.frame  # no two frames lie within the limit of each other
+    places = np.column_stack([rows.theta[:, :2], apart])
+    out[cKDTree(places).query_pairs(limit_nm, output_type="ndarray")] = True
     return out
+
+
+def meeting(rows: Rows, limit_nm: float) -> BoolArray:
+    """Tell which rows are of particles that meet: crowded, or shortly before or after that.
+
+    While two are so near that one fit takes the light of both, the other has no row beside it.
+
+    Parameters
+    ----------
+    rows : Rows
+        Particles with their tracks.
+    limit_nm : float
+        Distance within which they are crowded [nm].
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        True where a row of the same track, at most `_MEETING` frames away, is crowded.
+    """
+    near = crowded(rows, limit_nm)
+    apart = _MEETING + 1  # between tracks, so that frames of one are not near those of another
+    when = rows.track * (int(rows.frame.max(initial=0)) + apart) + rows.frame
+    times = np.sort(when[near])
+    if not times.size:
+        return near
+    after = np.searchsorted(times, when).clip(0, times.size - 1)
+    before = np.maximum(after - 1, 0)
+    gap = np.minimum(np.abs(times[after] - when), np.abs(times[before] - when))
+    return np.asarray(gap <= _MEETING)
 
 
 def bridge(config: Config, rows: Rows) -> IntArray:

@@ -37,7 +37,9 @@ from iscat_analysis.pipeline.linking import (
     linked,
     mass_error,
     mass_places,
+    meeting,
     numbered,
+    seen,
     shares_mass,
     trimmed,
     typical,
@@ -52,14 +54,15 @@ from iscat_analysis.species import fit_diffusion
 ROUNDS = 8
 """Searches of the whole movie; each sees what the fits so far leave over."""
 
-_FIRST_TURNS = 2  # of background and particles between two searches; one loses what hardly moves
+_FIRST_TURNS = 2  # of background and particles after each of the first `_FULL` searches; after one
+# turn what hardly moves would be lost
 _NEXT_TURNS = 2  # between two extensions of the tracks
 _LEAST_POSITIONS = 4  # of a track whose D is fitted
 _USELESS = 300.0  # times the median error of a track: such a place says nothing
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
 _FEW = 5e-3  # of all rows: a search that adds no more is the last
-_FULL, _SAMPLED = 2, 4  # searches of all frames, after which one of so many tells whether to go on
+_FULL = 2  # searches of all frames, after which some of them tell whether to go on
 _FIRST_HEIGHTS = 1  # searches after which every row is put into its fringe
 _HELD_ROUNDS = 2  # in which slow particles are tried where they were not seen
 
@@ -160,11 +163,8 @@ def follow(
     for number in range(ROUNDS):
         progress("track", number, total)
         before = len(rows.frame)
-        if number >= _FULL:
-            some = search_frames(scene, field, ground, rows, pool, every=_SAMPLED)
-            if len(some.frame) <= _FEW * before / _SAMPLED:
-                break
-        found = search_frames(scene, field, ground, rows, pool)
+        enough = round(_FEW * before) if number >= _FULL else 0
+        found = search_frames(scene, field, ground, rows, pool, enough=enough)
         if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(scene, rows, found)
@@ -174,7 +174,7 @@ def follow(
             rows,
             follow_power=follow_power,
             follow_level=follow_level,
-            turns=_FIRST_TURNS,
+            turns=_FIRST_TURNS if number < _FULL else 1,
             coarse=True,
         )
         if scene.mode == "joint" and number < _FIRST_HEIGHTS:
@@ -204,7 +204,7 @@ def follow(
             field, ground, rows, resolution_nm=resolution, reach_nm=config.track.max_step_nm
         )
         rows = linked(config, rows, mass_places(config, rows), bridged=True, inner=inner)
-        rows = alone(scene, field, rows, inner=inner)
+        rows = alone(scene, rows, inner=inner)
         if number < _HELD_ROUNDS and follow_level:
             rows, tried = held(config, field, rows)
             added += tried
@@ -219,19 +219,27 @@ def follow(
             rows = _in_their_fringes(scene, field, ground, rows)
         rows, ground, done = settle(
             field, ground, rows, follow_power=follow_power, follow_level=follow_level,
-            turns=MOST_TURNS if stage else _NEXT_TURNS, coarse=not stage,
+            turns=MOST_TURNS if stage else 1, coarse=not stage,
         )  # fmt: skip
         progress("track", ROUNDS + 1 + stage, total)
         if stage == 0:
             rows, variances, diffusion = _moved(config, field, rows)
             field.set_blurs(variances)
+    there = seen(scene, rows)  # the rings of others, drawn far out, may explain a track
+    if not there.all():
+        numbers = np.cumsum(there) - 1
+        rows = rows.only(there[rows.track])
+        rows, diffusion = replace(rows, track=numbers[rows.track]), diffusion[there]
+        rows, ground, done = settle(
+            field, ground, rows, follow_power=follow_power, follow_level=follow_level, turns=1
+        )
     judged = field.judge(ground, rows)
     shared = shared_errors(field, ground, rows, judged)
-    near = crowded(rows, field, config.detection.min_separation_nm)
+    near = meeting(rows, config.detection.min_separation_nm)
     unlike = shares_mass(rows, judged)
     close = near | unlike
     if scene.mode == "joint":  # a path along z takes as much of the mass, and must count
-        unlike = unlike & crowded(rows, field, scene.roi_px * scene.pixel_nm)
+        unlike = unlike & crowded(rows, scene.roi_px * scene.pixel_nm)
     counted = done & field.holds(rows.theta) & ~near & ~unlike
     common = common_amplitudes(field, ground, rows, judged, counted, shared)
     progress("track", total, total)
@@ -275,7 +283,7 @@ def _credible(scene: Scene, field: MovingField, rows: Rows, done: BoolArray) -> 
     kept = done & (rows.theta[:, 3] > 0) & (rows.snr > AS_FOUND * scene.templates.threshold)
     near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na)
     starts = rows.starts(field.frames)
-    for t in np.unique(rows.frame[crowded(rows, field, near)]):
+    for t in np.unique(rows.frame[crowded(rows, near)]):
         order = starts[t] + np.argsort(-rows.snr[starts[t] : starts[t + 1]])
         for i, a in enumerate(order):
             for b in order[:i]:
@@ -287,23 +295,41 @@ def _credible(scene: Scene, field: MovingField, rows: Rows, done: BoolArray) -> 
 
 def _moved(config: Config, field: MovingField, rows: Rows) -> tuple[Rows, FloatArray, FloatArray]:
     """Give tracks their blurs, with the variances that these number and the D they are made of."""
-    diffusion = _diffusion(config, field, rows)
+    diffusion = diffusion_of(config, field.free, rows)
     _, exposure = exposure_of(config)
     return *blurred_rows(rows, diffusion, exposure), diffusion
 
 
-def _diffusion(config: Config, field: MovingField, rows: Rows) -> FloatArray:
-    """D of every track and its standard error [µm²/s]; 0 where a track is too short to tell."""
+def diffusion_of(config: Config, free: BoolArray, rows: Rows) -> FloatArray:
+    """Fit D to the places of every track, where it is alone.
+
+    Places in a meeting are off by more than their errors say, and would count as steps.
+
+    Parameters
+    ----------
+    config : Config
+        Frame rate, exposure, and how near particles are too near.
+    free : ndarray of bool, shape (5,)
+        Fitted parameters.
+    rows : Rows
+        Particles with their tracks.
+
+    Returns
+    -------
+    ndarray, shape (tracks, 2)
+        D and its standard error [µm²/s]; 0 where a track is too short to tell.
+    """
     tracks = int(rows.track.max(initial=-1)) + 1
     out = np.zeros((tracks, 2))
-    index = np.flatnonzero(field.free[:4])
-    sigma = np.sqrt(variances_left(rows.fisher, index))
+    sigma = np.sqrt(variances_left(rows.fisher, np.flatnonzero(free[:4])))
     axes = [0, 1]
     rate, exposure = exposure_of(config)
+    apart = ~meeting(rows, config.detection.min_separation_nm)
     for k in range(tracks):
-        mine = rows.track == k
+        mine = apart & (rows.track == k)
         error = sigma[:, axes].max(axis=1)
-        mine &= error < _USELESS * np.nanmedian(error[mine])
+        if mine.any():
+            mine &= error < _USELESS * np.nanmedian(error[mine])
         if mine.sum() < _LEAST_POSITIONS:
             continue
         found = fit_diffusion(

@@ -27,6 +27,7 @@ RING_SLOPE = 1.7
 """Distance of the outer rings of a particle over its height, tan 60°: within it, what is much
 fainter than the particle may be what the model leaves over of them."""
 
+_SAMPLED = 4  # blocks, of which one tells whether the others are searched
 _BLOCK = 16  # frames that are read or searched at a time; what more of them need is slow to clear
 
 
@@ -146,7 +147,7 @@ def search_frames(
     pool: ThreadPoolExecutor,
     frames: tuple[int, int] | None = None,
     *,
-    every: int = 1,
+    enough: int = 0,
 ) -> Sightings:
     """Find candidates in what the rows leave over.
 
@@ -164,8 +165,9 @@ def search_frames(
         Runs blocks of frames; the result does not depend on its size.
     frames : (int, int), optional
         Which of the field's frames, half-open; default all.
-    every : int
-        Of blocks of frames, the first of so many is searched.
+    enough : int
+        Candidates in all frames, up to which none are worth it: where one of `_SAMPLED` blocks of
+        frames tells that there are no more, the others are not searched.
 
     Returns
     -------
@@ -193,8 +195,14 @@ def search_frames(
         )
 
     begin, end = frames or (0, field.frames)
-    parts = list(pool.map(block, range(begin, end, every * _BLOCK)))
+    blocks = list(range(begin, end, _BLOCK))
+    sample = blocks[:: _SAMPLED if enough else 1]
+    parts = dict(zip(sample, pool.map(block, sample), strict=True))
+    if sum(len(part.frame) for part in parts.values()) > enough / _SAMPLED:
+        others = [first for first in blocks if first not in parts]
+        parts |= zip(others, pool.map(block, others), strict=True)
+    found = [parts[first] for first in sorted(parts)]
     return Sightings(
-        *(np.concatenate([getattr(part, name) for part in parts])
+        *(np.concatenate([getattr(part, name) for part in found])
           for name in ("frame", "x_px", "y_px", "z_nm", "strength", "snr"))
     )  # fmt: skip

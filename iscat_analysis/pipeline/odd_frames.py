@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from iscat_analysis.pipeline.diagnosis import DRIFT_PX, pixel_warnings
 from iscat_analysis.pipeline.merging import Merged
 from iscat_analysis.records import FloatArray
+from iscat_analysis.units import listed
 
 JUMP = 0.1
 """Relative change of the light from one frame to the next that is reported."""
@@ -102,6 +103,4 @@ def _drift_warnings(name: str, merged: Merged, windows: float, corrected: bool) 
 
 
 def _frames(frames: NDArray[np.int64]) -> str:
-    shown = ", ".join(str(f) for f in frames[:4])
-    more = f" and {frames.size - 4} more" if frames.size > 4 else ""
-    return f"frame{'' if frames.size == 1 else 's'} {shown}{more}"
+    return f"frame{'' if frames.size == 1 else 's'} {listed(frames, 4)}"

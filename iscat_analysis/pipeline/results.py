@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import pandas as pd
@@ -119,6 +119,8 @@ class Found:
         Mode ``track``.
     trajectory : Trajectory or None
         Of the fixed pattern, where its motion was divided out.
+    optics : mapping
+        What the test of the optics found, where the tracks themselves made it.
     interrupted : bool
         Whether the user stopped it; what was finished is kept.
     """
@@ -134,6 +136,7 @@ class Found:
     empty: EmptySpread | None = None
     followed: Followed | None = None
     trajectory: Trajectory | None = None
+    optics: Mapping[str, Any] = field(default_factory=dict)
     interrupted: bool = False
 
 

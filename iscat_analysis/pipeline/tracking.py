@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from iscat_analysis.config import Config
 from iscat_analysis.movie.background import Check, add_frames, start_power
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pieces.regions import lines_from, numbered
@@ -23,6 +24,7 @@ from iscat_analysis.pipeline.diagnosis import pixel_warnings, shaking_warning
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.joining import join_blocks
+from iscat_analysis.pipeline.kept_frames import keep_frames
 from iscat_analysis.pipeline.moving_field import track_scene
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.ranges import checked, fitted_frames
@@ -30,6 +32,7 @@ from iscat_analysis.pipeline.regions import contrast_image
 from iscat_analysis.pipeline.results import Compared, Followed, Found, lines_of, view_of
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene
+from iscat_analysis.pipeline.tracked_optics import Begun, learn_from_tracks
 from iscat_analysis.records import EventView, FloatArray, FrameSource, Progress, Windows
 from iscat_analysis.search.moving import link
 from iscat_analysis.threads import threads
@@ -60,24 +63,41 @@ def find_moving(ready: Prepared, run: Run) -> Found:
     KeyboardInterrupt
         The user stopped it before the first block was finished.
     """
-    movie, config, camera = ready.steady, ready.config, ready.camera
-    first, last = fitted_frames(movie, config)
-    scene = track_scene(config, ready.shape, max(last - first, 1))
+    config, camera = ready.config, ready.camera
+    kept = keep_frames(ready.steady, camera, fitted_frames(ready.steady, config))
+    movie, (first, last) = kept.movie, kept.span
+    if kept.message:
+        run.tell(kept.message)
     run.clock.lap("model")
     check = checked(movie, camera)
-    plan = plan_blocks(movie, config, camera, check=check)
+    plan = plan_blocks(movie, config, camera, check=check, span=kept.span)
     if message := plan.message(movie.name):
         run.tell(message)
     shaken = shaking_warning(movie, camera, (first, last))
     if shaken:
         run.tell(f"{movie.name}: {shaken}")
     run.clock.lap("background")
-    identity = movie.identity if run.partial else ""
-    store = BlockStore(run.partial, config, identity, ready.shape, (first, last), camera)
+    identity = ready.steady.identity if run.partial else ""
+
+    def shelf(config: Config) -> BlockStore:
+        return BlockStore(run.partial, config, identity, ready.shape, (first, last), camera)
+
     with threads(config.compute.workers) as pool:
+
+        def begin(config: Config) -> Begun:
+            scene = track_scene(config, ready.shape, max(last - first, 1))
+            block = _analysed(
+                scene, movie, camera, plan, shelf(config), 0,
+                check=check, pool=pool, progress=run.progress,
+            )  # fmt: skip
+            return Begun(config, scene, block)
+
+        begun, learned = learn_from_tracks(config, begin, name=movie.name, pool=pool, tell=run.tell)
+        config, scene = begun.config, begun.scene
         blocks, interrupted = track_movie(
-            scene, movie, camera, plan, store, check=check, pool=pool, progress=run.progress
-        )
+            scene, movie, camera, plan, shelf(config),
+            check=check, pool=pool, progress=run.progress, first=begun.block,
+        )  # fmt: skip
     joined = join_blocks(config, blocks, camera)
     windows = joined.followed.windows
     if blocks[0].gain_message and not shaken:
@@ -85,7 +105,7 @@ def find_moving(ready: Prepared, run: Run) -> Found:
     for text in pixel_warnings(*windows.left_out):
         run.tell(text)
     run.clock.lap("track")
-    return Found(
+    found = Found(
         scene=replace(scene, mode="track", config=config),
         fits=joined.fits,
         views=joined.views,
@@ -94,8 +114,10 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         heading="blocks",
         summary=plan.summary,
         followed=joined.followed,
+        optics=learned,
         interrupted=interrupted,
     )
+    return kept.put_back(found)
 
 
 def track_movie(
@@ -108,6 +130,7 @@ def track_movie(
     check: Check,
     pool: ThreadPoolExecutor,
     progress: Progress,
+    first: Block | None = None,
 ) -> tuple[list[Block], bool]:
     """Track particles that are there in all frames, over backgrounds learnt with them.
 
@@ -129,6 +152,8 @@ def track_movie(
         Runs parts of blocks.
     progress : Progress
         Told the stages.
+    first : Block, optional
+        The first of them, where it is finished.
 
     Returns
     -------
@@ -144,22 +169,14 @@ def track_movie(
     KeyboardInterrupt
         The user stopped it before the first block was finished.
     """
-    blocks: list[Block] = []
-    count = len(plan.spans)
+    blocks: list[Block] = [] if first is None else [first]
     interrupted = False
     try:
-        for number, span in enumerate(plan.spans):
-            told = progress if count == 1 else _part_of(progress, number, count)
-            block = store.load(number, span)
-            if block is None:
-                block = analyse_block(
-                    scene, movie, camera, span,
-                    goes_on=(number > 0, number + 1 < count),
-                    check=check, pool=pool, progress=told,
-                )  # fmt: skip
-                store.save(number, block)
-            else:
-                told("track", 1, 1)
+        for number in range(len(blocks), len(plan.spans)):
+            block = _analysed(
+                scene, movie, camera, plan, store, number,
+                check=check, pool=pool, progress=progress,
+            )  # fmt: skip
             blocks.append(block)
     except KeyboardInterrupt:
         if not blocks:
@@ -168,6 +185,34 @@ def track_movie(
         pool.shutdown(wait=False, cancel_futures=True)
         interrupted = True
     return blocks, interrupted
+
+
+def _analysed(
+    scene: Scene,
+    movie: FrameSource,
+    camera: Camera,
+    plan: Plan,
+    store: BlockStore,
+    number: int,
+    *,
+    check: Check,
+    pool: ThreadPoolExecutor,
+    progress: Progress,
+) -> Block:
+    """Give a block of a movie, kept or analysed now."""
+    count, span = len(plan.spans), plan.spans[number]
+    told = progress if count == 1 else _part_of(progress, number, count)
+    block = store.load(number, span)
+    if block is not None:
+        told("track", 1, 1)
+        return block
+    block = analyse_block(
+        scene, movie, camera, span,
+        goes_on=(number > 0, number + 1 < count),
+        check=check, pool=pool, progress=told,
+    )  # fmt: skip
+    store.save(number, block)
+    return block
 
 
 def _part_of(progress: Progress, number: int, count: int) -> Progress:

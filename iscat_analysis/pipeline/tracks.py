@@ -33,6 +33,8 @@ from iscat_analysis.records import (
     track_numbers,
 )
 from iscat_analysis.species.tracks import Correlation, TrackSetup, describe_tracks
+from iscat_analysis.threads import one_thread_algebra
+from iscat_analysis.units import listed
 
 SHORT_MOVIE = 20
 """Fewer frames than this hardly tell a diffusion coefficient."""
@@ -130,14 +132,15 @@ def tracks_of(
         ``tracks`` and ``motion`` of ``summary.json``.
     """
     setup = track_setup(scene, windows)
-    tracks = describe_tracks(
-        fits,
-        setup,
-        correlation=mass_correlation(scene, fits),
-        masses=masses,
-        seed=scene.config.compute.seed,
-        progress=progress,
-    )
+    with one_thread_algebra():  # of matrices so small that more threads only wait
+        tracks = describe_tracks(
+            fits,
+            setup,
+            correlation=mass_correlation(scene, fits),
+            masses=masses,
+            seed=scene.config.compute.seed,
+            progress=progress,
+        )
     met = tracks[tracks["nearest_nm"] < setup.near_nm]
     if len(met):
         tell(_crossings(met, setup))
@@ -232,12 +235,10 @@ def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
 
 def _crossings(met: pd.DataFrame, setup: TrackSetup) -> str:
     """Say which tracks came near each other."""
-    named = ", ".join(str(track) for track in met["track"].head(_NAMED))
-    more = f" and {len(met) - _NAMED} more" if len(met) > _NAMED else ""
     return (
-        f"tracks {named}{more} come nearer than {setup.near_nm:g} nm to another (to "
-        f"{met['nearest_nm'].min():.0f} nm), where masses are shared and numbers may be exchanged: "
-        "they are flagged crosses; record fewer particles to avoid it"
+        f"tracks {listed(met['track'], _NAMED)} come nearer than {setup.near_nm:g} nm to another "
+        f"(to {met['nearest_nm'].min():.0f} nm), where masses are shared and numbers may be "
+        "exchanged: they are flagged crosses; record fewer particles to avoid it"
     )
 
 

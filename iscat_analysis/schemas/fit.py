@@ -275,8 +275,12 @@ class Blocks(Closed):
 class Learned(Closed):
     """What ``optics.calibrate`` did: the test of the optics, and what was learned of them."""
 
-    tested: Count = maybe("Bright particles that stand alone")
+    tested: Count = maybe("Bright particles that stand alone, or tracks")
     median_p: Share = maybe("Median p-value of the brightest in the configured optics")
+    left_over: Number = maybe(
+        "Of the pictures of tracks, what the configured optics leave over beyond the noise, over "
+        "the picture (root mean square)"
+    )
     calibrated: bool = key("Whether the analysis used learned optics")
     reason: str = maybe("Why it did not, where the test asked for it or could not be made")
     accepted: bool = maybe("Whether what was learned could be used")

@@ -97,7 +97,8 @@ class FrameFilter:
         images = templates.images
         half = images.shape[1] // 2
         self._half = half
-        self._padded = [next_fast_len(n + 2 * half, real=True) for n in level_e.shape]
+        # what wraps around falls on the first rows and columns, which are cut off
+        self._padded = [next_fast_len(n + half, real=True) for n in level_e.shape]
         flipped = images[:, ::-1, ::-1]
         self._layers = np.flatnonzero((polarity == 0) | (templates.signs == polarity))
         norm = self._cut(rfft2(light, self._padded) * rfft2(flipped**2, self._padded))

@@ -158,7 +158,7 @@ def anomalous_test(
     found = minimize(
         lost, [0.0, 0.0], method="L-BFGS-B",
         bounds=[(-20.0 / unit, 20.0 / unit), [(end - 1) / unit for end in _EXPONENTS]],
-        options={"ftol": 1e-9, "eps": _PART / unit},
+        options={"ftol": 1e-7, "eps": _PART / unit},
     )  # fmt: skip
     d, exponent = at(found.x)
     ratio = max(2 * (-float(found.fun) - track.likelihood(free).value), 0.0)

@@ -48,10 +48,12 @@ COVERAGE = 0.95
 SLOWED = 0.05
 """Share by which a wall slows a particle before its size is remarked on."""
 
+NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
+"""Of rows that do not say how a particle moves."""
+
 _FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
 _DOUBT = 0.1
 _ENOUGH = 3  # of the first that are as surprising leave none
-_NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
 _FREE = ("p_confinement", "p_anomalous", "p_steady")
 _STEPS = 3.0  # standard deviations of a displacement within which it may end beyond the border
 _LOOKS = 3  # at D, on which it depends which displacements tell it
@@ -188,7 +190,7 @@ def _placed(rows: pd.DataFrame) -> pd.DataFrame:
     """
     errors = rows[["sigma_x_nm", "sigma_y_nm"]].max(axis=1)
     useful = errors <= _USELESS * errors.median()
-    return rows[useful & ~rows["status"].isin(_NO_PLACE) & ~rows["frame"].duplicated()]
+    return rows[useful & ~rows["status"].isin(NO_PLACE) & ~rows["frame"].duplicated()]
 
 
 def _record(

@@ -7,6 +7,7 @@ import pytest
 
 from iscat_analysis.inference.rows import Rows
 from iscat_analysis.pipeline.identity import identified
+from iscat_analysis.pipeline.linking import meeting
 
 FRAMES, MEET, AROUND = 200, 100, 25
 NEAR_NM, ERROR = 370.0, 1.0
@@ -132,3 +133,15 @@ def test_no_rows_and_one_track_stay_as_they_are() -> None:
     single = _pair(np.random.default_rng(2), (30.0, 70.0), (20.0, 20.0))
     single = single.only(single.track == 0)
     assert np.array_equal(identified(single, near_nm=NEAR_NM, error=ERROR).track, single.track)
+
+
+def test_rows_shortly_before_and_after_a_meeting_are_of_it() -> None:
+    """The partner of a row may be hidden where there is none beside it."""
+    frame = np.array([10, 10, 11, 12, 13, 20, 20, 40, 41])
+    track = np.array([0, 1, 0, 0, 0, 0, 1, 1, 2])
+    theta = np.zeros((9, 5))
+    theta[1, 0], theta[6, 0], theta[8, 1] = 300.0, 3000.0, 100.0  # close, far, and of another time
+    rows = Rows.of(frame, track, theta, track)
+    assert meeting(rows, 500.0).tolist() == [True] * 5 + [False] * 4
+    assert not meeting(rows, 200.0).any()
+    assert not meeting(rows.only(np.zeros(9, dtype=bool)), 500.0).size

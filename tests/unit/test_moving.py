@@ -24,7 +24,9 @@ from iscat_analysis.inference.settling import first_ground, settle
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.pipeline import fit_stack
+from iscat_analysis.pipeline.moving import diffusion_of
 from iscat_analysis.search.moving import gaps, link
+from iscat_analysis.species import fit_diffusion
 
 SHAPE, FRAMES, LEVEL_E, ROI = (40, 44), 60, 4e5, 24
 MASSES = (200.0, 400.0)
@@ -240,18 +242,27 @@ def test_only_rows_that_are_the_same_recall_their_fits(pool: ThreadPoolExecutor)
     assert np.array_equal(kept.fisher, fitted.fisher[same])
 
 
-def test_rows_follow_a_step_of_their_background(pool: ThreadPoolExecutor) -> None:
-    """To first order, expected information for observed, as a fit over the new one moves them."""
-    counts, ground, truth = _movie(_paths(40.0), noise=True)
+@pytest.mark.parametrize("beside_nm", [None, 320.0])
+def test_rows_follow_a_step_of_their_background(
+    pool: ThreadPoolExecutor, beside_nm: float | None
+) -> None:
+    """To first order, expected information for observed, as a fit over the new one moves them.
+
+    Where two overlap they do so together: each by itself would go much too far.
+    """
+    paths = _paths(40.0)
+    if beside_nm is not None:
+        paths[1] = paths[0] + [beside_nm, 0.0]
+    counts, ground, truth = _movie(paths, noise=True)
     field = _field(counts, pool)
     for _ in range(3):
-        truth, _, _ = field.fit(ground, truth)
+        truth, _, _ = field.fit(ground, truth, sweeps=6)
     step = 1e-3 * np.random.default_rng(2).standard_normal(SHAPE)  # two thirds of a frame's noise
     foreseen = field.followed(truth, step).theta - truth.theta
     field = _field(counts, pool)
     rows = truth
     for _ in range(3):
-        rows, _, _ = field.fit(replace(ground, level=ground.level * np.exp(step)), rows, sweeps=2)
+        rows, _, _ = field.fit(replace(ground, level=ground.level * np.exp(step)), rows, sweeps=6)
     moved = rows.theta - truth.theta
     index = np.array([0, 1, 3])
     error = np.sqrt(np.mean((moved - foreseen)[:, index] ** 2, axis=0))
@@ -308,6 +319,34 @@ def _along_paths(
     spreads = 6 * q * (1 / 3 - (times + 1) / 2 + (times + 1) ** 2 / 4)
     path = sum(part / 2 * normal(v) for v, part in zip(spreads, parts, strict=True))
     return path, normal(q)
+
+
+def test_blur_is_of_places_where_a_particle_is_alone() -> None:
+    """Two that stay together for a while are lost in each other's pictures."""
+    config, rng = _config(), np.random.default_rng(8)
+    d, sigma_nm, frames = 0.15, 15.0, 600
+    rate, exposure = 331.0, 1 / 331.0
+    steps = rng.normal(0, math.sqrt(2 * d * 1e6 / rate / 16), (2, frames, 16, 2))
+    path = np.cumsum(steps.reshape(2, -1, 2), axis=1).reshape(2, frames, 16, 2).mean(axis=2)
+    first, last = 200, 260
+    path[1, :first] += path[0, first] - path[1, first]
+    path[1, last:] += path[0, last] - path[1, last]
+    path[1, first:last] = path[0, first:last] + rng.normal(0, 60.0, (last - first, 2))
+    places = path + rng.normal(0, sigma_nm, path.shape)
+    theta = np.zeros((2 * frames, 5))
+    theta[:, :2] = places.transpose(1, 0, 2).reshape(-1, 2)
+    theta[:, 3] = 1.0
+    frame, track = np.divmod(np.arange(2 * frames), 2)
+    fisher = np.broadcast_to(np.diag([sigma_nm**-2, sigma_nm**-2, 0.0, 1.0]), (2 * frames, 4, 4))
+    rows = replace(Rows.of(frame, track, theta), fisher=fisher)
+    free = np.array([True, True, False, True, False])
+    found, error = diffusion_of(config, free, rows).T
+    assert np.all(np.abs(found - d) < SIGMAS * error)
+    worse = fit_diffusion(
+        frame[track == 1], places[1], np.full((frames, 2), sigma_nm), frame_rate_hz=rate,
+        exposure_ms=1e3 * exposure,
+    )  # fmt: skip
+    assert worse.d_um2_s - d > 2 * SIGMAS * error[1]
 
 
 @pytest.mark.parametrize("optics", [{}, {"aberrations_nm": {"z7": 10.0}}])

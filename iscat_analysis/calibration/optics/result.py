@@ -76,8 +76,19 @@ class OpticsCalibration:
         row = self.parameters.set_index("parameter").loc[name]
         return float(row["sigma"])
 
-    def headline(self) -> str:
-        """Say in one line what was found."""
+    def headline(self, pictures_of: str = "particles") -> str:
+        """Say in one line what was found.
+
+        Parameters
+        ----------
+        pictures_of : str
+            What was looked at, in the plural.
+
+        Returns
+        -------
+        str
+            Focus, aperture, phase and aberrations, and how well they describe the pictures.
+        """
         judged, before = self.measured.judgement, self.measured.configured
         parts = []
         for name, unit in (("focus_nm", "nm"), ("na", ""), ("reference_phase_deg", "deg")):
@@ -96,9 +107,9 @@ class OpticsCalibration:
             parts.append(f"mask of NA {self.value('mask_na'):.3f}")
         parts.append(f"{self.measured.settings['polarization']} polarisation")
         return (
-            f"{', '.join(parts)} from {self.sights} particles; reduced chi2 of those that were not "
-            f"fitted {np.mean(judged.chi2_reduced):.3f} ({np.mean(before.chi2_reduced):.3g} as "
-            "configured)"
+            f"{', '.join(parts)} from {self.sights} {pictures_of}; reduced chi2 of those that "
+            f"were not fitted {np.mean(judged.chi2_reduced):.3f} "
+            f"({np.mean(before.chi2_reduced):.3g} as configured)"
         )
 
     def to_toml(self) -> str:

@@ -1,0 +1,253 @@
+"""The optics of a movie in which particles move, tested on its tracks and learned from them.
+
+The pictures of `iscat_analysis.pipeline.aligned` show what the model leaves over of all frames.  A
+good model leaves over noise, and less than a hundredth of the particle where there is little of it;
+an NA of 1.40 for 1.42, a focus wrong by 20 nm or 15 nm of coma leave over a tenth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from iscat_analysis.calibration.optics import FREE, MOST_SIGHTS, OpticsCalibration
+from iscat_analysis.calibration.optics.settings import with_settings
+from iscat_analysis.config import Config
+from iscat_analysis.errors import DataError
+from iscat_analysis.inference.cause import PIXEL, Cause, likely_cause
+from iscat_analysis.pipeline.aligned import Aligned
+from iscat_analysis.pipeline.block_store import Block
+from iscat_analysis.pipeline.learning import taken, usable
+from iscat_analysis.pipeline.microscope import calibrate_sights, with_sign
+from iscat_analysis.pipeline.scene import Scene
+from iscat_analysis.units import count
+
+REJECTED_SHARE = 0.04
+"""Of the particle's picture, what the model leaves over beyond the noise (root mean square): optics
+that leave over less are wrong by less than masses are."""
+
+REJECTED_CHI2 = 2.0
+"""Times the noise of single frames, what it leaves over too: less is seen in good movies whose
+particles meet often."""
+
+ROUNDS = 4
+"""Of optics learned from tracks, and tracks followed with them.  What is learned from tracks that
+were followed with wrong optics is only near the truth: it is taken from the round after."""
+
+_NOISE = "the noise is not what the camera's numbers predict, and may be what is left over"
+_LOOKED_AT = 24  # pictures in which the cause is looked for
+_PLACE_AND_MASS = np.array([True, True, False, True, False])
+
+
+@dataclass(frozen=True)
+class Begun:
+    """The first frames of a movie, followed with some optics.
+
+    Attributes
+    ----------
+    config : Config
+        With these.
+    scene : Scene
+        Its models.
+    block : Block
+        What was found.
+    """
+
+    config: Config
+    scene: Scene
+    block: Block
+
+
+@dataclass(frozen=True)
+class LeftOver:
+    """What the model leaves over of all pictures of tracks together.
+
+    Attributes
+    ----------
+    share : float
+        Beyond the noise, of the particle's picture.
+    chi2 : float
+        Reduced χ² over that of single frames.
+    tracks : int
+        That were looked at.
+    """
+
+    share: float
+    chi2: float
+    tracks: int
+
+    @property
+    def rejected(self) -> bool:
+        """Whether the optics are not those of the movie."""
+        return self.share > REJECTED_SHARE and self.chi2 > REJECTED_CHI2
+
+    @property
+    def verdict(self) -> str:
+        """Say so."""
+        if not self.rejected:
+            return "the optics cannot be learned from this movie"
+        return (
+            f"the configured optics do not describe the particles: of the pictures of "
+            f"{count(self.tracks, 'track')} they leave over {self.share:.0%}"
+        )
+
+
+def learn_from_tracks(
+    config: Config,
+    begin: Callable[[Config], Begun],
+    *,
+    name: str,
+    pool: ThreadPoolExecutor,
+    tell: Callable[[str], None],
+) -> tuple[Begun, dict[str, Any]]:
+    """Follow the first frames, test the optics on them, and learn better ones where they fail.
+
+    Parameters
+    ----------
+    config : Config
+        Resolved; ``optics.calibrate`` says what is wanted.
+    begin : callable
+        Follows the first frames with the optics of a configuration.
+    name : str
+        Of the movie.
+    pool : ThreadPoolExecutor
+        Runs the fits.
+    tell : callable
+        Told in one line what is wrong, or what was learned.
+
+    Returns
+    -------
+    begun : Begun
+        With the optics to go on with.
+    summary : dict
+        What ``summary.json`` says of it; empty where nothing could be tested.
+    """
+    begun, optics = begin(config), config.optics
+    left = left_over(begun)
+    suited = optics.convention == "exact" and optics.psf == "model"
+    if left is None or not suited:
+        return begun, {}
+    tested = {"tested": left.tracks, "left_over": left.share}
+    if not left.rejected and optics.calibrate != "always":
+        return begun, tested | {"calibrated": False}
+    cause = _cause(begun) if left.rejected else None
+    if begun.block.gain_message and cause is None and optics.calibrate != "always":
+        return begun, tested | {"calibrated": False, "reason": _NOISE}
+    learns = optics.calibrate == "always" or (optics.calibrate == "auto" and optics.file is None)
+    if not learns or (cause is not None and cause.name == PIXEL):
+        said = _said(left, cause, learns=learns)
+        tell(said)
+        return begun, tested | {"calibrated": False, "reason": said}
+    reason = "what was learned does not describe them either"
+    trial, near = begun, not left.rejected
+    try:
+        for _ in range(ROUNDS):
+            found = _measured(trial, _start(config, cause), name, pool)
+            learned, refusal = usable(found, config)
+            if learned is not None and near:
+                learned, told = taken(
+                    found, config, tested, left.verdict, pictures_of="pictures of tracks", tell=tell
+                )
+                return begin(learned), told
+            guess = learned or with_sign(with_settings(config, found.measured.settings))[0]
+            reason = refusal or reason
+            if guess is None:
+                break
+            trial = begin(guess)
+            now = left_over(trial)
+            near = now is not None and not now.rejected
+    except DataError as error:
+        reason = str(error)
+    said = f"{_said(left, cause, learns=True)} (other optics were not learned: {reason})"
+    tell(said if left.rejected else f"{left.verdict}: {reason}; the analysis goes on as configured")
+    return begun, tested | {"calibrated": False, "reason": reason}
+
+
+def left_over(begun: Begun) -> LeftOver | None:
+    """Add up what the model leaves over of all pictures.
+
+    Parameters
+    ----------
+    begun : Begun
+        The first frames.
+
+    Returns
+    -------
+    LeftOver or None
+        None where there is no picture.
+    """
+    block, scene = begun.block, begun.scene
+    aligned = block.aligned
+    if aligned is None or not len(aligned.track):
+        return None
+    rest, signal, variance = (np.zeros(aligned.light_e.shape[1:]) for _ in range(3))
+    for number, theta in enumerate(aligned.theta):
+        likelihood = aligned.likelihood(scene, number)
+        noise = np.where(likelihood.used, aligned.light_e[number] + aligned.read_e2[number], 0.0)
+        rest += theta[3] * np.nan_to_num(likelihood.residuals(theta)) * np.sqrt(noise)
+        signal += theta[3] * noise * likelihood.signal(theta)
+        variance += theta[3] ** 2 * noise
+    used = variance > 0
+    usual = max(1.0, float(block.table["chi2_reduced"].median()))
+    square = rest[used] ** 2 / variance[used] / usual
+    power = float(np.sum(signal[used] ** 2 / variance[used])) / usual
+    excess = max(float(np.sum(square - 1)), 0.0)
+    share = float(np.sqrt(excess / power)) if power > 0 else 0.0
+    return LeftOver(share, float(square.mean()), len(np.unique(aligned.track)))
+
+
+def _brightest(aligned: Aligned, most: int) -> list[int]:
+    """Numbers of the pictures that say most, the brightest first."""
+    energy = aligned.frames * aligned.theta[:, 3] ** 2 * aligned.light_e.mean(axis=(1, 2))
+    order: list[int] = np.argsort(-energy, kind="stable")[:most].tolist()
+    return order
+
+
+def _cause(begun: Begun) -> Cause | None:
+    """Name the part of the microscope that what is left over looks most like."""
+    aligned, scene = begun.block.aligned, begun.scene
+    if aligned is None:
+        return None
+    shown = _brightest(aligned, _LOOKED_AT)
+    fits = [(aligned.likelihood(scene, n), aligned.theta[n], _PLACE_AND_MASS) for n in shown]
+    return likely_cause(scene.config, fits)
+
+
+def _said(left: LeftOver, cause: Cause | None, *, learns: bool) -> str:
+    """Say what is wrong, and what to do."""
+    if cause is None:
+        return (
+            f"the model does not describe the particles: of the pictures of "
+            f"{count(left.tracks, 'track')} it leaves over {left.share:.0%}, and no part of the "
+            "microscope explains that: see whether the light under them changes slowly "
+            "(track.block_frames), or several things are wrong in the optics"
+        )
+    text = f"{left.verdict}, and masses are wrong too"
+    advice = [] if learns else ['optics.calibrate = "auto" learns them from the movie']
+    text += f"; it looks most like {cause.likeness}"
+    advice = ["correct that", *(advice if cause.name != PIXEL else [])]
+    return f"{text}: {', or '.join(advice)}"
+
+
+def _start(config: Config, cause: Cause | None) -> Config:
+    """Where the search begins: the aperture is not found across the critical angle."""
+    if cause is None or cause.name != "numerical aperture" or cause.step is None:
+        return config
+    most = min(config.optics.n_immersion, config.optics.n_glass)
+    na = min(config.optics.na + cause.step, 0.5 * (config.optics.na + most))
+    return config.model_copy(update={"optics": config.optics.model_copy(update={"na": na})})
+
+
+def _measured(
+    begun: Begun, start: Config, name: str, pool: ThreadPoolExecutor
+) -> OpticsCalibration:
+    """Measure the microscope from the pictures of tracks."""
+    aligned, scene = begun.block.aligned, begun.scene
+    shown = [] if aligned is None else _brightest(aligned, MOST_SIGHTS)
+    sights = [aligned.sight(scene, n) for n in shown] if aligned is not None else []
+    source: Mapping[str, str] = {"movie": name}
+    return calibrate_sights(sights, (), start, tuple(FREE), source, mapper=pool.map)

@@ -1,0 +1,131 @@
+"""What all particles do at once, and frames that show nothing new."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+from wanderers import wander
+
+import iscat_analysis as ia
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.pipeline.kept_frames import keep_frames
+from iscat_analysis.pipeline.together import warnings_of
+
+FRAMES, TRACKS, RATE_HZ = 300, 8, 331.0
+STEP_NM = np.where(np.arange(TRACKS) % 2, 30.0, 70.0)
+
+Walk = NDArray[np.float64]
+
+
+def _walk(seed: int, frames: int = FRAMES) -> Walk:
+    """Places of free particles, shape (frames, tracks, 2)."""
+    steps = np.random.default_rng(seed).standard_normal((frames, TRACKS, 2)) * STEP_NM[:, None]
+    return np.cumsum(steps, axis=0)
+
+
+def _table(walk: Walk) -> pd.DataFrame:
+    frame, track = (k.ravel() for k in np.indices(walk.shape[:2]))
+    return pd.DataFrame({
+        "track": track, "frame": frame, "status": "ok",
+        "x_nm": walk[..., 0].ravel(), "y_nm": walk[..., 1].ravel(),
+    })  # fmt: skip
+
+
+def _said(walk: Walk) -> list[str]:
+    return list(warnings_of(_table(walk), RATE_HZ))
+
+
+def _vibrating(walk: Walk) -> Walk:
+    return walk + 15.0 * np.random.default_rng(9).standard_normal((len(walk), 1, 2))
+
+
+def _lost_at_once(walk: Walk) -> Walk:
+    return np.delete(walk, np.arange(140, 180), axis=0)
+
+
+def _dropped(walk: Walk) -> Walk:
+    return np.delete(walk, np.random.default_rng(3).choice(len(walk), 35, replace=False), axis=0)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_free_particles_do_nothing_at_once(seed: int) -> None:
+    walk = _walk(seed)
+    assert not _said(walk)
+    walk[::60, 0] += 800.0  # and one of them is lost now and then
+    assert not _said(walk)
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "words"),
+    [
+        (_vibrating, "all particles move together, by 2"),
+        (_lost_at_once, "particles jump from frame 139 to 140"),
+        (_dropped, "the camera seems to have dropped frames"),
+    ],
+)
+def test_what_makes_d_too_large_for_all_is_said(
+    spoiled: Callable[[Walk], Walk], words: str
+) -> None:
+    for seed in range(5):
+        (said,) = _said(spoiled(_walk(seed, FRAMES + 40)))
+        assert words in said
+        assert "D" in said
+
+
+@pytest.mark.parametrize("status", ["poor_fit", "ok"])
+def test_parts_of_something_else_are_no_particles(status: str) -> None:
+    """As where rings of a bright particle outside the field are taken for some that run."""
+    walk = _walk(1)
+    walk[150:, :3] += 600.0
+    table = _table(walk)
+    table.loc[table["track"] < 3, "status"] = status
+    assert bool(list(warnings_of(table, RATE_HZ))) == (status == "ok")
+
+
+def test_two_particles_are_too_few_to_tell() -> None:
+    table = _table(_vibrating(_walk(1)))
+    assert not list(warnings_of(table[table["track"] < 2], RATE_HZ))
+
+
+@pytest.mark.usefixtures("sketched")
+def test_repeated_and_empty_frames_are_left_out_of_tracks() -> None:
+    movie = wander((120, 64, 64), seed=2, species=((400.0, 0.3, 2),))
+    counts = movie.counts.copy()
+    stuck = np.arange(10, 100, 5)
+    counts[stuck] = counts[stuck - 1]
+    counts[[57, 58]] = 0
+    settings: dict[str, Any] = {
+        "camera.pixel_size_nm": 84.0, "camera.gain_e_per_adu": 20.0,
+        "camera.frame_rate_hz": RATE_HZ,
+        "calibration.gradient_per_kda": -3.1e-5, "particle.mass_kda": 300.0, "fit.mode": "track",
+        "track.free": "mass", "optics.calibrate": "never",
+    }  # fmt: skip
+    result = ia.fit_movie(counts, settings=settings)
+    (said,) = [line for line in result.warnings if "left out" in line]
+    assert "frames 10, 15, 20, 25 and 16 more are zero throughout or repeat" in said
+    odd = [*stuck.tolist(), 57, 58]
+    assert not result.table["frame"].isin(odd).any()
+    own = result.table.merge(movie.truth, on="frame", suffixes=("", "_true"))
+    away = np.hypot(own["x_nm"] - own["x_nm_true"], own["y_nm"] - own["y_nm_true"])
+    nearest = away.groupby([own["track"], own["frame"]]).min()
+    assert np.median(nearest) < 30.0  # frames have the numbers that they have in the movie
+    tracks = result.tracks[result.tracks["n_frames"] > 60]
+    assert len(tracks)
+    assert (np.abs(tracks["d_um2_s"] - 0.3) < 4 * tracks["sigma_d_um2_s"]).all()
+    power = result.analysis.power
+    assert np.isnan(power).sum() == 2 * len(odd)
+
+
+def test_a_movie_without_odd_frames_is_itself() -> None:
+    from iscat_analysis.movie import open_stack
+
+    counts = np.random.default_rng(1).integers(900, 1100, (30, 8, 8)).astype(np.uint16)
+    with open_stack(counts) as movie:
+        kept = keep_frames(movie, Camera(), (0, 30))
+        assert kept.movie is movie
+        assert not kept.message

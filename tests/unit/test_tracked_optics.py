@@ -1,0 +1,93 @@
+"""The optics of movies in which particles move, tested on their tracks and learned from them."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from instruments import Instrument
+from wanderers import Wanderers, wander
+
+import iscat_analysis as ia
+from iscat_analysis.pipeline.tracked_optics import REJECTED_SHARE, LeftOver, _said
+
+pytestmark = pytest.mark.usefixtures("sketched")
+
+SHAPE = (120, 80, 80)
+MASS_KDA = 400.0
+SETTINGS: dict[str, Any] = {
+    "camera.pixel_size_nm": 84.0,
+    "camera.gain_e_per_adu": 20.0,
+    "camera.frame_rate_hz": 331.0,
+    "camera.exposure_ms": 1e3 / 331,
+    "calibration.gradient_per_kda": -3.1e-5,
+    "particle.mass_kda": 300.0,
+    "fit.mode": "track",
+    "track.free": "mass",
+    "optics.calibrate": "never",
+}
+
+
+def _movie(instrument: Instrument | None = None) -> Wanderers:
+    return wander(SHAPE, seed=4, instrument=instrument, species=((MASS_KDA, 0.4, 4),))
+
+
+@pytest.fixture(scope="module")
+def movie() -> Wanderers:
+    return _movie()
+
+
+def _about_optics(result: ia.Result) -> list[str]:
+    return [line for line in result.warnings if "optics" in line]
+
+
+def test_right_optics_are_not_doubted(movie: Wanderers) -> None:
+    result = ia.fit_movie(movie.counts, settings={**SETTINGS, "optics.calibrate": "auto"})
+    assert not _about_optics(result)
+    told = result.summary["optics"]
+    assert told["tested"] >= 2
+    assert told["left_over"] < REJECTED_SHARE / 2
+    assert not told["calibrated"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"optics.na": 1.30}, "wrong numerical aperture, off by about +0.1"),
+        ({"camera.pixel_size_nm": 92.4}, "wrong camera.pixel_size_nm, off by about -"),
+    ],
+)
+def test_what_is_wrong_is_named(movie: Wanderers, wrong: dict[str, Any], named: str) -> None:
+    """Single frames hide it: an NA of 1.30 for 1.42 makes masses 3 % wrong, and all rows ok."""
+    result = ia.fit_movie(movie.counts, settings={**SETTINGS, **wrong})
+    (said,) = _about_optics(result)
+    assert named in said
+    assert ("optics.calibrate" in said) == ("optics.na" in wrong)  # which learns no pixel size
+    assert result.summary["optics"]["left_over"] > 2 * REJECTED_SHARE
+
+
+def test_what_no_part_of_the_microscope_explains_is_not_called_wrong_optics() -> None:
+    """As where the light under the particles changes slowly: learning optics would not help."""
+    said = _said(LeftOver(0.15, 5.0, 10), None, learns=False)
+    assert "15%" in said
+    assert "no part of the microscope" in said
+    assert "optics.calibrate" not in said
+
+
+def test_an_aberration_is_learned_from_tracks() -> None:
+    aberrated = replace(Instrument(emission="reciprocal"), aberrations_nm={11: 20.0})
+    movie = _movie(aberrated)
+    result = ia.fit_movie(movie.counts, settings={**SETTINGS, "optics.calibrate": "auto"})
+    assert result.summary["optics"]["calibrated"]
+    assert any("optics learned from the movie" in line for line in result.warnings)
+    learned = tomllib.loads(result.config_toml)["optics"]["aberrations_nm"]
+    assert learned["z11"] == pytest.approx(20.0, abs=2.0)
+    tracks = result.tracks[result.tracks["status"] == "ok"]
+    error = (tracks["mass_kda"] - MASS_KDA) / np.hypot(
+        tracks["sigma_mass_kda"], tracks["systematic_mass_kda"]
+    )
+    assert len(tracks) >= 2
+    assert np.abs(error).max() < 4.0
