@@ -20,8 +20,9 @@ from iscat_analysis._kernels.lattice import FAST
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_STIFFER = 1e-3
-"""What is added to F, relative to its diagonal, for rows that cannot be told from each other."""
+_STIFFER, _STIFFEST = 1e-3, 1.0
+"""What is added to F, relative to its diagonal, for rows that cannot be told from each other: the
+least, and the most where rounding makes of F what no information is."""
 
 
 class Slopes(NamedTuple):
@@ -144,7 +145,9 @@ def join_rows(
             else:  # what it changes is not seen
                 joint[i, i] = 1.0
         low = clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n)
-        factorise(joint, np.arange(n), scale, _STIFFER, low)
+        stiffer = _STIFFER
+        while not factorise(joint, np.arange(n), scale, stiffer, low) and stiffer < _STIFFEST:
+            stiffer *= 10.0
         for i in range(n):
             for j in range(i + 1):
                 low[i, j] /= scale[i]

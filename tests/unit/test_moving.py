@@ -14,10 +14,13 @@ import pytest
 import tifffile
 from scenes import PIXEL_NM, make_config
 
+from iscat_analysis._kernels.canvas import Light
+from iscat_analysis._kernels.following import Slopes
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.bias import first_order_bias
 from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.newton import Response
 from iscat_analysis.inference.noise import poisson
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.inference.settling import first_ground, settle
@@ -268,6 +271,28 @@ def test_rows_follow_a_step_of_their_background(
     error = np.sqrt(np.mean((moved - foreseen)[:, index] ** 2, axis=0))
     assert np.all(error < 0.25 * np.sqrt(np.mean(moved[:, index] ** 2, axis=0)))
     assert np.all(foreseen[:, [2, 4]] == 0)
+
+
+@pytest.mark.parametrize("rounded", [1.0, 0.98])
+def test_rows_in_one_place_follow_as_one(pool: ThreadPoolExecutor, rounded: float) -> None:
+    """Whatever rounding makes of what each knows alone, each takes up half of what both see."""
+    side, level = 12, 100.0
+    slope = np.random.default_rng(4).standard_normal((1, 1, side * side)).astype(np.float32)
+    slopes = Slopes(np.tile([0, side, 0, side], (2, 1)), np.repeat(slope, 2, axis=0))
+    light = Light(
+        np.full((1, side, side), level, dtype=np.float32), np.ones(1),
+        np.full((side, side), level), np.zeros((side, side)),
+    )  # fmt: skip
+    own = float(np.sum(slope.astype(float) ** 2)) / level
+    response = Response(
+        slopes, np.array([0, 2]), light, np.zeros((1, side, side), dtype=np.float32),
+        np.full((2, 1, 1), rounded * own), pool,
+    )  # fmt: skip
+    free = np.array([False, False, False, True, False])
+    walls = np.full(5, -np.inf), np.full(5, np.inf)
+    move = slope.reshape(side, side) / level
+    moved = response.followed(np.zeros((2, 5)), move, free, walls)[:, 3]
+    assert moved == pytest.approx(-0.5, rel=0.05)
 
 
 def test_residuals_are_of_the_rows_that_are_asked_for(pool: ThreadPoolExecutor) -> None:
