@@ -28,7 +28,7 @@ from scipy.optimize import linear_sum_assignment
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-from wanderers import Wanderers, wander
+from wanderers import SETTINGS, Wanderers, wander
 
 import iscat_analysis as ia
 
@@ -37,16 +37,6 @@ SHAPE = (1500, 128, 128)
 MOVIES = 10
 NEAR_NM = 300.0
 LONG = 10  # frames of a false track that counts
-SETTINGS = {
-    "camera.pixel_size_nm": 84.0,
-    "camera.gain_e_per_adu": 20.0,
-    "camera.frame_rate_hz": 331.0,
-    "calibration.gradient_per_kda": -3.1e-5,
-    "particle.mass_kda": 300.0,
-    "fit.mode": "track",
-    "track.free": "mass",
-    "optics.calibrate": "never",
-}
 PEER_FRAMES = 100
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -28,6 +29,21 @@ MARGIN_PX = 8.0
 
 SPECIES = ((200.0, 0.15, 4), (200.0, 0.8, 3), (400.0, 0.15, 4), (400.0, 0.8, 3))
 """Mass [kDa], diffusion coefficient [µm²/s] and number."""
+
+PIXEL_NM, GAIN_E_PER_ADU, FRAME_RATE_HZ = 84.0, 20.0, 331.0
+"""Of the camera."""
+
+SETTINGS: dict[str, Any] = {
+    "camera.pixel_size_nm": PIXEL_NM,
+    "camera.gain_e_per_adu": GAIN_E_PER_ADU,
+    "camera.frame_rate_hz": FRAME_RATE_HZ,
+    "calibration.gradient_per_kda": -3.1e-5,
+    "particle.mass_kda": 300.0,
+    "fit.mode": "track",
+    "track.free": "mass",
+    "optics.calibrate": "never",
+}
+"""What an analysis of these movies is told."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +72,9 @@ def wander(
     level_e: float = 4e5,
     speckle: float = 0.15,
     power_noise: float = 0.01,
-    frame_rate_hz: float = 331.0,
-    pixel_nm: float = 84.0,
-    gain_e_per_adu: float = 20.0,
+    frame_rate_hz: float = FRAME_RATE_HZ,
+    pixel_nm: float = PIXEL_NM,
+    gain_e_per_adu: float = GAIN_E_PER_ADU,
     drift_nm_per_frame: tuple[float, float] = (0.0, 0.0),
     stage_nm: FloatArray | None = None,
     led: Callable[[FloatArray], FloatArray] | None = None,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from wanderers import Wanderers, wander
+from wanderers import SETTINGS, Wanderers, wander
 
 import iscat_analysis as ia
 
@@ -15,16 +15,6 @@ pytestmark = [pytest.mark.usefixtures("sketched"), pytest.mark.large]
 DRIFT_NM = 0.03  # a frame, 10 nm/s: 6 nm in all
 SPECIES = ((400.0, 0.15, 2), (200.0, 0.8, 1))
 NEAR_NM = 300.0
-SETTINGS = {
-    "camera.pixel_size_nm": 84.0,
-    "camera.gain_e_per_adu": 20.0,
-    "camera.frame_rate_hz": 331.0,
-    "calibration.gradient_per_kda": -3.1e-5,
-    "particle.mass_kda": 300.0,
-    "fit.mode": "track",
-    "track.free": "mass",
-    "optics.calibrate": "never",
-}
 
 
 def _pulls(movie: Wanderers, frames: int | str) -> tuple[list[float], int, int]:

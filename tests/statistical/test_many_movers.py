@@ -9,22 +9,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from wanderers import wander
+from wanderers import SETTINGS, wander
 
 import iscat_analysis as ia
 
 NEAR_NM = 300.0
 SPECIES = ((200.0, 0.15, 3), (200.0, 0.8, 2), (400.0, 0.15, 3), (400.0, 0.8, 2))
-SETTINGS = {
-    "camera.pixel_size_nm": 84.0,
-    "camera.gain_e_per_adu": 20.0,
-    "camera.frame_rate_hz": 331.0,
-    "calibration.gradient_per_kda": -3.1e-5,
-    "particle.mass_kda": 300.0,
-    "fit.mode": "track",
-    "track.free": "mass",
-    "optics.calibrate": "never",
-}
 
 
 def test_overlapping_particles_do_not_drive_the_background_away() -> None:

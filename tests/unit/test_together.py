@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from numpy.typing import NDArray
-from wanderers import wander
+from wanderers import FRAME_RATE_HZ, SETTINGS, wander
 
 import iscat_analysis as ia
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.kept_frames import keep_frames
 from iscat_analysis.pipeline.together import warnings_of
 
-FRAMES, TRACKS, RATE_HZ = 300, 8, 331.0
+FRAMES, TRACKS = 300, 8
 STEP_NM = np.where(np.arange(TRACKS) % 2, 30.0, 70.0)
 
 Walk = NDArray[np.float64]
@@ -37,7 +36,7 @@ def _table(walk: Walk) -> pd.DataFrame:
 
 
 def _said(walk: Walk) -> list[str]:
-    return list(warnings_of(_table(walk), RATE_HZ))
+    return list(warnings_of(_table(walk), FRAME_RATE_HZ))
 
 
 def _vibrating(walk: Walk) -> Walk:
@@ -84,12 +83,12 @@ def test_parts_of_something_else_are_no_particles(status: str) -> None:
     walk[150:, :3] += 600.0
     table = _table(walk)
     table.loc[table["track"] < 3, "status"] = status
-    assert bool(list(warnings_of(table, RATE_HZ))) == (status == "ok")
+    assert bool(list(warnings_of(table, FRAME_RATE_HZ))) == (status == "ok")
 
 
 def test_two_particles_are_too_few_to_tell() -> None:
     table = _table(_vibrating(_walk(1)))
-    assert not list(warnings_of(table[table["track"] < 2], RATE_HZ))
+    assert not list(warnings_of(table[table["track"] < 2], FRAME_RATE_HZ))
 
 
 @pytest.mark.usefixtures("sketched")
@@ -99,13 +98,7 @@ def test_repeated_and_empty_frames_are_left_out_of_tracks() -> None:
     stuck = np.arange(10, 100, 5)
     counts[stuck] = counts[stuck - 1]
     counts[[57, 58]] = 0
-    settings: dict[str, Any] = {
-        "camera.pixel_size_nm": 84.0, "camera.gain_e_per_adu": 20.0,
-        "camera.frame_rate_hz": RATE_HZ,
-        "calibration.gradient_per_kda": -3.1e-5, "particle.mass_kda": 300.0, "fit.mode": "track",
-        "track.free": "mass", "optics.calibrate": "never",
-    }  # fmt: skip
-    result = ia.fit_movie(counts, settings=settings)
+    result = ia.fit_movie(counts, settings=SETTINGS)
     (said,) = [line for line in result.warnings if "left out" in line]
     assert "frames 10, 15, 20, 25 and 16 more are zero throughout or repeat" in said
     odd = [*stuck.tolist(), 57, 58]

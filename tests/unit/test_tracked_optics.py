@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from instruments import Instrument
-from wanderers import Wanderers, wander
+from wanderers import SETTINGS, Wanderers, wander
 
 import iscat_analysis as ia
 from iscat_analysis.pipeline.tracked_optics import REJECTED_SHARE, LeftOver, _said
@@ -18,17 +18,6 @@ pytestmark = pytest.mark.usefixtures("sketched")
 
 SHAPE = (120, 80, 80)
 MASS_KDA = 400.0
-SETTINGS: dict[str, Any] = {
-    "camera.pixel_size_nm": 84.0,
-    "camera.gain_e_per_adu": 20.0,
-    "camera.frame_rate_hz": 331.0,
-    "camera.exposure_ms": 1e3 / 331,
-    "calibration.gradient_per_kda": -3.1e-5,
-    "particle.mass_kda": 300.0,
-    "fit.mode": "track",
-    "track.free": "mass",
-    "optics.calibrate": "never",
-}
 
 
 def _movie(instrument: Instrument | None = None) -> Wanderers:
