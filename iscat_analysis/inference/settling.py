@@ -14,6 +14,8 @@ MOST_TURNS = 12
 """Steps at most."""
 
 _SETTLED = 0.1  # step of the background, in its own standard deviations, that is the last one
+_FORESEEN = 0.02  # the same, of the next step if it shrinks as the last one did
+_ROUGHLY = 2.0  # step that is the last one while particles are still being looked for
 _NEAR, _FAR = 0.5, 5.0  # a step below the one after one above the other calls for new rings
 _MEDIAN_FRAMES = 400  # that suffice: particles are found over it, and fitted over a better one
 _DAMPING = 0.01  # of Newton's step, at first
@@ -89,7 +91,7 @@ def settle(
         Which fits did.
     """
     sigma = 1 / np.sqrt(np.maximum(field.total_e, 1.0))
-    largest, length, damping = 0.0, np.inf, _DAMPING
+    largest, length, change, damping = 0.0, np.inf, 0.0, _DAMPING
     done, step = np.ones(len(rows.frame), dtype=bool), np.zeros(field.used.shape)
     for turn in range(turns):
         rows, found, done = field.fit(ground, rows, coarse=coarse)
@@ -104,14 +106,14 @@ def settle(
         last, length = length, float(np.linalg.norm(move / sigma))
         damping *= _STIFFER if length > last else _SOFTER if length < last / 2 else 1.0
         step = field.where_turns_end(move, damping)
-        change = float(np.abs(step / sigma)[field.used].max(initial=0.0))
+        before, change = change, float(np.abs(step / sigma)[field.used].max(initial=0.0))
         level = np.where(field.used, ground.level * np.exp(step), found.level)
         ground = Ground(level, power)
         largest = max(largest, change)
         if change < _NEAR and largest > _FAR and not coarse:
             field.draw_anew()
             largest = change
-        elif change < _SETTLED:
+        elif change < (_ROUGHLY if coarse else _SETTLED) or change**2 < _FORESEEN * before:
             break
     if follow_level:
         rows = field.followed(rows, step)
