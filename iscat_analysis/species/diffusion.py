@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import sparse
 from scipy.constants import Boltzmann, zero_Celsius
 from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
@@ -291,10 +290,19 @@ def _covariance_based(track: Displacements, d_nm2_s: float) -> tuple[float, floa
     beside = np.where(track.linked, 0.5 * (diagonal[1:] + diagonal[:-1]), 0.0)
     time = 2 * float(track.gaps_s @ diagonal) * len(steps)
     total = float(np.sum(diagonal * steps**2) + 2 * np.sum(beside * steps[:, 1:] * steps[:, :-1]))
-    weights = sparse.diags([beside, diagonal, beside], [-1, 0, 1], format="csr")
     variance = 0.0
     for error, band in zip(*track.error, strict=True):
         main, next_ = error + d_nm2_s * track.rate[0], band + d_nm2_s * track.rate[1]
-        both = weights @ sparse.diags([next_, main, next_], [-1, 0, 1], format="csr")
-        variance += 2 * float(both.multiply(both.T).sum())
+        variance += 2 * _square_trace((diagonal, beside), (main, next_))
     return total / time, math.sqrt(variance) / time
+
+
+def _square_trace(one: tuple[FloatArray, FloatArray], two: tuple[FloatArray, FloatArray]) -> float:
+    """Trace of (AB)² of symmetric tridiagonal matrices, each its diagonal and what is beside."""
+    (a, b), (c, d) = one, two
+    main = a * c
+    main[:-1] += b * d
+    main[1:] += b * d
+    above, below = a[:-1] * d + b * c[1:], b * c[:-1] + a[1:] * d
+    farther = b[:-1] * d[1:] * b[1:] * d[:-1]
+    return float(np.sum(main**2) + 2 * np.sum(above * below) + 2 * np.sum(farther))
