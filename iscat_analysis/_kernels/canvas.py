@@ -254,3 +254,42 @@ def ready_frame(
                 draw(near, group[r], theta[r], pixels, near_profile, out)
                 add(total, r0, c0, 1.0, out)
             canvas.squares[r] = theta[r]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_squares(
+    light: Light, total: NDArray[np.float32], frame: IntArray, corner: IntArray, owner: IntArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Put squares of frames on top of each other.
+
+    Parameters
+    ----------
+    light : Light
+        The movie.
+    total : ndarray of float32, shape (t, y, x)
+        Signal of all rows of each frame.
+    frame : ndarray of int, shape (n,)
+        Of each square.
+    corner : ndarray of int, shape (n, 2)
+        Row and column of its first pixel, which may lie outside the field.
+    owner : ndarray of int, shape (n,)
+        To which of the sums it adds.
+    out : ndarray, shape (m, 3, side, side)
+        Counts minus what is expected, light without particles [e], and variance of the read noise
+        [e²] are added to it.
+    """
+    rows, columns = light.background.shape
+    side = out.shape[2]
+    for k in range(frame.size):
+        t, top, left = frame[k], corner[k, 0], corner[k, 1]
+        mine = out[owner[k]]
+        for i in range(max(top, 0), min(top + side, rows)):
+            for j in range(max(left, 0), min(left + side, columns)):
+                level = light.power[t] * light.background[i, j]
+                if level > 0.0:
+                    mine[0, i - top, j - left] += light.counts[t, i, j] - level * (
+                        1.0 + total[t, i, j]
+                    )
+                    mine[1, i - top, j - left] += level
+                    mine[2, i - top, j - left] += light.read[i, j]

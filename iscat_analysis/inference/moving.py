@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.canvas import Canvas, Field, Light
+from iscat_analysis._kernels.canvas import Canvas, Field, Light, add_squares
 from iscat_analysis._kernels.following import Slopes
 from iscat_analysis._kernels.judging import judge_frames
 from iscat_analysis._kernels.moving import Search, common_modes, fit_frames
@@ -313,6 +313,32 @@ class MovingField:
         np.subtract(self.counts_e[here], left, out=left)
         left[:, ~self.used] = 0.0
         return left
+
+    def add_squares(
+        self, ground: Ground, rows: Rows, which: IntArray, corner: IntArray, owner: IntArray,
+        out: FloatArray,
+    ) -> None:  # fmt: skip
+        """Put squares around rows on top of each other, with all rows taken off.
+
+        Parameters
+        ----------
+        ground : Ground
+            Background.
+        rows : Rows
+            Particles.
+        which : ndarray of int, shape (n,)
+            The rows.
+        corner : ndarray of int, shape (n, 2)
+            Row and column of the first pixel of each square, which may lie outside the field.
+        owner : ndarray of int, shape (n,)
+            To which of the sums each adds.
+        out : ndarray, shape (m, 3, side, side)
+            Counts minus what is expected, light without particles [e], and variance of the read
+            noise [e²] are added to it; nothing in pixels that are not used.
+        """
+        self.draw(ground, rows)
+        total = self._canvas_for(rows, coarse=True).total
+        add_squares(self._light(ground), total, rows.frame[which], corner, owner, out)
 
     def _signal(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
         """Draw the rows of some frames alone."""

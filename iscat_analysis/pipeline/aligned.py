@@ -195,27 +195,16 @@ def _summed(scene: Scene, moving: Moving, chosen: IntArray) -> Aligned:
     key = (rows.track[chosen] * PHASES + part[:, 1]) * PHASES + part[:, 0]
     keys, index = np.unique(key, return_inverse=True)
     variance = variances_left(moving.judged.fisher[chosen], np.flatnonzero(field.free[:4]))
-    left, light, read = (np.zeros((len(keys), side, side)) for _ in range(3))
-    base = np.where(field.used, ground.level, 0.0)
-    noise = np.where(field.used, field.read_e2, 0.0)
-    field.draw(ground, rows)
-    frames, firsts = np.unique(rows.frame[chosen], return_index=True)  # which are in order
-    for t, of_frame in zip(
-        frames.tolist(), np.split(np.arange(len(chosen)), firsts[1:]), strict=True
-    ):
-        over = field.residual(ground, rows, t, t + 1)[0]
-        for k in of_frame.tolist():
-            here, there = _squares(whole[k], side, base.shape)
-            into = (index[k], *there)
-            left[into] += over[here]
-            light[into] += ground.power[t] * base[here]
-            read[into] += noise[here]
+    sums = np.zeros((len(keys), 3, side, side))
+    corner = whole[:, ::-1] - side // 2
+    field.add_squares(ground, rows, chosen, np.ascontiguousarray(corner), index, sums)
+    left, light, read = np.moveaxis(sums, 1, 0)
     count = np.bincount(index)
-    sums = [np.bincount(index, weights=v) / count for v in (places - whole).T]
+    middle = [np.bincount(index, weights=v) / count for v in (places - whole).T]
     spread = np.bincount(index, weights=variance[:, :2].mean(axis=1)) / count
     track = keys // PHASES**2
     theta = np.zeros((len(keys), 5))
-    theta[:, 0], theta[:, 1] = ((v + side // 2) * pixel for v in sums)
+    theta[:, 0], theta[:, 1] = ((v + side // 2) * pixel for v in middle)
     theta[:, 2], theta[:, 3] = scene.model.height_nm, moving.common.amplitude[track]
     grid = PixelGrid.region((0, side), (0, side), pixel)
     counts = left + light
@@ -223,16 +212,3 @@ def _summed(scene: Scene, moving: Moving, chosen: IntArray) -> Aligned:
         unsure = blurred(scene.model, float(spread[number]), upwards=False)
         counts[number] += light[number] * unsure.amplitude_image(grid, x, y, z, amplitude)
     return Aligned(track, counts, light, read, theta, count.astype(np.int64))
-
-
-def _squares(
-    middle: IntArray, side: int, shape: tuple[int, ...]
-) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Give the part of the field that a square about a pixel has, and where that is in it."""
-    here, there = [], []
-    for centre, size in zip((int(middle[1]), int(middle[0])), shape, strict=True):
-        first = centre - side // 2
-        low, high = max(first, 0), min(first + side, size)
-        here.append(slice(low, high))
-        there.append(slice(low - first, high - first))
-    return (here[0], here[1]), (there[0], there[1])

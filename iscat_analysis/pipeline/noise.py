@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
@@ -184,12 +185,12 @@ def judge_beside(
     optics = scene.config.optics
     away = _AWAY * optics.wavelength_nm / optics.na
     y, x = np.indices(used.shape) * scene.pixel_nm
+    pixels = np.column_stack([x.ravel(), y.ravel()])
     frame, places_nm = seen
     count = min(_GAIN_FRAMES, span[1] - span[0])
     while count >= _FEWEST_FRAMES:
-        free = used.copy()
-        for place in places_nm[(frame >= span[0]) & (frame < span[0] + count)]:
-            free &= np.hypot(x - place[0], y - place[1]) > away
+        near = cKDTree(places_nm[(frame >= span[0]) & (frame < span[0] + count)])
+        free = used & (near.query(pixels)[0] > away).reshape(used.shape)
         if free.any() and free.sum() >= _FREE * used.sum():
             counts = movie.read(span[0], span[0] + count)
             if not judge_counts(counts, camera, masked=~free).gain_message:

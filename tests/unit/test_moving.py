@@ -309,6 +309,31 @@ def test_residuals_are_of_the_rows_that_are_asked_for(pool: ThreadPoolExecutor) 
     assert np.abs(field.residual(ground, start, 0, FRAMES) - alone).max() < 1.0
 
 
+def test_squares_are_put_on_top_of_each_other(pool: ThreadPoolExecutor) -> None:
+    """Also at the border, where a square has no pixels."""
+    counts, ground, rows = _movie(_paths(30.0), noise=True)
+    field = _field(counts, pool, READ_E2)
+    field.used[20, 17] = False
+    which, side = np.array([0, 5, 6, 31, 80]), 9
+    corner = np.rint(rows.theta[which, 1::-1] / PIXEL_NM).astype(np.int64) - side // 2
+    corner[3] = -4, SHAPE[1] - 3
+    owner = np.array([0, 1, 0, 2, 1])
+    sums, slow = np.zeros((3, 3, side, side)), np.zeros((3, 3, side, side))
+    field.add_squares(ground, rows, which, corner, owner, sums)
+    for row, (top, left), k in zip(which, corner, owner, strict=True):
+        t = rows.frame[row]
+        over = field.residual(ground, rows, t, t + 1)[0]
+        for i in range(side):
+            for j in range(side):
+                y, x = top + i, left + j
+                if 0 <= y < SHAPE[0] and 0 <= x < SHAPE[1] and field.used[y, x]:
+                    here = over[y, x], ground.power[t] * ground.level[y, x], READ_E2
+                    slow[k, :, i, j] += here
+    assert np.allclose(sums, slow, rtol=1e-6, atol=1.0)  # e, of noise 630
+    assert (slow[:, 1] > 0).any(axis=(1, 2)).all()
+    assert (slow[2, 1] == 0).any()
+
+
 def test_threads_do_not_change_the_result() -> None:
     counts, ground, truth = _movie(_paths(40.0), noise=True)
     found = []
