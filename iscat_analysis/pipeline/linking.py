@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
@@ -432,21 +433,18 @@ def bridge(config: Config, rows: Rows) -> IntArray:
         Track of each row.
     """
     reach = config.optics.wavelength_nm / config.optics.na
-    track, again = rows.track.copy(), np.full(len(rows.frame), -1)
-    first, last = (rows.track[np.isin(rows.frame, t)] for t in (rows.frame[:1], rows.frame[-1:]))
-    ended = np.flatnonzero(~np.isin(rows.track, first) | ~np.isin(rows.track, last))
-    some = rows.only(ended)
-    again[ended] = link(some.frame, some.theta[:, :2], reach_nm=reach, memory=_BRIDGE_FRAMES)
-    order = ended[np.lexsort((some.frame, again[ended]))]
-    for i, j in pairwise(order.tolist()):
-        if again[i] != again[j] or track[i] == track[j]:
-            continue
-        one, two = track == track[i], track == track[j]
-        if rows.frame[one].max() != rows.frame[i] or rows.frame[two].min() != rows.frame[j]:
-            continue
-        square = max(_step_nm2(rows.only(one)), _step_nm2(rows.only(two)))
-        if square * (rows.frame[j] - rows.frame[i]) < reach**2:
-            track[two] = track[i]
+    tracks = [np.flatnonzero(rows.track == k) for k in np.unique(rows.track)]
+    last, first = (np.array([mine[end] for mine in tracks], dtype=np.int64) for end in (-1, 0))
+    square = np.array([_step_nm2(rows.only(rows.track == k)) for k in rows.track[first]])
+    gap = rows.frame[first] - rows.frame[last][:, None]
+    apart = cdist(rows.theta[last, :2], rows.theta[first, :2])
+    may = (gap > 0) & (gap <= _BRIDGE_FRAMES + 1) & (apart < reach)
+    may &= np.maximum(square, square[:, None]) * np.maximum(gap, 1) < reach**2
+    before, after = linear_sum_assignment(np.where(may, apart, reach) ** 2)
+    track = rows.track.copy()
+    for i, j in zip(before.tolist(), after.tolist(), strict=True):
+        if may[i, j]:
+            track[track == track[first[j]]] = track[first[i]]
     return track
 
 

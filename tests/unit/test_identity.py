@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from iscat_analysis.config import Config, load_config
 from iscat_analysis.inference.rows import Rows
 from iscat_analysis.pipeline.identity import identified
-from iscat_analysis.pipeline.linking import meeting
+from iscat_analysis.pipeline.linking import bridge, meeting
 
 FRAMES, MEET, AROUND = 200, 100, 25
 NEAR_NM, ERROR = 370.0, 1.0
@@ -145,3 +146,46 @@ def test_rows_shortly_before_and_after_a_meeting_are_of_it() -> None:
     assert meeting(rows, 500.0).tolist() == [True] * 5 + [False] * 4
     assert not meeting(rows, 200.0).any()
     assert not meeting(rows.only(np.zeros(9, dtype=bool)), 500.0).size
+
+
+def _still(*parts: tuple[range, float, float]) -> Rows:
+    """Rows of particles at places x [nm], whose steps are so long along y [nm]."""
+    tables = []
+    for track, (frames, x, step) in enumerate(parts):
+        y = step * (np.arange(len(frames)) % 2)
+        tables += [(t, track, x, v) for t, v in zip(frames, y.tolist(), strict=True)]
+    frame, track, x, y = np.array(sorted(tables)).T
+    theta = np.zeros((len(frame), 5))
+    theta[:, 0], theta[:, 1] = x, y
+    return Rows.of(frame.astype(np.int64), track.astype(np.int64), theta)
+
+
+def _bridged(rows: Rows) -> list[int]:
+    """Give the track that each of the given ones is part of then."""
+    track = bridge(_config(), rows)
+    return [int(track[rows.track == k][0]) for k in np.unique(rows.track)]
+
+
+def _config() -> Config:
+    return load_config(None, ["camera.pixel_size_nm=84", "fit.mode=track"])
+
+
+def test_what_hides_in_the_background_for_a_while_is_one_particle() -> None:
+    rest = (range(10, 40), 90.0, 1.0)
+    assert _bridged(_still((range(6), 80.0, 1.0), rest, (range(90, 99), 95.0, 1.0))) == [0, 0, 0]
+    assert _bridged(_still((range(6), 80.0, 1.0), (range(107, 120), 80.0, 1.0))) == [0, 1]
+    assert _bridged(_still((range(6), 80.0, 90.0), (range(46, 99), 80.0, 90.0))) == [0, 1]
+    assert _bridged(_still((range(6), 80.0, 1.0), (range(9, 20), 900.0, 1.0))) == [0, 1]
+    assert _bridged(_still((range(6), 80.0, 1.0), (range(3, 20), 90.0, 1.0))) == [0, 1]
+
+
+def test_of_two_that_vanished_the_nearer_one_comes_back() -> None:
+    one, two = (range(20), 100.0, 1.0), (range(25), 300.0, 1.0)
+    assert _bridged(_still(one, two, (range(40, 60), 240.0, 1.0))) == [0, 1, 1]
+    both = _still(one, two, (range(40, 60), 220.0, 1.0), (range(45, 60), 130.0, 1.0))
+    assert _bridged(both) == [0, 1, 1, 0]
+
+
+def test_nothing_is_bridged_without_rows() -> None:
+    rows = _still((range(3), 0.0, 1.0))
+    assert not bridge(_config(), rows.only(rows.track > 0)).size
