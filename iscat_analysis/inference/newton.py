@@ -122,7 +122,6 @@ class Response:
         step, _ = cg(
             LinearOperator(square, undetermined, dtype=np.float64),
             (counts * move).ravel(),
-            x0=move.ravel(),
             rtol=_RESIDUE,
             maxiter=_MOST_STEPS,
             M=LinearOperator(square, lambda v: v.ravel() / weight, dtype=np.float64),

@@ -132,13 +132,14 @@ def tracks_of(
         ``tracks`` and ``motion`` of ``summary.json``.
     """
     setup = track_setup(scene, windows)
-    with one_thread_algebra():  # of matrices so small that more threads only wait
+    with one_thread_algebra():
         tracks = describe_tracks(
             fits,
             setup,
             correlation=mass_correlation(scene, fits),
             masses=masses,
             seed=scene.config.compute.seed,
+            workers=scene.config.compute.workers,
             progress=progress,
         )
     met = tracks[tracks["nearest_nm"] < setup.near_nm]

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
+from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.special import chdtrc
 
@@ -355,8 +355,8 @@ def _dense(track: Displacements, motion: FloatArray) -> float:
     value = 0.0
     for axis, steps in enumerate(track.steps_nm):
         try:
-            factor = cholesky(_with_errors(track, motion, axis), lower=True, check_finite=False)
-        except LinAlgError:
+            factor = np.linalg.cholesky(_with_errors(track, motion, axis))
+        except np.linalg.LinAlgError:
             return -math.inf
         white = solve_triangular(factor, steps, lower=True, check_finite=False)
         value -= float(white @ white) / 2 + float(np.log(np.diag(factor)).sum())
@@ -370,8 +370,8 @@ def _exponent_error(track: Displacements, lags: _Lags, d: float, exponent: float
     slope = (sides[1] - sides[0]) / (2 * _PART)
     information = np.zeros((2, 2))
     for axis in range(len(track.steps_nm)):
-        factor = cholesky(_with_errors(track, there, axis), lower=True)
-        parts = [cho_solve((factor, True), part) for part in (there, slope)]
+        sigma = _with_errors(track, there, axis)
+        parts = np.split(np.linalg.solve(sigma, np.hstack([there, slope])), 2, axis=1)
         information += [[0.5 * np.sum(a * b.T) for a in parts] for b in parts]
     return float(math.sqrt(np.linalg.inv(information)[1, 1]))
 

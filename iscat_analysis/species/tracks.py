@@ -14,6 +14,7 @@ that takes a neighbouring fringe makes a step that no particle made.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +36,7 @@ from iscat_analysis.species.diffusion import Diffusion, fit_diffusion, hydrodyna
 from iscat_analysis.species.displacements import LEAST_POSITIONS
 from iscat_analysis.species.motion import anomalous_test, confinement_test, steadiness_test
 from iscat_analysis.species.refraction import refractive_index
+from iscat_analysis.threads import threads
 
 TESTED_POSITIONS = 300
 """Positions of a track whose motion is tested, from its first: the time of a test grows fast."""
@@ -117,6 +119,7 @@ def describe_tracks(
     correlation: Correlation | None = None,
     masses: pd.DataFrame | None = None,
     seed: int = 1,
+    workers: int = 1,
     progress: Progress = silent,
 ) -> pd.DataFrame:
     """Make the table of tracks.
@@ -134,6 +137,8 @@ def describe_tracks(
         ``crb_mass_kda``, indexed by track.  They take the place of combinations of the frames.
     seed : int
         Of the free tracks that the test of confinement draws.
+    workers : int
+        Threads that test tracks; the result does not depend on it.
     progress : Progress
         Told the tracks; an interrupt leaves out the tests of those that remain.
 
@@ -156,24 +161,22 @@ def describe_tracks(
         ]
     )
     nearest = _nearest(fits[numbers.notna()], numbers.dropna())
-    records, tested = [], True
-    for done, (track, rows) in enumerate(groups.items()):
+    records, places = [], {}
+    for track, rows in groups.items():
         exact = masses.loc[track].to_dict() if masses is not None and track in masses.index else {}
         placed = _placed(rows)
         record = _record(track, rows, placed, setup, power, correlation, exact)
         record["nearest_nm"] = nearest.get(track, np.inf)
-        try:
-            if tested:
-                rng = np.random.default_rng([seed, track])
-                record |= _tests(placed, setup, rng) if np.isfinite(record["d_um2_s"]) else {}
-                progress("tracks", done + 1, len(groups))
-        except KeyboardInterrupt:
-            tested = False
+        records.append(record)
+        if np.isfinite(record["d_um2_s"]):
+            places[track] = placed
+    tests = _tested(places, setup, seed, workers, progress)
+    for record in records:
+        record |= tests.get(record["track"], {})
         status = _remarks(record, setup)
         record["status"] = str(status[0]) if status else str(TrackStatus.OK)
         crossed = ["crosses"] if record["nearest_nm"] < setup.near_nm else []
         record["flags"] = ";".join([*map(str, status), *crossed])
-        records.append(record)
     return _table(records, fits)
 
 
@@ -320,6 +323,26 @@ def _size(record: Mapping[str, Any], setup: TrackSetup) -> dict[str, float]:
         )
         size |= {"refractive_index": float(index), "sigma_refractive_index": float(error)}
     return size
+
+
+def _tested(
+    places: Mapping[int, pd.DataFrame],
+    setup: TrackSetup,
+    seed: int,
+    workers: int,
+    progress: Progress,
+) -> dict[int, dict[str, float]]:
+    """Test the motion of tracks, of some where that is interrupted."""
+
+    def test(track: int) -> dict[str, float]:
+        return _tests(places[track], setup, np.random.default_rng([seed, track]))
+
+    tested = {}
+    with threads(workers) as pool, suppress(KeyboardInterrupt):
+        for track, found in zip(places, pool.map(test, places), strict=True):
+            tested[track] = found
+            progress("tracks", len(tested), len(places))
+    return tested
 
 
 def _tests(placed: pd.DataFrame, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:

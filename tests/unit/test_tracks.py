@@ -142,6 +142,28 @@ def test_tracks_have_the_mass_and_d_of_their_particles() -> None:
     assert (tracks["ends"] != "movie").all()
 
 
+def test_threads_do_not_change_the_table() -> None:
+    rng = np.random.default_rng(7)
+    fits = fits_of([walk(rng, 60, 0.4, start_nm=(4e4 * (k + 1), 5e3)) for k in range(6)], rng)
+    shared = setup(field_nm=(1e4, 1e7))
+    one, three = (describe_tracks(fits, shared, workers=n) for n in (1, 3))
+    pd.testing.assert_frame_equal(one, three)
+    assert one["p_anomalous"].notna().all()
+
+
+def test_an_interrupt_leaves_out_the_tests_of_the_rest() -> None:
+    rng = np.random.default_rng(8)
+    fits = fits_of([walk(rng, 60, 0.4, start_nm=(4e4 * (k + 1), 5e3)) for k in range(6)], rng)
+
+    def stop(*so_far: object) -> None:
+        if so_far[1] == 2:
+            raise KeyboardInterrupt
+
+    tracks = describe_tracks(fits, setup(field_nm=(1e4, 1e7)), progress=stop)
+    assert tracks["d_um2_s"].notna().all()
+    assert tracks["p_anomalous"].notna().tolist() == 2 * [True] + 4 * [False]
+
+
 def test_only_particles_in_a_volume_have_a_size() -> None:
     rng = np.random.default_rng(6)
     diameter, density, n_frames = 30.0, 1350.0, 180
