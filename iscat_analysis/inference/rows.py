@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -49,15 +50,19 @@ class Rows:
         unknown = np.full((n, 4, 4), np.nan), np.full(n, np.nan)
         return cls(frame, track, theta, blur, *unknown).in_order()
 
+    @classmethod
+    def together(cls, parts: Sequence[Rows]) -> Rows:
+        """Take rows of several, one after the other."""
+        every = ([getattr(rows, part.name) for rows in parts] for part in fields(cls))
+        return cls(*map(np.concatenate, every))
+
     def in_order(self) -> Rows:
         """Put them into the order of their frames, and in a frame of their tracks."""
         return self.only(np.lexsort((self.track, self.frame)))
 
     def joined(self, frame: IntArray, track: IntArray, theta: FloatArray, group: IntArray) -> Rows:
         """Add rows that are not fitted yet."""
-        more = Rows.of(frame, track, theta, group)
-        both = ([getattr(rows, part.name) for rows in (self, more)] for part in fields(self))
-        return Rows(*map(np.concatenate, both)).in_order()
+        return Rows.together([self, Rows.of(frame, track, theta, group)]).in_order()
 
     def fitted(self, theta: FloatArray, fisher: FloatArray, gain: FloatArray) -> Rows:
         """Put rows at their estimates, with their informations and gains in log-likelihood."""

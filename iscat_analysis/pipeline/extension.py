@@ -74,7 +74,7 @@ def extended(
     for k in range(tracks):
         mine = rows.frame[rows.track == k]
         ends += [_End(k, int(mine.max()), 1), _End(k, int(mine.min()), -1)]
-    added = 0
+    added, refitted = 0, {}
     meeting, same = _MEETING * resolution_nm, _SAME * resolution_nm
     while ends:
         proposed: dict[int, dict[int, _End]] = {}
@@ -115,11 +115,15 @@ def extended(
                 if k in frames[t] or k in {end.track for end in kept}:
                     frames[t][k] = theta
             added += len(kept)
+            refitted[t] = fitted.only(of_frame)
             ends += [_End(end.track, t, end.way) for end in kept]
     frame = np.array([t for t, found in enumerate(frames) for _ in found], dtype=np.int64)
     track = np.array([k for found in frames for k in found], dtype=np.int64)
     theta = np.array([theta for found in frames for theta in found.values()])
-    return Rows.of(frame, track, theta, blur[track]).recalling(rows), added
+    longer = Rows.of(frame, track, theta, blur[track]).recalling(rows)
+    if refitted:
+        longer = longer.recalling(Rows.together([refitted[t] for t in sorted(refitted)]))
+    return longer, added
 
 
 def _starts(

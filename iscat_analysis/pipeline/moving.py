@@ -62,6 +62,7 @@ _USELESS = 300.0  # times the median error of a track: such a place says nothing
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
 _FEW = 5e-3  # of all rows: a search that adds no more is the last
+_MUCH = 0.5  # of all rows: where a search finds more, the model may leave over what it finds
 _FULL = 2  # searches of all frames, after which some of them tell whether to go on
 _FIRST_HEIGHTS = 1  # searches after which every row is put into its fringe
 _HELD_ROUNDS = 2  # in which slow particles are tried where they were not seen
@@ -159,12 +160,16 @@ def follow(
     ground = first_ground(field, follow_power=follow_power)
     nothing = np.zeros(0, dtype=np.int64)
     rows = Rows.of(nothing, nothing, np.zeros((0, 5)))
-    total = ROUNDS + 3
+    total, wrong = ROUNDS + 3, False
     for number in range(ROUNDS):
         progress("track", number, total)
         before = len(rows.frame)
         enough = round(_FEW * before) if number >= _FULL else 0
-        found = search_frames(scene, field, ground, rows, pool, enough=enough)
+        found = search_frames(scene, field, ground, rows, pool, enough=enough, wrong=wrong)
+        if number == 1 and len(found.frame) > _MUCH * before:
+            others = search_frames(scene, field, ground, rows, pool, wrong=True)
+            if len(others.frame) < len(found.frame) / 2:
+                wrong, found = True, others
         if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(scene, rows, found)
