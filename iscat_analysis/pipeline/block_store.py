@@ -119,6 +119,7 @@ def analyse_block(
     check: Callable[[NDArray[Any], int], None],
     pool: ThreadPoolExecutor,
     progress: Progress,
+    cautious: bool = False,
 ) -> Block:
     """Follow the particles of a block of frames.
 
@@ -140,6 +141,8 @@ def analyse_block(
         Runs parts of the block.
     progress : Progress
         Told the stages.
+    cautious : bool
+        As in `follow`.
 
     Returns
     -------
@@ -152,7 +155,7 @@ def analyse_block(
     inner = (near if goes_on[0] else 0, frames - near if goes_on[1] else frames)
     moving = follow(
         scene, movie, camera, span,
-        check=check, pool=pool, progress=progress, inner=inner,
+        check=check, pool=pool, progress=progress, inner=inner, cautious=cautious,
     )  # fmt: skip
     table, inside = moving_table(scene, moving, first), moving.field.holds(moving.rows.theta)
     best = table.loc[table[inside].groupby("track")["snr"].idxmax()]

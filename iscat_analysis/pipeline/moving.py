@@ -62,7 +62,6 @@ _USELESS = 300.0  # times the median error of a track: such a place says nothing
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
 _FEW = 5e-3  # of all rows: a search that adds no more is the last
-_MUCH = 0.5  # of all rows: where a search finds more, the model may leave over what it finds
 _FULL = 2  # searches of all frames, after which some of them tell whether to go on
 _FIRST_HEIGHTS = 1  # searches after which every row is put into its fringe
 _HELD_ROUNDS = 2  # in which slow particles are tried where they were not seen
@@ -120,6 +119,7 @@ def follow(
     pool: ThreadPoolExecutor,
     progress: Progress,
     inner: tuple[int, int] | None = None,
+    cautious: bool = False,
 ) -> Moving:
     """Find and fit every particle in every frame.
 
@@ -142,6 +142,9 @@ def follow(
     inner : (int, int), optional
         Frames of the span, counted from its first, beyond which tracks may go on in other spans: a
         track that reaches out of them is kept however short it is.
+    cautious : bool
+        Follow only what stands alone, as it is seen: through optics that are very wrong what they
+        leave over would be taken for particles.
 
     Returns
     -------
@@ -160,16 +163,14 @@ def follow(
     ground = first_ground(field, follow_power=follow_power)
     nothing = np.zeros(0, dtype=np.int64)
     rows = Rows.of(nothing, nothing, np.zeros((0, 5)))
-    total, wrong = ROUNDS + 3, False
+    total = ROUNDS + 3
     for number in range(ROUNDS):
         progress("track", number, total)
         before = len(rows.frame)
         enough = round(_FEW * before) if number >= _FULL else 0
-        found = search_frames(scene, field, ground, rows, pool, enough=enough, wrong=wrong)
-        if number == 1 and len(found.frame) > _MUCH * before:
-            others = search_frames(scene, field, ground, rows, pool, wrong=True)
-            if len(others.frame) < len(found.frame) / 2:
-                wrong, found = True, others
+        found = search_frames(
+            scene, field, ground, rows, pool, enough=enough, cautious=cautious
+        )  # fmt: skip
         if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(scene, rows, found)
@@ -204,13 +205,14 @@ def follow(
             field, ground, rows, follow_power=follow_power, follow_level=follow_level,
             turns=_NEXT_TURNS, coarse=True,
         )  # fmt: skip
-        rows = trimmed(rows)
-        rows, added = extended(
-            field, ground, rows, resolution_nm=resolution, reach_nm=config.track.max_step_nm
-        )
+        rows, added = trimmed(rows), 0
+        if not cautious:
+            rows, added = extended(
+                field, ground, rows, resolution_nm=resolution, reach_nm=config.track.max_step_nm
+            )
         rows = linked(config, rows, mass_places(config, rows), bridged=True, inner=inner)
         rows = alone(scene, rows, inner=inner)
-        if number < _HELD_ROUNDS and follow_level:
+        if number < _HELD_ROUNDS and follow_level and not cautious:
             rows, tried = held(config, field, rows)
             added += tried
         # the background that is told of all frames, before these are fitted over it

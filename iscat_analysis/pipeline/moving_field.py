@@ -148,7 +148,7 @@ def search_frames(
     frames: tuple[int, int] | None = None,
     *,
     enough: int = 0,
-    wrong: bool = False,
+    cautious: bool = False,
 ) -> Sightings:
     """Find candidates in what the rows leave over.
 
@@ -169,7 +169,7 @@ def search_frames(
     enough : int
         Candidates in all frames, up to which none are worth it: where one of `_SAMPLED` blocks of
         frames tells that there are no more, the others are not searched.
-    wrong : bool
+    cautious : bool
         As in `FrameFilter`.
 
     Returns
@@ -182,7 +182,7 @@ def search_frames(
         side += round(2 * RING_SLOPE * scene.config.fit.z_range_nm[1] / field.pixel_nm)
     search = FrameFilter(
         scene.templates, ground.level, field.read_e2, field.used,
-        polarity=scene.config.detection.sign, roi_px=side, wrong=wrong,
+        polarity=scene.config.detection.sign, roi_px=side, cautious=cautious,
     )  # fmt: skip
     if frames is None:
         field.draw(ground, rows)

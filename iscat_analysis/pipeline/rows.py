@@ -8,12 +8,14 @@ beginning.
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 
 from iscat_analysis.inference.achieved import Achieved
 from iscat_analysis.pipeline.achieved import measure_spread, measured_scale, repeat_columns
 from iscat_analysis.pipeline.results import Found
 from iscat_analysis.pipeline.systematic import systematic
+from iscat_analysis.pipeline.tracked_optics import mass_error
 from iscat_analysis.records import FloatArray
 
 
@@ -41,6 +43,9 @@ def reported_rows(found: Found) -> tuple[pd.DataFrame, dict[str, Achieved]]:
         columns[name] = fits[name] * scale[name] if name in scale else fits[name]
         if name == "flags":
             shared = systematic(config, fits)
+            if (share := mass_error(found.optics)) > 0:
+                wrong = share * fits["mass_kda"].abs().to_numpy()
+                shared["mass_kda"] = np.hypot(shared.get("mass_kda", 0.0), wrong)
             columns |= {f"systematic_{key}": sigma for key, sigma in shared.items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)

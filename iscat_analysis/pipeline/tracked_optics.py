@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -33,6 +33,10 @@ that leave over less are wrong by less than masses are."""
 REJECTED_CHI2 = 2.0
 """Times the noise of single frames, what it leaves over too: less is seen in good movies whose
 particles meet often."""
+
+MASS_SHARE = 0.4
+"""Error of masses over what optics that are wrong leave over of the pictures: root mean square of
+eleven such microscopes, 0 to 0.97."""
 
 ROUNDS = 4
 """Of optics learned from tracks, and tracks followed with them.  What is learned from tracks that
@@ -96,15 +100,26 @@ class LeftOver:
         )
 
 
+class Begin(Protocol):
+    """Follows the first frames of a movie."""
+
+    def __call__(self, config: Config, *, cautious: bool = False) -> Begun:
+        """Follow them with some optics; `cautious` as in `follow`."""
+        ...
+
+
 def learn_from_tracks(
     config: Config,
-    begin: Callable[[Config], Begun],
+    begin: Begin,
     *,
     name: str,
     pool: ThreadPoolExecutor,
     tell: Callable[[str], None],
 ) -> tuple[Begun, dict[str, Any]]:
     """Follow the first frames, test the optics on them, and learn better ones where they fail.
+
+    Through optics that are very wrong a particle leaves rings which are taken for others, until
+    nothing can be linked or learned.  Then only what stands alone is followed, and learned from.
 
     Parameters
     ----------
@@ -125,46 +140,118 @@ def learn_from_tracks(
         With the optics to go on with.
     summary : dict
         What ``summary.json`` says of it; empty where nothing could be tested.
+
+    Raises
+    ------
+    DataError
+        Nothing can be followed with the configured optics, and no others were learned.
     """
-    begun, optics = begin(config), config.optics
-    left = left_over(begun)
+    optics = config.optics
     suited = optics.convention == "exact" and optics.psf == "model"
+    begun, trouble = _first(config, begin) if suited else (begin(config), None)
+    left = left_over(begun)
+    if trouble is not None and (left is None or not left.rejected):
+        raise trouble
     if left is None or not suited:
         return begun, {}
     tested = {"tested": left.tracks, "left_over": left.share}
     if not left.rejected and optics.calibrate != "always":
         return begun, tested | {"calibrated": False}
     cause = _cause(begun) if left.rejected else None
-    if begun.block.gain_message and cause is None and optics.calibrate != "always":
+    noisy = bool(begun.block.gain_message) and trouble is None
+    if noisy and cause is None and optics.calibrate != "always":
         return begun, tested | {"calibrated": False, "reason": _NOISE}
+
+    def as_configured(said: str, reason: str) -> tuple[Begun, dict[str, Any]]:
+        if trouble is not None:
+            raise DataError(f"{said}; nothing can be followed with them") from trouble
+        tell(said)
+        return begun, tested | {"calibrated": False, "reason": reason}
+
     learns = optics.calibrate == "always" or (optics.calibrate == "auto" and optics.file is None)
     if not learns or (cause is not None and cause.name == PIXEL):
         said = _said(left, cause, learns=learns)
-        tell(said)
-        return begun, tested | {"calibrated": False, "reason": said}
-    reason = "what was learned does not describe them either"
-    trial, near = begun, not left.rejected
-    try:
-        for _ in range(ROUNDS):
-            found = _measured(trial, _start(config, cause), name, pool)
-            learned, refusal = usable(found, config)
-            if learned is not None and near:
+        return as_configured(said, said)
+    reason = ""
+    for cautious in (False, True) if trouble is None else (True,):
+        try:
+            trial = begin(config, cautious=True) if cautious and trouble is None else begun
+            found, near, why = _described(trial, begin, config, cause, name=name, pool=pool)
+            if found is not None:
                 learned, told = taken(
                     found, config, tested, left.verdict, pictures_of="pictures of tracks", tell=tell
                 )
                 return begin(learned), told
-            guess = learned or with_sign(with_settings(config, found.measured.settings))[0]
-            reason = refusal or reason
-            if guess is None:
-                break
-            trial = begin(guess)
-            now = left_over(trial)
-            near = now is not None and not now.rejected
+            if trouble is not None and near is not None:
+                tell(f"{left.verdict}; others are used that describe them better, but: {why}")
+                return near, tested | {"calibrated": True, "reason": why}
+        except DataError as error:
+            why = str(error)
+        reason = reason or why
+    if left.rejected:
+        said = f"{_said(left, cause, learns=True)} (other optics were not learned: {reason})"
+    else:
+        said = f"{left.verdict}: {reason}; the analysis goes on as configured"
+    return as_configured(said, reason)
+
+
+def _first(config: Config, begin: Begin) -> tuple[Begun, DataError | None]:
+    """Follow the first frames, cautiously where there is trouble, which is given then."""
+    try:
+        return begin(config), None
     except DataError as error:
-        reason = str(error)
-    said = f"{_said(left, cause, learns=True)} (other optics were not learned: {reason})"
-    tell(said if left.rejected else f"{left.verdict}: {reason}; the analysis goes on as configured")
-    return begun, tested | {"calibrated": False, "reason": reason}
+        try:
+            return begin(config, cautious=True), error
+        except DataError:
+            raise error from None
+
+
+def _described(
+    trial: Begun,
+    begin: Begin,
+    config: Config,
+    cause: Cause | None,
+    *,
+    name: str,
+    pool: ThreadPoolExecutor,
+) -> tuple[OpticsCalibration | None, Begun | None, str]:
+    """Measure optics from tracks that were followed with optics that describe them.
+
+    Where none are good enough: what was followed last, if it is described, and why.
+    """
+    reason, at_first = "what was learned does not describe them either", left_over(trial)
+    near = trial if at_first is not None and not at_first.rejected else None
+    for _ in range(ROUNDS):
+        found = _measured(trial, _start(config, cause), name, pool)
+        learned, refusal = usable(found, config)
+        if learned is not None and near is not None:
+            return found, near, ""
+        guess = learned or with_sign(with_settings(config, found.measured.settings))[0]
+        reason = refusal or reason
+        if guess is None:
+            break
+        trial, trouble = _first(guess, begin)
+        now = left_over(trial)
+        near = trial if trouble is None and now is not None and not now.rejected else None
+    return None, near, reason
+
+
+def mass_error(summary: Mapping[str, Any]) -> float:
+    """Say how wrong masses may be, as a share of them, with optics that do not describe tracks.
+
+    Parameters
+    ----------
+    summary : mapping
+        From `learn_from_tracks`.
+
+    Returns
+    -------
+    float
+        0 where the optics were not rejected, or others learned.
+    """
+    share = float(summary.get("left_over", 0.0))
+    rejected = share > REJECTED_SHARE and "reason" in summary and not summary["calibrated"]
+    return MASS_SHARE * share if rejected else 0.0
 
 
 def left_over(begun: Begun) -> LeftOver | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -79,23 +80,23 @@ def find_moving(ready: Prepared, run: Run) -> Found:
     run.clock.lap("background")
     identity = ready.steady.identity if run.partial else ""
 
-    def shelf(config: Config) -> BlockStore:
-        return BlockStore(run.partial, config, identity, ready.shape, (first, last), camera)
+    def shelf(config: Config, folder: Path | None) -> BlockStore:
+        return BlockStore(folder, config, identity, ready.shape, (first, last), camera)
 
     with threads(config.compute.workers) as pool:
 
-        def begin(config: Config) -> Begun:
+        def begin(config: Config, *, cautious: bool = False) -> Begun:
             scene = track_scene(config, ready.shape, max(last - first, 1))
             block = _analysed(
-                scene, movie, camera, plan, shelf(config), 0,
-                check=check, pool=pool, progress=run.progress,
+                scene, movie, camera, plan, shelf(config, None if cautious else run.partial), 0,
+                check=check, pool=pool, progress=run.progress, cautious=cautious,
             )  # fmt: skip
             return Begun(config, scene, block)
 
         begun, learned = learn_from_tracks(config, begin, name=movie.name, pool=pool, tell=run.tell)
         config, scene = begun.config, begun.scene
         blocks, interrupted = track_movie(
-            scene, movie, camera, plan, shelf(config),
+            scene, movie, camera, plan, shelf(config, run.partial),
             check=check, pool=pool, progress=run.progress, first=begun.block,
         )  # fmt: skip
     joined = join_blocks(config, blocks, camera)
@@ -198,6 +199,7 @@ def _analysed(
     check: Check,
     pool: ThreadPoolExecutor,
     progress: Progress,
+    cautious: bool = False,
 ) -> Block:
     """Give a block of a movie, kept or analysed now."""
     count, span = len(plan.spans), plan.spans[number]
@@ -209,7 +211,7 @@ def _analysed(
     block = analyse_block(
         scene, movie, camera, span,
         goes_on=(number > 0, number + 1 < count),
-        check=check, pool=pool, progress=told,
+        check=check, pool=pool, progress=told, cautious=cautious,
     )  # fmt: skip
     store.save(number, block)
     return block

@@ -28,10 +28,9 @@ from iscat_analysis.search.templates import FAR_LOBE, NEAR, SIDELOBE, Templates
 
 IntArray = NDArray[np.int64]
 
-_LEFT_OVER, _WRONG = (0.2, NEAR), (0.6, 1.0)
+LEFT_OVER = 0.2
 """Of a particle's signal-to-noise ratio that a candidate beside it must reach when what was fitted
-has been taken off, and within which part of the fitted square: less may be what the model leaves
-over.  Usually, and through optics that are very wrong."""
+has been taken off: less may be what the model leaves over."""
 
 _FIELDS = 32  # of frames and templates that are filtered at a time
 
@@ -79,8 +78,9 @@ class FrameFilter:
         Sign of the contrasts that are wanted; 0 for both.
     roi_px : int
         Side of the fitted square [pixels].
-    wrong : bool
-        Whether the optics are so wrong that they leave over more of a particle than usual.
+    cautious : bool
+        Nothing is found within a square's side of what is brighter or known, as through optics that
+        leave over bright rings.
     """
 
     def __init__(
@@ -92,11 +92,10 @@ class FrameFilter:
         *,
         polarity: int,
         roi_px: int,
-        wrong: bool,
+        cautious: bool,
     ) -> None:
         self._templates = templates
-        self._roi_px = roi_px
-        self._left_over, self._beside = _WRONG if wrong else _LEFT_OVER
+        self._roi_px, self._cautious = roi_px, cautious
         light = np.where(used, level_e**2 / (level_e + read_e2), 0.0)
         self._share = np.where(used, level_e / (level_e + read_e2), 0.0).astype(np.float32)
         images = templates.images
@@ -177,6 +176,8 @@ class FrameFilter:
             away = max(abs(x - ox), abs(y - oy))
             if height < other * (SIDELOBE if away < self._roi_px else FAR_LOBE):
                 return True
+            if self._cautious and away < self._roi_px:
+                return True
             if np.hypot(x - ox, y - oy) < NEAR * self._roi_px:
                 return True
         return False
@@ -185,8 +186,11 @@ class FrameFilter:
         """Whether a peak may be what the model leaves over of a particle that is known."""
         if not len(known):
             return False
-        near = np.hypot(known[:, 0] - x, known[:, 1] - y) < self._beside * self._roi_px
-        return bool(np.any(near & (height < self._left_over * known[:, 2])))
+        away = np.hypot(known[:, 0] - x, known[:, 1] - y)
+        if self._cautious:
+            return bool(away.min() < self._roi_px)
+        near = away < NEAR * self._roi_px
+        return bool(np.any(near & (height < LEFT_OVER * known[:, 2])))
 
     def _snr(self, residual_e: NDArray[np.float32], power: FloatArray) -> NDArray[np.float32]:
         """Give the signal-to-noise ratio of each template at each pixel, shape (n, k, y, x)."""

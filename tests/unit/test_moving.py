@@ -27,6 +27,7 @@ from iscat_analysis.inference.settling import first_ground, settle
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.pipeline import fit_stack
+from iscat_analysis.pipeline.extension import extended
 from iscat_analysis.pipeline.moving import diffusion_of
 from iscat_analysis.search.moving import gaps, link
 from iscat_analysis.species import fit_diffusion
@@ -307,6 +308,19 @@ def test_residuals_are_of_the_rows_that_are_asked_for(pool: ThreadPoolExecutor) 
     field.draw(ground, rows)
     field.draw(ground, start)
     assert np.abs(field.residual(ground, start, 0, FRAMES) - alone).max() < 1.0
+
+
+def test_what_extends_tracks_is_told_as_it_was_fitted(pool: ThreadPoolExecutor) -> None:
+    """Also where no row of a movie stays what it was."""
+    counts, ground, truth = _movie(_paths(30.0), noise=True)
+    field = _field(counts, pool)
+    fitted, _, _ = field.fit(ground, truth)
+    some = fitted.only(fitted.frame % 60 < 30)
+    longer, added = extended(field, ground, some, resolution_nm=370.0, reach_nm=600.0)
+    assert added == 60
+    assert np.isfinite(longer.snr).all()
+    error = 1 / np.sqrt(longer.fisher[:, 3, 3])
+    assert (np.abs(longer.theta - truth.theta)[:, 3] < 6 * error).all()
 
 
 def test_squares_are_put_on_top_of_each_other(pool: ThreadPoolExecutor) -> None:

@@ -12,6 +12,7 @@ from instruments import Instrument
 from wanderers import SETTINGS, Wanderers, wander
 
 import iscat_analysis as ia
+from iscat_analysis.errors import DataError
 from iscat_analysis.pipeline.tracked_optics import REJECTED_SHARE, LeftOver, _said
 
 pytestmark = pytest.mark.usefixtures("sketched")
@@ -40,6 +41,7 @@ def test_right_optics_are_not_doubted(movie: Wanderers) -> None:
     assert told["tested"] >= 2
     assert told["left_over"] < REJECTED_SHARE / 2
     assert not told["calibrated"]
+    assert "systematic_mass_kda" not in result.tracks
 
 
 @pytest.mark.parametrize(
@@ -56,6 +58,9 @@ def test_what_is_wrong_is_named(movie: Wanderers, wrong: dict[str, Any], named: 
     assert named in said
     assert ("optics.calibrate" in said) == ("optics.na" in wrong)  # which learns no pixel size
     assert result.summary["optics"]["left_over"] > 2 * REJECTED_SHARE
+    tracks = result.tracks[result.tracks["status"] == "ok"]
+    error = tracks["mass_kda"] - MASS_KDA
+    assert (error.abs() < 2 * tracks["systematic_mass_kda"]).all()
 
 
 def test_what_no_part_of_the_microscope_explains_is_not_called_wrong_optics() -> None:
@@ -80,3 +85,26 @@ def test_an_aberration_is_learned_from_tracks() -> None:
     )
     assert len(tracks) >= 2
     assert np.abs(error).max() < 4.0
+
+
+@pytest.fixture(scope="module")
+def ringed() -> Wanderers:
+    """Rings as bright as half of the particle, which the configured optics leave over."""
+    return _movie(replace(Instrument(emission="reciprocal"), aberrations_nm={11: -20.0}))
+
+
+def test_rings_that_are_left_over_do_not_hide_an_aberration(ringed: Wanderers) -> None:
+    """Taken for particles, they would be more than can be linked."""
+    result = ia.fit_movie(ringed.counts, settings={**SETTINGS, "optics.calibrate": "auto"})
+    assert result.summary["optics"]["left_over"] > 0.4
+    assert result.summary["optics"]["calibrated"]
+    learned = tomllib.loads(result.config_toml)["optics"]["aberrations_nm"]
+    assert learned["z11"] == pytest.approx(-20.0, abs=2.0)
+    tracks = result.tracks[result.tracks["status"] == "ok"]
+    assert len(tracks) >= 2
+    assert tracks["mass_kda"].to_numpy() == pytest.approx(MASS_KDA, rel=0.05)
+
+
+def test_why_nothing_can_be_followed_is_named(ringed: Wanderers) -> None:
+    with pytest.raises(DataError, match=r"wrong spherical aberration.*nothing can be followed"):
+        ia.fit_movie(ringed.counts, settings=SETTINGS)
