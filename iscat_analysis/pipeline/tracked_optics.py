@@ -164,7 +164,7 @@ def learn_from_tracks(
 
     def as_configured(said: str, reason: str) -> tuple[Begun, dict[str, Any]]:
         if trouble is not None:
-            raise DataError(f"{said}; nothing can be followed with them") from trouble
+            raise DataError(f"{said}; nothing can be followed with them: {trouble}") from trouble
         tell(said)
         return begun, tested | {"calibrated": False, "reason": reason}
 
