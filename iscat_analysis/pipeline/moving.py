@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
+from iscat_analysis.errors import DataError
 from iscat_analysis.inference.common import (
     CommonAmplitudes,
     common_amplitudes,
@@ -62,6 +63,7 @@ _USELESS = 300.0  # times the median error of a track: such a place says nothing
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
 _FEW = 5e-3  # of all rows: a search that adds no more is the last
+_FLOOD = 0.15  # rows in an area of (λ/NA)², beyond which they are no particles
 _FULL = 2  # searches of all frames, after which some of them tell whether to go on
 _FIRST_HEIGHTS = 1  # searches after which every row is put into its fringe
 _HELD_ROUNDS = 2  # in which slow particles are tried where they were not seen
@@ -154,7 +156,7 @@ def follow(
     Raises
     ------
     DataError
-        The span is too short.
+        The span is too short, or more is found in it than particles.
     """
     config = scene.config
     field = load_field(scene, movie, camera, span, check, pool, progress)
@@ -195,6 +197,7 @@ def follow(
                 field, ground, rows, follow_power=follow_power, follow_level=follow_level,
                 turns=_NEXT_TURNS, coarse=True,
             )  # fmt: skip
+        _refuse_flood(config, field, rows)
         if number and len(rows.frame) <= (1 + _FEW) * before:
             break
     progress("track", ROUNDS, total)
@@ -253,6 +256,27 @@ def follow(
     return Moving(
         rows, ground, judged, done, close, variances, diffusion, field, shared.covariance, common
     )
+
+
+def _refuse_flood(config: Config, field: MovingField, rows: Rows) -> None:
+    """Refuse more rows in a frame than particles that could be told apart, before all are fitted.
+
+    Raises
+    ------
+    DataError
+        There are.
+    """
+    side_um = field.pixel_nm / 1e3
+    area = side_um**2 * float(field.used.sum())
+    resolution = config.optics.wavelength_nm / config.optics.na / 1e3
+    each = len(rows.frame) / field.frames
+    if each > _FLOOD * area / resolution**2:
+        raise DataError(
+            f"{each:.0f} places in every frame of {area:.0f} um2 look like particles, more than "
+            "can be told apart: the light changes from frame to frame, as where the stage drifts "
+            "or vibrates, or the optics are far off; record a steadier movie or fewer particles, "
+            "or analyse fewer frames (fit.frames), in which it stands still"
+        )
 
 
 def _in_their_fringes(scene: Scene, field: MovingField, ground: Ground, rows: Rows) -> Rows:

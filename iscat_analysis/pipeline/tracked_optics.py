@@ -163,6 +163,8 @@ def learn_from_tracks(
         return begun, tested | {"calibrated": False, "reason": _NOISE}
 
     def as_configured(said: str, reason: str) -> tuple[Begun, dict[str, Any]]:
+        if trouble is not None and cause is None:
+            raise trouble
         if trouble is not None:
             raise DataError(f"{said}; nothing can be followed with them: {trouble}") from trouble
         tell(said)
