@@ -8,7 +8,6 @@ beginning.
 
 from __future__ import annotations
 
-import numpy as np
 import pandas as pd
 
 from iscat_analysis.inference.achieved import Achieved
@@ -42,10 +41,7 @@ def reported_rows(found: Found) -> tuple[pd.DataFrame, dict[str, Achieved]]:
     for name in fits:
         columns[name] = fits[name] * scale[name] if name in scale else fits[name]
         if name == "flags":
-            shared = systematic(config, fits)
-            if (share := mass_error(found.optics)) > 0:
-                wrong = share * fits["mass_kda"].abs().to_numpy()
-                shared["mass_kda"] = np.hypot(shared.get("mass_kda", 0.0), wrong)
+            shared = systematic(config, fits, mass_error(found.optics))
             columns |= {f"systematic_{key}": sigma for key, sigma in shared.items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)

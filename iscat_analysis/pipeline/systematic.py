@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,9 @@ _COMMON = (*PARAMETERS, "contrast")
 """What such errors are told of; of the contrast where it is the result, without a calibration."""
 
 
-def systematic(config: Config, table: pd.DataFrame) -> dict[str, FloatArray]:
+def systematic(
+    config: Config, table: pd.DataFrame, mass_share: float = 0.0
+) -> dict[str, FloatArray]:
     """Add up the errors that all events of a movie share.
 
     Parameters
@@ -44,6 +47,8 @@ def systematic(config: Config, table: pd.DataFrame) -> dict[str, FloatArray]:
         Says what was calibrated, and how well.
     table : pandas.DataFrame
         Events, with the columns of ``fits.csv``.
+    mass_share : float
+        Share of its mass by which every event may be wrong, for what the model leaves over.
 
     Returns
     -------
@@ -52,10 +57,19 @@ def systematic(config: Config, table: pd.DataFrame) -> dict[str, FloatArray]:
         standard deviation of every event [nm or kDa]; only of those for which an error is known.
     """
     squares: dict[str, FloatArray] = {}
-    for source in _SOURCES:
+    sources: tuple[Source, ...] = (*_SOURCES, partial(_of_what_is_left_over, mass_share))
+    for source in sources:
         for name, sigma in source(config, table).items():
             squares[name] = squares.get(name, np.zeros(len(table))) + np.square(sigma)
     return {name: np.sqrt(squares[name]) for name in _COMMON if name in squares}
+
+
+def _of_what_is_left_over(
+    mass_share: float, config: Config, table: pd.DataFrame
+) -> Mapping[str, FloatArray]:
+    """Give what masses are wrong by where the optics were rejected, and no others learned."""
+    del config
+    return {"mass_kda": mass_share * table["mass_kda"].to_numpy(float)} if mass_share else {}
 
 
 def _of_the_line(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
