@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -48,25 +49,6 @@ _PLACE_AND_MASS = np.array([True, True, False, True, False])
 
 
 @dataclass(frozen=True)
-class Begun:
-    """The first frames of a movie, followed with some optics.
-
-    Attributes
-    ----------
-    config : Config
-        With these.
-    scene : Scene
-        Its models.
-    block : Block
-        What was found.
-    """
-
-    config: Config
-    scene: Scene
-    block: Block
-
-
-@dataclass(frozen=True)
 class LeftOver:
     """What the model leaves over of all pictures of tracks together.
 
@@ -98,6 +80,35 @@ class LeftOver:
             f"the configured optics do not describe the particles: of the pictures of "
             f"{count(self.tracks, 'track')} they leave over {self.share:.0%}"
         )
+
+
+@dataclass(frozen=True)
+class Begun:
+    """The first frames of a movie, followed with some optics.
+
+    Attributes
+    ----------
+    config : Config
+        With these.
+    scene : Scene
+        Its models.
+    block : Block
+        What was found.
+    """
+
+    config: Config
+    scene: Scene
+    block: Block
+
+    @cached_property
+    def left(self) -> LeftOver | None:
+        """What the model leaves over of all pictures; None where there is none."""
+        return _left_over(self.block, self.scene)
+
+    @property
+    def described(self) -> bool:
+        """Whether the optics describe the tracks."""
+        return self.left is not None and not self.left.rejected
 
 
 class Begin(Protocol):
@@ -149,7 +160,7 @@ def learn_from_tracks(
     optics = config.optics
     suited = optics.convention == "exact" and optics.psf == "model"
     begun, trouble = _first(config, begin) if suited else (begin(config), None)
-    left = left_over(begun)
+    left = begun.left
     if trouble is not None and (left is None or not left.rejected):
         raise trouble
     if left is None or not suited:
@@ -221,8 +232,8 @@ def _described(
 
     Where none are good enough: what was followed last, if it is described, and why.
     """
-    reason, at_first = "what was learned does not describe them either", left_over(trial)
-    near = trial if at_first is not None and not at_first.rejected else None
+    reason = "what was learned does not describe them either"
+    near = trial if trial.described else None
     for _ in range(ROUNDS):
         found = _measured(trial, _start(config, cause), name, pool)
         learned, refusal = usable(found, config)
@@ -233,8 +244,7 @@ def _described(
         if guess is None:
             break
         trial, trouble = _first(guess, begin)
-        now = left_over(trial)
-        near = trial if trouble is None and now is not None and not now.rejected else None
+        near = trial if trouble is None and trial.described else None
     return None, near, reason
 
 
@@ -256,20 +266,8 @@ def mass_error(summary: Mapping[str, Any]) -> float:
     return MASS_SHARE * share if rejected else 0.0
 
 
-def left_over(begun: Begun) -> LeftOver | None:
-    """Add up what the model leaves over of all pictures.
-
-    Parameters
-    ----------
-    begun : Begun
-        The first frames.
-
-    Returns
-    -------
-    LeftOver or None
-        None where there is no picture.
-    """
-    block, scene = begun.block, begun.scene
+def _left_over(block: Block, scene: Scene) -> LeftOver | None:
+    """Add up what the model leaves over of all pictures; None where there is none."""
     aligned = block.aligned
     if aligned is None or not len(aligned.track):
         return None
