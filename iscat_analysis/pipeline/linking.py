@@ -435,7 +435,7 @@ def bridge(config: Config, rows: Rows) -> IntArray:
     reach = config.optics.wavelength_nm / config.optics.na
     tracks = [np.flatnonzero(rows.track == k) for k in np.unique(rows.track)]
     last, first = (np.array([mine[end] for mine in tracks], dtype=np.int64) for end in (-1, 0))
-    square = np.array([_step_nm2(rows.only(rows.track == k)) for k in rows.track[first]])
+    square = np.array([_step_nm2(rows.only(mine)) for mine in tracks])
     gap = rows.frame[first] - rows.frame[last][:, None]
     apart = cdist(rows.theta[last, :2], rows.theta[first, :2])
     may = (gap > 0) & (gap <= _BRIDGE_FRAMES + 1) & (apart < reach)
