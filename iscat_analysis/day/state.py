@@ -162,7 +162,8 @@ def claim_folder(out: Path) -> None:
     """
     state = out / STATE
     try:
-        if out.is_dir() and not state.is_dir() and (held := sorted(p.name for p in out.iterdir())):
+        held = sorted(p.name for p in out.iterdir()) if out.is_dir() else []
+        if held and not state.is_dir():  # asked last: another part may just have begun
             raise DataError(
                 f"{out}: holds {held[0]!r} and is no earlier batch, and is left alone; choose "
                 "another `out`"
