@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR
+from iscat_analysis._kernels.stepping import frame_scores, spreads
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 
 FloatArray = NDArray[np.float64]
@@ -171,67 +172,15 @@ def series_of(
     """
     lit = power > 0
     flat = weights.reshape(len(weights), -1)
-    seen = (weights * gain).reshape(len(weights), -1)
-    values = seen @ counts[lit].reshape(int(lit.sum()), -1).T.astype(np.float64)
-    values -= np.sum(weights * gain * offset, axis=(1, 2))[:, None]
+    seen = weights * gain
+    values = np.empty((len(weights), np.count_nonzero(lit)))
+    frame_scores(counts, lit, seen, values)
+    values -= np.sum(seen * offset, axis=(1, 2))[:, None]
     squared = flat**2
     return Series(
         values, power[lit], squared @ np.maximum(mean_e, 0.0).ravel(),
         squared @ read_variance_e2.ravel(),
     )  # fmt: skip
-
-
-def spread_of_parts(series: Series, parts: int = PARTS) -> tuple[FloatArray, int]:
-    """Scatter of an estimate between contiguous parts of the frames of one window.
-
-    Parameters
-    ----------
-    series : Series
-        Of the window.
-    parts : int
-        Parts, of frames that follow each other.
-
-    Returns
-    -------
-    squares : ndarray, shape (n,)
-        Sum of squared deviations over the variance that the model expects.
-    degrees : int
-        What it comes to under the model; 0 for fewer than two frames.
-    """
-    frames = series.power.size
-    parts = min(parts, frames)
-    if parts < 2:
-        return np.zeros(len(series.values)), 0
-    edges = np.linspace(0, frames, parts + 1).round().astype(int)
-    mean, variance = _blocks(series, edges)
-    weight = 1 / variance
-    middle = np.sum(weight * mean, axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)
-    return np.sum(weight * (mean - middle) ** 2, axis=1), parts - 1
-
-
-def spread_at(series: Series, length: int) -> tuple[FloatArray, int]:
-    """Scatter between neighbouring averages, as the Allan variance has it.
-
-    Parameters
-    ----------
-    series : Series
-        Of one window.
-    length : int
-        Frames averaged.
-
-    Returns
-    -------
-    squares : ndarray, shape (n,)
-        Sum of squared differences over the variance that the model expects.
-    pairs : int
-        How many differences.
-    """
-    pairs = series.power.size // (2 * length)
-    if not pairs:
-        return np.zeros(len(series.values)), 0
-    mean, variance = _blocks(series, np.arange(2 * pairs + 1) * length)
-    apart = mean[:, 1::2] - mean[:, 0::2]
-    return np.sum(apart**2 / (variance[:, 1::2] + variance[:, 0::2]), axis=1), pairs
 
 
 def repeats_of(windows: tuple[Series, ...]) -> FloatArray:
@@ -250,20 +199,10 @@ def repeats_of(windows: tuple[Series, ...]) -> FloatArray:
     """
     out = np.zeros((1 + len(LENGTHS), len(windows[0].values) + 1))
     for series in windows:
-        for row, found in enumerate(
-            [spread_of_parts(series), *(spread_at(series, n) for n in LENGTHS)]
-        ):
-            out[row, :-1] += found[0]
-            out[row, -1] += found[1]
+        frames = series.power.size
+        edges = np.linspace(0, frames, min(PARTS, frames) + 1).round().astype(np.int64)
+        spreads(
+            series.values, series.power, series.shot, series.read, edges,
+            np.array(LENGTHS, dtype=np.int64), out,
+        )  # fmt: skip
     return out
-
-
-def _blocks(series: Series, edges: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
-    """Mean of contiguous frames per unit of power, and its expected variance."""
-    starts = edges[:-1]
-    last = int(edges[-1])
-    total = np.add.reduceat(series.values[:, :last], starts, axis=1)
-    power = np.add.reduceat(series.power[:last], starts)
-    frames = np.diff(edges)
-    variance = series.shot[:, None] * power + series.read[:, None] * frames
-    return total / power, variance / power**2

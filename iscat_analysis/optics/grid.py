@@ -38,11 +38,11 @@ class PixelGrid:
     def __post_init__(self) -> None:
         for name in ("x_nm", "y_nm"):
             axis = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
-            if axis.ndim != 1 or not axis.size or not np.all(np.isfinite(axis)):
-                raise DataError(f"{name}: give the centres as one row of finite numbers")
-            if np.any(np.diff(axis) <= 0):
-                raise DataError(f"{name}: the centres must ascend; sort them, without doubles")
             object.__setattr__(self, name, axis)
+            if axis.ndim != 1 or not axis.size or not np.isfinite(axis).all():
+                raise DataError(f"{name}: give the centres as one row of finite numbers")
+            if (axis[1:] <= axis[:-1]).any():
+                raise DataError(f"{name}: the centres must ascend; sort them, without doubles")
         if not (math.isfinite(self.pixel_nm) and self.pixel_nm > 0):
             raise DataError(f"pixel_nm = {self.pixel_nm}: give the side of a pixel, above 0 nm")
 

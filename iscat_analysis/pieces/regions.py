@@ -12,6 +12,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.bounds import event_bounds
+from iscat_analysis.bounds.classical import ComplexArray
 from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import real_array
@@ -209,6 +210,7 @@ def line_of(
     n_before: int,
     n_after: int,
     sign: int = 1,
+    quantum: ComplexArray | None = None,
 ) -> dict[str, Any]:
     """Put a fit and its bounds into a line of the table, which has no number yet.
 
@@ -228,6 +230,8 @@ def line_of(
         Frames.
     sign : int
         −1 for a particle that leaves, whose mass and contrast are told with the other sign.
+    quantum : complex ndarray, shape (4, 4), optional
+        As in `iscat_analysis.bounds.classical.event_bounds`.
 
     Returns
     -------
@@ -236,8 +240,9 @@ def line_of(
     """
     model, pixel_nm = likelihood.model, likelihood.grid.pixel_nm
     bounds = event_bounds(
-        likelihood, fit.estimate, fit.free, collected, level=bool(fit.box.free[LEVEL])
-    )
+        likelihood, fit.estimate, fit.free, collected, quantum=quantum,
+        level=bool(fit.box.free[LEVEL]),
+    )  # fmt: skip
     status, noticed = verdict(flags)
     row: dict[str, Any] = {
         "frame": frame,

@@ -35,6 +35,7 @@ _ABOUT = {
     "score_test": "the goodness of fits",
     "scoring": "fits",
     "sliding": "sums of frames",
+    "stepping": "sums of frames",
 }
 _PICTURES = "the picture of a particle"
 

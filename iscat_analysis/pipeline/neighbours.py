@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from iscat_analysis._kernels.stepping import add_image, times_change
 from iscat_analysis.movie.drift import derivatives
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.pattern import MovingPattern
@@ -188,6 +189,21 @@ class Neighbours:
         moving: FloatArray = there[1] / there[0] * known[0] / known[1]
         return moving
 
+    def apply(
+        self, ratio: FloatArray, step: Step, before: slice, after: slice, region: Region
+    ) -> None:
+        """Multiply the pixels of a region that a step's image covers with `factor`."""
+        shared = self.shared(step, region)
+        if shared is None:
+            return
+        here, inside = shared
+        if self._pattern is not None:
+            ratio[here] *= self.factor(step, before, after, inside)
+            return
+        shares = self.presence(step, before), self.presence(step, after)
+        if shares[0] != shares[1]:
+            times_change(ratio, _ends(here), step.image, _ends(inside), *shares)
+
     def own_factor(
         self, step: Step, before: slice, after: slice, inside: tuple[slice, slice]
     ) -> FloatArray:
@@ -197,12 +213,14 @@ class Neighbours:
         factor: FloatArray = self.factor(step, before, after, inside) / model**step.sign
         return factor
 
-    def change(self, step: Step, before: slice, after: slice) -> FloatArray:
-        """Contrast that a step's particle makes between two ranges of frames."""
+    def add_change(self, total: FloatArray, step: Step, before: slice, after: slice) -> None:
+        """Add to a field the contrast that a step's particle makes between ranges of frames."""
         strong = abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK
         if strong or self._pattern is not None:
-            return self.factor(step, before, after) - 1
-        return (self.presence(step, after) - self.presence(step, before)) * step.image
+            total[self.box(step)] += self.factor(step, before, after) - 1
+            return
+        share = self.presence(step, after) - self.presence(step, before)
+        add_image(total, step.corner, step.image, share)
 
     def _present(self, step: Step, frames: slice) -> slice:
         """Give those of the frames in which the particle is there; all if it is there in none."""
@@ -288,6 +306,12 @@ def spans(
         Half-open.
     """
     return (corner[0], corner[0] + shape[0]), (corner[1], corner[1] + shape[1])
+
+
+def _ends(part: tuple[slice, slice]) -> tuple[int, int, int, int]:
+    """First and last row, first and last column, half-open."""
+    rows, columns = part
+    return rows.start, rows.stop, columns.start, columns.stop
 
 
 def distance_px(one: Step, two: Step) -> float:

@@ -8,6 +8,8 @@ from typing import Any
 
 import pandas as pd
 
+from iscat_analysis.bounds.classical import ComplexArray
+from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.pieces.regions import line_of, lines_from, numbered
@@ -183,13 +185,19 @@ def lines_of(
     list of dict
         As from `line_of`; with `FRAME_COLUMN`, where steps were dated.
     """
-    return list(mapper(lambda event: _line(scene, event), events))
+    heights = {event.fit.estimate[2] for event in events}
+    known = {}
+    if len(heights) == 1 and not scene.model.is_measured:  # of heights that are not fitted
+        (height,) = heights
+        known[height] = quantum_information(scene.model, height)
+    return list(mapper(lambda event: _line(scene, event, known), events))
 
 
-def _line(scene: Scene, event: Event) -> dict[str, Any]:
+def _line(scene: Scene, event: Event, quantum: Mapping[float, ComplexArray]) -> dict[str, Any]:
     line = line_of(
         event.likelihood, event.fit, collected_photons(scene, event), flags=event.flags,
         frame=event.frame, n_before=event.n_before, n_after=event.n_after, sign=event.sign,
+        quantum=quantum.get(event.fit.estimate[2]),
     )  # fmt: skip
     return line if event.half_width is None else line | {FRAME_COLUMN: event.half_width}
 

@@ -260,7 +260,7 @@ class ChunkFitter:
                 return moving.contrast[j] if moving else None
             total = np.zeros(chunk.shape)
             for step in near[j]:
-                total[self._neighbours.box(step)] += self._neighbours.change(step, before, after)
+                self._neighbours.add_change(total, step, before, after)
             total = scene.left(total)
             return total + moving.contrast[j] * (1 + total) if moving else total
 

@@ -125,10 +125,7 @@ class TaskBuilder:
         ratio = np.full(before.shape, power_after / power_before)
         cuts = chunk.cut(*first), chunk.cut(*second)
         for other in neighbours:
-            shared = self._neighbours.shared(other, region)
-            if shared is not None:
-                here, inside = shared
-                ratio[here] *= self._neighbours.factor(other, *cuts, inside)
+            self._neighbours.apply(ratio, other, *cuts, region)
         if scene.lines is not None:
             there = [self._present(steps, span, cut) for cut in cuts]
             taken = [scene.lines.taken(signal)[region.slices] for signal in there]

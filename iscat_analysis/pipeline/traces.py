@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -157,8 +156,7 @@ def clip_of(
     )
     # windows begin and end where others do, so that the parts between are summed once
     ends = [turn + k * window // CLIP_STEPS for k in range(-2 * CLIP_STEPS, 2 * CLIP_STEPS + 1)]
-    parts = [patch.window(*span) for span in pairwise(ends)]
-    light, n, power = (np.array(values) for values in zip(*parts, strict=True))
+    light, n, power = patch.windows(ends)
     own = n[CLIP_STEPS : 3 * CLIP_STEPS].reshape(2, -1).sum(axis=1)
     least = min(window / 2, *own)  # near the ends of a movie, the frames of the fit
     frames, after_e, expected_e = [], [], []

@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.stepping import ring_heights
+
 EXCEEDS = 1.5
 """Times the height of its ring that a particle must have."""
 
@@ -161,30 +163,14 @@ def size_on_ring(
     """
     (x0, y0), (xc, yc) = centre, place
     distance = max(math.hypot(xc - x0, yc - y0), _RING_PX)
-    far = distance + _RING_PX
-    (top, bottom), (left, right) = (
-        (max(math.floor(c - far), 0), max(min(math.ceil(c + far) + 1, n), 0))
-        for c, n in zip((y0, x0), snr.shape, strict=True)
-    )
-    rows, columns = np.arange(top, bottom), np.arange(left, right)
-    away2 = (rows - y0)[:, None] ** 2 + (columns - x0) ** 2
-    y, x = np.nonzero((away2 > (distance - _RING_PX) ** 2) & (away2 < far**2))
-    away2, y, x = away2[y, x], rows[y], columns[x]
-    own = (y - yc) ** 2 + (x - xc) ** 2 > _PATCH_PX**2
-    for xo, yo in others:
-        if math.hypot(xo - x0, yo - y0) < 2 * far:  # others are too far to share pixels of the ring
-            own &= (y - yo) ** 2 + (x - xo) ** 2 > away2
-    y, x = y[own], x[own]
-    if (
-        y.size and distance > 2 * _PATCH_PX
-    ):  # closer in, a patch would cover a whole lobe of the misfit
-        k = np.argmax(np.abs(snr[y, x]))
-        own = (y - y[k]) ** 2 + (x - x[k]) ** 2 > _PATCH_PX**2
-        y, x = y[own], x[own]
-    if not y.size:
+    reach = 2 * (distance + _RING_PX)  # farther away, others share no pixels with the ring
+    near = [(x, y) for x, y in others if math.hypot(x - x0, y - y0) < reach]
+    highest = np.empty(max(8, round(2 * math.pi * distance / _SECTOR_PX)))
+    ring_heights(
+        snr, (float(x0), float(y0)), (float(xc), float(yc)), _RING_PX, _PATCH_PX,
+        np.array(near, dtype=np.float64).reshape(-1, 2), highest,
+    )  # fmt: skip
+    seen = np.sort(highest[highest >= 0])
+    if not seen.size:
         return 0.0
-    sectors = max(8, round(2 * math.pi * distance / _SECTOR_PX))
-    sector = ((np.arctan2(y - y0, x - x0) / (2 * math.pi) + 0.5) * sectors).astype(int) % sectors
-    highest = np.full(sectors, -1.0)
-    np.maximum.at(highest, sector, np.abs(snr[y, x]))
-    return float(np.quantile(highest[highest >= 0], _HEIGHT))
+    return float(np.interp(_HEIGHT * (seen.size - 1), np.arange(seen.size), seen))

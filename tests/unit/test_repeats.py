@@ -22,8 +22,6 @@ from iscat_analysis.inference.repeats import (
     repeats_of,
     response_of,
     series_of,
-    spread_at,
-    spread_of_parts,
 )
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline.achieved import likely_noise, measured_scale, spread_verdict
@@ -121,13 +119,13 @@ def test_squares_come_to_their_number_times_the_excess(factor: float) -> None:
 def test_parts_of_one_window_do_not_see_the_step_but_see_a_drift() -> None:
     power, one = np.ones(80), np.array([1.0])
     still = Series(np.full((1, 80), 5.0), power, one, 0 * one)
-    assert spread_of_parts(still)[0] == pytest.approx(0)
+    assert repeats_of((still,))[0, 0] == pytest.approx(0)
     slope = 0.01
     moving = Series(slope * np.arange(80.0)[None], power, one, 0 * one)
     for length in (1, 10, 40):
-        squares, pairs = spread_at(moving, length)
+        squares, pairs = repeats_of((moving,))[1 + LENGTHS.index(length)]
         # the means of neighbouring parts are slope·n apart, their variance is 1/n each
-        assert squares[0] / pairs == pytest.approx((slope * length) ** 2 * length / 2)
+        assert squares / pairs == pytest.approx((slope * length) ** 2 * length / 2)
 
 
 def test_frames_that_are_left_out_do_not_count() -> None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from iscat_analysis._kernels.sliding import region_scores
+from iscat_analysis._kernels.stepping import one_change, projector
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.sliding.frames import Patch
 
@@ -108,19 +109,14 @@ def locate_step(
     heights, weight, scale = frame_heights(patch, image)
     if known is not None:
         heights = heights - known
-    n = np.cumsum(weight)
-    total = np.cumsum(weight * heights)
-    before, after = n[:-1], n[-1] - n[:-1]
-    usable = (before > 0) & (after > 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        jump = np.where(usable, (total[-1] - total[:-1]) / after - total[:-1] / before, 0.0)
-    gain_in_log = 0.5 * before * after / n[-1] * jump**2 * (jump > 0)
+    jump, gain_in_log = np.empty((2, max(heights.size - 1, 0)))
+    one_change(heights, weight, jump, gain_in_log)
     frames = np.arange(patch.first + 1, patch.first + heights.size)
-    inside = (frames >= search[0]) & (frames < search[1]) & usable
+    inside = (frames >= search[0]) & (frames < search[1]) & np.isfinite(gain_in_log)
     if not inside.any():
         middle = int(np.clip((search[0] + search[1]) // 2, frames[0], frames[-1]))
         return StepFrame(middle, search[1] - search[0], 0.0, 0.0, 1.0)
-    log = np.where(inside, gain_in_log, -np.inf)
+    log = np.where(inside, gain_in_log * (jump > 0), -np.inf)
     best = int(np.argmax(log))
     posterior = np.exp(log - log[best])
     posterior /= posterior.sum()
@@ -173,16 +169,13 @@ def _p_constant(heights: FloatArray, weight: FloatArray) -> float:
     Tail of the likelihood ratio of one change of mean anywhere: B. James, K. L. James and
     D. Siegmund, Biometrika 74, 71 (1987), eq. (4).
     """
-    lit = weight > 0
-    heights, weight = heights[lit], weight[lit]
-    if heights.size < 3:
+    scratch = np.empty((2, max(heights.size - 1, 0)))
+    largest, lit = one_change(heights, weight, *scratch)
+    if lit < 3:
         return 1.0
-    n, total = np.cumsum(weight), np.cumsum(weight * heights)
-    before, after = n[:-1], n[-1] - n[:-1]
-    jump = (total[-1] - total[:-1]) / after - total[:-1] / before
-    b = math.sqrt(float(np.max(before * after / n[-1] * jump**2)))
+    b = math.sqrt(2 * largest)
     density = math.exp(-0.5 * b * b) / math.sqrt(2 * math.pi)
-    widest = 2 * math.log(heights.size - 1)  # ln of the odds of the last split over the first
+    widest = 2 * math.log(lit - 1)  # ln of the odds of the last split over the first
     tail = density * ((b - 1 / b) * widest + 4 / b) if b > 1 else 1.0
     return min(tail, 1.0)
 
@@ -213,10 +206,7 @@ def crosstalk(patch: Patch, image: FloatArray, others: Sequence[FloatArray]) -> 
 
 def _projector(patch: Patch, image: FloatArray) -> tuple[FloatArray, float]:
     """Weights that measure the amplitude of an image and ignore a common level, and their scale."""
-    used = patch.usable
-    mean = np.where(used, patch.mean_e, 0.0)
-    share = mean / np.where(used, mean + np.square(patch.read_noise_e), 1.0)
-    light = mean * share
-    level = float(np.sum(light * image)) / max(float(light.sum()), 1e-300)
-    weights = np.where(used, share * (image - level), 0.0)
-    return weights, max(float(np.sum(weights * mean * image)), 1e-300)
+    weights = np.empty(image.shape)
+    read = np.atleast_2d(np.asarray(patch.read_noise_e, dtype=np.float64))
+    mean, used, seen = (np.ascontiguousarray(part) for part in (patch.mean_e, patch.usable, image))
+    return weights, projector(mean, read, used, seen, weights)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.sliding import block_sums, frame_totals, region_sum
+from iscat_analysis._kernels.stepping import part_sums
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 
@@ -149,6 +150,33 @@ class Patch:
         region_sum(self.counts[here], self.good[here], out)
         frames = int(np.count_nonzero(self.good[here]))
         return self.gain * (out - frames * self.offset), frames, float(self.power[here].sum())
+
+    def windows(self, ends: Sequence[int]) -> tuple[FloatArray, NDArray[np.int64], FloatArray]:
+        """Sum contiguous parts of the frames.
+
+        Parameters
+        ----------
+        ends : sequence of int
+            Where the parts begin and end, clipped to the frames held.
+
+        Returns
+        -------
+        electrons : ndarray, shape (n, ny, nx)
+            Summed photoelectrons of each [e].
+        frames : ndarray of int, shape (n,)
+            Good frames in each.
+        power : ndarray, shape (n,)
+            Their power.
+        """
+        edges = np.clip(np.asarray(ends, dtype=np.int64) - self.first, 0, len(self.good))
+        out = np.empty((edges.size - 1, *self.mean_e.shape))
+        part_sums(self.counts, self.good, edges, out)
+        known = np.zeros((2, len(self.good) + 1))
+        np.cumsum(self.good, out=known[0, 1:])
+        np.cumsum(self.power, out=known[1, 1:])
+        frames, power = np.diff(known[:, edges])
+        electrons = self.gain * (out - frames[:, None, None] * self.offset)
+        return electrons, frames.astype(np.int64), power
 
     def part(self, rows: slice, columns: slice) -> Patch:
         """Copy some of its pixels, which count from its own first one."""
