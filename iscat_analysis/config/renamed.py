@@ -1,4 +1,4 @@
-"""Old names of keys and values, which work for one release with a notice that names the new one."""
+"""Old values of keys, which work for one release with a notice that names the new one."""
 
 from __future__ import annotations
 
@@ -12,23 +12,15 @@ OLD_VALUES: dict[tuple[str, str], dict[str, str]] = {
 }
 """Section and key → old value → new value."""
 
-OLD_KEYS: dict[tuple[str, str], tuple[str, str]] = {}
-"""Old section and key → new section and key; the meaning and the unit are the same."""
-
 
 def rename(values: dict[str, Any]) -> None:
-    """Replace old names in place, and say so in a `FutureWarning`.
+    """Replace old values in place, and say so in a `FutureWarning`.
 
     Parameters
     ----------
     values : dict
         Sections of keys, not validated yet.
     """
-    for (section, key), (new_section, new_key) in OLD_KEYS.items():
-        table = values.get(section)
-        if isinstance(table, dict) and key in table:
-            values.setdefault(new_section, {}).setdefault(new_key, table.pop(key))
-            _notice(f"{section}.{key}", f"{new_section}.{new_key}")
     _name_all_frames(values)
     for (section, key), names in OLD_VALUES.items():
         table = values.get(section)

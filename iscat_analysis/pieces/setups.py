@@ -181,6 +181,7 @@ def darkfield_photons(particle: Particle) -> float:
     if particle.photons_per_frame is None:
         raise ConfigError(
             "particle.photons_per_frame is needed in dark field, where it is the scale of masses: "
-            "Particle(mass_kda=480, photons_per_frame=3000)"
+            "give the scattered photons that are collected per frame from a particle of "
+            "particle.mass_kda, as in photons_per_frame=3000"
         )
     return particle.photons_per_frame

@@ -16,6 +16,7 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_ratio
 from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.movie.metadata import resolve_metadata
+from iscat_analysis.pieces.setups import darkfield_photons
 from iscat_analysis.pipeline.diagnosis import axes_warning, judge_lines
 from iscat_analysis.pipeline.learning import learn_optics
 from iscat_analysis.pipeline.ranges import fitted_frames, tracked_frames
@@ -100,6 +101,8 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     DataError
         The frames are impossible.
     """
+    if config.optics.scheme == "darkfield":
+        darkfield_photons(config.particle)
     config, notes = resolve_metadata(config, movie.metadata)
     for note in (*movie.notes, *notes):
         run.tell(note)
@@ -110,7 +113,6 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if tracked:
         for note in judge_times(config, tracked_frames(movie, config), movie.name):
             run.tell(note)
-    config = _with_photons(config, run)
     if config.optics.psf == "measured":
         run.tell(
             'optics.psf = "measured": bounds are those of the template, and there is no quantum '
@@ -154,21 +156,6 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if way != "sliding":
         _refuse_what_only_slides(run, movie.name)
     return Prepared(movie, steady, config, camera, way, lines, other_kind, digest, summary)
-
-
-def _with_photons(config: Config, run: Run) -> Config:
-    """Take the scale of masses in dark field from the simulation, for one more release."""
-    if config.optics.scheme != "darkfield" or config.particle.photons_per_frame is not None:
-        return config
-    photons = config.simulation.photons_per_pixel
-    run.tell(
-        f"particle.photons_per_frame is not given, so that masses rest on "
-        f"simulation.photons_per_pixel = {photons:g}, which says nothing of this movie; give "
-        "the scattered photons collected per frame from a particle of particle.mass_kda: the "
-        "next release asks for it"
-    )
-    particle = config.particle.model_copy(update={"photons_per_frame": photons})
-    return config.model_copy(update={"particle": particle})
 
 
 def _refuse_still(counts: NDArray[Any], name: str) -> None:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iscat_analysis.config import Config
-from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import MEAN, counts_likelihood
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.movie.background import smooth_background
 from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.pieces.setups import darkfield_photons
 from iscat_analysis.pipeline.scene import Scene, is_counted
 from iscat_analysis.records import Candidate, FloatArray, Windows
 
@@ -222,13 +222,7 @@ def photons_scale(scene: Scene, windows: Windows) -> float:
     float
         Photoelectrons per pixel for unit |E_sca|², summed over the frames after.
     """
-    photons = scene.config.particle.photons_per_frame
-    if photons is None:
-        raise ConfigError(
-            "particle.photons_per_frame is needed in dark field, where it is the scale of masses: "
-            "give the scattered photons that are collected per frame from a particle of "
-            "particle.mass_kda"
-        )
+    photons = darkfield_photons(scene.config.particle)
     per_frame = photons_per_intensity(scene.model, photons, scene.pixel_nm)
     return per_frame * windows.power_ratio * max(windows.n_before, 1)
 

@@ -327,7 +327,7 @@ def test_the_simulation_says_nothing_of_dark_field_masses() -> None:
         photons_scale(bare, windows)  # type: ignore[arg-type]
 
 
-def test_only_the_simulator_and_one_announced_fallback_read_the_simulation() -> None:
+def test_only_the_simulator_reads_the_simulation() -> None:
     package = Path(ia.__file__).parent
     readers = {
         str(path.relative_to(package))
@@ -339,7 +339,6 @@ def test_only_the_simulator_and_one_announced_fallback_read_the_simulation() -> 
         "study/simulate.py",
         "study/movers.py",
         "study/particles.py",
-        "pipeline/prepare.py",
     }
 
 

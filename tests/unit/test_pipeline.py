@@ -276,6 +276,16 @@ def test_dark_field_refuses_what_needs_a_reference(tmp_path: Path) -> None:
     assert not movie.with_suffix(".iscat").exists()
 
 
+def test_dark_field_takes_no_scale_from_the_simulation(tmp_path: Path) -> None:
+    config = _small(**DARK_FIELD, background={"level_e": 20.0})
+    particle = config.particle.model_copy(update={"photons_per_frame": None})
+    movie = tmp_path / "movie.tif"
+    write_stack(config, movie)
+    with pytest.raises(ConfigError, match=r"particle\.photons_per_frame is needed in dark field"):
+        fit_stack(movie, config.model_copy(update={"particle": particle}))
+    assert not movie.with_suffix(".iscat").exists()
+
+
 # ---- other backgrounds, cameras and metadata -----------------------------------------------------
 
 
