@@ -36,16 +36,13 @@ StandardsOption = Annotated[
         metavar="MASSES",
         help="Masses in the calibrants [kDa], beside those of the table, as in 66,146,480; "
         "66:0.5 gives one its standard error, otherwise 1 %.",
-        show_default=False,
     ),
 ]
 
 KdOption = Annotated[
     Reaction | None,
     typer.Option(
-        "--kd",
-        help="Fit K_D to each condition with several concentrations, as iscat kd does.",
-        show_default=False,
+        "--kd", help="Fit K_D to each condition with several concentrations, as iscat kd does."
     ),
 ]
 
@@ -55,7 +52,6 @@ KdMassesOption = Annotated[
         "--kd-masses",
         metavar="M | A,B",
         help="About the mass of the monomer, found otherwise, or of A and B [kDa]; fitted.",
-        show_default=False,
     ),
 ]
 
@@ -81,18 +77,14 @@ def batch(
     samples: Annotated[
         Path,
         typer.Argument(
-            metavar="SAMPLES",
-            help="A table of movies, CSV or TOML, or a folder of movies.",
-            show_default=False,
+            metavar="SAMPLES", help="A table of movies, CSV or TOML, or a folder of movies."
         ),
     ],
     *,
     out: Annotated[
         Path,
         typer.Option(
-            metavar="DIR",
-            help="Folder of the batch; an earlier one is brought up to date.",
-            show_default=False,
+            metavar="DIR", help="Folder of the batch; an earlier one is brought up to date."
         ),
     ],
     config: ConfigOption = None,
@@ -106,7 +98,6 @@ def batch(
             metavar="K/N",
             help="Analyse the K-th of N parts of the movies, and the calibrations unless another "
             "part does; no page.",
-            show_default=False,
         ),
     ] = None,
     merge: Annotated[

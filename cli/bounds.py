@@ -75,7 +75,6 @@ def bounds(
             metavar="NAME=A:B:STEP",
             help="Bounds along z, focus, attenuation, na, pixel, fov or photons; B is included, "
             "and NAME=a,b,c lists values.",
-            show_default=False,
         ),
     ] = None,
     optimize: Annotated[
@@ -84,7 +83,6 @@ def bounds(
             "--optimize",
             help="Find the best focus, the best attenuation, or the best pupil: focus, phase and "
             "attenuation of the reference, mask and low Zernike terms together.",
-            show_default=False,
         ),
     ] = None,
     wanted: Annotated[
@@ -95,7 +93,6 @@ def bounds(
             help="What --optimize shall make precise: x, y, z or mass, for the pupil also several, "
             "as in z,mass; default all that are free. optics: how well particles would tell focus, "
             "NA, phase, mask and aberrations, instead of the bounds of one particle.",
-            show_default=False,
             autocompletion=lambda: ["x", "y", "z", "mass", "z,mass", OPTICS],
         ),
     ] = None,
@@ -106,7 +103,6 @@ def bounds(
             metavar="N",
             min=1,
             help="With --for optics: particles of particle.mass_kda; default 60.",
-            show_default=False,
         ),
     ] = None,
     free: Annotated[
@@ -117,16 +113,12 @@ def bounds(
             help="With --for optics: what is fitted, some of "
             "focus,na,phase,mask,zernike,polarization; with --optimize pupil: what may change, "
             "some of focus,phase,attenuation,mask,zernike; default all.",
-            show_default=False,
         ),
     ] = None,
     seed: Annotated[
         int | None,
         typer.Option(
-            "--seed",
-            min=0,
-            help="With --optimize pupil: of the starts of the search; default 0.",
-            show_default=False,
+            "--seed", min=0, help="With --optimize pupil: of the starts of the search; default 0."
         ),
     ] = None,
     target: Annotated[
@@ -136,18 +128,13 @@ def bounds(
             metavar="NAME=VALUE",
             help="Frames and photons that a precision takes, as in mass=5kDa or z=2nm, and what "
             "costs how much.",
-            show_default=False,
         ),
     ] = None,
     preset: Annotated[
-        Preset | None,
-        typer.Option(
-            "--preset", help="Reproduce every table and figure of a paper.", show_default=False
-        ),
+        Preset | None, typer.Option("--preset", help="Reproduce every table and figure of a paper.")
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder for figures.", show_default=False),
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder for figures.")
     ] = None,
     settings: SetOption = None,
     overwrite: OverwriteOption = False,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from iscat_cli.console import Messages, failures, print_json, print_result
+from iscat_cli.console import Messages, failures, print_json, print_result, table
 from iscat_cli.options import (
     ConfigOption,
     DebugOption,
@@ -54,21 +54,15 @@ def camera(
     stacks: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="[STACK]...",
-            help="Flats at one or several levels, or the movie itself.",
-            show_default=False,
+            metavar="[STACK]...", help="Flats at one or several levels, or the movie itself."
         ),
     ] = None,
     *,
     dark: Annotated[
-        Path | None,
-        typer.Option(metavar="STACK", help="Frames without light.", show_default=False),
+        Path | None, typer.Option(metavar="STACK", help="Frames without light.")
     ] = None,
     offset: Annotated[
-        float | None,
-        typer.Option(
-            metavar="COUNTS", help="The offset, known without a dark.", show_default=False
-        ),
+        float | None, typer.Option(metavar="COUNTS", help="The offset, known without a dark.")
     ] = None,
     maps: Annotated[
         bool, typer.Option("--maps", help="Write maps, one number per pixel, as TIFF.")
@@ -76,9 +70,7 @@ def camera(
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR",
-            help="Output folder; default the first stack's name with .camera.",
-            show_default=False,
+            metavar="DIR", help="Output folder; default the first stack's name with .camera."
         ),
     ] = None,
     overwrite: OverwriteOption = False,
@@ -135,22 +127,16 @@ def mass(
         typer.Option(
             metavar="KDA,KDA,...",
             help="Masses of the standards; 66:0.5 gives one its standard error, otherwise 1 %.",
-            show_default=False,
         ),
     ],
     landing: Annotated[
         LandingSign | None,
-        typer.Option(
-            help="What landing does; default what the table's masses say, or dark.",
-            show_default=False,
-        ),
+        typer.Option(help="What landing does; default what the table's masses say, or dark."),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR",
-            help="Output folder; default the table's name with .calibration.",
-            show_default=False,
+            metavar="DIR", help="Output folder; default the table's name with .calibration."
         ),
     ] = None,
     overwrite: OverwriteOption = False,
@@ -192,7 +178,6 @@ def optics(
         typer.Argument(
             metavar="MOVIE",
             help="A landing movie, one with background frames, or a scan of the focus.",
-            show_default=False,
         ),
     ],
     *,
@@ -203,7 +188,6 @@ def optics(
         typer.Option(
             metavar="NAMES",
             help="What may change, some of focus,na,phase,mask,zernike,polarization; default all.",
-            show_default=False,
         ),
     ] = None,
     focus_step: Annotated[
@@ -212,7 +196,6 @@ def optics(
             metavar="NM",
             help="The movie is a scan of immobile particles: rise of the focus per frame [nm]; "
             "where focus is free it is measured as well.",
-            show_default=False,
         ),
     ] = None,
     measured: Annotated[
@@ -224,11 +207,7 @@ def optics(
     ] = False,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Output folder; default the movie's name with .optics.",
-            show_default=False,
-        ),
+        typer.Option(metavar="DIR", help="Output folder; default the movie's name with .optics."),
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
@@ -338,17 +317,15 @@ def _standards(text: str) -> tuple[list[float], list[float]]:
 
 
 def _print_camera(found: CameraCalibration) -> None:
-    table = _table("camera")
-    for name in ("value", "95 % low", "95 % high"):
-        table.add_column(name, justify="right", no_wrap=True)
+    shown = table("camera", "value", "95 % low", "95 % high")
     for label, estimate in (
         ("gain [e/count]", found.gain_e_per_adu),
         ("offset [counts]", found.offset_adu),
         ("read noise [counts]", found.read_noise_adu),
         ("read noise [e]", found.read_noise_e),
     ):
-        table.add_row(label, *_cells(estimate))
-    print_result(table)
+        shown.add_row(label, *_cells(estimate))
+    print_result(shown)
     if found.read_noise_below_e is not None:
         print_result(f"read noise below {found.read_noise_below_e:.3g} e (95 %)")
     print_result(found.verdict)
@@ -363,34 +340,21 @@ def _cells(estimate: Estimate | None) -> list[str]:
 
 
 def _print_optics(found: OpticsCalibration) -> None:
-    table = _table("optics")
-    for name in ("value", "±", "CRB", "configured"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("")
+    shown = table("optics", "value", "±", "CRB", "configured")
+    shown.add_column("")
     for row in found.parameters.to_dict("records"):
         numbers = ("value", "sigma", "crb", "configured")
         cells = ("–" if row[name] != row[name] else f"{row[name]:.6g}" for name in numbers)
-        table.add_row(row["parameter"], *cells, row["state"])
-    print_result(table)
+        shown.add_row(row["parameter"], *cells, row["state"])
+    print_result(shown)
     print_result(found.headline())
 
 
 def _print_mass(found: MassCalibration) -> None:
-    table = _table("standard [kDa]")
-    for name in ("contrast", "± ", "by the line [kDa]", "95 % low", "95 % high", "residual [%]"):
-        table.add_column(name, justify="right", no_wrap=True)
+    headings = ("contrast", "± ", "by the line [kDa]", "95 % low", "95 % high", "residual [%]")
+    shown = table("standard [kDa]", *headings)
     for row in found.standards.to_dict("records"):
         names = ("contrast", "contrast_se", "found_kda", "low_kda", "high_kda", "residual_percent")
-        table.add_row(f"{row['mass_kda']:g}", *(f"{row[name]:.4g}" for name in names))
-    print_result(table)
+        shown.add_row(f"{row['mass_kda']:g}", *(f"{row[name]:.4g}" for name in names))
+    print_result(shown)
     print_result(found.to_toml())
-
-
-def _table(title: str) -> Any:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD if Console().is_terminal else None, pad_edge=False)
-    table.add_column(title, no_wrap=True)
-    return table

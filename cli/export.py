@@ -46,7 +46,6 @@ def export(
             metavar="FILE",
             help="The file; default the folder's name with .trackpy.csv, .napari.npy, "
             ".photomol.csv or .picasso.hdf5.",
-            show_default=False,
         ),
     ] = None,
     overwrite: OverwriteOption = False,

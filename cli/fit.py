@@ -60,37 +60,27 @@ def fit(
     config: ConfigOption = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Output folder; default the movie's name with .iscat.",
-            show_default=False,
-        ),
+        typer.Option(metavar="DIR", help="Output folder; default the movie's name with .iscat."),
     ] = None,
     raw: Annotated[
         str | None,
         typer.Option(
             metavar="SHAPE,TYPE",
             help="STACK is nothing but numbers, as in 1500x128x128,uint16; also STACK::SHAPE,TYPE.",
-            show_default=False,
         ),
     ] = None,
     frames: Annotated[
-        str | None,
-        typer.Option(metavar="A:B", help="Frames to fit, half-open.", show_default=False),
+        str | None, typer.Option(metavar="A:B", help="Frames to fit, half-open.")
     ] = None,
     background: Annotated[
         str | None,
-        typer.Option(
-            metavar="A:B", help="Frames before the particles bound, half-open.", show_default=False
-        ),
+        typer.Option(metavar="A:B", help="Frames before the particles bound, half-open."),
     ] = None,
     settings: SetOption = None,
     posterior: Annotated[
         bool | None,
         typer.Option(
-            "--posterior/--no-posterior",
-            help="Sample the posterior; default as configured.",
-            show_default=False,
+            "--posterior/--no-posterior", help="Sample the posterior; default as configured."
         ),
     ] = None,
     workers: WorkersOption = None,
@@ -103,15 +93,13 @@ def fit(
             metavar="N",
             help="Landing movies: add N known particles, which land and leave, in a second run and "
             "report recall, bias and spread.",
-            show_default=False,
         ),
     ] = None,
     overwrite: OverwriteOption = False,
     strict: Annotated[
         bool,
         typer.Option(
-            "--strict",
-            help="Exit with status 3 if any result is flagged, or σ is understated.",
+            "--strict", help="Exit with status 3 if any result is flagged, or σ is understated."
         ),
     ] = False,
     as_json: JsonOption = False,

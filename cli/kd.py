@@ -43,7 +43,6 @@ def kd(
         typer.Argument(
             metavar="SAMPLES.csv",
             help="One row per table: path, and concentration_nm, or a_nm and b_nm.",
-            show_default=False,
         ),
     ],
     *,
@@ -53,7 +52,6 @@ def kd(
             "--model",
             help="dimer: 2 M = D with concentration_nm of monomers in all; ab: A + B = AB with "
             "a_nm and b_nm in all.",
-            show_default=False,
         ),
     ],
     masses: Annotated[
@@ -62,7 +60,6 @@ def kd(
             "--masses",
             metavar="M | A,B",
             help="About the mass of the monomer, found otherwise, or of A and B [kDa]; fitted.",
-            show_default=False,
         ),
     ] = None,
     landing: Annotated[
@@ -72,7 +69,6 @@ def kd(
             metavar="P",
             help="Landings are as concentration times mass^P; default -1/6, out of a drop at rest "
             "onto an absorbing surface; -0.333 where liquid flows, 0 where all land alike.",
-            show_default=False,
         ),
     ] = None,
     inactive: Annotated[
@@ -82,10 +78,7 @@ def kd(
     limit: LimitOption = None,
     above: AboveOption = None,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", help="Folder for kd.csv, kd.json and a figure.", show_default=False
-        ),
+        Path | None, typer.Option(metavar="DIR", help="Folder for kd.csv, kd.json and a figure.")
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,

@@ -50,18 +50,12 @@ ModeOption = Annotated[
         metavar="MODE",
         help="Free parameters: mass (x, y, mass), localize (x, y, z), joint (all four), "
         "track (joint in every frame, linked).",
-        show_default=False,
     ),
 ]
 
 ConfigOption = Annotated[
     Path | None,
-    typer.Option(
-        "--config",
-        metavar="C.toml",
-        help="Configuration; `iscat config` prints one.",
-        show_default=False,
-    ),
+    typer.Option("--config", metavar="C.toml", help="Configuration; `iscat config` prints one."),
 ]
 
 SetOption = Annotated[
@@ -70,14 +64,12 @@ SetOption = Annotated[
         "--set",
         metavar="section.key=value",
         help="Change one key of the configuration, as in optics.na=1.42; may be repeated.",
-        show_default=False,
         autocompletion=complete_setting,
     ),
 ]
 
 WorkersOption = Annotated[
-    int | None,
-    typer.Option("--workers", min=1, metavar="N", help="Threads.", show_default=False),
+    int | None, typer.Option("--workers", min=1, metavar="N", help="Threads.")
 ]
 
 SchedulerOption = Annotated[
@@ -95,7 +87,6 @@ SchedulerFileOption = Annotated[
         "--scheduler-file",
         metavar="F",
         help="The file in which the scheduler of the cluster left its address.",
-        show_default=False,
     ),
 ]
 

@@ -26,17 +26,13 @@ def simulate(
     context: typer.Context,
     *,
     config: Annotated[
-        Path,
-        typer.Option(metavar="C.toml", help="Configuration with a [simulation] section."),
+        Path, typer.Option(metavar="C.toml", help="Configuration with a [simulation] section.")
     ],
     out: Annotated[
         Path, typer.Option(metavar="STACK.tif", help="The movie; STACK.truth.csv lands beside it.")
     ],
     seed: Annotated[
-        int | None,
-        typer.Option(
-            min=0, metavar="N", help="In place of the configured seed.", show_default=False
-        ),
+        int | None, typer.Option(min=0, metavar="N", help="In place of the configured seed.")
     ] = None,
     settings: SetOption = None,
     overwrite: OverwriteOption = False,

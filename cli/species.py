@@ -68,27 +68,16 @@ def species(
             help="Output folder of iscat fit, fits.csv or .parquet, a table of Refeyn's or for "
             "PhotoMol (h5, csv), or any CSV with a column mass_kda. Of several, the others are "
             "compared with the first.",
-            show_default=False,
         ),
     ],
     *,
     k: Annotated[
         int | None,
-        typer.Option(
-            "--k",
-            metavar="N",
-            help="So many species; default as many as BIC likes.",
-            show_default=False,
-        ),
+        typer.Option("--k", metavar="N", help="So many species; default as many as BIC likes."),
     ] = None,
     masses: Annotated[
         str | None,
-        typer.Option(
-            "--masses",
-            metavar="M1,M2",
-            help="Species of these masses, held [kDa].",
-            show_default=False,
-        ),
+        typer.Option("--masses", metavar="M1,M2", help="Species of these masses, held [kDa]."),
     ] = None,
     ladder: Annotated[
         str | None,
@@ -96,16 +85,12 @@ def species(
             "--ladder",
             metavar="M1",
             help="Oligomers of a monomer of about this mass [kDa], which is fitted; auto finds it.",
-            show_default=False,
         ),
     ] = None,
     steps: Annotated[
         str | None,
         typer.Option(
-            "--steps",
-            metavar="N1,N2",
-            help="Which oligomers, as in 1,2,4; default those found.",
-            show_default=False,
+            "--steps", metavar="N1,N2", help="Which oligomers, as in 1,2,4; default those found."
         ),
     ] = None,
     offset: Annotated[
@@ -119,7 +104,6 @@ def species(
         typer.Option(
             "--widths",
             help="Of --masses and --ladder: one width for all species (default), or one each.",
-            show_default=False,
         ),
     ] = None,
     background: Annotated[
@@ -142,7 +126,6 @@ def species(
             metavar="HZ",
             help="Frames per second, for rates of landing and leaving; default as the "
             "configuration beside the table says.",
-            show_default=False,
         ),
     ] = None,
     frames: Annotated[
@@ -152,7 +135,6 @@ def species(
             metavar="A:B",
             help="Frames in which events were looked for, for the rates; default from the first "
             "to the last event.",
-            show_default=False,
         ),
     ] = None,
     draws: Annotated[
@@ -161,11 +143,7 @@ def species(
     seed: Annotated[int, typer.Option("--seed", metavar="N", help="Of the repetitions.")] = 1,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Folder for species.csv, species.json and a figure.",
-            show_default=False,
-        ),
+        typer.Option(metavar="DIR", help="Folder for species.csv, species.json and a figure."),
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,

@@ -9,9 +9,8 @@ import typer
 SigmaOption = Annotated[
     float | None,
     typer.Option(
-        "--sigma", metavar="KDA", help="Error of every event, in place of the table's [kDa].",
-        show_default=False,
-    ),
+        "--sigma", metavar="KDA", help="Error of every event, in place of the table's [kDa]."
+    )
 ]  # fmt: skip
 
 LimitOption = Annotated[
@@ -21,16 +20,14 @@ LimitOption = Annotated[
         metavar="M[:S]",
         help="Mass of which every other particle is detected, and the spread of the detector's "
         "estimate [kDa]; default from the table.",
-        show_default=False,
     ),
 ]
 
 AboveOption = Annotated[
     float | None,
     typer.Option(
-        "--above", metavar="KDA", help="Use events above this mass only, and correct for the cut.",
-        show_default=False,
-    ),
+        "--above", metavar="KDA", help="Use events above this mass only, and correct for the cut."
+    )
 ]  # fmt: skip
 
 

@@ -24,7 +24,6 @@ def view(
             metavar="DIR",
             help="Output folder of fit, batch, calibrate or benchmark; or a movie that has one "
             "beside it.",
-            show_default=False,
         ),
     ],
     *,

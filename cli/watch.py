@@ -45,10 +45,7 @@ same command goes on; 2 usage, table or configuration.
 def watch(
     context: typer.Context,
     folder: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FOLDER", help="Folder that movies are saved in.", show_default=False
-        ),
+        Path, typer.Argument(metavar="FOLDER", help="Folder that movies are saved in.")
     ],
     *,
     out: Annotated[
@@ -56,7 +53,6 @@ def watch(
         typer.Option(
             metavar="DIR",
             help="Folder of the batch; default FOLDER/batch; an earlier one is brought up to date.",
-            show_default=False,
         ),
     ] = None,
     config: ConfigOption = None,

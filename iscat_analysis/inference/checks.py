@@ -36,7 +36,7 @@ def real_array(name: str, value: ArrayLike) -> FloatArray:
     Raises
     ------
     DataError
-        It does not hold real numbers.
+        It does not hold real numbers, or not at all of its places.
     """
     if type(value) is np.ndarray and value.dtype == np.float64 and value.flags.c_contiguous:
         return value
@@ -44,6 +44,8 @@ def real_array(name: str, value: ArrayLike) -> FloatArray:
         array: NDArray[Any] = np.asarray(value)
     except ValueError:
         raise DataError(f"{name}: its rows have different lengths; give a regular array") from None
+    if np.ma.is_masked(value):
+        raise DataError(f"{name}: has masked elements, whose values mean nothing; leave them out")
     if array.dtype.kind not in "iufb":
         raise DataError(
             f"{name}: holds {array.dtype} where real numbers are needed; convert it with "

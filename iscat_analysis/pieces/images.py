@@ -10,7 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle
 from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.pieces.setups import config_of, darkfield_photons, number_in, together
+from iscat_analysis.pieces.setups import (
+    LARGEST_REGION,
+    config_of,
+    darkfield_photons,
+    number_in,
+    together,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -76,7 +82,7 @@ def psf(
     (5, 33, 33)
     """
     config = config_of(optics, particle, camera, calibration=calibration)
-    side = int(number_in("pixels", pixels, least=1, whole=True))
+    side = int(number_in("pixels", pixels, least=1, most=LARGEST_REGION, whole=True))
     pixel_nm = float(config.camera.pixel_size_nm or 0.0)
     height = particle.height_nm if z_nm is None else z_nm
     reference = forward_model(config, pixel_nm)

@@ -14,7 +14,13 @@ from iscat_analysis.config import Calibration, CameraConfig, Config, Optics, Par
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.pieces.setups import config_of, darkfield_photons, number_in, together
+from iscat_analysis.pieces.setups import (
+    LARGEST_REGION,
+    config_of,
+    darkfield_photons,
+    number_in,
+    together,
+)
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
 
 FloatArray = NDArray[np.float64]
@@ -103,7 +109,7 @@ def crb(
     (2, 3)
     """
     config = config_of(optics, particle, camera, mode=mode, calibration=calibration)
-    side = int(number_in("pixels", pixels, least=2, whole=True))
+    side = int(number_in("pixels", pixels, least=2, most=LARGEST_REGION, whole=True))
     setups = _Setups(
         config, side, x_nm=x_nm, y_nm=y_nm, z_nm=z_nm, mass_kda=mass_kda, focus_nm=focus_nm,
         photons_per_pixel=photons_per_pixel, n_after=n_after, n_before=n_before,

@@ -10,11 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.config import Calibration, CameraConfig, Config, Fit, Optics, Particle
+from iscat_analysis.config.values import LARGEST_NM
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import real_array
 from iscat_analysis.records import FREE_PARAMETERS
 
 FloatArray = NDArray[np.float64]
+
+LARGEST = 1e15
+"""No mass [kDa], light [e] or number of frames is larger; the square of one is still a number."""
+
+LARGEST_REGION = 10_000
+"""No region has more pixels along a side."""
 
 
 def config_of(
@@ -83,7 +90,7 @@ def config_of(
 
 
 def number_in(
-    name: str, value: Any, *, least: float, whole: bool = False, above: bool = False
+    name: str, value: Any, *, least: float, most: float = LARGEST, whole: bool = False
 ) -> float:
     """Check a single number.
 
@@ -93,12 +100,10 @@ def number_in(
         What messages call it.
     value : Any
         The number.
-    least : float
-        Smallest that is possible.
+    least, most : float
+        Smallest and largest that are possible.
     whole : bool
         Whether it counts something.
-    above : bool
-        Whether it must exceed `least`.
 
     Returns
     -------
@@ -111,11 +116,10 @@ def number_in(
         It is not such a number.
     """
     array = real_array(name, value)
-    kind = "whole number" if whole else "number"
-    limit = f"above {least:g}" if above else f"of at least {least:g}"
     number = float(array) if array.ndim == 0 else math.nan
-    good = math.isfinite(number) and (number > least if above else number >= least)
-    if not good or (whole and number != round(number)):
+    if not least <= number <= most or (whole and number != round(number)):
+        kind = "whole number" if whole else "number"
+        limit = f"of at most {most:g}" if number > most else f"of at least {least:g}"
         raise ConfigError(f"{name} = {value!r}: give one {kind} {limit}")
     return number
 
@@ -135,7 +139,7 @@ def together(
     Returns
     -------
     dict of str to ndarray
-        All of one shape, finite.
+        All of one shape, finite, and no length beyond `LARGEST_NM`.
 
     Raises
     ------
@@ -144,12 +148,16 @@ def together(
     """
     arrays = {name: real_array(name, value) for name, value in given.items()}
     for name, array in arrays.items():
-        bad = ~np.isfinite(array)
+        most = LARGEST_NM if name.endswith("_nm") else LARGEST
+        bad = ~(np.abs(array) <= most)
         if name in least:
             bad |= array < least[name]
         if bad.any():
+            value = array[bad].flat[0]
             limit = f" of at least {least[name]:g}" if name in least else ""
-            raise ConfigError(f"{name} = {array[bad].flat[0]:g}: give finite numbers{limit}")
+            if np.isfinite(value) and abs(value) > most:
+                limit = f" of at most {most:g}"
+            raise ConfigError(f"{name} = {value:g}: give finite numbers{limit}")
     try:
         same = np.broadcast_arrays(*arrays.values())
     except ValueError:
