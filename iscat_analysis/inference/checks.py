@@ -1,20 +1,52 @@
-"""What every array must be before a kernel reads it: real numbers, of the right shape, finite.
+"""What every argument must be: real numbers, of the right shape, finite, of a possible size.
 
 Kernels read memory without asking.  Each array is therefore looked at once, where it enters.
 """
 
 from __future__ import annotations
 
+import math
+import reprlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from iscat_analysis.errors import DataError
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.units import count
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+
+LARGEST = 1e15
+"""No mass [kDa], light [e] or number of frames is larger; the square of one is still a number."""
+
+
+def array_of(name: str, value: ArrayLike) -> NDArray[Any]:
+    """Turn an argument into an array of whatever type it is.
+
+    Parameters
+    ----------
+    name : str
+        What messages call it.
+    value : array_like
+        Anything regular.
+
+    Returns
+    -------
+    ndarray
+        The same.
+
+    Raises
+    ------
+    DataError
+        Its rows have different lengths.
+    """
+    try:
+        return np.asarray(value)
+    except ValueError:
+        raise DataError(f"{name}: its rows have different lengths; give a regular array") from None
 
 
 def real_array(name: str, value: ArrayLike) -> FloatArray:
@@ -40,10 +72,7 @@ def real_array(name: str, value: ArrayLike) -> FloatArray:
     """
     if type(value) is np.ndarray and value.dtype == np.float64 and value.flags.c_contiguous:
         return value
-    try:
-        array: NDArray[Any] = np.asarray(value)
-    except ValueError:
-        raise DataError(f"{name}: its rows have different lengths; give a regular array") from None
+    array = array_of(name, value)
     if np.ma.is_masked(value):
         raise DataError(f"{name}: has masked elements, whose values mean nothing; leave them out")
     if array.dtype.kind not in "iufb":
@@ -173,3 +202,123 @@ def mask_of(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> BoolA
     if array.shape != shape:
         raise DataError(f"{name}: has shape {array.shape}; give an array of shape {shape}")
     return array
+
+
+def number_in(
+    name: str,
+    value: Any,
+    *,
+    least: float | None = None,
+    above: float | None = None,
+    most: float = LARGEST,
+    whole: bool = False,
+    what: str = "",
+) -> float:
+    """Check a single number.
+
+    Parameters
+    ----------
+    name : str
+        What messages call it.
+    value : Any
+        The number.
+    least : float, optional
+        Smallest that is possible.
+    above : float, optional
+        In place of `least`: what it must exceed.
+    most : float
+        Largest that is possible.
+    whole : bool
+        Whether it counts something.
+    what : str
+        What it is a number of, for the message; default a number.
+
+    Returns
+    -------
+    float
+        The number.
+
+    Raises
+    ------
+    ConfigError
+        It is not such a number.
+    """
+    try:
+        array = real_array(name, value)
+    except DataError:
+        array = np.array(math.nan)
+    number = math.nan if array.ndim or isinstance(value, (bool, np.bool_)) else float(array)
+    low = -most if least is None else least
+    if above is not None:
+        low = math.nextafter(above, math.inf)
+    if low <= number <= most and not (whole and number != round(number)):
+        return number
+    limit = f" of at least {least:g}" if least is not None else ""
+    limit = f" above {above:g}" if above is not None else limit
+    limit = f" of at most {most:g}" if number > most else limit
+    what = what or ("whole number" if whole else "number")
+    raise ConfigError(f"{name} = {shown(value)}: give one {what}{limit}")
+
+
+def truth_in(name: str, value: Any) -> bool:
+    """Check an answer to yes or no.
+
+    Parameters
+    ----------
+    name : str
+        What messages call it.
+    value : Any
+        The answer.
+
+    Returns
+    -------
+    bool
+        The answer.
+
+    Raises
+    ------
+    ConfigError
+        It is neither True nor False.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise ConfigError(f"{name} = {shown(value)}: give True or False")
+    return bool(value)
+
+
+def choice_in(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Check that a word is one of those that have a meaning.
+
+    Parameters
+    ----------
+    name : str
+        What messages call it.
+    value : Any
+        The word.
+    choices : sequence of str
+        Which there are.
+
+    Raises
+    ------
+    ConfigError
+        It is none of them.
+    """
+    if not isinstance(value, str) or value not in choices:
+        raise ConfigError(f"{name} = {shown(value)}: choose one of {', '.join(choices)}")
+
+
+def shown(value: Any) -> str:
+    """Write a value of any type into a message, in one line and not at length.
+
+    Parameters
+    ----------
+    value : Any
+        What was given.
+
+    Returns
+    -------
+    str
+        Its beginning and its end.
+    """
+    if isinstance(value, float):
+        return f"{value:g}"
+    return " ".join(reprlib.repr(value).split())

@@ -9,17 +9,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.config import Config
-from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.checks import BoolArray, real_array
+from iscat_analysis.errors import DataError
+from iscat_analysis.inference.checks import BoolArray, array_of, number_in, real_array, truth_in
 from iscat_analysis.inference.counts import KNOWN, MEAN, counts_likelihood
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.pieces.setups import darkfield_photons, number_in
+from iscat_analysis.pieces.setups import darkfield_photons
 from iscat_analysis.units import count
 
 FloatArray = NDArray[np.float64]
+
+LARGEST_RATIO = 1e9
+"""The light after is at most so many times that before, and at least its reciprocal."""
 
 
 @dataclass(frozen=True)
@@ -181,19 +184,17 @@ def gather(
         raise DataError(
             f"power_ratio: has shape {ratio.shape}; give one number or {events.shape[0]}"
         )
-    bad = ~(np.isfinite(ratio) & (ratio > 0))
+    bad = ~((ratio > 1 / LARGEST_RATIO) & (ratio < LARGEST_RATIO))
     if bad.any():
         raise DataError(
-            f"power_ratio = {ratio[bad].flat[0]:g}: give the light after over that before, above 0"
+            f"power_ratio = {ratio[bad].flat[0]:g}: give the light after over that before, above 0 "
+            f"and below {LARGEST_RATIO:g}"
         )
-    if level not in (None, True, False):
-        raise ConfigError(f"level = {level!r}: give True, False or None")
     pixel_nm = float(config.camera.pixel_size_nm or 0.0)
     rows, columns = events.shape[1:]
     reach = math.hypot(rows + 2, columns + 2) * pixel_nm + window_nm(pixel_nm)
     model = forward_model(config, reach)
-    if level is None:
-        level = frames_before > 0 and power_ratio is None and bool(model.rho)
+    guessed = frames_before > 0 and power_ratio is None and bool(model.rho)
     return Counts(
         config=config,
         model=model,
@@ -201,7 +202,7 @@ def gather(
         before=background,
         after=events,
         ratio=np.array(np.broadcast_to(ratio, events.shape[:1])),
-        level=bool(level),
+        level=guessed if level is None else truth_in("level", level),
         n_before=frames_before,
         n_after=frames_after,
         masked=out,
@@ -213,7 +214,7 @@ def _mask_of(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> Bool
     """Give a mask for every region, from one for each or one for all."""
     if value is None:
         return np.zeros(shape, dtype=np.bool_)
-    array = np.asarray(value)
+    array = array_of(name, value)
     if array.dtype != np.bool_:
         raise DataError(f"{name}: holds {array.dtype}; give True where a pixel must not be used")
     if array.shape not in (shape, shape[1:]):

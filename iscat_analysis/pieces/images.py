@@ -8,15 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle
+from iscat_analysis.inference.checks import number_in
 from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.pieces.setups import (
-    LARGEST_REGION,
-    config_of,
-    darkfield_photons,
-    number_in,
-    together,
-)
+from iscat_analysis.pieces.setups import LARGEST_REGION, config_of, darkfield_photons, together
 
 FloatArray = NDArray[np.float64]
 

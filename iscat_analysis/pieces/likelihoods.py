@@ -223,11 +223,11 @@ def log_likelihood(
     >>> bool(logl(at) > logl([900.0, 844.0, 48_700.0])), logl.gradient(at).shape
     (True, (3,))
     """
-    if mode == "track":
-        raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
     config = config_of(
         optics, particle, camera, mode=mode, z_range_nm=z_range_nm, calibration=calibration
     )
+    if mode == "track":
+        raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
     image, known = real_array("after", after), real_array("before", before)
     if image.ndim != 2:
         raise DataError(f"after: has shape {image.shape}; give one region as (y, x)")
@@ -237,9 +237,10 @@ def log_likelihood(
     )  # fmt: skip
     model, grid = counts.model, counts.grid
     half = grid.pixel_nm / 2
+    z_low_nm, z_high_nm = config.fit.z_range_nm
     signed = "z_nm" not in FREE_PARAMETERS[mode] and model.rho > 0
-    lower = [grid.x_nm[0] - half, grid.y_nm[0] - half, z_range_nm[0], -np.inf if signed else 0.0]
-    upper = [grid.x_nm[-1] + half, grid.y_nm[-1] + half, z_range_nm[1], np.inf]
+    lower = [grid.x_nm[0] - half, grid.y_nm[0] - half, z_low_nm, -np.inf if signed else 0.0]
+    upper = [grid.x_nm[-1] + half, grid.y_nm[-1] + half, z_high_nm, np.inf]
     names = FREE_PARAMETERS[mode]
     free = [PARAMETERS.index(name) for name in names]
     if counts.level:

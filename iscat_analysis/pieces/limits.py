@@ -12,15 +12,11 @@ from iscat_analysis.bounds import event_bounds, quantum_information
 from iscat_analysis.bounds.experiment import expected_likelihood
 from iscat_analysis.config import Calibration, CameraConfig, Config, Optics, Particle
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.checks import number_in, truth_in
 from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.pieces.setups import (
-    LARGEST_REGION,
-    config_of,
-    darkfield_photons,
-    number_in,
-    together,
-)
+from iscat_analysis.optics.scale import MassScale
+from iscat_analysis.pieces.setups import LARGEST_REGION, config_of, darkfield_photons, together
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
 
 FloatArray = NDArray[np.float64]
@@ -114,6 +110,7 @@ def crb(
         config, side, x_nm=x_nm, y_nm=y_nm, z_nm=z_nm, mass_kda=mass_kda, focus_nm=focus_nm,
         photons_per_pixel=photons_per_pixel, n_after=n_after, n_before=n_before,
     )  # fmt: skip
+    joint, level = truth_in("joint", joint), truth_in("level", level)
     free = FREE_PARAMETERS[mode]
     index = [PARAMETERS.index(name) for name in free]
     read_noise_e = float(config.camera.read_noise_e)
@@ -196,8 +193,10 @@ def qcrb(
         config, 2, x_nm=0.0, y_nm=0.0, z_nm=z_nm, mass_kda=mass_kda, focus_nm=focus_nm,
         photons_per_pixel=photons_per_pixel, n_after=n_after, n_before=0,
     )  # fmt: skip
+    joint = truth_in("joint", joint)
     free = FREE_PARAMETERS[mode]
     index = [PARAMETERS.index(name) for name in free]
+    is_mass = np.array(index) == PARAMETERS.index("mass_kda")
     out = np.full((len(free), *setups.shape), np.nan)
     for place in np.ndindex(setups.shape):
         at = setups.at(place)
@@ -207,9 +206,11 @@ def qcrb(
         if joint:
             inverse = np.linalg.inv(information * np.outer(scale, scale))
             bound = scale * np.sqrt(np.diag(inverse))
-        step = abs(at.theta[3] * at.model.scale.slope(float(at.theta[3])))  # mass per unit of ln a
-        units = np.where(np.array(index) == PARAMETERS.index("mass_kda"), step, 1.0)
-        out[(slice(None), *place)] = bound * units / math.sqrt(at.collected)
+        # photons are as a², and the information is of ln a: that of the mass is finite at a = 0
+        amplitude = abs(float(at.theta[3]))
+        shift = 1 / amplitude if amplitude else np.nan
+        units = np.where(is_mass, abs(at.model.scale.slope(float(at.theta[3]))), shift)
+        out[(slice(None), *place)] = bound * units / math.sqrt(at.collected_per_a2)
     return {name: np.asarray(values) for name, values in zip(free, out, strict=True)}
 
 
@@ -223,7 +224,12 @@ class _At:
     scale_e: float
     n_before: float
     n_after: float
-    collected: float
+    collected_per_a2: float
+
+    @property
+    def collected(self) -> float:
+        """Scattered photons that the pupil collects."""
+        return self.collected_per_a2 * float(self.theta[3]) ** 2
 
 
 class _Setups:
@@ -299,9 +305,10 @@ class _Setups:
         if self._dark:
             photons = darkfield_photons(self._config.particle)
             scale_e = photons_per_intensity(model, photons, self._pixel_nm)
-        area = collected_area_nm2(model, now["z_nm"], now["mass_kda"]) / self._pixel_nm**2
-        collected = now["n_after"] * scale_e * area
-        return _At(model, theta, level_e, scale_e, now["n_before"], now["n_after"], collected)
+        unit = replace(model, scale=MassScale())  # whose mass is the amplitude
+        area = collected_area_nm2(unit, now["z_nm"], 1.0) / self._pixel_nm**2
+        light = now["n_after"] * scale_e * area
+        return _At(model, theta, level_e, scale_e, now["n_before"], now["n_after"], light)
 
     def _model(self, focus_nm: float) -> ForwardModel:
         if focus_nm not in self._models:

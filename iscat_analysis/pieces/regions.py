@@ -15,12 +15,12 @@ from iscat_analysis.bounds import event_bounds
 from iscat_analysis.bounds.classical import ComplexArray
 from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.checks import real_array
+from iscat_analysis.inference.checks import number_in, real_array
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.noise import compile_kernels
 from iscat_analysis.pieces.counts import Counts, gather
-from iscat_analysis.pieces.setups import config_of, number_in
+from iscat_analysis.pieces.setups import config_of
 from iscat_analysis.records import (
     EVENT_COLUMNS,
     FREE_PARAMETERS,
@@ -129,11 +129,11 @@ def fit_rois(
     >>> abs(table.mass_kda[0] - 480) < 4 * table.sigma_mass_kda[0]
     np.True_
     """
-    if mode == "track":
-        raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
     config = config_of(
         optics, particle, camera, mode=mode, z_range_nm=z_range_nm, calibration=calibration
     )
+    if mode == "track":
+        raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
     counts = gather(
         config, before, after, n_before=n_before, n_after=n_after, power_ratio=power_ratio,
         level=level, masked=masked, saturated=saturated,

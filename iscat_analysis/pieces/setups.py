@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,13 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from iscat_analysis.config import Calibration, CameraConfig, Config, Fit, Optics, Particle
 from iscat_analysis.config.values import LARGEST_NM
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference.checks import real_array
+from iscat_analysis.inference.checks import LARGEST, choice_in, real_array
 from iscat_analysis.records import FREE_PARAMETERS
 
 FloatArray = NDArray[np.float64]
-
-LARGEST = 1e15
-"""No mass [kDa], light [e] or number of frames is larger; the square of one is still a number."""
 
 LARGEST_REGION = 10_000
 """No region has more pixels along a side."""
@@ -80,48 +75,12 @@ def config_of(
         raise ConfigError(
             f"camera.read_noise_e = {camera.read_noise_e!r} is a map: give one number [e]"
         )
-    if mode not in FREE_PARAMETERS:
-        raise ConfigError(f"mode = {mode!r}: choose one of {', '.join(FREE_PARAMETERS)}")
+    choice_in("mode", mode, tuple(FREE_PARAMETERS))
     fit = {"mode": mode} if z_range_nm is None else {"mode": mode, "z_range_nm": z_range_nm}
     return Config(
         optics=optics, particle=particle, camera=camera, calibration=calibration,
         fit=Fit(**fit),
     )  # fmt: skip
-
-
-def number_in(
-    name: str, value: Any, *, least: float, most: float = LARGEST, whole: bool = False
-) -> float:
-    """Check a single number.
-
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    value : Any
-        The number.
-    least, most : float
-        Smallest and largest that are possible.
-    whole : bool
-        Whether it counts something.
-
-    Returns
-    -------
-    float
-        The number.
-
-    Raises
-    ------
-    ConfigError
-        It is not such a number.
-    """
-    array = real_array(name, value)
-    number = float(array) if array.ndim == 0 else math.nan
-    if not least <= number <= most or (whole and number != round(number)):
-        kind = "whole number" if whole else "number"
-        limit = f"of at most {most:g}" if number > most else f"of at least {least:g}"
-        raise ConfigError(f"{name} = {value!r}: give one {kind} {limit}")
-    return number
 
 
 def together(

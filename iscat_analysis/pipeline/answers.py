@@ -6,9 +6,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import choice_in, number_in, shown, truth_in
 from iscat_analysis.pipeline.kinetics import Kinetics
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.distribution import species_figure
@@ -25,6 +27,8 @@ SPECIES_FILES = frozenset({"species.csv", "species.json", "figures"})
 """Everything `find_species` may leave in its folder."""
 
 _EVENTS_EACH = 5  # of a species
+_MOST_SPECIES = 1000
+_MOST_DRAWS = 1_000_000
 
 
 def find_species(
@@ -116,10 +120,9 @@ def find_species(
         k, masses_kda, ladder, steps=steps, offset=offset, hold=hold, widths=widths,
         background=background,
     )  # fmt: skip
-    if draws < 0:
-        raise ConfigError(f"`draws` = {draws}: must be 0 or more")
-    if branch not in ("magnitude", "landing", "leaving"):
-        raise ConfigError(f"`branch` = {branch!r}: must be one of magnitude, landing, leaving")
+    number_in("`draws`", draws, least=0, most=_MOST_DRAWS, whole=True)
+    number_in("`seed`", seed, least=0, whole=True)
+    choice_in("`branch`", branch, ("magnitude", "landing", "leaving"))
     folder = None if out is None else Path(out)
     if folder is not None:
         check_output(folder, overwrite, known=SPECIES_FILES)
@@ -214,34 +217,36 @@ def choice_of(
         raise ConfigError(
             f"`{named[0]}` and `{named[1]}` are two descriptions of the species; give one of them"
         )
-    if ladder is None and (steps or offset or hold):
-        which = "steps" if steps else "offset" if offset else "hold"
+    for name, value in (("offset", offset), ("hold", hold), ("background", background)):
+        truth_in(f"`{name}`", value)
+    choice_in("`widths`", widths, ("common", "free"))
+    for name, several in (("masses_kda", masses_kda), ("steps", steps)):
+        if several is not None and not isinstance(several, (list, tuple, np.ndarray)):
+            raise ConfigError(f"`{name}` = {shown(several)}: give a list, as in [66, 132]")
+    if ladder is None and (len(steps) or offset or hold):
+        which = "steps" if len(steps) else "offset" if offset else "hold"
         raise ConfigError(f"`{which}` is of a ladder; give `ladder` as well")
-    if widths not in ("common", "free"):
-        raise ConfigError(f"`widths` = {widths!r}: must be common or free")
     if k is not None:
-        if k < 1:
-            raise ConfigError(f"`k` = {k}: must be a number of species, 1 or more")
-        return Number(k)
+        return Number(int(number_in("`k`", k, least=1, most=_MOST_SPECIES, whole=True)))
     if masses_kda is not None:
-        if not masses_kda or not all(0 < m < float("inf") for m in masses_kda):
-            raise ConfigError("`masses_kda`: must be masses in kDa above 0, as in 66,132")
-        if len(set(masses_kda)) < len(masses_kda):
+        masses = [number_in("`masses_kda`", m, above=0.0, what="mass in kDa") for m in masses_kda]
+        if not masses:
+            raise ConfigError("`masses_kda`: is empty; give masses in kDa, as in 66,132")
+        if len(set(masses)) < len(masses):
             raise ConfigError("`masses_kda`: names a mass twice; name each once")
-        return Given(tuple(map(float, masses_kda)), widths, background)
+        return Given(tuple(masses), widths, background)
     if ladder is None:
         return Searched()
-    if any(n < 1 for n in steps) or len(set(steps)) < len(steps):
+    rungs = [int(number_in("`steps`", n, least=1, most=1e6, whole=True)) for n in steps]
+    if len(set(rungs)) < len(rungs):
         raise ConfigError("`steps`: must be different numbers of monomers, 1 or more, as in 1,2,4")
-    if ladder == "auto":
-        if hold or steps:
+    if isinstance(ladder, str) and ladder == "auto":
+        if hold or rungs:
             which = "hold" if hold else "steps"
             raise ConfigError(f"`{which}` needs a monomer whose mass is given, as in `ladder` = 66")
         return Ladder(None, (), offset, widths=widths, background=background)
-    monomer = float(ladder)
-    if not 0 < monomer < float("inf"):
-        raise ConfigError(f"`ladder` = {monomer:g}: must be the mass of a monomer in kDa, or auto")
-    return Ladder(monomer, tuple(steps), offset, hold, widths, background)
+    monomer = number_in("`ladder`", ladder, above=0.0, what="mass of a monomer in kDa")
+    return Ladder(monomer, tuple(rungs), offset, hold, widths, background)
 
 
 def _write(

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import choice_in, number_in, truth_in
 from iscat_analysis.movie.text_tables import separator, without_remarks
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.report import atomic_folder, check_output
@@ -175,10 +176,11 @@ def fit_kd(
     True
     """
     check_reaction(model, masses_kda)
-    if not (math.isfinite(landing_power) and abs(landing_power) <= 1):
+    if not -1 <= number_in("`landing_power`", landing_power) <= 1:
         raise ConfigError(
             f"`landing_power` = {landing_power:g}: must lie between -1 and 1, as in -0.167"
         )
+    truth_in("`inactive`", inactive)
     folder = None if out is None else Path(out)
     if folder is not None:
         check_output(folder, overwrite, known=BINDING_FILES)
@@ -258,17 +260,19 @@ def check_reaction(
     ConfigError
         Otherwise.
     """
-    if model not in get_args(Model):
-        raise ConfigError(f"`{names[0]}` = {model!r}: must be dimer or ab")
+    choice_in(f"`{names[0]}`", model, get_args(Model))
     parts = len(CONCENTRATIONS[model])  # type: ignore[index]
     if masses_kda is None:
         if parts > 1:
             raise ConfigError(f"`{names[1]}`: model ab needs the masses of A and B, as in 40,80")
-    elif len(masses_kda) != parts or not all(0 < m < math.inf for m in masses_kda):
+        return
+    if not isinstance(masses_kda, (list, tuple, np.ndarray)) or len(masses_kda) != parts:
         wanted = (
             "the mass of the monomer, as in 66" if parts == 1 else "those of A and B, as in 40,80"
         )
-        raise ConfigError(f"`{names[1]}`: model {model} takes {wanted} [kDa], above 0")
+        raise ConfigError(f"`{names[1]}`: model {model} takes {wanted} [kDa]")
+    for mass in masses_kda:
+        number_in(f"`{names[1]}`", mass, above=0.0, what="mass in kDa")
 
 
 def _read_samples(path: Path) -> pd.DataFrame:

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import number_in, shown
 from iscat_analysis.records import BoolArray
 from iscat_analysis.species.kinetics import (
     LandingRate,
@@ -117,18 +118,15 @@ def fit_kinetics(
         frame_rate_hz = configured_frame_rate(Path(events))
     if frame_rate_hz is None:
         raise ConfigError("`frame_rate_hz`: rates need the frames per second; give it")
-    for option, value in (("frame_rate_hz", frame_rate_hz), ("radius_px", radius_px)):
-        if not (math.isfinite(value) and value > 0):
-            raise ConfigError(f"`{option}` = {value:g}: must be above 0")
+    number_in("`frame_rate_hz`", frame_rate_hz, above=0.0)
+    number_in("`radius_px`", radius_px, above=0.0)
     frame = table.frame
     if not np.isfinite(frame).all():
         raise DataError(f"{table.name}: has events without a frame, so that there is no rate")
     if frames is None:
         start, stop = int(frame.min()), int(frame.max()) + 1
     else:
-        start, stop = frames
-        if not 0 <= start < stop:
-            raise ConfigError(f"`frames` = {start}:{stop}: must be a first frame and a later one")
+        start, stop = _range_of(frames)
     inside = (frame >= start) & (frame < stop)
     if not inside.any():
         raise DataError(f"{table.name}: no event lies in the frames {start}:{stop}")
@@ -172,6 +170,16 @@ def configured_frame_rate(path: Path) -> float | None:
         return float(found) if float(found) > 0 else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def _range_of(frames: tuple[int, int]) -> tuple[int, int]:
+    """Check a range of frames."""
+    if not isinstance(frames, (tuple, list)) or len(frames) != 2:
+        raise ConfigError(f"`frames` = {shown(frames)}: give the first and the one after the last")
+    start, stop = (int(number_in("`frames`", frame, least=0, whole=True)) for frame in frames)
+    if start >= stop:
+        raise ConfigError(f"`frames` = {start}:{stop}: must be a first frame and a later one")
+    return start, stop
 
 
 def _unbinding(

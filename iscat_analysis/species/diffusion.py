@@ -23,7 +23,7 @@ from scipy.special import ndtr, ndtri
 
 from iscat_analysis._kernels.diffusion import most_likely_diffusion
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.checks import real_array
+from iscat_analysis.inference.checks import number_in, real_array
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.displacements import Displacements, gather
 
@@ -135,7 +135,7 @@ def fit_diffusion(
         frames, positions_nm, sigma_nm,
         frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms, counted=counted,
     )  # fmt: skip
-    if not 0 < level < 1:
+    if not 0 < number_in("level", level) < 1:
         raise ConfigError(f"level = {level!r}: give a coverage between 0 and 1")
     best = most_likely(track)
     there = track.likelihood(best)
@@ -195,12 +195,8 @@ def hydrodynamic_diameter(
     ----------
     Einstein, Ann. Phys. 322, 549 (1905).
     """
-    for name, value, least in (
-        ("viscosity_mpa_s", viscosity_mpa_s, 0.0),
-        ("temperature_c", temperature_c, -zero_Celsius),
-    ):
-        if not (math.isfinite(value) and value > least):
-            raise ConfigError(f"{name} = {value!r}: give one number above {least:g}")
+    number_in("viscosity_mpa_s", viscosity_mpa_s, above=0.0)
+    number_in("temperature_c", temperature_c, above=-zero_Celsius)
     d, sigma = real_array("d_um2_s", d_um2_s), real_array("sigma_d_um2_s", sigma_d_um2_s)
     for name, array in (("d_um2_s", d), ("sigma_d_um2_s", sigma)):
         bad = ~(np.isfinite(array) & (array >= 0))

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis._kernels.diffusion import displacement_likelihood
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.checks import real_array
+from iscat_analysis.inference.checks import array_of, real_array
 from iscat_analysis.records import FloatArray
 
 LEAST_POSITIONS = 4
@@ -224,7 +224,8 @@ def gather(
             "that say nothing beside the others"
         )
     variance = np.broadcast_to(columns**2, places.shape).T
-    going = np.ones(when.size - 1, dtype=bool) if counted is None else np.asarray(counted)
+    every = np.ones(when.size - 1, dtype=bool)
+    going = every if counted is None else array_of("counted", counted)
     if going.shape != (when.size - 1,) or going.dtype != bool:
         raise DataError(
             f"counted: has shape {going.shape} of {going.dtype}; give ({when.size - 1},) of bool, "

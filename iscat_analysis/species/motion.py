@@ -22,6 +22,7 @@ from scipy.special import chdtrc
 
 from iscat_analysis._kernels.well import most_likely_well
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import number_in, shown
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.diffusion import most_likely
 from iscat_analysis.species.displacements import Displacements, gather
@@ -226,17 +227,18 @@ def confinement_test(
     track = gather(
         frames, positions_nm, sigma_nm, frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms
     )
-    most = resamples if enough is None else enough
-    for name, count in (("resamples", resamples), ("enough", most)):
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise ConfigError(f"{name} = {count!r}: give a whole number of at least 1")
+    turns = int(number_in("resamples", resamples, least=1, whole=True))
+    if enough is not None:
+        number_in("enough", enough, least=1, whole=True)
+    if rng is not None and not isinstance(rng, np.random.Generator):
+        raise ConfigError(f"rng = {shown(rng)}: give what numpy.random.default_rng(1) returns")
     draw = np.random.default_rng(1) if rng is None else rng
     free = most_likely(track)
     if not free > 0:
         return ConfinementTest(1.0, 0.0, math.inf, 0.0)
     ratio, d, stiffness = _well(track, free)
     larger, p_value = 0, math.nan
-    for number in range(1, resamples + 1):
+    for number in range(1, turns + 1):
         drawn = _free_track(track, free, draw)
         larger += _well(drawn, most_likely(drawn))[0] >= ratio
         p_value = (larger + 1) / (number + 1)

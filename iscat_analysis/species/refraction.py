@@ -22,9 +22,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.checks import real_array
+from iscat_analysis.inference.checks import LARGEST, number_in, real_array
 from iscat_analysis.records import FloatArray
 from iscat_analysis.units import KILODALTON_KG, NM
+
+_LARGEST_INDEX = 10.0
 
 
 def refractive_index(
@@ -80,9 +82,12 @@ def refractive_index(
     >>> print(f"{n:.3f} ± {error:.3f}")
     1.460 ± 0.012
     """
-    for name, value in (("index", index), ("density_kg_m3", density_kg_m3), ("n_medium", n_medium)):
-        if not (np.isfinite(value) and value > 0):
-            raise ConfigError(f"{name} = {value!r}: give one number above 0")
+    for name, value, most in (
+        ("index", index, _LARGEST_INDEX),
+        ("density_kg_m3", density_kg_m3, LARGEST),
+        ("n_medium", n_medium, _LARGEST_INDEX),
+    ):
+        number_in(name, value, above=0.0, most=most)
     if index == n_medium:
         raise ConfigError(f"index = {index:g} is that of the medium: such particles are not seen")
     named = {
@@ -90,6 +95,10 @@ def refractive_index(
         "sigma_mass_kda": sigma_mass_kda, "sigma_diameter_nm": sigma_diameter_nm,
     }  # fmt: skip
     arrays = [real_array(name, value) for name, value in named.items()]
+    for name, array in zip(named, arrays, strict=True):
+        wrong = array < 0 if name.startswith("sigma") else np.abs(array) > LARGEST
+        if wrong.any():
+            raise DataError(f"{name} = {array[wrong].flat[0]:g}: no particle has that; check it")
     try:
         mass, diameter, sigma_mass, sigma_diameter = np.broadcast_arrays(*arrays)
     except ValueError:

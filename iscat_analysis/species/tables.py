@@ -27,6 +27,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import log_ndtr
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.movie.hdf5 import SIGNATURE as HDF5
 from iscat_analysis.records import FloatArray, Status
@@ -133,8 +134,8 @@ def event_table(
         ("limit_sigma_kda", limit_sigma_kda),
         ("above_kda", above_kda),
     ):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise ConfigError(f"`{option}` = {value:g}: must be a mass in kDa above 0")
+        if value is not None:
+            number_in(f"`{option}`", value, above=0.0, what="mass in kDa")
     if limit_kda is not None and above_kda is not None:
         raise ConfigError(
             "`limit_kda` and `above_kda` are two ways to say what is missed; give one of them"
@@ -143,6 +144,10 @@ def event_table(
         raise ConfigError("`limit_sigma_kda` is the spread of a limit; give `limit_kda` as well")
     if isinstance(events, pd.DataFrame):
         table, path, called = events, None, name or "table"
+    elif not isinstance(events, (str, Path)):
+        raise ConfigError(
+            f"`events`: is {type(events).__name__}; give the path of a table, or a pandas.DataFrame"
+        )
     else:
         table, path = _read(Path(events))
         called = name or str(events)

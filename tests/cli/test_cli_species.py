@@ -59,7 +59,7 @@ def test_json_follows_the_schema(events: Path, tmp_path: Path, capsys) -> None:
         ("--masses 66;132", 2, "--masses 66;132: write masses in kDa as in --masses 66,132"),
         ("--limit a:b", 2, "--limit a:b: write it as --limit 40"),
         ("--limit 40 --above 50", 2, "--limit and --above"),
-        ("--sigma 0", 2, "--sigma 0: must be a mass"),
+        ("--sigma 0", 2, "--sigma 0: give one mass in kDa above 0"),
         ("--above 9000", 1, "no event lies above --above 9000"),
         ("--k 200", 1, "give a smaller --k"),
         ("--branch leaving", 1, "holds 0 leaving events"),
@@ -134,7 +134,7 @@ def test_rates_stand_below_the_species(visits: Path, tmp_path: Path, capsys) -> 
 @pytest.mark.parametrize(
     ("options", "status", "said"),
     [
-        ("--frame-rate 0", 2, "--frame-rate 0: must be above 0"),
+        ("--frame-rate 0", 2, "--frame-rate 0: give one number above 0"),
         ("--frames 0:100", 2, "--frames 0:100 is for rates, which need --frame-rate"),
         ("--frames x --frame-rate 3", 2, "write it as A:B"),
     ],

@@ -169,10 +169,14 @@ def test_samples_are_read_as_the_table_of_a_day_is(dimers, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"model": "trimer"}, "must be dimer or ab"),
+        ({"model": "trimer"}, "choose one of dimer, ab"),
         ({"model": "ab"}, "needs the masses of A and B"),
         ({"model": "dimer", "masses_kda": [66.0, 80.0]}, "takes the mass of the monomer"),
-        ({"model": "ab", "masses_kda": [66.0, -1.0]}, "takes those of A and B"),
+        ({"model": "ab", "masses_kda": [66.0]}, "takes those of A and B"),
+        ({"model": "ab", "masses_kda": [66.0, -1.0]}, "= -1: give one mass in kDa above 0"),
+        ({"model": ["dimer"]}, "choose one of dimer, ab"),
+        ({"model": "dimer", "masses_kda": "66"}, "takes the mass of the monomer"),
+        ({"model": "dimer", "inactive": "yes"}, "`inactive` = 'yes': give True or False"),
         ({"model": "dimer", "landing_power": 5.0}, "between -1 and 1"),
     ],
 )

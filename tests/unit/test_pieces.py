@@ -442,6 +442,14 @@ def test_bad_setups_are_refused_by_every_piece(piece: str, changed: dict, messag
         ("fit_rois", {"n_before": -1}, "n_before = -1: give one whole number of at least 0"),
         ("fit_rois", {"n_after": 1.5}, "n_after = 1.5"),
         ("fit_rois", {"level": "yes"}, "level = 'yes'"),
+        ("fit_rois", {"level": np.zeros(2)}, "level = array"),
+        ("fit_rois", {"n_after": 1e30}, "n_after = 1e\\+30: give one whole number of at most"),
+        ("fit_rois", {"mode": ["mass"]}, r"mode = \['mass'\]: choose one of mass"),
+        ("log_likelihood", {"mode": {}}, "mode = {}"),
+        ("crb", {"mode": np.zeros(2)}, "mode = array"),
+        ("crb", {"joint": "no"}, "joint = 'no': give True or False"),
+        ("crb", {"level": 2}, "level = 2"),
+        ("qcrb", {"joint": None}, "joint = None"),
         ("fit_rois", {"workers": 0}, "workers = 0"),
         ("fit_rois", {"z_range_nm": (300.0, 0.0)}, "z_range_nm"),
         ("log_likelihood", {"mode": "track"}, 'give "joint"'),
@@ -462,6 +470,8 @@ def test_bad_arguments_are_named(piece: str, changed: dict, message: str) -> Non
         ("fit_rois", {"after": REGION.astype(str)}, "after: holds"),
         ("fit_rois", {"after": np.where(REGION > 0, np.nan, 0)}, "162 pixels; mask them"),
         ("fit_rois", {"power_ratio": [1.0, 0.0]}, "power_ratio = 0"),
+        ("fit_rois", {"power_ratio": 1e30}, r"power_ratio = 1e\+30: .* below 1e\+09"),
+        ("fit_rois", {"masked": [[True], [True, False]]}, "masked: its rows have different"),
         ("fit_rois", {"power_ratio": [1.0, 1.0, 1.0]}, "power_ratio: has shape"),
         ("fit_rois", {"masked": REGION}, "masked: holds float64"),
         ("fit_rois", {"saturated": np.zeros((3, 9, 9), dtype=bool)}, "saturated: has shape"),
@@ -476,6 +486,17 @@ def test_bad_arguments_are_named(piece: str, changed: dict, message: str) -> Non
 def test_bad_arrays_are_named(piece: str, changed: dict, message: str) -> None:
     with pytest.raises(ia.DataError, match=message):
         _call(piece, changed)
+
+
+def test_bounds_at_no_mass_are_limits() -> None:
+    """No position of nothing; but how little mass is told from none is finite."""
+    for bound in (ia.crb, ia.qcrb):
+        found = bound(
+            OPTICS, PROTEIN, CAMERA, photons_per_pixel=1e4, mass_kda=[0.0, 1e-3], calibration=LINE
+        )
+        assert np.isnan(found["x_nm"][0])
+        assert found["x_nm"][1] > 1e5
+        np.testing.assert_allclose(found["mass_kda"][0], found["mass_kda"][1], rtol=1e-5)
 
 
 @pytest.mark.parametrize(
