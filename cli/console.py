@@ -255,11 +255,12 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
 _OPTIONS = {
     **{
         name: name
-        for name in ("dark", "draws", "free", "hold", "inactive", "inject", "k", "kd", "ladder",
-                     "landing", "maps", "model", "offset", "optimize", "out", "overwrite",
+        for name in ("config", "dark", "draws", "free", "hold", "inactive", "inject", "k", "kd",
+                     "ladder", "landing", "maps", "model", "offset", "optimize", "out", "overwrite",
                      "scan", "scheduler", "standards", "steps", "target")
     },
     "above_kda": "above",
+    "settings": "set",
     "frame_rate_hz": "frame-rate",
     "interval_s": "interval",
     "landing_power": "landing",

@@ -17,6 +17,8 @@ from iscat_analysis.calibration.optics import OpticsCalibration, OpticsForecast
 from iscat_analysis.calibration.optics import forecast_optics as _forecast
 from iscat_analysis.calibration.optics.forecast import EVENTS
 from iscat_analysis.config import Config, configure
+from iscat_analysis.config.values import LARGEST_NM
+from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.pipeline.calibrations import optics_calibration
@@ -108,7 +110,7 @@ def fit_movie(
         "workers": workers,
     }
     resolved = _resolved(config, settings, given)
-    folder = _path(out)
+    folder = None if out is None else path_in("`out`", out)
     if folder is not None:
         check_output(folder, overwrite)
     with open_stack(movie, name=name) as stack, open_place(scheduler, scheduler_file) as place:
@@ -168,8 +170,11 @@ def calibrate_optics(
     ConfigError
         A setting is unknown or impossible, or cannot be calibrated.
     """
-    resolved, folder = configure(config, settings=settings), _path(out)
-    if folder is not None:
+    resolved = configure(config, settings=settings)
+    if focus_step_nm is not None:
+        number_in("`focus_step_nm`", focus_step_nm, least=-LARGEST_NM, most=LARGEST_NM)
+    if out is not None:
+        folder = path_in("`out`", out)
         return optics_calibration(
             movie, resolved, folder, name=name, free=free, focus_step_nm=focus_step_nm,
             overwrite=overwrite, progress=progress,
@@ -221,7 +226,11 @@ def simulate_movie(
         The file exists, or cannot be written.
     """
     resolved = configure(config, settings=settings)
-    return write_stack(resolved, Path(path), seed=seed, overwrite=overwrite, progress=progress)
+    if seed is not None:
+        number_in("`seed`", seed, least=0, whole=True)
+    return write_stack(
+        resolved, path_in("`path`", path), seed=seed, overwrite=overwrite, progress=progress
+    )
 
 
 def compute_bounds(
@@ -320,7 +329,3 @@ def _resolved(
     arguments = {_KEYS[name]: value for name, value in given.items() if value is not None}
     called = {_KEYS[name]: name for name in given if given[name] is not None}
     return configure(config, settings=settings, arguments=arguments, called=called)
-
-
-def _path(source: str | Path | None) -> Path | None:
-    return None if source is None else Path(source)

@@ -333,6 +333,9 @@ def open_place(
         The scheduler cannot be reached, the file holds no address, a worker has other versions, or
         Dask is not installed.
     """
+    for name, value in (("scheduler", scheduler), ("scheduler_file", scheduler_file)):
+        if value is not None and not isinstance(value, (str, Path)):
+            raise ConfigError(f"`{name}` = {value!r}: give a text or a path")
     if scheduler_file is not None:
         if scheduler != THREADS:
             raise ConfigError(

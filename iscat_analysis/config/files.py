@@ -155,6 +155,8 @@ def config_to_toml(
     str
         TOML text.
     """
+    if not isinstance(config, Config):
+        raise ConfigError(f"`config`: is {type(config).__name__}; give what `configure` returns")
     blocks = []
     for name, field in type(config).model_fields.items():
         if sections is not None and name not in sections:

@@ -161,6 +161,10 @@ def _changes(settings: Mapping[str, Any] | Iterable[str] | None) -> list[Change]
     if isinstance(settings, str):
         settings = [settings]
     if not isinstance(settings, Mapping):
+        if not isinstance(settings, Iterable):
+            raise ConfigError(
+                f'`settings` = {settings!r}: give a mapping, as in {{"optics.na": 1.42}}'
+            )
         return [_parsed(text) for text in settings]
     found = []
     for name, value in settings.items():
@@ -179,7 +183,9 @@ def _parsed(text: str) -> Change:
     name, equals, written = text.partition("=")
     section, dot, key = name.strip().partition(".")
     if not (equals and dot and section and key):
-        raise ConfigError(f"--set {text}: write it as section.key=value, as in optics.na=1.42")
+        raise ConfigError(
+            f"`settings` = {text}: write it as section.key=value, as in optics.na=1.42"
+        )
     try:
         value = tomllib.loads(f"value = {written}")["value"]
     except tomllib.TOMLDecodeError:

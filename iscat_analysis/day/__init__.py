@@ -25,6 +25,7 @@ from iscat_analysis.day.run import Outcome, Runner
 from iscat_analysis.day.state import Records, claim_folder, hash_of
 from iscat_analysis.day.table import Table, read_standards, read_table
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.checks import path_in, shown
 from iscat_analysis.places import THREADS, open_place
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.mass_action import Model
@@ -169,6 +170,9 @@ def batch(
     KeyboardInterrupt
         The user stopped it; finished movies are kept, and the same call goes on.
     """
+    folder = path_in("`out`", out)
+    if only is not None and (not isinstance(only, tuple) or len(only) != 2):
+        raise ConfigError(f"`only` = {shown(only)}: give (K, N), the K-th of N parts")
     if only is not None and (merge or not 1 <= only[0] <= only[1]):
         raise ConfigError(
             f"`only` = {only[0]}/{only[1]}: "
@@ -176,13 +180,12 @@ def batch(
             + ", as in 1/4 for the first of four parts"
         )
     reaction = reaction_of(kd, kd_masses_kda)
-    table = samples if isinstance(samples, Table) else read_table(Path(samples))
+    table = samples if isinstance(samples, Table) else read_table(path_in("`samples`", samples))
     try:
         named = read_standards(standards) if standards is not None else ()
     except ValueError as error:
         raise ConfigError(f"`standards`: {error}") from None
     plan = make_plan(table, configure(config, settings=settings), named)
-    folder = Path(out)
     claim_folder(folder)
     tell = notify or (lambda _: None)
     said = command or f"iscat_analysis.batch({str(table.source)!r}, out={str(out)!r})"

@@ -240,6 +240,8 @@ def read_standards(text: str | Sequence[float]) -> tuple[tuple[float, float], ..
     ValueError
         Something in it is not a mass.
     """
+    if not isinstance(text, (str, list, tuple)):
+        raise ValueError(f"{text!r} is no list of masses; write it as 66,146,480")
     parts = text.replace(";", " ").replace(",", " ").split() if isinstance(text, str) else text
     found = []
     for part in parts:
@@ -333,7 +335,7 @@ def _from_toml(source: Path, text: str) -> Records:
         what = f"has {other[0]!r}" if other else "is not a list of movies"
         raise ConfigError(
             f"{source}: {what}: a table of movies holds [[movies]] and nothing else; a "
-            "configuration is given with --config"
+            "configuration is given as `config`"
         )
     records: Records = []
     for number, movie in enumerate(movies, 1):

@@ -6,7 +6,6 @@ taken once two looks find it the same and it can be read to its end.
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections import Counter
@@ -22,6 +21,7 @@ from iscat_analysis.day.equilibria import reaction_of
 from iscat_analysis.day.state import Records, claim_folder
 from iscat_analysis.day.table import TABLES, Table, read_growing, read_standards
 from iscat_analysis.errors import ConfigError, IscatError, SchedulerError
+from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.folders import files_of, find_movies
 from iscat_analysis.places import THREADS
@@ -99,12 +99,11 @@ def watch(
     DataError
         The folder of the batch holds something else.
     """
-    place = Path(folder)
+    place = path_in("`folder`", folder)
     if not place.is_dir():
         raise ConfigError(f"{place}: there is no such folder; give the one movies are saved in")
-    if not (math.isfinite(interval_s) and interval_s > 0):
-        raise ConfigError(f"`interval_s` = {interval_s:g} must be positive")
-    results = place / FOLDER if out is None else Path(out)
+    number_in("`interval_s`", interval_s, above=0.0)
+    results = place / FOLDER if out is None else path_in("`out`", out)
     if results.resolve() == place.resolve():
         raise ConfigError(f"{results}: is where the movies are; choose another `out`")
     try:

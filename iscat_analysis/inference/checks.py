@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -304,6 +305,31 @@ def choice_in(name: str, value: Any, choices: Sequence[str]) -> None:
     """
     if not isinstance(value, str) or value not in choices:
         raise ConfigError(f"{name} = {shown(value)}: choose one of {', '.join(choices)}")
+
+
+def path_in(name: str, value: Any) -> Path:
+    """Check the path of a file or a folder.
+
+    Parameters
+    ----------
+    name : str
+        What messages call it.
+    value : Any
+        The path.
+
+    Returns
+    -------
+    Path
+        The path.
+
+    Raises
+    ------
+    ConfigError
+        It is neither text nor a path.
+    """
+    if not isinstance(value, (str, Path)):
+        raise ConfigError(f"{name} = {shown(value)}: give a path")
+    return Path(value)
 
 
 def shown(value: Any) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from numbers import Real
 from pathlib import Path
 
 from iscat_analysis.errors import ConfigError, DataError
@@ -112,11 +113,11 @@ def open_stack(
         return _open_file(Path(movie))
     if not isinstance(movie, ArrayLike):
         raise DataError(
-            f"a {type(movie).__name__} is no movie; give the path of a file, or an array (t, y, x)"
+            f"{type(movie).__name__} is no movie; give the path of a file, or an array (t, y, x)"
         )
     for key, value in said.items():
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise ConfigError(f"{key} = {value:g} must be positive")
+        if value is not None and not (isinstance(value, Real) and 0 < value < math.inf):
+            raise ConfigError(f"{key} = {value!r} must be a positive number")
     source = "arguments" if any(value is not None for value in said.values()) else "none"
     name = name or "array"
     return Stack(

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.checks import path_in
 from iscat_analysis.movie import Stack, beside, open_stack
 from iscat_analysis.pipeline.bound import find_bound
 from iscat_analysis.pipeline.compilation import compiling, needed_parts
@@ -47,7 +48,7 @@ FEW_FIGURES = 2
 
 
 def fit_stack(
-    stack: Path,
+    stack: str | Path,
     config: Config,
     *,
     out: Path | None = None,
@@ -62,7 +63,7 @@ def fit_stack(
 
     Parameters
     ----------
-    stack : Path
+    stack : str or Path
         The movie.
     config : Config
         What to do; see `iscat_analysis.config`.
@@ -96,6 +97,7 @@ def fit_stack(
     KeyboardInterrupt
         The user stopped it; what was finished is in the folder.
     """
+    stack = path_in("`stack`", stack)
     folder = beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
     with claim_output(folder, overwrite):

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.checks import choice_in, number_in, shown, truth_in
+from iscat_analysis.inference.checks import choice_in, number_in, path_in, shown, truth_in
 from iscat_analysis.pipeline.kinetics import Kinetics
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.distribution import species_figure
@@ -123,7 +123,7 @@ def find_species(
     number_in("`draws`", draws, least=0, most=_MOST_DRAWS, whole=True)
     number_in("`seed`", seed, least=0, whole=True)
     choice_in("`branch`", branch, ("magnitude", "landing", "leaving"))
-    folder = None if out is None else Path(out)
+    folder = None if out is None else path_in("`out`", out)
     if folder is not None:
         check_output(folder, overwrite, known=SPECIES_FILES)
     table = events

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.checks import choice_in, number_in, truth_in
+from iscat_analysis.inference.checks import choice_in, number_in, path_in, truth_in
 from iscat_analysis.movie.text_tables import separator, without_remarks
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.report import atomic_folder, check_output
@@ -181,11 +181,15 @@ def fit_kd(
             f"`landing_power` = {landing_power:g}: must lie between -1 and 1, as in -0.167"
         )
     truth_in("`inactive`", inactive)
-    folder = None if out is None else Path(out)
+    folder = None if out is None else path_in("`out`", out)
     if folder is not None:
         check_output(folder, overwrite, known=BINDING_FILES)
     name = "samples" if isinstance(samples, pd.DataFrame) else str(samples)
-    rows = samples if isinstance(samples, pd.DataFrame) else _read_samples(Path(samples))
+    rows = (
+        samples
+        if isinstance(samples, pd.DataFrame)
+        else _read_samples(path_in("`samples`", samples))
+    )
     rows, kept = _used(rows, name)
     totals = _totals(rows, model, name)
     rows[list(CONCENTRATIONS[model])] = totals

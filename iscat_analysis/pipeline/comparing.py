@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.inference.checks import path_in
 from iscat_analysis.pipeline.answers import choice_of
 from iscat_analysis.records import FloatArray, Progress, silent
 from iscat_analysis.report import atomic_folder, check_output
@@ -169,7 +170,7 @@ def compare_tables(
         k, masses_kda, ladder, steps=steps, offset=False, hold=False, widths="free",
         background=background,
     )  # fmt: skip
-    folder = None if out is None else Path(out)
+    folder = None if out is None else path_in("`out`", out)
     if folder is not None:
         check_output(folder, overwrite, known=COMPARISON_FILES)
     if len(tables) < 2:

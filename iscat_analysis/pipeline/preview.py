@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_ratio
 from iscat_analysis.movie.lines import Lines
@@ -70,6 +71,11 @@ class Preview:
     """
 
     def __init__(self, movie: Stack, config: Config) -> None:
+        if not isinstance(movie, Stack) or not isinstance(config, Config):
+            raise ConfigError(
+                f"`movie` is {type(movie).__name__} and `config` {type(config).__name__}: give "
+                "what open_stack and configure return"
+            )
         config, notes = resolve_metadata(config, movie.metadata)
         self.config = config
         self.notes = (*movie.notes, *notes)
@@ -153,14 +159,11 @@ class Preview:
         ConfigError
             The window is not one of 1 to `longest`.
         """
+        number = int(number_in("`frame`", frame, whole=True))
         with self._lock:
-            return self._search.look(frame, self._checked(window))
+            return self._search.look(number, self._checked(window))
 
     def _checked(self, window: int | None) -> int:
         if window is None:
             return self.window
-        if not 1 <= window <= self.longest:
-            raise ConfigError(
-                f"window = {window}: choose 1 to {self.longest} frames, which this movie allows"
-            )
-        return window
+        return int(number_in("window", window, least=1, most=self.longest, whole=True))

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import path_in
 from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.addresses import split_address
 from iscat_analysis.pipeline.redraw import Redraw, redraw
@@ -49,7 +50,9 @@ def open_result(folder: str | Path, *, movie: str | Path | None = None) -> Store
     >>> with ia.open_result("movie.iscat") as result:  # doctest: +SKIP
     ...     figure = result.view(0)
     """
-    return StoredResult(Path(folder), None if movie is None else Path(movie))
+    return StoredResult(
+        path_in("`folder`", folder), None if movie is None else path_in("`movie`", movie)
+    )
 
 
 class StoredResult:

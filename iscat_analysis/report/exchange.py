@@ -14,7 +14,7 @@ import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
-from iscat_analysis.records import FloatArray, Status, track_numbers
+from iscat_analysis.records import EVENT_COLUMNS, FloatArray, Status, track_numbers
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.units import count
 
@@ -327,12 +327,26 @@ def _pixel_nm(rows: pd.DataFrame) -> float:
 
 def _events(fits: pd.DataFrame) -> pd.DataFrame:
     """Give the events that are fit to be used, by frame."""
+    _refuse_others(fits)
     good = (fits["status"] == Status.OK) & fits["x_px"].notna() & fits["contrast"].notna()
     return fits[good].sort_values("frame", kind="stable")
 
 
+def _refuse_others(fits: pd.DataFrame) -> None:
+    """Refuse what is no table of fits."""
+    if not isinstance(fits, pd.DataFrame):
+        raise DataError(f"`fits`: is {type(fits).__name__}; give `Result.table`")
+    missing = [name for name in EVENT_COLUMNS if name not in fits]
+    if missing:
+        raise DataError(
+            f"`fits`: has no column {', '.join(missing[:3])}; give `Result.table`, or fits.csv "
+            "with all of its columns"
+        )
+
+
 def _tracked(fits: pd.DataFrame) -> pd.DataFrame:
     """Rows that belong to a track and have a place, by track and frame."""
+    _refuse_others(fits)
     numbers = track_numbers(fits)
     known = numbers.notna() & fits["x_px"].notna() & (fits["status"] != Status.SIDELOBE)
     rows = fits[known].assign(particle=numbers[known].astype("int64"))

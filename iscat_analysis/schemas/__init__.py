@@ -78,7 +78,7 @@ def schema(name: str) -> dict[str, Any]:
     ConfigError
         There is no such schema; the known ones are named.
     """
-    if name not in _DOCUMENTS:
+    if not isinstance(name, str) or name not in _DOCUMENTS:
         raise ConfigError(f"schema {name!r} is not known; there are {', '.join(_DOCUMENTS)}")
     return _DOCUMENTS[name].model_json_schema(mode="serialization")
 

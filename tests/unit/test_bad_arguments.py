@@ -86,6 +86,41 @@ def test_what_says_which_species_is_checked(changed: dict[str, object], said: st
         ia.find_species(**(_SPECIES | changed))
 
 
+@pytest.mark.parametrize(
+    ("function", "arguments", "said"),
+    [
+        ("fit_movie", {"movie": 3}, "int is no movie"),
+        ("fit_movie", {"movie": np.zeros((9, 8, 8)), "out": 3}, "`out` = 3: give a path"),
+        ("fit_movie", {"movie": "m.tif", "settings": 3}, "`settings` = 3: give a mapping"),
+        ("open_stack", {"movie": np.zeros((9, 8, 8)), "pixel_size_nm": "x"}, "pixel_size_nm = 'x'"),
+        ("open_result", {"folder": 3}, "`folder` = 3: give a path"),
+        ("schema", {"name": []}, r"schema \[\] is not known"),
+        ("forecast_optics", {"events": "x"}, "`events` = 'x': give one whole number"),
+        ("forecast_optics", {"free": 3}, "`free` = 3: give some of focus"),
+        ("calibrate_optics", {"movie": "m.tif", "focus_step_nm": "x"}, "`focus_step_nm` = 'x'"),
+        ("batch", {"samples": 3, "out": "x"}, "`samples` = 3: give a path"),
+        ("batch", {"samples": "s.csv", "out": 3}, "`out` = 3: give a path"),
+        ("batch", {"samples": "s.csv", "out": "x", "only": 3}, r"`only` = 3: give \(K, N\)"),
+        ("watch", {"folder": 3}, "`folder` = 3: give a path"),
+        ("watch", {"folder": ".", "interval_s": "x"}, "`interval_s` = 'x'"),
+        ("watch", {"folder": ".", "standards": 3}, "`standards`: 3 is no list of masses"),
+        ("to_trackpy", {"fits": 3}, "`fits`: is int"),
+        ("to_napari", {"fits": pd.DataFrame()}, "`fits`: has no column event"),
+        ("to_picasso", {"fits": pd.DataFrame()}, "`fits`: has no column event"),
+        ("config_to_toml", {"config": 3}, "`config`: is int"),
+        ("Preview", {"movie": 3, "config": 3}, "`movie` is int"),
+        ("fit_stack", {"stack": 3, "config": ia.configure()}, "`stack` = 3: give a path"),
+    ],
+)
+def test_whole_jobs_name_their_arguments(
+    function: str, arguments: dict[str, object], said: str
+) -> None:
+    setup = {"settings": {"camera.pixel_size_nm": 84.4}}
+    takes = function in ("forecast_optics", "calibrate_optics", "watch") and "settings" not in said
+    with pytest.raises(ia.IscatError, match=said):
+        getattr(ia, function)(**arguments, **(setup if takes else {}))
+
+
 def test_errors_below_zero_are_refused() -> None:
     with pytest.raises(ia.DataError, match="sigma_mass_kda = -1"):
         ia.refractive_index(150.0, 7.0, sigma_mass_kda=-1.0)

@@ -101,7 +101,7 @@ def test_what_cannot_be_exported_is_refused(folder: Path) -> None:
     with pytest.raises(DataError, match=r"let `out` end in \.hdf5"):
         export_result(folder, "picasso", out=folder / "locs.yaml")
     (folder / "fits.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(DataError, match="is not a table of fits"):
+    with pytest.raises(DataError, match="`fits`: has no column event, frame"):
         export_result(folder, "napari")
     (folder / "fits.csv").unlink()
     with pytest.raises(DataError, match=r"holds no fits\.csv"):

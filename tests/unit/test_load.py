@@ -528,8 +528,8 @@ def test_an_array_is_read_a_few_frames_at_a_time() -> None:
         (np.zeros((1, 10, 14)), "single frame"),
         (np.zeros((3, 10, 14), complex), "complex128"),
         (np.full((3, 10, 14), "a"), "<U1"),
-        ([[[1, 2], [3, 4]]] * 3, "a list is no movie"),
-        (None, "a NoneType is no movie"),
+        ([[[1, 2], [3, 4]]] * 3, "^list is no movie"),
+        (None, "^NoneType is no movie"),
     ],
 )
 def test_refuses_arrays_that_are_no_movie(array: object, message: str) -> None:

@@ -26,6 +26,7 @@ from iscat_analysis.calibration.optics.measure import FAINTEST, LEAST_SIGHTS, MO
 from iscat_analysis.calibration.optics.settings import FREE, exists, free_groups, settings_of
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.checks import number_in
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.grid import PixelGrid
@@ -212,8 +213,7 @@ def forecast_optics(
         There is no reference, no pixel size or no event, or a name in `free` is unknown.
     """
     names = _names(config, free)
-    if events < 1:
-        raise ConfigError(f"events = {events}: give 1 or more")
+    number_in("`events`", events, least=1, whole=True)
     model, grid = _model(config)
     pictures = {f: _Picture.expected(config, model, grid, f, names) for f in FACTORS}
     here = pictures[1.0]

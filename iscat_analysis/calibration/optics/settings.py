@@ -51,12 +51,14 @@ def free_groups(text: str | Sequence[str] | None) -> tuple[str, ...]:
     """
     if text is None:
         return tuple(FREE)
-    given = text.split(",") if isinstance(text, str) else list(text)
+    if not isinstance(text, (str, list, tuple)):
+        raise ConfigError(f"`free` = {text!r}: give some of {', '.join(FREE)}")
+    given = [str(name) for name in (text.split(",") if isinstance(text, str) else text)]
     names = {name.strip() for name in given if name.strip()}
     unknown = sorted(names - set(FREE))
     if unknown or not names:
         raise ConfigError(
-            f"--free {','.join(given)}: {unknown[0] if unknown else 'nothing'!r} cannot be set "
+            f"`free` = {','.join(given)}: {unknown[0] if unknown else 'nothing'!r} cannot be set "
             f"free; give some of {', '.join(FREE)}"
         )
     return tuple(name for name in FREE if name in names)
