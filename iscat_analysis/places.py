@@ -71,6 +71,20 @@ class Place(Protocol):
     def distant(self) -> bool:
         """Whether jobs run in other processes, which read movies by their paths."""
 
+    def threads(self, wanted: int) -> int:
+        """Say how many threads this process may use.
+
+        Parameters
+        ----------
+        wanted : int
+            ``compute.workers``.
+
+        Returns
+        -------
+        int
+            At least 1.
+        """
+
     def call(self, job: Callable[..., R], /, *arguments: Any, progress: Progress = silent) -> R:
         """Do a job and wait for it.
 
@@ -127,6 +141,10 @@ class Here:
 
     distant = False
 
+    def threads(self, wanted: int) -> int:
+        """Use as many as are wanted; see `Place`."""
+        return wanted
+
     def call(self, job: Callable[..., R], /, *arguments: Any, progress: Progress = silent) -> R:
         """Do a job; see `Place`."""
         return job(*arguments, progress=progress)
@@ -182,6 +200,10 @@ class Cluster:
         for worker, found in self._client.run(look).items():
             _compare(self._versions, found["versions"], worker)
             self._memory[worker] = found["memory"]
+
+    def threads(self, wanted: int) -> int:
+        """Use as many as are wanted; see `Place`."""
+        return wanted
 
     def remarks(self, memory_limit_mb: int) -> list[str]:
         """Say which workers are missing or have too little memory; see `Place`."""

@@ -23,6 +23,21 @@ class _Allotment:
 _ALLOTTED: ContextVar[_Allotment | None] = ContextVar("allotted", default=None)
 
 
+class _Inline(ThreadPoolExecutor):
+    """The thread that asks, which does each task at once."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+
+    def submit(self, task: Callable[..., Any], /, *args: Any, **options: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        try:
+            done.set_result(task(*args, **options))
+        except Exception as error:  # noqa: BLE001  # raised where the result is asked for
+            done.set_exception(error)
+        return done
+
+
 class _Watched(ThreadPoolExecutor):
     """Threads that look before each task whether they are still wanted."""
 
@@ -89,9 +104,23 @@ def threads(count: int) -> Iterator[ThreadPoolExecutor]:
         Open until the block ends.
     """
     given = _ALLOTTED.get()
-    pool = ThreadPoolExecutor(count) if given is None else _Watched(given)
+    if given is not None:
+        pool: ThreadPoolExecutor = _Watched(given)
+    else:
+        pool = ThreadPoolExecutor(count) if count > 1 else _Inline()
     with one_thread_algebra(), pool:
         yield pool
+
+
+def is_allotted() -> bool:
+    """Tell whether work in this thread has the threads of a place, and no more.
+
+    Returns
+    -------
+    bool
+        Whether it is done within `allotted`.
+    """
+    return _ALLOTTED.get() is not None
 
 
 @contextmanager

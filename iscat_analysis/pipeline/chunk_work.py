@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -69,6 +70,19 @@ class ChunkSetting:
     excess_noise: ExcessNoise | None
     lines: Lines | None
 
+    @cached_property
+    def reader(self) -> Reader:
+        """The frames, for one chunk after the other."""
+        return Reader(self.frames, self.camera, *self.span, counts_budget(self.config))
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The models, which all chunks share."""
+        return make_scene(
+            self.config, self.reader.shape, searches=self.searches, noise=self.noise,
+            lines=self.lines, sliding=True,
+        )  # fmt: skip
+
 
 def chunk_job(
     setting: ChunkSetting,
@@ -96,17 +110,11 @@ def chunk_job(
     Done
         The same as in the process that has the other chunks.
     """
-    config, frames = setting.config, setting.frames
-    reader = Reader(frames, setting.camera, *setting.span, counts_budget(config))
-    with threads(config.compute.workers) as pool:
-        scene = make_scene(
-            config, reader.shape, searches=setting.searches, noise=setting.noise,
-            lines=setting.lines, sliding=True,
-        )  # fmt: skip
-        chunk = reader.chunk(span, stride_of(setting.window), pool)
+    with threads(setting.config.compute.workers) as pool:
+        chunk = setting.reader.chunk(span, stride_of(setting.window), pool)
         progress("landing", 0, 1)
         return analyse_chunk(
-            scene, chunk, core, setting.window, pool, posteriors, setting.excess_noise
+            setting.scene, chunk, core, setting.window, pool, posteriors, setting.excess_noise
         )
 
 

@@ -62,6 +62,11 @@ class Reader:
         """What messages call the movie."""
         return self._movie.name
 
+    def forget(self) -> None:
+        """Give the memory of the frames back."""
+        self._buffer = self._buffer[:0].copy()
+        self._held = (self.first, self.first)
+
     def _reserve(self, frames: int) -> None:
         if frames > len(self._buffer):
             kept = self._held[1] - self._held[0]

@@ -24,6 +24,7 @@ from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.pipeline.chunk_work import ChunkSetting, analyse_chunk, chunk_job
 from iscat_analysis.pipeline.chunks import Reader, counts_budget, plan_chunks
+from iscat_analysis.pipeline.companion import paired
 from iscat_analysis.pipeline.merging import Done, Merged
 from iscat_analysis.pipeline.noise import judge_opening
 from iscat_analysis.pipeline.odd_frames import frame_warnings
@@ -164,9 +165,10 @@ def analyse_landings(
         frames, camera, with_absolute_paths(config), (first, last), count, window,
         noise.spectrum, noise.excess, lines,
     )  # fmt: skip
+    place = paired(place, config, movie_job, len(plan))
     merged = Merged(reader.shape)
     interrupted = False
-    with threads(config.compute.workers) as pool:
+    with threads(place.threads(config.compute.workers)) as pool:
 
         def finish(number: int) -> Done:
             done = None if posterior else store.load(number)
@@ -174,6 +176,7 @@ def analyse_landings(
                 core, span = plan[number]
                 budget = POSTERIORS - merged.sampled if posterior else 0
                 if place.distant:
+                    reader.forget()  # whoever does it has a reader of its own
                     done = place.call(chunk_job, movie_job, core, span, budget)
                 else:
                     chunk = reader.chunk(span, stride, pool)

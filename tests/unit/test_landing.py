@@ -536,7 +536,7 @@ def movie(counts: np.ndarray, tmp_path: Path) -> Path:
 def test_an_interrupted_run_resumes_to_the_same_result(
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = _config("posterior.enabled=false", "background.window_frames=20")
+    config = _config("posterior.enabled=false", "background.window_frames=20", "compute.workers=1")
     monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.0031)
     monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
     fit_stack(movie, config, out=tmp_path / "whole.iscat")
@@ -740,8 +740,9 @@ def test_a_corrected_run_resumes_to_the_same_result(
     drifting: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.005)
+    config = _config(CORRECTED, "compute.workers=1")
     real, calls = landing_module.analyse_chunk, []
-    whole, _ = _run(drifting, _config(CORRECTED))
+    whole, _ = _run(drifting, config)
 
     def stopping(*arguments: Any) -> Any:
         calls.append(1)
@@ -750,8 +751,8 @@ def test_a_corrected_run_resumes_to_the_same_result(
         return real(*arguments)
 
     monkeypatch.setattr(landing_module, "analyse_chunk", stopping)
-    _run(drifting, _config(CORRECTED), partial=tmp_path, identity="movie")
-    resumed, _ = _run(drifting, _config(CORRECTED), partial=tmp_path, identity="movie")
+    _run(drifting, config, partial=tmp_path, identity="movie")
+    resumed, _ = _run(drifting, config, partial=tmp_path, identity="movie")
     assert len(calls) == 1 + whole.summary["chunks"]
     pd.testing.assert_frame_equal(resumed.fits, whole.fits)
     assert resumed.summary == whole.summary

@@ -1,0 +1,282 @@
+"""A second process beside this one, which does half of the chunks of a landing movie.
+
+Threads of one process take turns at Python, so that two of them analyse chunks no faster than one.
+The second process is a copy of the first, made when the models are ready and their kernels loaded:
+it shares their memory, has nothing to load, and opens the movie again for itself.  It asks for no
+input, writes nothing but its results, ignores interrupts, which are the first one's business, and
+ends with it.  Systems other than Linux, on which a copy of a process with threads may not go on,
+have none.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import io
+import os
+import pickle
+import queue
+import signal
+import struct
+import sys
+import threading
+import warnings
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from contextlib import suppress
+from typing import IO, Any, NoReturn, TypeVar
+
+from iscat_analysis.config import Config
+from iscat_analysis.pipeline.chunk_work import ChunkSetting
+from iscat_analysis.places import Here, Place
+from iscat_analysis.records import Progress, silent
+from iscat_analysis.threads import allotted, is_allotted
+
+_LENGTH = struct.Struct("<Q")
+_MMAP_THRESHOLD, _LARGE_BYTES = -3, 4 * 2**20  # GNU's name for it, and from where on
+_LOOK_S = 0.2  # between two looks at whether an interrupt has come
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class _LostError(Exception):
+    """The second process has ended."""
+
+
+class Pair:
+    """The process that asks, and a copy of it for as long as `each` is at work.
+
+    Parameters
+    ----------
+    threads : int
+        Of both processes together.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._first = os.getpid()
+        self._threads = max(1, threads // 2)
+        self._opened: tuple[object, Any] | None = None  # as given, and as opened again
+
+    @property
+    def distant(self) -> bool:
+        """Whether this is the second process."""
+        return os.getpid() != self._first
+
+    def remarks(self, memory_limit_mb: int) -> list[str]:
+        """Say nothing; see `iscat_analysis.places.Place`."""
+        del memory_limit_mb
+        return []
+
+    def threads(self, wanted: int) -> int:
+        """Give half of the threads to each process; see `iscat_analysis.places.Place`."""
+        del wanted
+        return self._threads
+
+    def call(self, job: Callable[..., R], /, *arguments: Any, progress: Progress = silent) -> R:
+        """Do a job in this process; see `iscat_analysis.places.Place`.
+
+        In the second one the first argument, which holds the movie, is taken as another process
+        would receive it, once for all jobs.
+        """
+        if not self.distant:
+            return job(*arguments, progress=progress)
+        common, *rest = arguments
+        if self._opened is None or self._opened[0] is not common:
+            self._opened = common, pickle.loads(pickle.dumps(common))
+        with allotted(self._threads, lambda: None):
+            return job(self._opened[1], *rest, progress=progress)
+
+    def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
+        """Do something with every item, in both processes; see `iscat_analysis.places.Place`.
+
+        What the second process was at when it was lost is done in the first.
+        """
+        waiting = deque(enumerate(items))
+        done: queue.SimpleQueue[tuple[int, R] | Exception] = queue.SimpleQueue()
+        other = _Copy(lambda number: work(items[number]))
+
+        def drive() -> None:
+            while waiting:
+                try:
+                    number, item = waiting.popleft()
+                except IndexError:  # the other thread was quicker
+                    return
+                try:
+                    done.put((number, other.do(number)))
+                except _LostError:
+                    waiting.appendleft((number, item))
+                    return
+                except Exception as error:  # noqa: BLE001  # raised where results are asked for
+                    done.put(error)
+                    return
+
+        driver = threading.Thread(target=drive, daemon=True, name="companion")
+        driver.start()
+        try:
+            while waiting or driver.is_alive() or not done.empty():
+                while not done.empty():
+                    found = done.get()
+                    if isinstance(found, Exception):
+                        raise found
+                    yield found
+                try:
+                    number, item = waiting.popleft()
+                except IndexError:
+                    driver.join(_LOOK_S)
+                    continue
+                yield number, work(item)
+        finally:
+            other.end()
+            driver.join()
+            other.close()
+
+
+def paired(place: Place, config: Config, setting: ChunkSetting, chunks: int) -> Place:
+    """Let a second process help, where there is something to do for it and room.
+
+    Parameters
+    ----------
+    place : Place
+        Where the work runs without one.
+    config : Config
+        Says how many threads may run.
+    setting : ChunkSetting
+        What the chunks have in common.
+    chunks : int
+        Their number.
+
+    Returns
+    -------
+    Place
+        A `Pair` where several chunks of a movie in a file would be analysed in this process, and
+        two threads may run on two processors; else the place that was given.
+    """
+    wanted = (
+        sys.platform == "linux"
+        and isinstance(place, Here)
+        and not is_allotted()
+        and chunks > 1
+        and min(config.compute.workers, _processors()) > 1
+    )
+    if not wanted:
+        return place
+    try:
+        pickle.dumps(setting)
+    except TypeError:  # an array in memory, which cannot be opened again
+        return place
+    _give_back_large_arrays()
+    return Pair(config.compute.workers)
+
+
+def _give_back_large_arrays() -> None:
+    """Have memory of large arrays go back to the system as they are freed: two processes hold it.
+
+    The C library otherwise keeps up to 32 MB at a time, between others that are still in use.
+    """
+    with suppress(OSError, AttributeError):  # of GNU
+        library = ctypes.CDLL(None)
+        library.mallopt(_MMAP_THRESHOLD, _LARGE_BYTES)
+        library.malloc_trim(0)
+
+
+def _processors() -> int:
+    """Count the processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+
+
+class _Copy:
+    """A copy of this process.
+
+    Parameters
+    ----------
+    work : callable
+        Number of an item → what the copy sends back.
+    """
+
+    def __init__(self, work: Callable[[int], Any]) -> None:
+        theirs, asking = os.pipe()
+        telling, answers = os.pipe()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # that there are other threads
+            self.pid = os.fork()
+        if not self.pid:
+            _serve(work, theirs, answers, (asking, telling))
+        os.close(theirs)
+        os.close(answers)
+        self._asking, self._telling = os.fdopen(asking, "wb"), os.fdopen(telling, "rb")
+
+    def do(self, number: int) -> Any:
+        """Have an item done, and wait for it."""
+        try:
+            _send(self._asking, number)
+            failed, result = _received(self._telling)
+        except (OSError, EOFError):
+            raise _LostError from None
+        if failed:
+            raise result
+        return result
+
+    def end(self) -> None:
+        """End it, whatever it is at."""
+        with suppress(OSError):  # somebody else has buried it
+            os.kill(self.pid, signal.SIGKILL)
+            os.waitpid(self.pid, 0)
+
+    def close(self) -> None:
+        """Close what led to it."""
+        for pipe in (self._asking, self._telling):
+            with suppress(OSError):
+                pipe.close()
+
+
+def _send(pipe: IO[bytes], value: Any) -> None:
+    sent = pickle.dumps(value)
+    pipe.write(_LENGTH.pack(len(sent)))
+    pipe.write(sent)
+    pipe.flush()
+
+
+def _received(pipe: IO[bytes]) -> Any:
+    (length,) = _LENGTH.unpack(_exactly(pipe, _LENGTH.size))
+    return pickle.loads(_exactly(pipe, length))
+
+
+def _exactly(pipe: IO[bytes], length: int) -> bytes:
+    part = pipe.read(length)
+    if len(part) < length:
+        raise EOFError
+    return part
+
+
+def _serve(
+    work: Callable[[int], Any], asked: int, answers: int, others: tuple[int, int]
+) -> NoReturn:
+    """Do what is asked for, as a copy, until nobody asks any more."""
+    try:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        gc.freeze()  # what belongs to the other process is not for this one to end
+        sys.stdout = sys.stderr = io.StringIO()
+        for pipe in others:
+            os.close(pipe)
+        numbers: queue.SimpleQueue[int] = queue.SimpleQueue()
+
+        def listen() -> None:
+            try:
+                with os.fdopen(asked, "rb") as pipe:
+                    while True:
+                        numbers.put(_received(pipe))
+            finally:
+                os._exit(0)  # in the middle of an item, too: nobody waits for it
+
+        threading.Thread(target=listen, daemon=True).start()
+        with os.fdopen(answers, "wb") as out:
+            while True:
+                number = numbers.get()
+                try:
+                    result = False, work(number)
+                except Exception as error:  # noqa: BLE001  # for the other process to raise
+                    result = True, error
+                _send(out, result)
+    finally:
+        os._exit(1)
