@@ -118,7 +118,7 @@ def batch(
     """
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
-        part = _part(only)
+        part = _part(only, merge=merge)
 
         from iscat_analysis.day import batch as run
 
@@ -155,12 +155,14 @@ def batch(
             raise typer.Exit(INCOMPLETE)
 
 
-def _part(text: str | None) -> tuple[int, int] | None:
+def _part(text: str | None, *, merge: bool) -> tuple[int, int] | None:
     """Read ``K/N``."""
     from iscat_analysis.errors import ConfigError
 
     if text is None:
         return None
+    if merge:
+        raise ConfigError(f"--only {text}: parts are analysed first, and merged when all are")
     match = re.fullmatch(r"\s*(\d+)\s*/\s*(\d+)\s*", text, flags=re.ASCII)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
         raise ConfigError(f"--only {text}: write it as K/N, as in --only 1/4 for the first of four")

@@ -137,7 +137,7 @@ def batch(
         Analyse the K-th of N parts of the movies, and make no picture; several parts may be
         analysed at the same time, on machines that share the folder.
     merge : bool
-        Make the picture of what is finished, and analyse nothing.
+        Make the picture of what is finished, or with `only` say what is, and analyse nothing.
     retry : bool
         Try again what failed, though nothing has changed.
     scheduler : str
@@ -173,11 +173,9 @@ def batch(
     folder = path_in("`out`", out)
     if only is not None and (not isinstance(only, tuple) or len(only) != 2):
         raise ConfigError(f"`only` = {shown(only)}: give (K, N), the K-th of N parts")
-    if only is not None and (merge or not 1 <= only[0] <= only[1]):
+    if only is not None and not 1 <= only[0] <= only[1]:
         raise ConfigError(
-            f"`only` = {only[0]}/{only[1]}: "
-            + ("parts are analysed first, and merged when all are" if merge else "write it as K/N")
-            + ", as in 1/4 for the first of four parts"
+            f"`only` = {only[0]}/{only[1]}: write it as K/N, as in 1/4 for the first of four parts"
         )
     reaction = reaction_of(kd, kd_masses_kda)
     table = samples if isinstance(samples, Table) else read_table(path_in("`samples`", samples))

@@ -6,6 +6,7 @@ taken once two looks find it the same and it can be read to its end.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import Counter
@@ -266,9 +267,11 @@ class _Run:
         self._table = table
         number = sum(row.role != "flat" for row in table.rows)
         self._batch(table, only=(number + 1, number + 1))  # without a movie: the calibrations
-        page, due = self._page(table)
-        movies = page.movies[page.movies["role"] != "flat"].sort_values("movie")
-        waiting = [k for k, state in enumerate(movies["state"], 1) if state == "missing"]
+        states = self._batch(table, only=(1, 1), merge=True).movies["state"]
+        waiting = [k for k, state in enumerate(states, 1) if state == "missing"]
+        if not waiting:  # the table has changed, or a movie is gone
+            self._page(table)
+        due = -math.inf
         for k in waiting:
             if stop.is_set():
                 return

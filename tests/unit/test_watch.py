@@ -19,6 +19,7 @@ from small_movies import SETUP, simulate
 from tiff_files import write_ome_set
 
 import iscat_analysis as ia
+import iscat_analysis.day as day_module
 from iscat_analysis.day import run
 from iscat_analysis.day.watch import PATIENCE, Look, _Folder
 from iscat_analysis.errors import ConfigError, DataError, SchedulerError
@@ -236,6 +237,22 @@ def test_movies_are_analysed_as_they_come_and_failures_told_once(
     assert fits == ["a.tif", "b.tif", "cut.tif"]
 
 
+def test_a_new_movie_makes_one_page(folder: Path, made: Path, fits: list[str], monkeypatch) -> None:
+    pages: list[int] = []
+    publish = day_module.publish_day
+    monkeypatch.setattr(
+        day_module, "publish_day", lambda *a, **k: (pages.append(len(fits)), publish(*a, **k))[1]
+    )
+    shutil.copy(made / "movie.tif", folder / "a.tif")
+    day = Day(
+        ("1 done", lambda: shutil.copy(made / "movie.tif", folder / "b.tif")),
+        ("2 done", lambda: None),
+    )
+    day.watch(folder)
+    assert pages[:2] == [1, 2]  # how many movies were finished when a page was made
+    assert len(pages) <= 3  # and the last one, when the watching ended
+
+
 def test_what_failed_is_tried_again_when_the_watching_begins(
     folder: Path, made: Path, fits: list[str], monkeypatch
 ) -> None:
@@ -311,8 +328,8 @@ def test_ctrl_c_ends_the_waiting_without_an_error(folder: Path) -> None:
 def test_what_cannot_be_watched_is_refused_at_once(folder: Path, capsys) -> None:
     for options, said in (
         ([str(folder / "absent")], "there is no such folder"),
-        ([str(folder), "--interval", "0"], "--interval 0 must be positive"),
-        ([str(folder), "--interval", "nan"], "--interval nan must be positive"),
+        ([str(folder), "--interval", "0"], "--interval 0: give one number above 0"),
+        ([str(folder), "--interval", "nan"], "--interval nan: give one number above 0"),
         ([str(folder), "--out", str(folder)], "choose another --out"),
         ([str(folder), "--standards", "x"], "--standards: 'x' is not a mass"),
         ([str(folder), "--set", "optics.nna=1"], "did you mean"),
