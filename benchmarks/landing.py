@@ -23,9 +23,11 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,17 +47,9 @@ RESULTS = ROOT / "results"
 CONFIG = ROOT.parent / "sample_configs" / "landing.toml"
 JOB_MB_PER_S, RATIO, MEMORY_MB = 60.0, 5.0, 1000.0
 WINDOW = 100
-PROGRAM = """
-import sys
-from pathlib import Path
-from iscat_cli import main
-report, sys.argv[0] = Path(sys.argv.pop(1)), "iscat"
-status = main()
-lines = Path("/proc/self/status").read_text().splitlines()
-report.write_text(next(line.split()[1] for line in lines if line.startswith("VmHWM")))
-sys.exit(status)
-"""
-"""The command line, which leaves its own peak memory [kB]: that of `os.wait4` begins with ours."""
+LOOK_S = 0.1
+"""Between two looks at how much memory a job has."""
+PROGRAM = "import sys; sys.argv[0] = 'iscat'; from iscat_cli import main; sys.exit(main())"
 PEER_PACKAGES = ("piscat==0.2.5", "PyWavelets")
 
 PEER = """
@@ -79,8 +73,7 @@ def whole_job(folder: Path, settings: list[str], seed: int) -> dict[str, float]:
     movie = folder / "movie.tif"
     config = load_config(CONFIG, settings)
     truth = write_stack(config, movie, seed=seed, overwrite=True)
-    peak = folder / "peak"
-    command = [sys.executable, "-c", PROGRAM, str(peak), "fit", str(movie), "--config", str(CONFIG)]
+    command = [sys.executable, "-c", PROGRAM, "fit", str(movie), "--config", str(CONFIG)]
     command += ["--quiet", "--json", "--out", str(folder / "movie.iscat"), "--overwrite"]
     size = movie.stat().st_size / 1e6
     seconds, processor = [], []
@@ -90,12 +83,15 @@ def whole_job(folder: Path, settings: list[str], seed: int) -> dict[str, float]:
         start = time.perf_counter()
         with answer.open("w", encoding="utf-8") as out:
             job = subprocess.Popen(command, stdout=out)
+            watch = _Memory(job.pid)
+            watch.start()
             _, status, usage = os.wait4(job.pid, 0)
+            watch.join()
         seconds.append(time.perf_counter() - start)
         processor.append(usage.ru_utime + usage.ru_stime)
         if status:
             raise SystemExit(f"{' '.join(command)} did not finish")
-        memory = max(memory, float(peak.read_text(encoding="utf-8")) / 1e3)
+        memory = max(memory, watch.peak_mb)
     summary: dict[str, Any] = json.loads(answer.read_text(encoding="utf-8"))
     movie.unlink()
     return {
@@ -108,6 +104,41 @@ def whole_job(folder: Path, settings: list[str], seed: int) -> dict[str, float]:
         "steps": int(len(truth) + truth["leave"].notna().sum()),
         "found": len(summary["events"]),
     }
+
+
+class _Memory(threading.Thread):
+    """Looks at the memory of a process and of those it has made, until it ends.
+
+    What several of them share is divided among them.
+    """
+
+    def __init__(self, pid: int) -> None:
+        super().__init__(daemon=True)
+        self._pid = pid
+        self.peak_mb = 0.0
+
+    def run(self) -> None:
+        """Keep the largest sum."""
+        while Path(f"/proc/{self._pid}/status").exists():
+            self.peak_mb = max(self.peak_mb, sum(map(_memory_mb, _family(self._pid))))
+            time.sleep(LOOK_S)
+
+
+def _family(pid: int) -> list[int]:
+    found = [pid]
+    with suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            for child in (task / "children").read_text().split():
+                found += _family(int(child))
+    return found
+
+
+def _memory_mb(pid: int) -> float:
+    with suppress(OSError):
+        for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
+            if line.startswith("Pss:"):
+                return float(line.split()[1]) * 1024 / 1e6
+    return 0.0
 
 
 def growth(whole: dict[str, float], half: dict[str, float]) -> dict[str, float]:

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter, uniform_filter
+from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.camera import Camera
@@ -28,6 +29,7 @@ DEFECT_SIGMAS = 6.0
 
 _BLOCK_BYTES = 16 * 2**20
 _CLIP_SIGMAS = 3.0
+_NEIGHBOURS = 5  # pixels along each side, whose median tells what a pixel should hold
 _NEIGHBOURHOOD = 7  # pixels, on which a faint background is averaged for the weights
 _OUTSHONE = 0.1
 _LEAST_TOTAL_E = 1e6  # fewer background photoelectrons leave the power uncertain by over 0.1 %
@@ -333,14 +335,25 @@ def find_defects(before_e: FloatArray, read_variance_e2: FloatArray) -> BoolArra
     ndarray of bool, shape (y, x)
         The pixels to leave out.
     """
-    local = np.maximum(median_filter(before_e, size=5, mode="nearest"), 0.0)
-    off = (before_e < DEAD * local) | (before_e > HOT * local)
-    # Anscombe's transform makes the noise 1 at every level, a few counts included.
-    steady, expected = (
-        2 * np.sqrt(np.maximum(counts + 0.375 + read_variance_e2, 0.0))
-        for counts in (before_e, local)
+    # a median lies between the lowest and the highest of its neighbours, which are found sooner
+    lowest, highest = (
+        np.maximum(extreme(before_e, size=_NEIGHBOURS, mode="nearest"), 0.0)
+        for extreme in (minimum_filter, maximum_filter)
     )
-    return np.asarray(off & (np.abs(steady - expected) > DEFECT_SIGMAS), dtype=bool)
+    doubtful = np.nonzero((before_e < DEAD * highest) | (before_e > HOT * lowest))
+    padded = np.pad(before_e, _NEIGHBOURS // 2, mode="edge")
+    around = sliding_window_view(padded, (_NEIGHBOURS, _NEIGHBOURS))[doubtful]
+    median = np.median(around.reshape(len(around), _NEIGHBOURS**2), axis=1)
+    own, local = before_e[doubtful], np.maximum(median, 0.0)
+    off = (own < DEAD * local) | (own > HOT * local)
+    # Anscombe's transform makes the noise 1 at every level, a few counts included.
+    read = np.broadcast_to(read_variance_e2, before_e.shape)[doubtful]
+    steady, expected = (
+        2 * np.sqrt(np.maximum(counts + 0.375 + read, 0.0)) for counts in (own, local)
+    )
+    defects = np.zeros(before_e.shape, dtype=np.bool_)
+    defects[doubtful] = off & (np.abs(steady - expected) > DEFECT_SIGMAS)
+    return defects
 
 
 def _frame_power(before_e: FloatArray, after_e: FloatArray) -> FloatArray:

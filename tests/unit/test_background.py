@@ -5,9 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scenes import Stack
+from scipy.ndimage import median_filter
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.background import measure_windows, refine_power, smooth_background
+from iscat_analysis.movie.background import (
+    DEAD,
+    DEFECT_SIGMAS,
+    HOT,
+    find_defects,
+    measure_windows,
+    refine_power,
+    smooth_background,
+)
 from iscat_analysis.movie.camera import Camera
 
 SHAPE = (48, 56)
@@ -272,3 +281,26 @@ def test_the_full_scale_of_a_converter_is_saturation() -> None:
     assert not other.saturated.any()
     stack.counts[3, 4, 5] = 2 ** int(np.log2(stack.counts.max()) + 1) - 1
     assert not measure_windows(stack, Camera(full_scale_adu=65535.0), BEFORE, AFTER).saturated.any()
+
+
+def test_defects_are_told_by_the_median_of_their_neighbours_everywhere() -> None:
+    rng = np.random.default_rng(8)
+    read = 4.0 * np.ones(SHAPE)
+    bright = rng.poisson(2e3 * np.random.default_rng(2).uniform(0.7, 1.3, SHAPE)).astype(float)
+    spoilt = bright.copy()
+    for _ in range(40):  # singly and in groups, at edges and in corners too
+        y, x = rng.integers(0, SHAPE[0]), rng.integers(0, SHAPE[1])
+        spoilt[y : y + 2, x : x + 3] = rng.choice([0.0, -30.0, 1e5, 350.0, 11_000.0])
+    spoilt[0, 0], spoilt[-1, -1] = 0.0, 1e6
+    steep = 10 ** rng.uniform(0, 6, SHAPE)
+    few = rng.poisson(1.0, SHAPE) + rng.normal(0, 2, SHAPE)
+    for image in (bright, spoilt, steep, few, np.zeros(SHAPE)):
+        local = np.maximum(median_filter(image, size=5, mode="nearest"), 0.0)
+        steady, expected = (
+            2 * np.sqrt(np.maximum(part + 0.375 + read, 0)) for part in (image, local)
+        )
+        off = (image < DEAD * local) | (image > HOT * local)
+        wanted = off & (np.abs(steady - expected) > DEFECT_SIGMAS)
+        np.testing.assert_array_equal(find_defects(image, read), wanted)
+    assert find_defects(spoilt, read).sum() > 40
+    assert not find_defects(bright, read).any()
