@@ -128,26 +128,29 @@ def fit(
         changes = _changes(settings, mode, frames, background, posterior, workers)
         resolved = load_config(config, changes)
 
-        from iscat_analysis.movie.addresses import MARK, beside
-        from iscat_analysis.pipeline import fit_stack
-        from iscat_analysis.places import open_place
+        from iscat_analysis.draughtsman import draughtsman
 
-        if raw is not None:
-            stack = Path(f"{stack}{MARK}{raw}")
-        folder = beside(stack, ".iscat") if out is None else out
+        with draughtsman() as pen:  # first, because it has as much to load
+            from iscat_analysis.movie.addresses import MARK, beside
+            from iscat_analysis.pipeline import fit_stack
+            from iscat_analysis.places import open_place
 
-        with open_place(scheduler, scheduler_file) as place, messages.progress() as progress:
-            analysis = fit_stack(
-                stack,
-                resolved,
-                out=folder,
-                overwrite=overwrite,
-                progress=progress,
-                notify=messages.notify,
-                command=context.obj,
-                inject=inject or 0,
-                place=place,
-            )
+            if raw is not None:
+                stack = Path(f"{stack}{MARK}{raw}")
+            folder = beside(stack, ".iscat") if out is None else out
+            with open_place(scheduler, scheduler_file) as place, messages.progress() as progress:
+                analysis = fit_stack(
+                    stack,
+                    resolved,
+                    out=folder,
+                    overwrite=overwrite,
+                    progress=progress,
+                    notify=messages.notify,
+                    command=context.obj,
+                    inject=inject or 0,
+                    place=place,
+                    draughtsman=pen,
+                )
         rows: list[dict[str, Any]] = analysis.table.to_dict("records")
         if as_json:
             found: dict[str, Any] = {**analysis.summary, "events": rows, "out": str(folder)}

@@ -11,23 +11,19 @@ import pytest
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from iscat_analysis import report
-
-PAGES = (
-    report,
-    *(
-        importlib.import_module(f"iscat_analysis.report.{name}")
-        for name in (
-            "batch",
-            "benchmark",
-            "bounds",
-            "calibration",
-            "optics",
-            "page",
-            "paper",
-            "template",
-        )
-    ),
+PAGES = tuple(
+    importlib.import_module(f"iscat_analysis.report.{name}")
+    for name in (
+        "batch",
+        "benchmark",
+        "bounds",
+        "calibration",
+        "drawing",
+        "optics",
+        "page",
+        "paper",
+        "template",
+    )
 )
 """Modules that publish figures."""
 

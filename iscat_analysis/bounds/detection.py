@@ -19,7 +19,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 from scipy.special import ndtr, ndtri
 
 from iscat_analysis.bounds.experiment import Experiment, expected_likelihood
@@ -137,7 +137,9 @@ def detection_limit(experiment: Experiment) -> DetectionLimit | None:
     searched = height_reached(-math.log1p(-false), area, lowest=known)
     snr = known - float(ndtri(miss))
     snr_searched = float(
-        brentq(lambda s: power_searched(s, searched) - (1 - miss), 0.0, searched + 40.0)
+        scipy.optimize.brentq(
+            lambda s: power_searched(s, searched) - (1 - miss), 0.0, searched + 40.0
+        )
     )
     root = math.sqrt(float(fisher[3, 3]))
     sign = math.copysign(1.0, float(experiment.theta[3]))

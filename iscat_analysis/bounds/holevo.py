@@ -33,7 +33,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq
+import scipy
 
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.errors import ConfigError
@@ -217,7 +217,7 @@ def _angle(sizes: FloatArray, angle: float) -> float:
             - sizes[1] * math.tan(angle - first) / math.cos(angle - first) ** 2
         )
 
-    return float(brentq(slope, 0.0, angle, xtol=1e-14)) if angle else 0.0
+    return float(scipy.optimize.brentq(slope, 0.0, angle, xtol=1e-14)) if angle else 0.0
 
 
 def _orthonormal(information: ComplexArray) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
+import scipy
 
 from iscat_analysis.bounds.experiment import plan
 from iscat_analysis.bounds.scan import AXES, Scan, calibrated_scale, changed, scan
@@ -131,7 +131,7 @@ def optimize(
 
     value, smallest = float(grid[best]), float(score[best])
     if 0 < best < grid.size - 1:
-        fine = minimize_scalar(
+        fine = scipy.optimize.minimize_scalar(
             bound, bounds=(grid[best - 1], grid[best + 1]), method="bounded",
             options={"xatol": 1e-3 * (grid[best + 1] - grid[best - 1])},
         )  # fmt: skip
@@ -263,7 +263,7 @@ def _effort(config: Config, goal: Goal, name: str, before: Callable[[int], int])
         return Effort(name, before(0), math.inf, None, math.inf)
     frames = 1
     if one > goal.value:
-        root = brentq(
+        root = scipy.optimize.brentq(
             lambda t: bound(max(1, round(math.exp(t)))) / goal.value - 1,
             0.0, math.log(MAX_FRAMES), xtol=1e-3,
         )  # fmt: skip

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from iscat_analysis.bounds.classical import bounds_from_matrices
 from iscat_analysis.bounds.experiment import Experiment, plan
@@ -142,7 +142,7 @@ class Search:
         if not keys:
             return self.value(self.decode(keys, start))
         low, high = np.array([self.range(key)[1] for key in keys]).T
-        found = minimize(
+        found = scipy.optimize.minimize(
             lambda point: self.value(self.decode(keys, point))[0],
             np.clip(start, low, high), bounds=list(zip(low, high, strict=True)), method="COBYQA",
             options={

@@ -7,6 +7,7 @@ keeps compiled kernels, and the other process finds it there.
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Collection
 
@@ -25,6 +26,7 @@ def main(parts: Collection[str]) -> None:
     parts : collection of str
         As in `iscat_analysis.inference.noise.compile_values`.
     """
+    gc.disable()  # the process is short, and what it makes stays
     compile_values(forward_model(Config(), _REACH_NM), parts)
 
 

@@ -8,8 +8,8 @@ from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, cg
 
 from iscat_analysis._kernels.canvas import Light
 from iscat_analysis._kernels.following import (
@@ -119,12 +119,13 @@ class Response:
 
         weight = np.where(used, np.maximum(counts, 1.0), 1.0).ravel()
         square = (move.size, move.size)
-        step, _ = cg(
-            LinearOperator(square, undetermined, dtype=np.float64),
+        of = scipy.sparse.linalg
+        step, _ = of.cg(
+            of.LinearOperator(square, undetermined, dtype=np.float64),
             (counts * move).ravel(),
             rtol=_RESIDUE,
             maxiter=_MOST_STEPS,
-            M=LinearOperator(square, lambda v: v.ravel() / weight, dtype=np.float64),
+            M=of.LinearOperator(square, lambda v: v.ravel() / weight, dtype=np.float64),
         )
         return np.asarray(np.clip(step.reshape(move.shape), -_FARTHEST, _FARTHEST))
 

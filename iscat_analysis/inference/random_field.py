@@ -14,15 +14,17 @@ filter is cut, and maxima are not more frequent than elsewhere.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from iscat_analysis.records import FloatArray
 
 _HIGHEST = 40.0  # no threshold is larger
+_FINEST = 1e-10  # to which a level is found
+
 LOWEST = 2.0
 """Level from which on both terms of N fall as it rises."""
 
@@ -157,7 +159,10 @@ class Excursions:
         high = low
         while excess(high) > 0 and high < _HIGHEST:
             high = min(high + 1.0, _HIGHEST)
-        return float(brentq(excess, low, high, xtol=1e-10))
+        # by halves: loading SciPy's search of roots takes longer than a small search for particles
+        steps = range(math.ceil((high - low) / _FINEST))
+        few = bisect_left(steps, True, key=lambda k: excess(low + k * _FINEST) <= 0)
+        return low + few * _FINEST
 
 
 def height_reached(

@@ -14,10 +14,9 @@ from pathlib import Path
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.addresses import MARK, beside, split_address
-from iscat_analysis.movie.datasets import open_hdf5
 from iscat_analysis.movie.file_set import FileSet
 from iscat_analysis.movie.folders import files_of
-from iscat_analysis.movie.hdf5 import SIGNATURE
+from iscat_analysis.movie.mapped import HDF5_SIGNATURE
 from iscat_analysis.movie.mapped_frames import NPY_SIGNATURE, open_npy, open_raw
 from iscat_analysis.movie.ome_zarr import is_zarr, open_zarr
 from iscat_analysis.movie.recorded import description_of, open_recorded
@@ -140,7 +139,9 @@ def _open_file(address: Path) -> Stack:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     if not signature:
         raise DataError(f"{path}: is empty (0 bytes); copy it again or export it again")
-    if signature == SIGNATURE:
+    if signature == HDF5_SIGNATURE:
+        from iscat_analysis.movie.datasets import open_hdf5  # h5py takes long
+
         return Stack(path, open_hdf5(path, part), part=part)
     if part:
         return Stack(path, open_raw(path, part), part=part)

@@ -16,13 +16,17 @@ from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.hdf5 import SIGNATURE, Hdf5Reader, StoredArray
+from iscat_analysis.movie.mapped import HDF5_SIGNATURE
 from iscat_analysis.records import FloatArray
+
+if TYPE_CHECKING:
+    from iscat_analysis.movie.hdf5 import Hdf5Reader, StoredArray
 
 TABLE_COLUMNS = ("frame", "x_px", "y_px", "contrast", "mass_kda")
 """The columns of `read_events`, in order."""
@@ -131,12 +135,12 @@ def read_events(path: Path) -> pd.DataFrame:
     path = Path(path)
     try:
         with path.open("rb") as file:
-            signature = file.read(len(SIGNATURE))
+            signature = file.read(len(HDF5_SIGNATURE))
         size = path.stat().st_size
     except OSError as error:
         what = "is a folder" if path.is_dir() else f"cannot be read ({error.strerror})"
         raise DataError(f"{path}: {what}; give the path of one event table") from None
-    if signature == SIGNATURE:
+    if signature == HDF5_SIGNATURE:
         columns, calibration = _from_hdf5(path)
     else:
         columns, calibration = _from_csv(path, size), None
@@ -209,6 +213,8 @@ def _table(
 
 
 def _from_hdf5(path: Path) -> tuple[dict[str, FloatArray], StoredCalibration | None]:
+    from iscat_analysis.movie.hdf5 import Hdf5Reader  # h5py takes long
+
     with closing(Hdf5Reader(path)) as reader:
         try:
             locs = reader.records("locs")

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import split_address
-from iscat_analysis.movie.datasets import is_one_movie
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
 from iscat_analysis.movie.ome import files_of_set, is_ome
 from iscat_analysis.movie.recorded import SUFFIXES as RECORDED
@@ -90,6 +89,8 @@ def _described(path: Path, size: int, changed_ns: int) -> tuple[str, ...]:
 @lru_cache(maxsize=_REMEMBERED)
 def _holds_one(path: Path, size: int, changed_ns: int) -> bool:
     del size, changed_ns
+    from iscat_analysis.movie.datasets import is_one_movie  # h5py takes long
+
     return is_one_movie(path)
 
 

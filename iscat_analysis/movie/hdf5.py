@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, map_file, refuse_changed
 
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
-
 _LARGEST_CHUNK_BYTES = 2**28
 _LARGEST_TEXT_BYTES = 4096
 _BOMB_RATIO = 2000  # decoded over stored; Deflate reaches 1032, on constant images only

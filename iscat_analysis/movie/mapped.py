@@ -14,6 +14,9 @@ WHAT_LIBRARIES_RAISE = (
 )  # fmt: skip
 """What a damaged file makes tifffile, h5py and imagecodecs raise."""
 
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+"""How HDF5 files begin."""
+
 _MAPPED_ALONG = 2**16
 
 

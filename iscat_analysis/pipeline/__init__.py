@@ -15,6 +15,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
@@ -35,6 +36,9 @@ from iscat_analysis.places import Here, Place
 from iscat_analysis.records import Analysis, Progress, silent
 from iscat_analysis.report import EVENT_FIGURES, write_report
 from iscat_analysis.report.output import claim_output
+
+if TYPE_CHECKING:
+    from iscat_analysis.draughtsman import Draughtsman
 
 FIND: Mapping[Way, Callable[[Prepared, Run], Found]] = {
     "fixed": find_bound,
@@ -58,6 +62,7 @@ def fit_stack(
     command: str = "",
     inject: int = 0,
     place: Place | None = None,
+    draughtsman: Draughtsman | None = None,
 ) -> Analysis:
     """Analyse a movie and write the report.
 
@@ -82,6 +87,8 @@ def fit_stack(
         and how well they are measured; ``summary["injection"]``.
     place : Place, optional
         Where the chunks of a landing movie are analysed; default in this process.
+    draughtsman : Draughtsman, optional
+        The process that draws the report; default this one.
 
     Returns
     -------
@@ -113,7 +120,9 @@ def fit_stack(
                 place=place,
             )
         figures = FEW_FIGURES if way_of(config) == "sliding" else EVENT_FIGURES
-        write_report(analysis, folder, overwrite=overwrite, event_figures=figures)
+        write_report(
+            analysis, folder, overwrite=overwrite, event_figures=figures, draughtsman=draughtsman
+        )
         if not analysis.summary["interrupted"]:
             shutil.rmtree(partial_folder(folder.resolve()), ignore_errors=True)
     if analysis.summary["interrupted"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +15,7 @@ from iscat_analysis.inference.checks import choice_in, number_in, path_in, shown
 from iscat_analysis.pipeline.kinetics import Kinetics
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.distribution import species_figure
-from iscat_analysis.report.style import publish
+from iscat_analysis.report.style import drawn, publish
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.schemas import jsonable, to_json
 from iscat_analysis.species import LEAST_EVENTS, Distribution, describe
@@ -257,4 +258,5 @@ def _write(
         species.to_csv(building / "species.csv", index=False, float_format=f"%.{CSV_DIGITS}g")
         (building / "species.json").write_text(to_json("species", contents) + "\n", "utf-8")
         (building / "figures").mkdir()
-        publish(species_figure(jsonable(contents)), building / "figures")
+        sketch = ("species", partial(species_figure, jsonable(contents)))
+        publish(drawn([sketch]), building / "figures")

@@ -6,10 +6,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
@@ -381,7 +379,7 @@ def crowded(rows: Rows, limit_nm: float) -> BoolArray:
     out = np.zeros(len(rows.frame), dtype=bool)
     apart = (2 * limit_nm + 1) * rows.frame  # no two frames lie within the limit of each other
     places = np.column_stack([rows.theta[:, :2], apart])
-    out[cKDTree(places).query_pairs(limit_nm, output_type="ndarray")] = True
+    out[scipy.spatial.cKDTree(places).query_pairs(limit_nm, output_type="ndarray")] = True
     return out
 
 
@@ -437,10 +435,10 @@ def bridge(config: Config, rows: Rows) -> IntArray:
     last, first = (np.array([mine[end] for mine in tracks], dtype=np.int64) for end in (-1, 0))
     square = np.array([_step_nm2(rows.only(mine)) for mine in tracks])
     gap = rows.frame[first] - rows.frame[last][:, None]
-    apart = cdist(rows.theta[last, :2], rows.theta[first, :2])
+    apart = scipy.spatial.distance.cdist(rows.theta[last, :2], rows.theta[first, :2])
     may = (gap > 0) & (gap <= _BRIDGE_FRAMES + 1) & (apart < reach)
     may &= np.maximum(square, square[:, None]) * np.maximum(gap, 1) < reach**2
-    before, after = linear_sum_assignment(np.where(may, apart, reach) ** 2)
+    before, after = scipy.optimize.linear_sum_assignment(np.where(may, apart, reach) ** 2)
     track = rows.track.copy()
     for i, j in zip(before.tolist(), after.tolist(), strict=True):
         if may[i, j]:

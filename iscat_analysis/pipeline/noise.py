@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
@@ -189,7 +189,7 @@ def judge_beside(
     frame, places_nm = seen
     count = min(_GAIN_FRAMES, span[1] - span[0])
     while count >= _FEWEST_FRAMES:
-        near = cKDTree(places_nm[(frame >= span[0]) & (frame < span[0] + count)])
+        near = scipy.spatial.cKDTree(places_nm[(frame >= span[0]) & (frame < span[0] + count)])
         free = used & (near.query(pixels)[0] > away).reshape(used.shape)
         if free.any() and free.sum() >= _FREE * used.sum():
             counts = movie.read(span[0], span[0] + count)

@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from iscat_analysis.calibration.optics import (
     FAINTEST,
@@ -269,7 +268,7 @@ def known_places(
     room = (_roi_px(config) // 2 + 1) * pixel
     far = np.array(windows.after_e.shape[::-1]) * pixel - room
     inside = ((known_nm >= room) & (known_nm < far)).all(axis=1)
-    apart = cdist(known_nm, known_nm)
+    apart = np.hypot(*(known_nm[:, None] - known_nm).transpose(2, 0, 1))
     np.fill_diagonal(apart, np.inf)
     nearest = apart.min(axis=1, initial=np.inf)[inside]
     seen = [_among(sight, others, 0.0) for sight in cut(known_nm[inside], _roi_px(config))]

@@ -1,6 +1,7 @@
 """The last stage: an `Analysis` becomes a folder of tables, figures and one self-contained page.
 
 ``tables`` writes what programs read, ``figures`` what papers print, ``page`` what people open;
+``drawing`` makes both of the latter, in a process of its own where a `Draughtsman` was begun, and
 ``output`` makes the folder appear whole or not at all.  The page templates are shared: anything
 that wants to look like the report calls `render_page`, most easily with ``document.html``.
 """
@@ -8,15 +9,20 @@ that wants to look like the report calls `render_page`, most easily with ``docum
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from iscat_analysis.records import Analysis
-from iscat_analysis.report.event_figures import EVENT_FIGURES
-from iscat_analysis.report.event_figures import event_figures as draw_events
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output
-from iscat_analysis.report.page import render_page, render_report
 from iscat_analysis.report.posterior import write_posterior
-from iscat_analysis.report.style import publish
 from iscat_analysis.report.tables import write_tables
+
+if TYPE_CHECKING:
+    from iscat_analysis.draughtsman import Draughtsman
+    from iscat_analysis.report.page import render_page as render_page
+    from iscat_analysis.report.page import render_report as render_report
+
+EVENT_FIGURES = 12
+"""Events whose images are drawn into the folder, at most."""
 
 __all__ = [
     "EVENT_FIGURES",
@@ -29,12 +35,22 @@ __all__ = [
 ]
 
 
+def __getattr__(name: str) -> Any:
+    """Import pages where they are asked for: Matplotlib is a quarter of all that a fit imports."""
+    if name not in ("render_page", "render_report"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from iscat_analysis.report import page
+
+    return getattr(page, name)
+
+
 def write_report(
     analysis: Analysis,
     folder: Path,
     *,
     overwrite: bool = False,
     event_figures: int = EVENT_FIGURES,
+    draughtsman: Draughtsman | None = None,
 ) -> Path:
     """Write everything one analysis found into a folder.
 
@@ -53,6 +69,8 @@ def write_report(
         Whether an earlier result may be replaced.
     event_figures : int
         Events whose images are drawn into the folder, at most; each takes a fifth of a second.
+    draughtsman : Draughtsman, optional
+        The process that draws; default this one.
 
     Returns
     -------
@@ -65,11 +83,15 @@ def write_report(
         The folder exists and may not be replaced, or cannot be written.
     """
     with atomic_folder(folder, overwrite) as building:
-        write_tables(analysis, building)
-        write_posterior(analysis, building / "posterior.nc")
         pictures = building / "figures"
         pictures.mkdir()
-        page = render_report(analysis, folder=pictures)
-        publish(draw_events(analysis, event_figures), pictures)
+        begun = draughtsman is not None and draughtsman.begin(analysis, pictures, event_figures)
+        write_tables(analysis, building)
+        write_posterior(analysis, building / "posterior.nc")
+        page = draughtsman.page() if draughtsman is not None and begun else None
+        if page is None:
+            from iscat_analysis.report.drawing import draw
+
+            page = draw(analysis, pictures, event_figures)
         (building / "report.html").write_text(page, encoding="utf-8")
     return folder

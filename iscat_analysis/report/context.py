@@ -48,10 +48,8 @@ _SIGNS = {
 _SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "Dark field"}
 
 
-def report_context(
-    analysis: Analysis, table: pd.DataFrame, figures: Mapping[str, Markup]
-) -> dict[str, Any]:
-    """Gather everything ``report.html`` shows.
+def report_context(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any]:
+    """Gather everything that ``report.html`` shows beside figures.
 
     Parameters
     ----------
@@ -59,8 +57,6 @@ def report_context(
         What was found.
     table : pandas.DataFrame
         From `event_table`.
-    figures : mapping of str to Markup
-        From `publish`: those of `page_figures`, of `corner_figures` and ``species``.
 
     Returns
     -------
@@ -94,8 +90,6 @@ def report_context(
         "has_holevo": any(math.isfinite(p.holevo) for p in precision),
         "precision_rows": precision_rows(analysis, precision),
         "warnings": analysis.warnings,
-        "figures": figures,
-        "histogram": next((name for name in figures if name.endswith("_histogram")), None),
         "main_label": main_quantity(analysis).label.capitalize(),
         "signs": _SIGNS.get(main_quantity(analysis).column),
         "events": {} if tracked else event_rows(analysis, table),
@@ -106,7 +100,6 @@ def report_context(
         if 0 < len(images) < len(table)
         else None,
         "posterior_rows": list(_posterior_rows(sampled, table)),
-        "corners": [name for name in figures if name.startswith("corner_")],
         "refused_rows": [
             [str(view.event), view.posterior.message]
             for view in sampled

@@ -5,7 +5,7 @@ Everything arrives as ``summary["distribution"]``; nothing is computed here.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -120,7 +120,7 @@ def _rows(species: Sequence[Mapping[str, Any]]) -> list[list[Any]]:
     return [list(row) for row in zip(*columns, strict=True)]
 
 
-def species_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
+def species_figure(found: Mapping[str, Any]) -> Figure | None:
     """Draw masses, species and the efficiency of their detection.
 
     Parameters
@@ -128,15 +128,13 @@ def species_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     found : mapping
         What ``summary.json`` holds under ``distribution``.
 
-    Yields
-    ------
-    name : str
-        ``species``; nothing where there are none.
-    figure : Figure
-        One panel, or two where particles were missed.
+    Returns
+    -------
+    Figure or None
+        One panel, or two where particles were missed; None where there are no species.
     """
     if not found["species"]:
-        return
+        return None
     bars, curves = found["histogram"], found["curves"]
     width = bars["high_kda"][0] - bars["low_kda"][0]
     mass, efficiency = np.array(curves["mass_kda"]), np.array(curves["efficiency"])
@@ -176,4 +174,4 @@ def species_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
                 ha="center", va="bottom", color=INK,
             )  # fmt: skip
     panels[0].legend(loc="best")  # said, because without it Matplotlib warns where that is slow
-    yield "species", figure
+    return figure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,11 +27,8 @@ from iscat_analysis.report.scales import (
     residual_limit,
     shaded,
 )
-from iscat_analysis.report.style import BLUE, INK, new_figure
+from iscat_analysis.report.style import BLUE, INK, Sketch, new_figure
 from iscat_analysis.report.traces import draw_trace, trace_svg, trace_words
-
-EVENT_FIGURES = 12
-"""Events whose images are drawn into the folder, at most."""
 
 CORNER_FIGURES = 20
 """Posteriors that are drawn, at most."""
@@ -73,8 +71,8 @@ class EventDetail(NamedTuple):
     sliding: str
 
 
-def event_figures(analysis: Analysis, most: int) -> Iterator[tuple[str, Figure]]:
-    """Draw the images of the first events.
+def event_figures(analysis: Analysis, most: int) -> Iterator[Sketch]:
+    """Name the images of the first events, and what draws them.
 
     Parameters
     ----------
@@ -85,20 +83,19 @@ def event_figures(analysis: Analysis, most: int) -> Iterator[tuple[str, Figure]]
 
     Yields
     ------
-    name : str
-        ``event_NNNN``; for a track, which has one view of each of its frames, with a number.
-    figure : Figure
-        Data, model and residual.
+    Sketch
+        ``event_NNNN``; for a track, which has one view of each of its frames, with a number: data,
+        model and residual.
     """
     seen: dict[int, int] = {}
     for view in analysis.views[:most]:
         seen[view.event] = nth = seen.get(view.event, 0) + 1
         name = f"event_{view.event:04d}" + (f"_{nth}" if nth > 1 else "")
-        yield name, triptych(view, analysis.scheme, analysis.pixel_size_nm)
+        yield name, partial(triptych, view, analysis.scheme, analysis.pixel_size_nm)
 
 
-def corner_figures(analysis: Analysis) -> Iterator[tuple[str, Figure]]:
-    """Draw the first converged posteriors.
+def corner_figures(analysis: Analysis) -> Iterator[Sketch]:
+    """Name the first converged posteriors, and what draws them.
 
     Parameters
     ----------
@@ -107,10 +104,8 @@ def corner_figures(analysis: Analysis) -> Iterator[tuple[str, Figure]]:
 
     Yields
     ------
-    name : str
-        ``corner_NNNN``.
-    figure : Figure
-        A corner plot.
+    Sketch
+        ``corner_NNNN``, a corner plot.
     """
     sampled = [
         (view.event, view.posterior)
@@ -118,7 +113,7 @@ def corner_figures(analysis: Analysis) -> Iterator[tuple[str, Figure]]:
         if view.posterior is not None and view.posterior.converged
     ]
     for event, posterior in sampled[:CORNER_FIGURES]:
-        yield f"corner_{event:04d}", corner(posterior, event)
+        yield f"corner_{event:04d}", partial(corner, posterior, event)
 
 
 def event_details(analysis: Analysis, table: pd.DataFrame) -> dict[int, EventDetail]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,9 @@ from iscat_analysis.report.event_figures import HALO, scale_bar
 from iscat_analysis.report.headline import as_contrasts, label_of, main_quantity
 from iscat_analysis.report.numbers import UNITS
 from iscat_analysis.report.scales import display_range
-from iscat_analysis.report.spread import counted, spread_figure
-from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, VERMILLION, new_figure
+from iscat_analysis.report.spread import counted
+from iscat_analysis.report.spread_figure import spread_figure
+from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, VERMILLION, Sketch, new_figure
 from iscat_analysis.report.track_figures import track_figures
 
 NUMBERED_EVENTS = 100
@@ -38,8 +40,8 @@ MOST_POINTS = 800
 _NAMES = {"mass_kda": "mass", "z_nm": "height", "n_scattered": "photon"}
 
 
-def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
-    """Draw the figures of the report page.
+def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
+    """Name the figures of the report page, and what draws them.
 
     Parameters
     ----------
@@ -50,32 +52,28 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[tuple[str,
 
     Yields
     ------
-    name : str
+    Sketch
         Those of `track_figures` where there are tracks, else ``overview`` (the field with its
         events), a histogram, ``timeline``, ``precision`` (σ
         against the bounds), ``spread`` (what was measured of it), ``diagnostics`` and ``power``;
         what has no data is left out.
-    figure : Figure
-        The figure.
     """
     main = main_quantity(analysis).column
     fitted = np.isfinite(counted(table)[main].to_numpy(float)).any()
     if analysis.tracks is not None:
         yield from track_figures(analysis, table)
     elif np.asarray(analysis.ratio_image).size:
-        yield "overview", overview(analysis, table)
+        yield "overview", partial(overview, analysis, table)
     if fitted and analysis.tracks is None:
-        yield f"{_NAMES.get(main, main)}_histogram", histogram(analysis, table)
-        yield "timeline", timeline(analysis, table)
+        yield f"{_NAMES.get(main, main)}_histogram", partial(histogram, analysis, table)
+        yield "timeline", partial(timeline, analysis, table)
     if fitted:
-        yield "precision", precision(analysis, table)
-    if (measured := spread_figure(analysis, label_of)) is not None:
-        yield "spread", measured
-    if (found := diagnostics(analysis, table)) is not None:
-        yield "diagnostics", found
+        yield "precision", partial(precision, analysis, table)
+    yield "spread", partial(spread_figure, analysis, label_of)
+    yield "diagnostics", partial(diagnostics, analysis, table)
     power_known = np.isfinite(np.asarray(analysis.power, float))
     if power_known.size > 1 and power_known.any():
-        yield "power", power(analysis)
+        yield "power", partial(power, analysis)
 
 
 def _points(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from itertools import chain
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jinja2
+import pandas as pd
 from markupsafe import Markup
 
 from iscat_analysis.records import Analysis
@@ -17,7 +18,7 @@ from iscat_analysis.report.distribution import distribution_section, species_fig
 from iscat_analysis.report.event_figures import corner_figures
 from iscat_analysis.report.figures import page_figures
 from iscat_analysis.report.headline import caution, is_uncalibrated
-from iscat_analysis.report.style import publish
+from iscat_analysis.report.style import Sketch, drawn, publish
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.report.track_context import tracks_context
 from iscat_analysis.schemas import jsonable
@@ -80,16 +81,61 @@ def render_report(analysis: Analysis, *, folder: Path | None = None) -> str:
         HTML.
     """
     table = event_table(analysis)
+    about = page_context(analysis, table, folder)
+    return page_of(about, publish(drawn(page_sketches(analysis, table)), folder))
+
+
+def page_sketches(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
+    """Name the figures of the page, and what draws them.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    table : pandas.DataFrame
+        From `event_table`.
+
+    Yields
+    ------
+    Sketch
+        Those of `page_figures`, ``species`` and those of `corner_figures`.
+    """
+    yield from page_figures(analysis, table)
+    if (found := _species(analysis, table)) is not None:
+        yield "species", partial(species_figure, found)
+    yield from corner_figures(analysis)
+
+
+def _species(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any] | None:
+    """Give what ``summary.json`` holds of the species, where the page shows them."""
     found = analysis.summary.get("distribution") if caution(table) is None else None
-    species = distribution_section(jsonable(found)) if found else None
+    return jsonable(found) if found else None
+
+
+def page_context(
+    analysis: Analysis, table: pd.DataFrame, folder: Path | None = None
+) -> dict[str, Any]:
+    """Gather what the page says.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    table : pandas.DataFrame
+        From `event_table`.
+    folder : Path, optional
+        Where films of tracks go.
+
+    Returns
+    -------
+    dict
+        The template's context, without figures.
+    """
+    found = _species(analysis, table)
+    species = distribution_section(found) if found else None
     if species is not None and is_uncalibrated(analysis):
         species["lead"] = f"On the model's own scale, which is not a mass. {species['lead']}"
-    drawn = chain(
-        page_figures(analysis, table),
-        species_figure(jsonable(found)) if found else (),
-        corner_figures(analysis),
-    )
-    context = report_context(analysis, table, publish(drawn, folder))
+    context = report_context(analysis, table)
     tracked = analysis.tracks is not None
     if tracked:
         context |= tracks_context(analysis, table, folder)
@@ -109,9 +155,30 @@ def render_report(analysis: Analysis, *, folder: Path | None = None) -> str:
         ("configuration", "Configuration"),
         ("provenance", "Provenance"),
     ]
-    return render_page(
-        "report.html", {"tracked": tracked, **context, "species": species, "nav": nav}
-    )
+    return {"tracked": tracked, **context, "species": species, "nav": nav}
+
+
+def page_of(about: Mapping[str, Any], figures: Mapping[str, Markup]) -> str:
+    """Put words and figures together.
+
+    Parameters
+    ----------
+    about : mapping
+        From `page_context`.
+    figures : mapping of str to Markup
+        From `publish`.
+
+    Returns
+    -------
+    str
+        HTML.
+    """
+    shown = {
+        "figures": figures,
+        "histogram": next((name for name in figures if name.endswith("_histogram")), None),
+        "corners": [name for name in figures if name.startswith("corner_")],
+    }
+    return render_page("report.html", {**about, **shown})
 
 
 class _AskableUndefined(jinja2.StrictUndefined):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +79,30 @@ def new_figure(width: float, height: float, *, constrained: bool = True) -> Figu
     return figure
 
 
+Sketch = tuple[str, Callable[[], Figure | None]]
+"""Name of a figure, and what draws it; nothing where there is nothing to show."""
+
+
+def drawn(sketches: Iterable[Sketch]) -> Iterator[tuple[str, Figure]]:
+    """Draw figures one after the other.
+
+    Parameters
+    ----------
+    sketches : iterable of Sketch
+        What to draw.
+
+    Yields
+    ------
+    name : str
+        Of a figure.
+    figure : Figure
+        The figure.
+    """
+    for name, draw in sketches:
+        if (figure := draw()) is not None:
+            yield name, figure
+
+
 def publish(
     figures: Iterable[tuple[str, Figure]], folder: Path | None = None, *, printed: bool = False
 ) -> dict[str, Markup]:
@@ -117,12 +141,25 @@ def publish(
             figure.savefig(buffer, format="svg", metadata=_NO_METADATA)
             if folder is not None:
                 (folder / f"{name}.svg").write_text(buffer.getvalue(), encoding="utf-8")
-            inline[name] = _inline(buffer.getvalue(), name)
+            inline[name] = inline_svg(buffer.getvalue(), name)
     return inline
 
 
-def _inline(svg: str, name: str) -> Markup:
-    """Fit an SVG file of Matplotlib's into a page that holds others."""
+def inline_svg(svg: str, name: str) -> Markup:
+    """Fit an SVG file of Matplotlib's into a page that holds others.
+
+    Parameters
+    ----------
+    svg : str
+        What the file holds.
+    name : str
+        Of the figure.
+
+    Returns
+    -------
+    Markup
+        An element.
+    """
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", svg, count=1, flags=re.DOTALL)
     svg = re.sub(r' (xmlns|xmlns:xlink|width|height|version)="[^"]*"', "", svg, count=5)

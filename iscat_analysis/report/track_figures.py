@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import matplotlib as mpl
@@ -19,7 +20,7 @@ from iscat_analysis.records import Analysis, BoolArray, FloatArray, TrackStatus,
 from iscat_analysis.report.event_figures import scale_bar
 from iscat_analysis.report.headline import main_quantity
 from iscat_analysis.report.scales import display_range
-from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, new_figure
+from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, Sketch, new_figure
 from iscat_analysis.report.tracks import tracks_of
 
 MOST_TRACKS = 400
@@ -38,8 +39,8 @@ _UM2 = 1e6  # nm²
 _NO_MASS = (0.6, 0.6, 0.6, 1.0)
 
 
-def track_figures(analysis: Analysis, fits: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
-    """Draw the figures of the tracks.
+def track_figures(analysis: Analysis, fits: pd.DataFrame) -> Iterator[Sketch]:
+    """Name the figures of the tracks, and what draws them.
 
     Parameters
     ----------
@@ -50,23 +51,20 @@ def track_figures(analysis: Analysis, fits: pd.DataFrame) -> Iterator[tuple[str,
 
     Yields
     ------
-    name : str
+    Sketch
         ``overview`` (the field with its tracks), ``mass_d`` (density of mass and D),
         ``distributions`` and ``msd``; what has no data is left out.
-    figure : Figure
-        The figure.
     """
     tracks = tracks_of(analysis)
     if np.asarray(analysis.ratio_image).size:
-        yield "overview", trajectories(analysis, fits)
+        yield "overview", partial(trajectories, analysis, fits)
     size, _ = masses(analysis)
     moving = tracks["d_um2_s"].to_numpy(float) > 0
     if (np.isfinite(size) & moving).any():
-        yield "mass_d", mass_d(analysis)
+        yield "mass_d", partial(mass_d, analysis)
     if np.isfinite(size).any():
-        yield "distributions", distributions(analysis)
-    if (drawn := msd(analysis, fits)) is not None:
-        yield "msd", drawn
+        yield "distributions", partial(distributions, analysis)
+    yield "msd", partial(msd, analysis, fits)
 
 
 def masses(analysis: Analysis) -> tuple[FloatArray, FloatArray]:

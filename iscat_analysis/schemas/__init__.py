@@ -12,36 +12,41 @@ import json
 import math
 from collections.abc import Mapping
 from enum import Enum
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import BaseModel
 
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.schemas.answers import Kd, Species, SpeciesComparison
-from iscat_analysis.schemas.bounds import Bounds, Comparison, OpticsBounds
-from iscat_analysis.schemas.calibration import Camera, MassCalibration, Optics, Template
-from iscat_analysis.schemas.day import Batch
-from iscat_analysis.schemas.fit import Fit, Simulate, Summary
-from iscat_analysis.schemas.study import Benchmark
 
-_DOCUMENTS: Mapping[str, type[BaseModel]] = {
-    "batch": Batch,
-    "benchmark": Benchmark,
-    "bounds": Bounds,
-    "calibration": MassCalibration,
-    "camera": Camera,
-    "comparison": Comparison,
-    "fit": Fit,
-    "kd": Kd,
-    "optics": Optics,
-    "optics_bounds": OpticsBounds,
-    "simulate": Simulate,
-    "species": Species,
-    "species_comparison": SpeciesComparison,
-    "summary": Summary,
-    "template": Template,
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+_DOCUMENTS: Mapping[str, str] = {
+    "batch": "day.Batch",
+    "benchmark": "study.Benchmark",
+    "bounds": "bounds.Bounds",
+    "calibration": "calibration.MassCalibration",
+    "camera": "calibration.Camera",
+    "comparison": "bounds.Comparison",
+    "fit": "fit.Fit",
+    "kd": "answers.Kd",
+    "optics": "calibration.Optics",
+    "optics_bounds": "bounds.OpticsBounds",
+    "simulate": "fit.Simulate",
+    "species": "answers.Species",
+    "species_comparison": "answers.SpeciesComparison",
+    "summary": "fit.Summary",
+    "template": "calibration.Template",
 }
+"""Model of each document; only what is asked for is imported, as each takes some milliseconds."""
+
+
+def _model(name: str) -> type[BaseModel]:
+    """Import the model of a document."""
+    module, _, model = _DOCUMENTS[name].partition(".")
+    found: type[BaseModel] = getattr(import_module(f"{__name__}.{module}"), model)
+    return found
 
 
 def schema_names() -> tuple[str, ...]:
@@ -80,7 +85,7 @@ def schema(name: str) -> dict[str, Any]:
     """
     if not isinstance(name, str) or name not in _DOCUMENTS:
         raise ConfigError(f"schema {name!r} is not known; there are {', '.join(_DOCUMENTS)}")
-    return _DOCUMENTS[name].model_json_schema(mode="serialization")
+    return _model(name).model_json_schema(mode="serialization")
 
 
 def to_json(name: str, values: Mapping[str, Any]) -> str:
@@ -103,7 +108,7 @@ def to_json(name: str, values: Mapping[str, Any]) -> str:
     pydantic.ValidationError
         The content is not what the schema promises.
     """
-    document = _DOCUMENTS[name].model_validate(jsonable(values))
+    document = _model(name).model_validate(jsonable(values))
     plain = document.model_dump(mode="json", exclude_unset=True, by_alias=True)
     return json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
 

@@ -16,9 +16,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.constants import Boltzmann, zero_Celsius
-from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
 from iscat_analysis._kernels.diffusion import most_likely_diffusion
@@ -196,7 +195,7 @@ def hydrodynamic_diameter(
     Einstein, Ann. Phys. 322, 549 (1905).
     """
     number_in("viscosity_mpa_s", viscosity_mpa_s, above=0.0)
-    number_in("temperature_c", temperature_c, above=-zero_Celsius)
+    number_in("temperature_c", temperature_c, above=-scipy.constants.zero_Celsius)
     d, sigma = real_array("d_um2_s", d_um2_s), real_array("sigma_d_um2_s", sigma_d_um2_s)
     for name, array in (("d_um2_s", d), ("sigma_d_um2_s", sigma)):
         bad = ~(np.isfinite(array) & (array >= 0))
@@ -208,7 +207,7 @@ def hydrodynamic_diameter(
         raise DataError(
             f"sigma_d_um2_s: has shape {sigma.shape}, which does not go with {d.shape} of d_um2_s"
         ) from None
-    energy = Boltzmann * (temperature_c + zero_Celsius)
+    energy = scipy.constants.Boltzmann * (temperature_c + scipy.constants.zero_Celsius)
     drag = 3 * math.pi * viscosity_mpa_s * 1e-3
     with np.errstate(divide="ignore", invalid="ignore"):
         diameter = energy / (drag * d * 1e-12) * 1e9
@@ -249,8 +248,10 @@ def _interval(track: Displacements, best: float, level: float) -> tuple[float, f
     while beyond(high) < 0:
         step *= 2
         high += step
-    upper = float(brentq(beyond, best, high))
-    lower = 0.0 if best == 0 or beyond(0.0) <= 0 else float(brentq(beyond, 0.0, best))
+    upper = float(scipy.optimize.brentq(beyond, best, high))
+    lower = (
+        0.0 if best == 0 or beyond(0.0) <= 0 else float(scipy.optimize.brentq(beyond, 0.0, best))
+    )
     return lower, upper
 
 
@@ -268,7 +269,7 @@ def _critical(mu: float, level: float) -> float:
         low = c if c <= mu else (mu * mu + c * c) / (2 * mu)
         return float(ndtr(c) - ndtr(-low)) - level
 
-    return float(brentq(short, one, two)) if mu > 0 and short(one) < 0 else one
+    return float(scipy.optimize.brentq(short, one, two)) if mu > 0 and short(one) < 0 else one
 
 
 def _covariance_based(track: Displacements, d_nm2_s: float) -> tuple[float, float]:

@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 from scipy.special import chdtrc
 
 from iscat_analysis.records import FloatArray
@@ -327,7 +327,7 @@ class _Series:
             return -value / self.events, -(slope * scale)[moving] / self.events
 
         low, high = (end[moving] / scale[moving] for end in (self.limits.low, self.limits.high))
-        found = minimize(
+        found = scipy.optimize.minimize(
             loss, np.clip(start[moving] / scale[moving], low, high), jac=True, method="TNC",
             bounds=list(zip(low, high, strict=True)),
             options={"maxfun": 600, "ftol": _TOLERANCE, "gtol": 1e-7},

@@ -27,9 +27,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.spatial import cKDTree
 from scipy.special import chdtrc, kolmogorov
 
 from iscat_analysis.records import FloatArray
@@ -130,7 +129,7 @@ def landing_rate(times_s: FloatArray, seconds: float) -> LandingRate:
     def rise(x: float) -> float:
         return _middle(x) - mean
 
-    best = float(brentq(rise, -_STEEPEST, _STEEPEST, xtol=1e-10))
+    best = float(scipy.optimize.brentq(rise, -_STEEPEST, _STEEPEST, xtol=1e-10))
     ends = _ends(height, best, -_STEEPEST, _STEEPEST)
     flat = 2 * (height(best) - height(0.0))
     # Information on ln λ₀ and x = kT: n, −n g', and that of ∫λ.
@@ -184,7 +183,7 @@ def pair_events(
     lands, leaves = np.flatnonzero(mass_kda > 0), np.flatnonzero(mass_kda < 0)
     if not lands.size or not leaves.size:
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    tree = cKDTree(place_px[lands])
+    tree = scipy.spatial.cKDTree(place_px[lands])
     taken: dict[int, int] = {}
     for leaving in leaves[np.argsort(frame[leaves], kind="stable")]:
         near = lands[tree.query_ball_point(place_px[leaving], radius_px)]
@@ -278,4 +277,4 @@ def _crossing(height: Callable[[float], float], top: float, start: float, far: f
     """Where it has, between a place where it has not and an end of the range."""
     if top - height(far) < _DROP:
         return far
-    return float(brentq(lambda x: top - height(x) - _DROP, start, far, xtol=1e-9))
+    return float(scipy.optimize.brentq(lambda x: top - height(x) - _DROP, start, far, xtol=1e-9))

@@ -15,9 +15,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
-from scipy.optimize import minimize
 from scipy.special import chdtrc
 
 from iscat_analysis._kernels.well import most_likely_well
@@ -156,7 +156,7 @@ def anomalous_test(
         d, exponent = at(theta)
         return -_dense(track, d * _covariance(track, lags, exponent))
 
-    found = minimize(
+    found = scipy.optimize.minimize(
         lost, [0.0, 0.0], method="L-BFGS-B",
         bounds=[(-20.0 / unit, 20.0 / unit), [(end - 1) / unit for end in _EXPONENTS]],
         options={"ftol": 1e-7, "eps": _PART / unit},

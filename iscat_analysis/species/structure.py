@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from iscat_analysis._kernels.mixture import detection_score, mixture_score
 from iscat_analysis.records import FloatArray
@@ -206,7 +206,7 @@ def maximise(
 
     low, high = limits.low / limits.scale, limits.high / limits.scale
     # TNC and not L-BFGS-B, whose calls of a threaded BLAS take longer than all the rest.
-    found = minimize(
+    found = scipy.optimize.minimize(
         loss, np.clip(start / limits.scale, low, high), jac=True, method="TNC",
         bounds=list(zip(low, high, strict=True)),
         options={"maxfun": evaluations, "ftol": tolerance, "gtol": 1e-6},

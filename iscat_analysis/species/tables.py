@@ -23,13 +23,13 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy.optimize import minimize_scalar
+import scipy
 from scipy.special import log_ndtr
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie.event_tables import read_events
-from iscat_analysis.movie.hdf5 import SIGNATURE as HDF5
+from iscat_analysis.movie.mapped import HDF5_SIGNATURE
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.species.events import Efficiency, Events
 from iscat_analysis.units import count
@@ -222,7 +222,9 @@ def _truncated(mass: FloatArray, snr: FloatArray, sigma: FloatArray, threshold_s
 
     if not mass.size:
         return middle
-    found = minimize_scalar(loss, bounds=(0.8 * middle, 2.0 * middle), method="bounded")
+    found = scipy.optimize.minimize_scalar(
+        loss, bounds=(0.8 * middle, 2.0 * middle), method="bounded"
+    )
     return float(found.x)
 
 
@@ -282,7 +284,7 @@ def _read(path: Path) -> tuple[pd.DataFrame, Path]:
     try:
         return read_events(path), path
     except DataError:
-        if head.startswith(HDF5) or {"contrasts", "masses_kDa"} & set(names):
+        if head.startswith(HDF5_SIGNATURE) or {"contrasts", "masses_kDa"} & set(names):
             raise
         if {"x", "y", "frame", "mass", "signal"} <= set(names):
             raise DataError(

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.distance import cdist
+import scipy
 
 from iscat_analysis.records import (
     TRACK_COLUMNS,
@@ -398,7 +398,7 @@ def _nearest(fits: pd.DataFrame, numbers: pd.Series[int]) -> dict[int, float]:
     for rows in fits.reset_index(drop=True).groupby("frame").indices.values():
         if len(rows) < 2:
             continue
-        apart = cdist(places[rows], places[rows])
+        apart = scipy.spatial.distance.cdist(places[rows], places[rows])
         apart[tracks[rows][:, None] == tracks[rows]] = np.inf
         for track, distance in zip(tracks[rows], apart.min(axis=1), strict=True):
             closest[int(track)] = min(closest.get(int(track), np.inf), float(distance))

@@ -34,18 +34,17 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 
 from sketches import PAGES, sketch
 
-from iscat_analysis import report
 from iscat_analysis.pipeline import chunks
+from iscat_analysis.report.style import publish
 from iscat_cli import main
 
-_publish = report.publish
 _SKETCH = partial(sketch, pause_s=0.01)  # a moment to be killed in, at each figure
 
 
 def _run(order: dict[str, Any]) -> int:
     os.chdir(order["cwd"])
     for module in PAGES:
-        module.publish = _publish if order.get("figures") else _SKETCH
+        module.publish = publish if order.get("figures") else _SKETCH
     if "limit" in order:
         resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
     if "memory_share" in order:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import scipy
 from scipy.ndimage import gaussian_filter1d
-from scipy.optimize import minimize
 from scipy.special import ndtr
 
 from iscat_analysis.records import FloatArray
@@ -150,7 +150,7 @@ def _fit_peak(
         return -float(np.sum(np.log(np.maximum(density * (high - low), 1e-300))))
 
     bounds = [(-1.5, 1.5), (-2.5, 1.0), (-3.0, 6.0)]
-    best = minimize(loss, [0.0, 0.0, 2.0], method="TNC", bounds=bounds)
+    best = scipy.optimize.minimize(loss, [0.0, 0.0, 2.0], method="TNC", bounds=bounds)
     theta = np.asarray(best.x)
     curvature = _hessian(loss, theta, bounds)
     free = np.array([lo + 1e-3 < t < hi - 1e-3 for t, (lo, hi) in zip(theta, bounds, strict=True)])

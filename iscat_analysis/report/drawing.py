@@ -1,0 +1,128 @@
+"""The figures and the page of an analysis, drawn by one process or by two.
+
+Run as ``python -m iscat_analysis.report.drawing``, this is the process that
+`iscat_analysis.draughtsman` starts.  It reads what to draw from stdin, writes the page to stdout,
+and has drawn all if it ends with status 0.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import pickle
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from markupsafe import Markup
+
+from iscat_analysis.records import Analysis
+from iscat_analysis.report.event_figures import event_figures
+from iscat_analysis.report.page import page_context, page_of, page_sketches
+from iscat_analysis.report.style import Sketch, drawn, inline_svg, publish
+from iscat_analysis.report.tables import event_table
+
+_MOST_SHARED = 256  # figures that two processes take from each other: a number is one byte
+
+
+def draw(analysis: Analysis, folder: Path, most: int) -> str:
+    """Draw all figures into a folder, and make the page.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    folder : Path
+        An existing folder.
+    most : int
+        Events whose images are drawn, at most.
+
+    Returns
+    -------
+    str
+        The page.
+    """
+    table = event_table(analysis)
+    about = page_context(analysis, table, folder)
+    publish(drawn(event_figures(analysis, most)), folder)
+    return page_of(about, publish(drawn(page_sketches(analysis, table)), folder))
+
+
+def draw_together(analysis: Analysis, folder: Path, most: int) -> str:
+    """Do the same as `draw`; on Linux a copy of this process draws as well.
+
+    Only for a process that has no threads, which a copy would lack.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    folder : Path
+        An existing folder.
+    most : int
+        Events whose images are drawn, at most.
+
+    Returns
+    -------
+    str
+        The page.
+
+    Raises
+    ------
+    RuntimeError
+        The copy could not draw what it had taken.
+    """
+    table = event_table(analysis)
+    shown = list(page_sketches(analysis, table))
+    sketches = [*shown, *event_figures(analysis, most)]
+    if sys.platform != "linux" or len(sketches) > _MOST_SHARED:
+        return draw(analysis, folder, most)
+    reader, writer = os.pipe()
+    os.write(writer, bytes(range(len(sketches))))
+    os.close(writer)
+    copy = os.fork()
+    if copy == 0:
+        status = 1
+        try:
+            publish(drawn(_taken(sketches, reader)), folder)
+            status = 0
+        finally:
+            os._exit(status)
+    about = page_context(analysis, table, folder)
+    figures = publish(drawn(_taken(sketches, reader)), folder)
+    _, status = os.waitpid(copy, 0)
+    if status:
+        raise RuntimeError(f"a process that drew figures ended with status {status}")
+    return page_of(about, dict(_gathered(shown, figures, folder)))
+
+
+def _taken(sketches: Sequence[Sketch], reader: int) -> Iterator[Sketch]:
+    """Take one sketch after the other that no other process has taken; each is a byte of a pipe."""
+    while number := os.read(reader, 1):
+        yield sketches[number[0]]
+
+
+def _gathered(
+    sketches: Sequence[Sketch], figures: dict[str, Markup], folder: Path
+) -> Iterator[tuple[str, Markup]]:
+    """Give the figures of the page in their order, those of the other process from its files."""
+    for name, _ in sketches:
+        file = folder / f"{name}.svg"
+        if name in figures:
+            yield name, figures[name]
+        elif file.exists():
+            yield name, inline_svg(file.read_text(encoding="utf-8"), name)
+
+
+def main() -> None:
+    """Draw what stdin holds, where it holds anything."""
+    gc.disable()  # the process is short, and what it makes stays
+    try:  # not until stdin ends: a copy of the other process may hold it open
+        order = pickle.Unpickler(sys.stdin.buffer).load()
+    except EOFError:
+        return
+    sys.stdout.buffer.write(draw_together(*order).encode("utf-8"))
+
+
+if __name__ == "__main__":
+    main()

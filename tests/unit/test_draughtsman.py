@@ -1,0 +1,166 @@
+"""A report drawn by a process of its own: the same report, and no process that stays."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from iscat_analysis import draughtsman as module
+from iscat_analysis.draughtsman import Draughtsman, draughtsman
+from iscat_analysis.records import Analysis
+from iscat_analysis.report import write_report
+from iscat_analysis.report.drawing import draw_together
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from report_factory import make_analysis
+
+pytestmark = pytest.mark.skipif(os.cpu_count() == 1, reason="one processor: nothing is started")
+
+
+@pytest.fixture(scope="module")
+def analysis() -> Analysis:
+    return make_analysis(3, "joint", posteriors=1)
+
+
+@pytest.fixture(scope="module")
+def expected(analysis: Analysis, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return contents(write_report(analysis, tmp_path_factory.mktemp("here") / "out"))
+
+
+@pytest.fixture
+def pen(monkeypatch: pytest.MonkeyPatch) -> Iterator[Draughtsman]:
+    monkeypatch.delitem(sys.modules, "matplotlib")
+    with draughtsman() as begun:
+        monkeypatch.undo()
+        assert begun is not None
+        yield begun
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+
+def wait_until_gone(kill: Callable[[int, int], None], number: int) -> None:
+    """Wait for the end of a process or group that is no child: the system collects it."""
+    with contextlib.suppress(ProcessLookupError):
+        while True:
+            kill(number, 0)
+            time.sleep(0.01)
+
+
+def test_it_draws_the_same_report(
+    pen: Draughtsman, analysis: Analysis, expected: dict[str, bytes], tmp_path: Path
+) -> None:
+    pictures = tmp_path / "figures"
+    pictures.mkdir()
+    assert pen.begin(analysis, pictures, 12)
+    page = pen.page()
+    assert page is not None
+    drawn = {name for name in expected if name.startswith("figures")}
+    assert len(drawn) > 8
+    assert contents(tmp_path) == {name: expected[name] for name in drawn}
+    assert page.encode() == expected["report.html"]
+    assert not pen.begin(analysis, pictures, 12), "it draws once"
+
+
+def test_a_report_is_written_with_it(
+    pen: Draughtsman,
+    analysis: Analysis,
+    expected: dict[str, bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("iscat_analysis.report.drawing.draw", None)  # nothing is drawn here
+    assert contents(write_report(analysis, tmp_path / "out", draughtsman=pen)) == expected
+
+
+@pytest.mark.parametrize("when", ["before", "while it draws"])
+def test_where_it_fails_the_report_is_drawn_here(
+    pen: Draughtsman,
+    when: str,
+    analysis: Analysis,
+    expected: dict[str, bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    process = pen._process
+    if when == "before":
+        process.kill()
+        process.wait()
+    else:
+        monkeypatch.setattr("iscat_analysis.report.write_tables", lambda *_: process.kill())
+    found = contents(write_report(analysis, tmp_path / "out", draughtsman=pen))
+    tables = {name for name in expected if name.partition(".")[0] in ("fits", "summary", "config")}
+    assert found == {k: v for k, v in expected.items() if when == "before" or k not in tables}
+
+
+def test_it_ends_with_its_copy_whatever_they_are_at(
+    pen: Draughtsman, analysis: Analysis, tmp_path: Path
+) -> None:
+    pen.begin(analysis, tmp_path, 12)
+    while not any(tmp_path.iterdir()):  # until it draws
+        time.sleep(0.01)
+    pen.close()
+    assert pen._process.returncode == -signal.SIGKILL
+    assert pen.page() is None
+    wait_until_gone(os.killpg, pen._process.pid)
+
+
+def test_it_ends_when_the_command_is_killed(tmp_path: Path) -> None:
+    text = (
+        "import sys, time; from iscat_analysis.draughtsman import draughtsman\n"
+        "with draughtsman() as pen: print(pen._process.pid, flush=True); time.sleep(60)"
+    )
+    command = [sys.executable, "-c", text]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        pid = int(process.stdout.readline())
+        process.kill()
+    wait_until_gone(os.kill, pid)
+
+
+def test_a_process_that_has_matplotlib_draws_itself() -> None:
+    assert "matplotlib" in sys.modules
+    with draughtsman() as pen:
+        assert pen is None
+
+
+def test_one_that_cannot_be_started_is_done_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "matplotlib")
+    monkeypatch.setattr(module.sys, "executable", "/nowhere/python")
+    with draughtsman() as pen:
+        assert pen is None
+
+
+def test_what_the_copy_cannot_draw_is_an_error(
+    analysis: Analysis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = os.getpid()
+
+    def fail(*_: object, **__: object) -> dict[str, str]:
+        if os.getpid() != here:
+            raise OSError("no space left on device")
+        return {}
+
+    monkeypatch.setattr("iscat_analysis.report.drawing.publish", fail)
+    with pytest.raises(RuntimeError, match="ended with status"):
+        draw_together(analysis, tmp_path, 12)
+
+
+def test_a_fit_loads_matplotlib_in_the_other_process_only() -> None:
+    text = (
+        "import sys, iscat_cli.app, iscat_analysis.pipeline, iscat_analysis.report.headline\n"
+        "assert 'iscat_analysis.inference.fit' in sys.modules\n"
+        "print(*({'matplotlib', 'jinja2', 'h5py', 'scipy.optimize'} & {*sys.modules}))"
+    )
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert done.stdout == "\n"
