@@ -33,24 +33,6 @@ def sphere_mass_kda(diameter_nm: float, density_kg_m3: float) -> float:
     return density_kg_m3 * math.pi / 6 * (diameter_nm * NM) ** 3 / KILODALTON_KG
 
 
-def sphere_diameter_nm(mass_kda: float, density_kg_m3: float) -> float:
-    """Diameter of the sphere that has a given mass; the inverse of `sphere_mass_kda`.
-
-    Parameters
-    ----------
-    mass_kda : float
-        Mass [kDa].
-    density_kg_m3 : float
-        Density [kg/m³].
-
-    Returns
-    -------
-    float
-        Diameter [nm].
-    """
-    return math.cbrt(mass_kda * KILODALTON_KG / density_kg_m3 * 6 / math.pi) / NM
-
-
 def count(n: int, noun: str) -> str:
     """Write so many of something, in the plural unless it is one.
 

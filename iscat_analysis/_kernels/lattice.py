@@ -48,9 +48,6 @@ FILTER = 10
 """Half length of the filter that undoes the window."""
 _BLOCK = 128  # radial nodes whose Bessel functions are held at once
 
-RADIAL_STEP = 0.3
-"""Radial step times bandwidth: the quintic errs by 1.6e-8 of the peak."""
-
 
 @cache
 def window() -> tuple[FloatArray, FloatArray]:

@@ -226,13 +226,11 @@ def _on_axis(experiment: Experiment, root: float) -> tuple[float, float]:
     return phase, signal / noise * math.sqrt(scale) / root
 
 
-def reproduce(*, workers: int = 2, progress: Progress = silent) -> Reproduction:
+def reproduce(*, progress: Progress = silent) -> Reproduction:
     """Compute every panel and Table 1.
 
     Parameters
     ----------
-    workers : int
-        Threads.
     progress : Progress, optional
         Told after each curve.
 
@@ -252,7 +250,7 @@ def reproduce(*, workers: int = 2, progress: Progress = silent) -> Reproduction:
                 jobs.append((over_z, scheme, convention, attenuation))
                 jobs.append((over_focus, scheme, convention, attenuation))
     parts: list[pd.DataFrame] = []
-    with threads(workers) as pool:
+    with threads(2) as pool:
         for done, part in enumerate(pool.map(lambda job: _curves(*job), jobs), start=1):
             parts.append(part)
             progress("curves of Dong et al. (2021)", done, len(jobs))

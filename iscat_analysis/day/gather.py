@@ -47,7 +47,7 @@ SPECIES_COLUMNS = (
 the detection limit stands for any number of particles, and would take the others' fractions."""
 
 _Z95 = 1.959964
-_MASSES = ("mass_kda", "sigma_mass_kda", "status", "p_value")
+_MASSES = ("mass_kda", "status", "p_value")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Found:
         Of its result.
     summary : mapping of str to Any
         Its ``summary.json``; empty where there is no result.
-    masses_kda, sigmas_kda : ndarray, shape (n,)
+    masses_kda : ndarray, shape (n,)
         Of its events, or tracks, that are ok [kDa]; negative for those that leave.
     p_values : ndarray, shape (n,)
         Of its events, poor fits included.
@@ -77,7 +77,6 @@ class Found:
     folder: Path
     summary: Mapping[str, Any]
     masses_kda: FloatArray
-    sigmas_kda: FloatArray
     p_values: FloatArray
     config: Config | None
 
@@ -135,21 +134,20 @@ def read_movie(movie: Movie, outcome: Outcome, folder: Path) -> Found:
     """
     nothing = np.empty(0)
     if outcome.state != "done" or movie.row.role == "flat":
-        return Found(movie, outcome, folder, {}, nothing, nothing, nothing, None)
+        return Found(movie, outcome, folder, {}, nothing, nothing, None)
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     config = load_config(folder / "config.toml")
     events = pd.read_parquet(folder / "fits.parquet", columns=list(_MASSES))
     kept = events[events["status"].isin([Status.OK, Status.POOR_FIT])]
     if (folder / "tracks.parquet").is_file():
-        good = pd.read_parquet(folder / "tracks.parquet", columns=["mass_kda", "sigma_mass_kda"])
+        good = pd.read_parquet(folder / "tracks.parquet", columns=["mass_kda"])
     else:
         good = events[events["status"] == Status.OK]
     good = good if summary["mode"] != "localize" else good[:0]
-    mass, sigma = (good[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
-    known = np.isfinite(mass)
+    mass = good["mass_kda"].to_numpy(float)
     p_values = kept["p_value"].to_numpy(float)
     return Found(
-        movie, outcome, folder, summary, mass[known], sigma[known],
+        movie, outcome, folder, summary, mass[np.isfinite(mass)],
         p_values[np.isfinite(p_values)], config,
     )  # fmt: skip
 

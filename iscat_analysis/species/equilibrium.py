@@ -44,7 +44,6 @@ from iscat_analysis.species.structure import (
 _REACH = math.log(1e4)  # of ln K_D beyond the concentrations
 _GRID = 25
 _SIGMAS = 1.959964
-_DEVIANCE = _SIGMAS**2
 _SETTLED = 0.01  # of the signed root of the deviance at an end of the interval
 _STEPS = 30
 _MASS_RANGE = 0.2  # of the masses that were given

@@ -12,7 +12,6 @@ from iscat_analysis.study.baselines import Baselines
 from iscat_analysis.study.posteriors import PosteriorRanks, calibrate_posterior
 from iscat_analysis.study.scores import (
     Score,
-    gaussian_posterior,
     pull_histogram,
     rank_test,
     score,
@@ -36,7 +35,6 @@ __all__ = [
     "Trials",
     "calibrate_posterior",
     "check_benchmark_output",
-    "gaussian_posterior",
     "make_setting",
     "pull_histogram",
     "rank_test",

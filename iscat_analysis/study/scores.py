@@ -150,15 +150,13 @@ def spread_error(error: FloatArray) -> float:
     return math.sqrt(max(2 + unbiased, 0.1) / (4 * (n - 1)))
 
 
-def spread_interval(error: FloatArray, level: float = 0.95) -> tuple[float, float]:
-    """Confidence interval of a standard deviation.
+def spread_interval(error: FloatArray) -> tuple[float, float]:
+    """Give the 95 % interval of a standard deviation.
 
     Parameters
     ----------
     error : ndarray, shape (n,)
         Sample.
-    level : float
-        Probability.
 
     Returns
     -------
@@ -167,7 +165,7 @@ def spread_interval(error: FloatArray, level: float = 0.95) -> tuple[float, floa
         (D. G. Bonett, Comput. Stat. Data Anal. 50, 775, 2006).
     """
     spread = float(np.std(error, ddof=1))
-    reach = float(norm.ppf(0.5 + level / 2)) * spread_error(error)
+    reach = float(norm.ppf(0.975)) * spread_error(error)
     if not math.isfinite(reach):
         return spread, spread
     return spread * math.exp(-reach), spread * math.exp(reach)
@@ -189,15 +187,13 @@ def share(inside: BoolArray) -> float:
     return float(np.mean(inside)) if inside.size else math.nan
 
 
-def share_interval(inside: BoolArray, level: float = 0.95) -> tuple[float, float]:
-    """Confidence interval of a share.
+def share_interval(inside: BoolArray) -> tuple[float, float]:
+    """Give the 95 % interval of a share.
 
     Parameters
     ----------
     inside : ndarray of bool, shape (n,)
         For which trials it holds.
-    level : float
-        Probability.
 
     Returns
     -------
@@ -209,7 +205,7 @@ def share_interval(inside: BoolArray, level: float = 0.95) -> tuple[float, float
     if not n:
         return math.nan, math.nan
     found = binomtest(int(np.count_nonzero(inside)), n)
-    low, high = found.proportion_ci(level, method="wilson")
+    low, high = found.proportion_ci(0.95, method="wilson")
     return float(low), float(high)
 
 
@@ -271,28 +267,6 @@ def rank_test(ranks: NDArray[np.int64], possible: int, bins: int = 20) -> tuple[
     expected = counts.sum() / bins
     statistic = float(np.sum((counts - expected) ** 2) / expected) if expected else 0.0
     return float(chi2.sf(statistic, bins - 1)), counts
-
-
-def gaussian_posterior(
-    estimate: FloatArray, sigma: FloatArray, centre: float, width: float
-) -> tuple[FloatArray, FloatArray]:
-    """Join estimates with a normal prior.
-
-    Parameters
-    ----------
-    estimate, sigma : ndarray, shape (n,)
-        Maximum-likelihood estimates and their standard deviations.
-    centre, width : float
-        Mean and standard deviation of the prior.
-
-    Returns
-    -------
-    mean, sigma : ndarray, shape (n,)
-        Of the posterior where the likelihood is normal.
-    """
-    weight = 1 / sigma**2
-    known = 1 / width**2
-    return (estimate * weight + centre * known) / (weight + known), 1 / np.sqrt(weight + known)
 
 
 def _ratio(value: float, bound: float) -> float:

@@ -15,17 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import compile_kernels
-from iscat_analysis.records import BoolArray, Candidate, FitResult, FloatArray, Status
+from iscat_analysis.records import BoolArray, FitResult, FloatArray, Status
 from iscat_analysis.study.baselines import Baselines
 from iscat_analysis.study.setting import Setting
 from iscat_analysis.threads import threads
 
 CHUNK = 16
 """Trials that a thread takes at a time."""
-
-Draw = Callable[[np.random.Generator], tuple[Likelihood, Candidate]]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from iscat_analysis.records import FREE_PARAMETERS, Candidate
 from iscat_analysis.report.benchmark import BENCHMARK_NAMES, benchmark_figures, render_benchmark
 from iscat_analysis.study import (
     Baselines,
-    gaussian_posterior,
     make_setting,
     pull_histogram,
     rank_test,
@@ -120,12 +119,6 @@ def test_van_trees_adds_information() -> None:
     assert van_trees(nothing, 4 * np.eye(2)) == pytest.approx([0.5, 0.5])
     with pytest.raises(ConfigError, match="determine"):
         van_trees(np.diag([1.0, 0.0]), nothing)
-
-
-def test_gaussian_posterior_weighs_by_precision() -> None:
-    mean, sigma = gaussian_posterior(np.array([2.0]), np.array([1.0]), 0.0, 1.0)
-    assert mean == pytest.approx([1.0])
-    assert sigma == pytest.approx([math.sqrt(0.5)])
 
 
 # ---- settings ----------------------------------------------------------------------------------

@@ -162,9 +162,9 @@ class MassCalibration:
         )
 
     def prediction_interval(
-        self, contrast: ArrayLike, sigma_contrast: ArrayLike = 0.0, *, level: float = 0.95
+        self, contrast: ArrayLike, sigma_contrast: ArrayLike = 0.0
     ) -> tuple[FloatArray, FloatArray]:
-        """Give the interval that holds the true mass with a given probability.
+        """Give the interval that holds the true mass with a probability of 95 %.
 
         Parameters
         ----------
@@ -172,22 +172,13 @@ class MassCalibration:
             Signed peak contrasts.
         sigma_contrast : array_like
             Their standard deviations.
-        level : float
-            Probability, in (0, 1).
 
         Returns
         -------
         low, high : ndarray
             Ends of the interval [kDa].
-
-        Raises
-        ------
-        ValueError
-            `level` is not a probability.
         """
-        if not 0 < level < 1:
-            raise ValueError(f"level = {level} must lie between 0 and 1")
-        reach = float(ndtri((1 + level) / 2)) * self.sigma_kda(contrast, sigma_contrast)
+        reach = float(ndtri(0.975)) * self.sigma_kda(contrast, sigma_contrast)
         mass = self.mass_kda(contrast)
         return mass - reach, mass + reach
 
