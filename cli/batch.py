@@ -170,13 +170,7 @@ def _part(text: str | None, *, merge: bool) -> tuple[int, int] | None:
 
 
 def print_batch(found: Batch) -> None:
-    """Print a line per movie, and what there is now.
-
-    Parameters
-    ----------
-    found : Batch
-        Of all movies.
-    """
+    """Print a line per movie, and what there is now."""
     done = int((found.movies["state"] == "done").sum())
     shown = table("movie")
     shown.add_column("sample", no_wrap=True)

@@ -91,18 +91,7 @@ def benchmark(
 
 
 def benchmark_table(study: Mapping[str, Any]) -> Table:
-    """Tabulate a study: one row per mode and parameter.
-
-    Parameters
-    ----------
-    study : mapping
-        What benchmark.json holds.
-
-    Returns
-    -------
-    rich.table.Table
-        Spread, bounds and their ratios.
-    """
+    """Tabulate what benchmark.json holds: one row per mode and parameter."""
     headings = ("bias", "spread", "CRB", "QCRB", "spread/CRB", "95 % interval", "coverage 68 %")
     found = table("mode", "parameter", *headings, "failed")
     found.columns[1].justify = "left"

@@ -21,13 +21,7 @@ KINDS = {
 
 
 def print_bounds(report: Mapping[str, Any]) -> None:
-    """Print what `iscat bounds` found.
-
-    Parameters
-    ----------
-    report : mapping
-        As `--json` prints it.
-    """
+    """Print what `iscat bounds` found, which `--json` prints whole."""
     photons = report["n_scattered"]
     print_result(
         f"scattered photons: {short(photons['camera'])} on the camera, "

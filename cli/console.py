@@ -37,12 +37,7 @@ PLAIN_WIDTH = 200
 class Messages:
     """Progress, notes and errors of one command, on stderr.
 
-    Parameters
-    ----------
-    name : str
-        The command, as each error line begins.
-    quiet : bool
-        Drop progress and notes; errors are always shown.
+    `quiet` drops progress and notes; errors are always shown, and begin with `name`.
     """
 
     def __init__(self, name: str, *, quiet: bool = False) -> None:
@@ -52,23 +47,11 @@ class Messages:
         self._terminal = Console(stderr=True, highlight=False, markup=False, emoji=False)
 
     def error(self, text: str) -> None:
-        """Say in one line what went wrong.
-
-        Parameters
-        ----------
-        text : str
-            What, and what to do.
-        """
+        """Say in one line what went wrong, and what to do."""
         self._line(f"{self.name}: error: {_one_line(text)}")
 
     def notify(self, text: str) -> None:
-        """Say something in one line, unless quiet.
-
-        Parameters
-        ----------
-        text : str
-            What to say.
-        """
+        """Say something in one line, unless quiet."""
         if not self.quiet:
             self._line(f"{self.name}: {_one_line(text)}")
 
@@ -80,13 +63,7 @@ class Messages:
 
     @contextmanager
     def progress(self) -> Iterator[Progress]:
-        """Show how far the work is: bars on a terminal, a line now and then elsewhere.
-
-        Yields
-        ------
-        Progress
-            To be handed to the library.
-        """
+        """Show how far the work is: bars on a terminal, a line now and then elsewhere."""
         with self._shown() as shown:
 
             def tell(stage: str, done: int, total: int) -> None:
@@ -169,18 +146,7 @@ class _Lines:
 
 
 def duration(seconds: float) -> str:
-    """Write a time as people say it.
-
-    Parameters
-    ----------
-    seconds : float
-        Not negative.
-
-    Returns
-    -------
-    str
-        ``"8 s"``, ``"3 min"`` or ``"2 h 5 min"``.
-    """
+    """Write a time as people say it: ``"8 s"``, ``"3 min"`` or ``"2 h 5 min"``."""
     if seconds < 100:
         return f"{math.ceil(seconds)} s"
     minutes = math.ceil(seconds / 60)
@@ -195,24 +161,7 @@ def _ignore(stage: str, done: int, total: int) -> None:
 
 @contextmanager
 def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
-    """Turn whatever a command raises into one line and an exit status.
-
-    Parameters
-    ----------
-    messages : Messages
-        Where the line goes.
-    debug : bool
-        Show the traceback as well.
-
-    Yields
-    ------
-    None
-
-    Raises
-    ------
-    typer.Exit
-        With the status.
-    """
+    """Turn whatever a command raises into one line and an exit status; `debug` shows it all."""
 
     def show(
         message: Warning | str,
@@ -284,18 +233,7 @@ _KEYS_WITH_OPTIONS = (
 
 
 def with_options(text: str) -> str:
-    """Name options where the library names its arguments, which it writes in backquotes.
-
-    Parameters
-    ----------
-    text : str
-        What the library says.
-
-    Returns
-    -------
-    str
-        The same for whoever typed a command.
-    """
+    """Name options where the library names its arguments, which it writes in backquotes."""
 
     def option(match: re.Match[str]) -> str:
         return f"--{_OPTIONS[match[1]]}{' ' if match[2] else ''}"
@@ -326,13 +264,7 @@ def _verdict(error: Exception, *, debug: bool) -> tuple[str, int]:
 
 
 def print_result(result: RenderableType) -> None:
-    """Print a result on stdout: in colour on a terminal, as plain text elsewhere.
-
-    Parameters
-    ----------
-    result : renderable
-        Text, or anything rich can draw.
-    """
+    """Print a result on stdout: in colour on a terminal, as plain text elsewhere."""
     console = Console(highlight=False, markup=False, emoji=False)
     if not console.is_terminal:
         console = Console(
@@ -346,17 +278,7 @@ def print_result(result: RenderableType) -> None:
 def table(title: str, *headings: str) -> Table:
     """Begin a table: what its rows are about, then a right-aligned column for each heading.
 
-    Parameters
-    ----------
-    title : str
-        Heading of the first column.
-    *headings : str
-        Of the others.
-
-    Returns
-    -------
-    rich.table.Table
-        With a frame on a terminal, plain elsewhere; it has no rows yet.
+    It has a frame on a terminal and is plain elsewhere.
     """
     from rich import box
     from rich.table import Table
@@ -369,33 +291,12 @@ def table(title: str, *headings: str) -> Table:
 
 
 def short(value: float | None, digits: int = 4) -> str:
-    """Write a number to a few significant digits, and a dash for one that is not known.
-
-    Parameters
-    ----------
-    value : float or None
-        Any number.
-    digits : int
-        How many are significant.
-
-    Returns
-    -------
-    str
-        As in ``"3.142"``.
-    """
+    """Write a number to a few significant digits, and a dash for one that is not known."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}g}"
 
 
 def print_json(document: str, values: Mapping[str, Any]) -> None:
-    """Print one JSON object on stdout.
-
-    Parameters
-    ----------
-    document : str
-        Name of its schema, as for `iscat_analysis.schema`.
-    values : mapping
-        Of plain values, NumPy scalars and arrays, nested at will.
-    """
+    """Print one JSON object on stdout; `document` names its `iscat_analysis.schema`."""
     from iscat_analysis.schemas import to_json
 
     _write(sys.stdout, to_json(document, values) + "\n")
@@ -410,13 +311,7 @@ def _write(stream: TextIO | None, text: str) -> None:
 
 
 def silence(stream: TextIO) -> None:
-    """Let a stream that cannot be written swallow what comes later, Python's last flush included.
-
-    Parameters
-    ----------
-    stream : text stream
-        With a file descriptor.
-    """
+    """Let a stream that cannot be written swallow what comes later, the last flush included."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)

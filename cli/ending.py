@@ -34,15 +34,6 @@ def ending_in_time(messages: Messages) -> Iterator[None]:
     Python raises `KeyboardInterrupt` between two of its own instructions, so a long call into
     compiled code delays it, and so do threads that must finish first.  The operating system's
     handler writes each signal's number into a pipe at once; a thread reads it and keeps the time.
-
-    Parameters
-    ----------
-    messages : Messages
-        Says that it ended, and knows whether results are being written.
-
-    Yields
-    ------
-    None
     """
     if threading.current_thread() is not threading.main_thread() or os.name == "nt":
         yield
@@ -96,12 +87,7 @@ _ENDING = {
 
 @contextmanager
 def termination_interrupts() -> Iterator[None]:
-    """Let a request to end (SIGTERM, SIGHUP) end the command as Ctrl-C does: tidied up.
-
-    Yields
-    ------
-    None
-    """
+    """Let a request to end (SIGTERM, SIGHUP) end the command as Ctrl-C does: tidied up."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         del frame
@@ -129,11 +115,6 @@ def interrupts_kept() -> Iterator[list[BaseException]]:
 
     Python can only print what is raised where compiled code called it: the compiler's look into its
     cache, for one.  The interrupt would be lost, or end as an error of whoever made the call.
-
-    Yields
-    ------
-    list of BaseException
-        What was swallowed.
     """
     earlier = sys.unraisablehook
     swallowed: list[BaseException] = []

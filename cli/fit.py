@@ -264,20 +264,7 @@ def _print_tracks(analysis: Analysis, folder: Path) -> None:
 
 
 def tracks_table(tracks: pd.DataFrame, *, contrast: bool = False) -> Table:
-    """Tabulate tracks: mass and D ± σ, and where they are known diameter and index.
-
-    Parameters
-    ----------
-    tracks : pandas.DataFrame
-        Rows of ``tracks.csv``.
-    contrast : bool
-        Show contrasts in place of masses.
-
-    Returns
-    -------
-    rich.table.Table
-        One row per track.
-    """
+    """Tabulate rows of ``tracks.csv``: mass or contrast, D, diameter and index if known."""
     from rich.table import Table
 
     from iscat_analysis.report.tracks import TRACK_HEADINGS
@@ -312,23 +299,10 @@ def events_table(
     mass: tuple[str, str] = ("mass", "kDa"),
     width: int | None = None,
 ) -> Table:
-    """Tabulate fitted events: every parameter ± σ, and the bounds of z and mass where free.
+    """Tabulate rows of ``fits.csv``: every parameter ± σ, and the bounds of z and mass where free.
 
-    Parameters
-    ----------
-    rows : sequence of mapping
-        Rows of ``fits.csv``.
-    free : sequence of str
-        Names of the free parameters.
-    mass : tuple of two str
-        What the column ``mass_kda`` is called, and its unit, which may be empty.
-    width : int, optional
-        Characters there is room for; what fits least is left out.  Default all there are.
-
-    Returns
-    -------
-    rich.table.Table
-        One row per event.
+    `mass` is what the column ``mass_kda`` is called, and its unit, which may be empty.  Where
+    there are fewer than `width` characters, what fits least is left out.
     """
     from rich import box
     from rich.table import Table

@@ -20,18 +20,7 @@ class Mode(StrEnum):
 
 
 def complete_setting(incomplete: str) -> list[str]:
-    """Offer keys of the configuration to the shell.
-
-    Parameters
-    ----------
-    incomplete : str
-        What stands there already.
-
-    Returns
-    -------
-    list of str
-        ``"section.key="`` for every key that begins so.
-    """
+    """Offer to the shell every key of the configuration that begins so."""
     from iscat_analysis.config import SIMULATED, Config
 
     found = []
@@ -104,25 +93,7 @@ DebugOption = Annotated[bool, typer.Option("--debug", help="Show the traceback o
 
 
 def frame_range(option: str, text: str) -> tuple[int, int]:
-    """Read a half-open range of frames.
-
-    Parameters
-    ----------
-    option : str
-        The option's name, for the message.
-    text : str
-        ``"A:B"``.
-
-    Returns
-    -------
-    start, stop : int
-        ``[start, stop)``.
-
-    Raises
-    ------
-    ConfigError
-        It is not written as ``A:B`` with A < B.
-    """
+    """Read a half-open range of frames, ``"A:B"``; messages name the option."""
     from iscat_analysis.errors import ConfigError
 
     match = re.fullmatch(r"\s*(\d+)\s*:\s*(\d+)\s*", text, flags=re.ASCII)
@@ -135,18 +106,5 @@ def frame_range(option: str, text: str) -> tuple[int, int]:
 
 
 def with_workers(settings: list[str] | None, workers: int | None) -> list[str]:
-    """Add the number of threads to changes of the configuration.
-
-    Parameters
-    ----------
-    settings : list of str or None
-        From ``--set``.
-    workers : int or None
-        From ``--workers``.
-
-    Returns
-    -------
-    list of str
-        The threads last: they win.
-    """
+    """Add the number of threads to changes of the configuration, last, so that they win."""
     return [*(settings or ()), *([f"compute.workers={workers}"] if workers else [])]

@@ -32,25 +32,7 @@ AboveOption = Annotated[
 
 
 def numbers(option: str, text: str) -> list[float]:
-    """Read ``66,132``.
-
-    Parameters
-    ----------
-    option : str
-        The option's name, for the message.
-    text : str
-        Numbers with commas between.
-
-    Returns
-    -------
-    list of float
-        The numbers.
-
-    Raises
-    ------
-    ConfigError
-        One of them is none.
-    """
+    """Read ``66,132``; messages name the option."""
     from iscat_analysis.errors import ConfigError
 
     try:
@@ -60,25 +42,7 @@ def numbers(option: str, text: str) -> list[float]:
 
 
 def whole(option: str, text: str) -> list[int]:
-    """Read ``1,2,4``.
-
-    Parameters
-    ----------
-    option : str
-        The option's name, for the message.
-    text : str
-        Whole numbers with commas between.
-
-    Returns
-    -------
-    list of int
-        The numbers.
-
-    Raises
-    ------
-    ConfigError
-        One of them is none.
-    """
+    """Read ``1,2,4``; messages name the option."""
     from iscat_analysis.errors import ConfigError
 
     try:
@@ -88,25 +52,7 @@ def whole(option: str, text: str) -> list[int]:
 
 
 def pair(option: str, text: str | None) -> tuple[float | None, float | None]:
-    """Read ``40:8`` or ``40``.
-
-    Parameters
-    ----------
-    option : str
-        The option's name, for the message.
-    text : str or None
-        One number, or two with a colon between.
-
-    Returns
-    -------
-    first, second : float or None
-        The numbers, None where they are missing.
-
-    Raises
-    ------
-    ConfigError
-        One of them is none.
-    """
+    """Read ``40:8`` or ``40``, None where a number is missing; messages name the option."""
     from iscat_analysis.errors import ConfigError
 
     if text is None:
