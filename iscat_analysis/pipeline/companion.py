@@ -94,7 +94,11 @@ class Pair:
         """
         waiting = deque(enumerate(items))
         done: queue.SimpleQueue[tuple[int, R] | Exception] = queue.SimpleQueue()
-        other = _Copy(lambda number: work(items[number]))
+        try:
+            other = _Copy(lambda number: work(items[number]))
+        except OSError:  # there is no room for another process
+            yield from Here().each(work, items)
+            return
 
         def drive() -> None:
             while waiting:
@@ -114,7 +118,8 @@ class Pair:
         driver = threading.Thread(target=drive, daemon=True, name="companion")
         driver.start()
         try:
-            while waiting or driver.is_alive() or not done.empty():
+            # whether it lives is asked first: what it leaves behind is there when it does not
+            while driver.is_alive() or waiting or not done.empty():
                 while not done.empty():
                     found = done.get()
                     if isinstance(found, Exception):
@@ -199,7 +204,12 @@ class _Copy:
         telling, answers = os.pipe()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # that there are other threads
-            self.pid = os.fork()
+            try:
+                self.pid = os.fork()
+            except OSError:
+                for pipe in (theirs, asking, telling, answers):
+                    os.close(pipe)
+                raise
         if not self.pid:
             _serve(work, theirs, answers, (asking, telling))
         os.close(theirs)

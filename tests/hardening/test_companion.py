@@ -158,6 +158,16 @@ def test_what_a_lost_process_was_at_is_done_here() -> None:
     assert dict(both.each(work, items)) == {item: 2 * item for item in items}
 
 
+def test_where_there_is_no_room_for_a_second_process_one_does_everything(monkeypatch) -> None:
+    def full() -> int:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(os, "fork", full)
+    held = set(Path("/proc/self/fd").iterdir())
+    assert list(Pair(2).each(lambda item: 2 * item, range(3))) == [(0, 0), (1, 2), (2, 4)]
+    assert set(Path("/proc/self/fd").iterdir()) == held
+
+
 def test_the_second_process_has_half_of_the_threads_and_its_own_movie() -> None:
     both, common = Pair(4), [1]
 
