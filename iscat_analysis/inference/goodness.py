@@ -1,16 +1,16 @@
 """Does the model describe the data?  Three tests of the residuals of one fit, and their verdict.
 
-`scatter`
+scatter
     Pearson's χ², two-sided: noise stronger or weaker than the camera's.  Cells that expect few
     counts are pooled, and the variance carries the fourth moment of the counts.
-`structure`
+structure
     Rao's score test against smooth changes of the image around the particle, Hermite–Gauss modes up
     to `ORDER`: a wrong focus or aperture, a neighbour.  A few directions, so that a misfit
     that drowns in the χ² of a thousand pixels is seen.
-`outlier`
+outlier
     The least likely pixel, by the exact tail of its counts: a dead, hot or saturated one.
 
-Each p-value is uniform on good data; `goodness_of_fit` joins them by Šidák's rule.
+Each p-value (`three_tests`) is uniform on good data; `goodness_of_fit` joins them by Šidák's rule.
 """
 
 from __future__ import annotations
@@ -43,7 +43,6 @@ POOLED_COUNTS = 5.0
 MANY_COUNTS = 1e6
 """Counts above which tails are normal: 5 σ out to a few per cent."""
 
-_TESTS = 3
 _NARROWEST = 0.1  # variance of a sum of squares over that of normal residuals, at least
 _SUSPECTS = 8  # largest residuals whose exact tail is looked up
 _DEPENDENT = 1e-8  # share of a mode outside the fitted directions that counts as none
@@ -82,82 +81,53 @@ def goodness_of_fit(
     -----
     Z. Šidák, J. Am. Stat. Assoc. 62, 626 (1967).
     """
-    view = _look(likelihood, theta, derivatives)
-    free = np.asarray(free, dtype=np.bool_)
-    chi2, spread_p = _scatter(view, int(np.count_nonzero(free)))
-    if not math.isfinite(spread_p):
+    chi2, p_values = three_tests(likelihood, theta, free, derivatives)
+    if math.isnan(p_values[0]):
         return chi2, math.nan
-    worst = min(spread_p, _structure(likelihood, theta, free, view), _outlier(view))
-    return chi2, -math.expm1(_TESTS * math.log1p(-min(worst, 1 - 1e-16)))
+    return chi2, -math.expm1(len(p_values) * math.log1p(-min(*p_values, 1 - 1e-16)))
 
 
-def scatter(likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> tuple[float, float]:
-    """Pearson's χ² and its two-sided p-value.
+def three_tests(
+    likelihood: Likelihood,
+    theta: FloatArray,
+    free: BoolArray,
+    derivatives: FloatArray | None = None,
+) -> tuple[float, tuple[float, float, float]]:
+    """Test one fit for the scatter of its residuals, for structure in them, and for outliers.
 
     Parameters
     ----------
     likelihood : Likelihood
-        The one that was maximised.
+        As in `goodness_of_fit`.
     theta : ndarray, shape (5,)
-        The estimate.
+        As in `goodness_of_fit`.
     free : ndarray of bool, shape (5,)
-        Which parameters were fitted.
+        As in `goodness_of_fit`.
+    derivatives : ndarray, shape (ny, ROWS, nx), optional
+        As in `goodness_of_fit`.
 
     Returns
     -------
-    chi2_reduced, p_value : float
-        NaN without degrees of freedom.
+    chi2_reduced : float
+        χ² over its degrees of freedom; NaN without any.
+    p_values : (float, float, float)
+        Of Pearson's χ², two-sided; of smooth changes of the image around the particle; of the least
+        likely pixel among as many as there are.  Each is uniform on good data; all are NaN without
+        degrees of freedom.
 
     Notes
     -----
     The squared residual of a count of excess kurtosis κ has variance 2 + κ; χ² follows a gamma law
-    with that variance.
+    with that variance.  A smooth mode B multiplies the expected counts by 1 + ε B.  Its score, made
+    independent of the fitted directions, is compared with its information (C. R. Rao, Proc. Camb.
+    Phil. Soc. 44, 50, 1948).
     """
-    return _scatter(_look(likelihood, theta), int(np.count_nonzero(free)))
-
-
-def structure(likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> float:
-    """Test for smooth changes of the image around the particle.
-
-    Parameters
-    ----------
-    likelihood : Likelihood
-        The one that was maximised.
-    theta : ndarray, shape (5,)
-        The estimate.
-    free : ndarray of bool, shape (5,)
-        Which parameters were fitted.
-
-    Returns
-    -------
-    float
-        The p-value, uniform on good data.
-
-    Notes
-    -----
-    A mode B multiplies the expected counts by 1 + ε B.  Its score, made independent of the fitted
-    directions, is compared with its information (C. R. Rao, Proc. Camb. Phil. Soc. 44, 50, 1948).
-    """
+    view = _look(likelihood, theta, derivatives)
     free = np.asarray(free, dtype=np.bool_)
-    return _structure(likelihood, theta, free, _look(likelihood, theta))
-
-
-def outlier(likelihood: Likelihood, theta: FloatArray) -> float:
-    """Test for the least likely pixel among all.
-
-    Parameters
-    ----------
-    likelihood : Likelihood
-        The one that was maximised.
-    theta : ndarray, shape (5,)
-        The estimate.
-
-    Returns
-    -------
-    float
-        The p-value, two-sided, for as many pixels as there are.
-    """
-    return _outlier(_look(likelihood, theta))
+    chi2, spread_p = _scatter(view, int(np.count_nonzero(free)))
+    if not math.isfinite(spread_p):
+        return chi2, (math.nan, math.nan, math.nan)
+    return chi2, (spread_p, _structure(likelihood, theta, free, view), _outlier(view))
 
 
 @dataclass(frozen=True)
@@ -177,7 +147,7 @@ class _View:
     least_rate: float
 
 
-def _look(likelihood: Likelihood, theta: FloatArray, rows: FloatArray | None = None) -> _View:
+def _look(likelihood: Likelihood, theta: FloatArray, rows: FloatArray | None) -> _View:
     if rows is None:
         rows = likelihood.derivatives(theta)
     rate, residual = np.empty((2, *likelihood.grid.shape))

@@ -11,7 +11,7 @@ from microscopes import configuration, setting
 from scipy.stats import binom, kstest, poisson
 
 from iscat_analysis.inference.fit import POOR_FIT_P, fit_particle
-from iscat_analysis.inference.goodness import _attainable, outlier, scatter, structure
+from iscat_analysis.inference.goodness import _attainable, three_tests
 from iscat_analysis.records import FitResult, FloatArray, Status
 from iscat_analysis.study import Setting, make_setting, run_trials, trial_generator
 
@@ -72,7 +72,7 @@ def test_each_test_is_uniform_on_good_data() -> None:
         start = experiment.start(experiment.truth, random)
         fit = fit_particle(likelihood, start, "joint", (0.0, 1000.0), level=False)
         at = likelihood, fit.theta
-        found.append([scatter(*at, fit.box.free)[1], structure(*at, fit.box.free), outlier(*at)])
+        found.append(three_tests(*at, fit.box.free)[1])
     for column in np.transpose(found):
         assert kstest(column, "uniform").pvalue > SURPRISE
 
@@ -143,9 +143,9 @@ def test_modes_are_tested_only_outside_the_fitted_directions() -> None:
     crb = experiment.bounds.crb_joint
     moved = theta + np.array([15 * crb[0], 0, 0, 0, 0])
     free = np.array([True, True, True, True, False])
-    assert structure(likelihood, moved, free) > 0.9
-    assert structure(likelihood, moved, free & [False, True, True, True, True]) < 1e-6
-    assert structure(likelihood, theta, free) == pytest.approx(1.0)
+    assert three_tests(likelihood, moved, free)[1][1] > 0.9
+    assert three_tests(likelihood, moved, free & [False, True, True, True, True])[1][1] < 1e-6
+    assert three_tests(likelihood, theta, free)[1][1] == pytest.approx(1.0)
 
 
 def _noticed(experiment: Setting, frame) -> None:  # type: ignore[no-untyped-def]

@@ -17,7 +17,7 @@ from iscat_analysis.config import Calibration
 from iscat_analysis.inference import noise
 from iscat_analysis.inference.bias import first_order_bias
 from iscat_analysis.inference.fit import FOLLOWED, fit_particle, search_box
-from iscat_analysis.inference.goodness import ORDER, WAIST, _gamma_above, structure
+from iscat_analysis.inference.goodness import ORDER, WAIST, _gamma_above, three_tests
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import BoolArray, Candidate, FloatArray
@@ -185,7 +185,7 @@ def _structure(which: Likelihood, theta: FloatArray, free: BoolArray) -> float:
 def test_structure(case: Case, free: tuple[bool, ...]) -> None:
     for moved in (0.0, 25.0):  # a place where it is good, and one where it is not
         theta = case.theta + np.array([moved, 0, 0, 0, 0])
-        got = structure(case.likelihood, theta, np.array(free))
+        got = three_tests(case.likelihood, theta, np.array(free))[1][1]
         slow = _structure(case.likelihood, theta, np.array(free))
         assert math.log(got) == pytest.approx(math.log(slow), rel=1e-6, abs=1e-7)
 
@@ -193,7 +193,7 @@ def test_structure(case: Case, free: tuple[bool, ...]) -> None:
 def test_structure_of_many_counts() -> None:
     """Where no leverage matters, none is looked at."""
     many = _case("conditional", light=3e6)
-    got = structure(many.likelihood, many.theta, np.array(FREE[0]))
+    got = three_tests(many.likelihood, many.theta, np.array(FREE[0]))[1][1]
     slow = _structure(many.likelihood, many.theta, np.array(FREE[0]))
     assert got == pytest.approx(slow, rel=1e-5)
 
