@@ -148,7 +148,7 @@ class Merged:
         )
 
     def unfollowed(self) -> list[tuple[int, int]]:
-        """Frames in which there was no pattern to follow, or nobody asked."""
+        """Frames of chunks in which no motion was looked for, or there was no pattern to follow."""
         return [done.core for done in self._done if done.trajectory is None]
 
     def drift(self) -> list[float] | None:
