@@ -14,8 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.image import Lens, Pixels, signal_gradient, signal_image
+from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens, StampLens
 from iscat_analysis._kernels.radial import AxialTable
 from iscat_analysis._kernels.scoring import picture_at, span
 from iscat_analysis._kernels.stamp import stamp_gradient, stamp_signal
@@ -123,11 +124,19 @@ def table_of(pictures: Pictures, group: int) -> AxialTable:
 @njit(cache=True, nogil=True, error_model="numpy")
 def lens_of(pictures: Pictures, group: int) -> Lens:
     """Lens of one blur."""
-    one, window = pictures.lens, pictures.windows[min(group, pictures.windows.shape[0] - 1)]
-    return Lens(
-        one.inv_step, one.rho, one.cos_psi, one.sin_psi, one.co, one.cross, one.ring, one.half,
-        one.components, window, one.fine,
-    )  # fmt: skip
+    window = pictures.windows[min(group, pictures.windows.shape[0] - 1)]
+    lens: Lens = _with_window(pictures.lens, window)
+    return lens
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _with_window(lens: Lens, window: FloatArray) -> Lens:
+    """Give a lens another window; a round one has none."""
+    if len(lens) == ROUND:
+        return lens
+    if len(lens) == LATTICE:
+        return LatticeLens(lens.inv_step, lens.rho, lens.half, lens.components, window)
+    return StampLens(lens.inv_step, lens.half, window, lens.fine)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -162,8 +171,17 @@ def draw(
 ) -> None:  # fmt: skip
     """Fill `out` with the signal of one row."""
     table, lens = table_of(pictures, group), lens_of(pictures, group)
-    if lens.fine:
-        stamp_signal(pictures.nodes, lens, pixels, theta[0], theta[1], theta[3], out)
+    _draw(table, lens, pictures.nodes, theta, pixels, profile, out)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw(
+    table: AxialTable, lens: Lens, nodes: NDArray[np.float32], theta: FloatArray, pixels: Pixels,
+    profile: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Do the same as `draw`; what a lens leaves out depends on an argument's type."""
+    if len(lens) == STAMP:
+        stamp_signal(nodes, lens, pixels, theta[0], theta[1], theta[3], out)
         return
     start, stop = span(lens, pixels, theta, table.heights.shape[3])
     picture = picture_at(table, lens, theta[2], start, stop, profile)
@@ -177,8 +195,17 @@ def draw_gradient(
 ) -> None:  # fmt: skip
     """Fill `out` (ny, 5, nx) with the signal of one row and its gradient."""
     table, lens = table_of(pictures, group), lens_of(pictures, group)
-    if lens.fine:
-        stamp_gradient(pictures.nodes, lens, pixels, theta[0], theta[1], theta[3], out)
+    _draw_gradient(table, lens, pictures.nodes, theta, pixels, profile, out)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw_gradient(
+    table: AxialTable, lens: Lens, nodes: NDArray[np.float32], theta: FloatArray, pixels: Pixels,
+    profile: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Do the same as `draw_gradient`; what a lens leaves out depends on an argument's type."""
+    if len(lens) == STAMP:
+        stamp_gradient(nodes, lens, pixels, theta[0], theta[1], theta[3], out)
         return
     start, stop = span(lens, pixels, theta, table.heights.shape[3])
     picture = picture_at(table, lens, theta[2], start, stop, profile)

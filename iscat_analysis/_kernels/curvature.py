@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.dense import factorise
 from iscat_analysis._kernels.hessian import signal_hessian
-from iscat_analysis._kernels.image import Lens, Pixels
+from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lens import Lens
 from iscat_analysis._kernels.radial import AxialTable, profile_at
 from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, blank_profile, image_score, span
 

@@ -16,9 +16,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.image import Lens, Pixels
+from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lattice_rows import lattice_fields
+from iscat_analysis._kernels.lens import LATTICE, LatticeLens, Lens, RoundLens
 from iscat_analysis._kernels.quintics import (
     DISTANCE,
     evaluate_bends,
@@ -63,7 +64,7 @@ def signal_hessian(
     out : ndarray, shape (ny, ROWS, nx)
         Filled with s, its derivatives in (x_p, y_p, z, a), and those of `PAIRS`.
     """
-    if lens.half:
+    if len(lens) == LATTICE:
         _lattice_hessian(profile, lens, pixels, x_p, y_p, amplitude, out)
         return
     nx, offsets, weights = pixels.x.size, pixels.offsets, pixels.weights
@@ -118,8 +119,8 @@ def _copy(sums: FloatArray, first: int, out: FloatArray) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _lattice_hessian(
-    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
-    out: FloatArray,
+    profile: FloatArray, lens: LatticeLens, pixels: Pixels, x_p: float, y_p: float,
+    amplitude: float, out: FloatArray,
 ) -> None:  # fmt: skip
     """Do the same as `signal_hessian` with a lattice."""
     out[:] = 0.0
@@ -138,7 +139,7 @@ def _lattice_hessian(
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _bend(lens: Lens, amplitude: float, weight: float, f: FloatArray) -> None:
+def _bend(lens: RoundLens, amplitude: float, weight: float, f: FloatArray) -> None:
     """Add weight × all that needs no derivative in z; leave DF (4 to 7 in f) and (F″ − DF)/r²."""
     inv_step, rho, cos, sin = lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi
     co, cross, ring, a = lens.co, lens.cross, lens.ring, amplitude
@@ -221,7 +222,7 @@ def _bend(lens: Lens, amplitude: float, weight: float, f: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _bend_z(lens: Lens, amplitude: float, weight: float, f: FloatArray) -> None:
+def _bend_z(lens: RoundLens, amplitude: float, weight: float, f: FloatArray) -> None:
     """Add weight × the derivatives in z, after `_bend`."""
     inv_step, rho, cos, sin = lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi
     co, cross, ring, a = lens.co, lens.cross, lens.ring, amplitude

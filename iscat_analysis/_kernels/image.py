@@ -26,46 +26,11 @@ from iscat_analysis._kernels.lattice_rows import (
     lattice_signal,
     rows_needed,
 )
+from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens
 from iscat_analysis._kernels.radial_rows import radial_gradient, radial_parts, radial_signal
 from iscat_analysis._kernels.stamp import stamp_gradient, stamp_signal
 
 FloatArray = NDArray[np.float64]
-
-
-class Lens(NamedTuple):
-    """What turns a profile into a signal.
-
-    Attributes
-    ----------
-    inv_step : float
-        One over the step of the radial profile or of the lattice [1/nm].
-    rho : float
-        1 with a reference, 0 in dark field.
-    cos_psi, sin_psi : float
-        Polarisation angle of a radial profile.
-    co, cross, ring : float
-        How a radial profile makes the components; see the module's docstring.
-    half : int
-        Nodes of the lattice on either side of the particle; 0 for a radial profile.
-    components : int
-        Components of the field on the lattice.
-    window : ndarray, shape (degree + 1, TAPS)
-        Weights of the lattice's nodes.
-    fine : int
-        Samples per pixel of a picture at one height; 0 for profiles of the field.
-    """
-
-    inv_step: float
-    rho: float
-    cos_psi: float
-    sin_psi: float
-    co: float
-    cross: float
-    ring: float
-    half: int
-    components: int
-    window: FloatArray
-    fine: int = 0
 
 
 class Pixels(NamedTuple):
@@ -87,7 +52,12 @@ class Pixels(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _begin_lattice(
-    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, with_gradient: bool
+    profile: FloatArray,
+    lens: LatticeLens,
+    pixels: Pixels,
+    x_p: float,
+    y_p: float,
+    with_gradient: bool,
 ) -> FloatArray:
     """Interpolate the columns of an image on a lattice."""
     f = np.empty((rows_needed(lens, pixels), pixels.x.size))
@@ -110,7 +80,7 @@ def signal_parts(
     `unit` is an amplitude at which neither drowns in the other.  Not for samples at one height,
     which are P and Q themselves.
     """
-    if not lens.half:
+    if len(lens) == ROUND:
         radial_parts(profile, lens, pixels, x_p, y_p, out)
         return
     f, nx = _begin_lattice(profile, lens, pixels, x_p, y_p, False), pixels.x.size
@@ -134,9 +104,9 @@ def signal_image(
     out: FloatArray,
 ) -> None:
     """Fill `out` (ny, nx) with the signal on a pixel grid; the rest as in `signal_gradient`."""
-    if lens.fine:
+    if len(lens) == STAMP:
         stamp_signal(profile, lens, pixels, x_p, y_p, amplitude, out)
-    elif lens.half:
+    elif len(lens) == LATTICE:
         f = _begin_lattice(profile, lens, pixels, x_p, y_p, False)
         for row in range(pixels.y.size):
             lattice_signal(lens, pixels, row, y_p, amplitude, f, out[row])
@@ -171,9 +141,9 @@ def signal_gradient(
     out : ndarray, shape (ny, 5, nx)
         Filled with s, ∂s/∂x_p, ∂s/∂y_p, ∂s/∂z, ∂s/∂a.
     """
-    if lens.fine:
+    if len(lens) == STAMP:
         stamp_gradient(profile, lens, pixels, x_p, y_p, amplitude, out)
-    elif lens.half:
+    elif len(lens) == LATTICE:
         f = _begin_lattice(profile, lens, pixels, x_p, y_p, True)
         for row in range(pixels.y.size):
             lattice_gradient(lens, pixels, row, y_p, amplitude, f, out[row])

@@ -17,7 +17,8 @@ from iscat_analysis._kernels.lattice import DEGREE, FAST, TAPS
 from iscat_analysis._kernels.mixing import mix, mix_both
 
 if TYPE_CHECKING:
-    from iscat_analysis._kernels.image import Lens, Pixels
+    from iscat_analysis._kernels.image import Pixels
+    from iscat_analysis._kernels.lens import LatticeLens
 
 FloatArray = NDArray[np.float64]
 
@@ -44,7 +45,7 @@ def taps(weights: FloatArray, t: float, value: FloatArray, slope: FloatArray) ->
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def node_rows(lens: Lens, pixels: Pixels, y_p: float) -> tuple[int, int]:
+def node_rows(lens: LatticeLens, pixels: Pixels, y_p: float) -> tuple[int, int]:
     """First row of nodes that an image needs, and how many."""
     margin = abs(pixels.offsets[-1])
     low = (pixels.y.min() - margin - y_p) * lens.inv_step + lens.half
@@ -54,7 +55,7 @@ def node_rows(lens: Lens, pixels: Pixels, y_p: float) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def rows_needed(lens: Lens, pixels: Pixels) -> int:
+def rows_needed(lens: LatticeLens, pixels: Pixels) -> int:
     """Rows of work space that an image needs, wherever the particle is."""
     span = pixels.y.max() - pixels.y.min() + 2 * abs(pixels.offsets[-1])
     rows = int(span * lens.inv_step) + TAPS + 2
@@ -116,7 +117,7 @@ def _columns(
 @njit(cache=True, nogil=True, error_model="numpy")
 def interpolate_columns(
     profile: FloatArray,
-    lens: Lens,
+    lens: LatticeLens,
     pixels: Pixels,
     x_p: float,
     y_p: float,
@@ -170,7 +171,7 @@ def _add_gradient(
 
 @njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
 def lattice_gradient(
-    lens: Lens,
+    lens: LatticeLens,
     pixels: Pixels,
     row: int,
     y_p: float,
@@ -216,7 +217,7 @@ def _add_signal(
 
 @njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
 def lattice_signal(
-    lens: Lens,
+    lens: LatticeLens,
     pixels: Pixels,
     row: int,
     y_p: float,
@@ -258,7 +259,7 @@ def _add_product(
 @njit(cache=True, nogil=True, error_model="numpy")
 def lattice_values(
     stack: FloatArray,
-    lens: Lens,
+    lens: LatticeLens,
     pixels: Pixels,
     x_p: float,
     y_p: float,
@@ -315,7 +316,7 @@ def lattice_values(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def lattice_span(lens: Lens, x: FloatArray, margin: float, x_p: float) -> tuple[int, int]:
+def lattice_span(lens: LatticeLens, x: FloatArray, margin: float, x_p: float) -> tuple[int, int]:
     """Range of the flattened lattice that an image needs."""
     side = 2 * lens.half + 1
     first = int((x.min() - margin - x_p) * lens.inv_step + lens.half) - BEFORE
@@ -326,7 +327,7 @@ def lattice_span(lens: Lens, x: FloatArray, margin: float, x_p: float) -> tuple[
 @njit(cache=True, nogil=True, error_model="numpy")
 def lattice_fields(
     profile: FloatArray,
-    lens: Lens,
+    lens: LatticeLens,
     dx: float,
     dy: float,
     e: NDArray[np.complex128],

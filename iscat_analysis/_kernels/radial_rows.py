@@ -22,7 +22,8 @@ from iscat_analysis._kernels.quintics import (
 )
 
 if TYPE_CHECKING:
-    from iscat_analysis._kernels.image import Lens, Pixels
+    from iscat_analysis._kernels.image import Pixels
+    from iscat_analysis._kernels.lens import RoundLens
 
 FloatArray = NDArray[np.float64]
 
@@ -34,7 +35,7 @@ _STRIP = 256  # pixels, or one row of more
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def intervals_needed(lens: Lens, pixels: Pixels, x_p: float, y_p: float, most: int) -> int:
+def intervals_needed(lens: RoundLens, pixels: Pixels, x_p: float, y_p: float, most: int) -> int:
     """Count the intervals of a radial profile that an image needs, of `most`, and one to round."""
     x, y, margin = pixels.x, pixels.y, abs(pixels.offsets[-1])
     dx = max(abs(x[0] - x_p), abs(x[-1] - x_p)) + margin
@@ -122,8 +123,8 @@ def strip_scratch(pixels: Pixels) -> tuple[int, FloatArray]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def radial_strip(
-    profile: FloatArray, lens: Lens, pixels: Pixels, first: int, last: int, x_p: float, y_p: float,
-    amplitude: float, count: int, f: FloatArray,
+    profile: FloatArray, lens: RoundLens, pixels: Pixels, first: int, last: int, x_p: float,
+    y_p: float, amplitude: float, count: int, f: FloatArray,
 ) -> FloatArray:  # fmt: skip
     """Make rows `first` to `last` of signal and gradient (`count` 5) or of the parts (2).
 
@@ -155,7 +156,7 @@ def radial_strip(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def radial_gradient(
-    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
+    profile: FloatArray, lens: RoundLens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
     out: FloatArray,
 ) -> None:  # fmt: skip
     """As `iscat_analysis._kernels.image.signal_gradient`."""
@@ -174,7 +175,7 @@ def radial_gradient(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def radial_parts(
-    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, out: FloatArray
+    profile: FloatArray, lens: RoundLens, pixels: Pixels, x_p: float, y_p: float, out: FloatArray
 ) -> None:
     """As `iscat_analysis._kernels.image.signal_parts`."""
     rows, columns = pixels.y.size, pixels.x.size
@@ -190,7 +191,7 @@ def radial_parts(
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def radial_signal(
-    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
+    profile: FloatArray, lens: RoundLens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
     out: FloatArray,
 ) -> None:  # fmt: skip
     """As `iscat_analysis._kernels.image.signal_image`."""

@@ -10,8 +10,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.image import Lens, Pixels, signal_parts
+from iscat_analysis._kernels.image import Pixels, signal_parts
 from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lens import Lens
 from iscat_analysis._kernels.radial import AxialTable, profile_at
 from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, blank_profile, signal_value, span
 

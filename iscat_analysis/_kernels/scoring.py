@@ -20,14 +20,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.dense import factorise
-from iscat_analysis._kernels.image import (
-    Lens,
-    Pixels,
-    signal_gradient,
-    signal_image,
-)
+from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lattice_rows import lattice_span
+from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, Lens
 from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_at
 from iscat_analysis._kernels.radial_rows import intervals_needed, radial_strip, strip_scratch
 
@@ -247,7 +243,7 @@ def score_pass(
     """Fill score (5) and Fisher matrix (5, 5) at θ and return the log-likelihood."""
     level = np.exp(theta[4])
     ny, nx = pixels.y.size, pixels.x.size
-    if not (lens.fine or lens.half):  # strip by strip, as long as the first cache holds it
+    if len(lens) == ROUND:  # strip by strip, as long as the first cache holds it
         flat, sums, total = data.reshape(4, ny * nx), np.zeros(20), 0.0
         together, f = strip_scratch(pixels)
         for row in range(0, ny, together):
@@ -284,9 +280,9 @@ def value_pass(
 @njit(cache=True, nogil=True, error_model="numpy")
 def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int, int]:
     """Range of the flattened profile, `width` long, that an image needs."""
-    if lens.fine:
+    if len(lens) == STAMP:
         return 0, width
-    if lens.half:
+    if len(lens) == LATTICE:
         first, last = lattice_span(lens, pixels.x, abs(pixels.offsets[-1]), theta[0])
         return first, last
     return 0, POWERS * intervals_needed(lens, pixels, theta[0], theta[1], width // POWERS)
@@ -296,9 +292,9 @@ def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int
 def blank_profile(axial: AxialTable, lens: Lens, orders: int) -> FloatArray:
     """Profile for `picture_at` to fill."""
     channels, width = axial.heights.shape[2:]
-    if lens.fine:
+    if len(lens) == STAMP:
         return np.empty((0, 0, 0))
-    if lens.half:
+    if len(lens) == LATTICE:
         nodes = 2 * lens.half + 1
         return np.empty((orders * channels, nodes, nodes))
     return np.empty((width // POWERS, POWERS, orders * channels))
@@ -314,7 +310,7 @@ def picture_at(
     profile: FloatArray,
 ) -> FloatArray:
     """Profile at a height, of which a range is filled; that of a stamp is the table's only one."""
-    if lens.fine:
+    if len(lens) == STAMP:
         rows = 2 * lens.half + 1
         only: FloatArray = axial.heights[0, 0].reshape(2, rows, axial.heights.shape[3] // rows)
         return only

@@ -31,7 +31,8 @@ from iscat_analysis._kernels.lattice_rows import BEFORE, taps
 from iscat_analysis._kernels.mixing import mix, mix_both
 
 if TYPE_CHECKING:
-    from iscat_analysis._kernels.image import Lens, Pixels
+    from iscat_analysis._kernels.image import Pixels
+    from iscat_analysis._kernels.lens import StampLens
 
 FloatArray = NDArray[np.float64]
 AnyFloatArray = NDArray[np.floating[Any]]
@@ -44,7 +45,7 @@ _WEIGHTS = 4 * TAPS + 3  # of x and y, their slopes, the first nodes, and the am
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sizes(lens: Lens, columns: int) -> tuple[int, int, int, int]:
+def _sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
     """Length of a line, of a block of nodes, of what is made of them, and of a strip's pixels."""
     more = (TAPS + lens.fine - 2) // lens.fine
     line = columns + more
@@ -53,7 +54,12 @@ def _sizes(lens: Lens, columns: int) -> tuple[int, int, int, int]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _begin(
-    profile: AnyFloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float
+    profile: AnyFloatArray,
+    lens: StampLens,
+    pixels: Pixels,
+    x_p: float,
+    y_p: float,
+    amplitude: float,
 ) -> AnyFloatArray:
     """Work space of an image, the weights of all of its pixels at the beginning."""
     _, block, made, strip = _sizes(lens, pixels.x.size)
@@ -117,7 +123,7 @@ def _mix_both(
 
 @njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _make_strip(
-    profile: AnyFloatArray, lens: Lens, row: int, rows: int, columns: int,
+    profile: AnyFloatArray, lens: StampLens, row: int, rows: int, columns: int,
     gradient: bool, at: IntArray, w: AnyFloatArray,
 ) -> int:  # fmt: skip
     """Make a strip: P + a Q of its pixels, and with `gradient` ∂/∂x and ∂/∂y of it and P + 2a Q.
@@ -170,8 +176,8 @@ def _make_strip(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def stamp_gradient(
-    profile: AnyFloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
-    out: FloatArray,
+    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
+    amplitude: float, out: FloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (ny, 5, nx) with signal and gradient of an image; ∂s/∂z is 0."""
     f = _begin(profile, lens, pixels, x_p, y_p, amplitude)
@@ -180,7 +186,7 @@ def stamp_gradient(
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _fill_gradient(
-    profile: AnyFloatArray, lens: Lens, amplitude: float, at: IntArray, f: AnyFloatArray,
+    profile: AnyFloatArray, lens: StampLens, amplitude: float, at: IntArray, f: AnyFloatArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
     rows, n = out.shape[0], out.shape[2]
@@ -203,8 +209,8 @@ def _fill_gradient(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def stamp_signal(
-    profile: AnyFloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
-    out: FloatArray,
+    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
+    amplitude: float, out: FloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (ny, nx) with the signal of an image."""
     f = _begin(profile, lens, pixels, x_p, y_p, amplitude)
@@ -213,7 +219,7 @@ def stamp_signal(
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
 def _fill_signal(
-    profile: AnyFloatArray, lens: Lens, amplitude: float, at: IntArray, f: AnyFloatArray,
+    profile: AnyFloatArray, lens: StampLens, amplitude: float, at: IntArray, f: AnyFloatArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
     rows, n = out.shape

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.curvature import observed_information
-from iscat_analysis._kernels.image import Lens, Pixels
+from iscat_analysis._kernels.image import Pixels
+from iscat_analysis._kernels.lens import Lens
 from iscat_analysis._kernels.radial import AxialTable
 from iscat_analysis._kernels.scan import scan_heights
 from iscat_analysis._kernels.scoring import (

@@ -248,19 +248,23 @@ def compile_kernels(model: ForwardModel) -> None:
     compile_values(model)
 
 
-def compile_maximisation(model: ForwardModel) -> None:
+def compile_maximisation(model: ForwardModel, parts: Collection[str] = PARTS) -> None:
     """Run the kernels of a maximisation once on a few pixels: half of `compile_kernels`.
 
     Parameters
     ----------
     model : ForwardModel
         Any.
+    parts : collection of str
+        Which of `PARTS` will be needed.
     """
     likelihood, theta = _small(model)
-    free = np.array([True, True, True, True, False])
     margin = np.array([1.0, 1.0, 0.0, 1.0, 0.0])
-    likelihood.maximize(theta, free, theta - margin, theta + margin, passes=2)
-    likelihood.score_fisher(theta)
+    for free_height in (False, True) if "heights" in parts else (False,):
+        free = np.array([True, True, free_height, True, False])
+        likelihood.maximize(theta, free, theta - margin, theta + margin, passes=2)
+    if parts:
+        likelihood.score_fisher(theta)
 
 
 def compile_values(model: ForwardModel, parts: Collection[str] = PARTS) -> None:

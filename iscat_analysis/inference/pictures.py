@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from iscat_analysis._kernels.canvas import Pictures
+from iscat_analysis._kernels.lens import RoundLens
 from iscat_analysis.optics.blur import blurred, spreads
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.stamp import sample_picture, weights_between
@@ -88,8 +89,9 @@ def _along_z(
         axial_table(blurred(model, float(q), upwards=True).wave, z_range_nm) for q in variances_nm2
     ]
     heights = np.stack([table.heights for table in tables])
-    one = tables[0]
+    one, lens = tables[0], model.lens
+    window = np.zeros((1, 0, 0)) if isinstance(lens, RoundLens) else lens.window[None]
     return Pictures(
-        heights, one.first_nm, one.step_nm, one.kappa, model.lens, model.lens.window[None],
+        heights, one.first_nm, one.step_nm, one.kappa, lens, window,
         np.zeros((2, 0, 0), dtype=np.float32),
     )  # fmt: skip

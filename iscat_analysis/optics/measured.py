@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.image import Lens
 from iscat_analysis._kernels.lattice import FILTER, LATTICE_STEP, lattice_half, undoing, window
+from iscat_analysis._kernels.lens import LatticeLens
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.kept import kept
 
@@ -189,10 +189,10 @@ class MeasuredField:
         """Numbers in the profile of one order."""
         return 2 * (2 * self.half + 1) ** 2
 
-    def lens(self, rho: float) -> Lens:
+    def lens(self, rho: float) -> LatticeLens:
         """How the kernels make a signal of a profile, with the reference ρ."""
         step = self.template.step_nm
-        return Lens(1 / step, rho, 1.0, 0.0, 0.0, 0.0, 0.0, self.half, 1, window()[0])
+        return LatticeLens(1 / step, rho, self.half, 1, window()[0])
 
     def profile(self, _z_nm: float, orders: int) -> FloatArray:
         """Profile at any height, shape (2·orders, nodes, nodes)."""

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.curvature import derivatives_between
 from iscat_analysis._kernels.hessian import PAIRS, ROWS, signal_hessian
-from iscat_analysis._kernels.image import Lens, Pixels, signal_gradient, signal_image
+from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
+from iscat_analysis._kernels.lens import LatticeLens, Lens, RoundLens
 from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_between
 from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
@@ -341,7 +342,7 @@ class ForwardModel:
         geometry = self._geometry(grid, x, y, amplitude)
         if height == "between":
             derivatives_between(self.axial_table, *geometry[:2], theta, rows)
-        elif height == "fixed" and not self.lens.half:
+        elif height == "fixed" and isinstance(self.lens, RoundLens):
             signal_hessian(self.profile(z, 1), *geometry, rows)
         else:
             signal_hessian(self.profile(z, 3), *geometry, rows)
@@ -400,8 +401,8 @@ class ForwardModel:
         return out[0], out[1:], shared
 
     @cached_property
-    def _sensitivities(self) -> Callable[[float, tuple[str, ...]], tuple[Lens, FloatArray]]:
-        def at(z_nm: float, names: tuple[str, ...]) -> tuple[Lens, FloatArray]:
+    def _sensitivities(self) -> Callable[[float, tuple[str, ...]], tuple[LatticeLens, FloatArray]]:
+        def at(z_nm: float, names: tuple[str, ...]) -> tuple[LatticeLens, FloatArray]:
             return sensitivity_lattices(
                 self.aperture,
                 lambda opening: weight_on(opening, self.factor, self.oil_nm),

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.image import Lens, Pixels
+from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice_rows import lattice_values
+from iscat_analysis._kernels.lens import LatticeLens
 from iscat_analysis._kernels.zernike import zernike
 from iscat_analysis.config import MEASURABLE, Optics
 from iscat_analysis.errors import ConfigError
@@ -72,7 +73,7 @@ def sensitivity_lattices(
     *,
     rho: float,
     reach_nm: float,
-) -> tuple[Lens, FloatArray]:
+) -> tuple[LatticeLens, FloatArray]:
     """Lattices of the field and of its derivatives at one height.
 
     Parameters
@@ -92,7 +93,7 @@ def sensitivity_lattices(
 
     Returns
     -------
-    lens : Lens
+    lens : LatticeLens
         How the kernels read them.
     stack : ndarray, shape (2 + len(names), components, 2, nodes, nodes)
         The field's lattice, that of its derivative along z, then that of each parameter.
@@ -151,7 +152,7 @@ def _log_efficiency_slope(optics: Optics) -> float:
 
 def signal_derivatives(
     stack: FloatArray,
-    lens: Lens,
+    lens: LatticeLens,
     pixels: Pixels,
     x_nm: float,
     y_nm: float,
@@ -163,7 +164,7 @@ def signal_derivatives(
     ----------
     stack : ndarray, shape (2 + n, components, 2, nodes, nodes)
         From `sensitivity_lattices`.
-    lens : Lens
+    lens : LatticeLens
         Beside them.
     pixels : Pixels
         Where.

@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from iscat_analysis._kernels.image import Lens, Pixels, signal_image
+from iscat_analysis._kernels.image import Pixels, signal_image
 from iscat_analysis._kernels.lattice import DEGREE, TAPS
+from iscat_analysis._kernels.lens import StampLens
 from iscat_analysis.records import FloatArray
 
 if TYPE_CHECKING:
@@ -73,7 +74,9 @@ def margin_nm(optics: Optics, pixel_nm: float) -> float:
     return pixel_nm + TAPS / 2 * pixel_nm / samples_per_pixel(optics, pixel_nm)
 
 
-def sample_picture(model: ForwardModel, pixel_nm: float, half_px: float) -> tuple[Lens, FloatArray]:
+def sample_picture(
+    model: ForwardModel, pixel_nm: float, half_px: float
+) -> tuple[StampLens, FloatArray]:
     """Sample the picture of a particle at the model's height.
 
     Parameters
@@ -87,7 +90,7 @@ def sample_picture(model: ForwardModel, pixel_nm: float, half_px: float) -> tupl
 
     Returns
     -------
-    lens : Lens
+    lens : StampLens
         How the kernels take it; sharp.
     samples : ndarray, shape (2, nodes, nodes)
         P and Q of a P + a² Q, columns in the order that `iscat_analysis._kernels.stamp` needs; 0
@@ -118,7 +121,7 @@ def sample_picture(model: ForwardModel, pixel_nm: float, half_px: float) -> tupl
     per_phase = math.ceil(nodes.size / fine)
     padded = np.pad(samples, ((0, 0), (0, 0), (0, per_phase * fine - nodes.size)))
     phased = padded.reshape(2, nodes.size, per_phase, fine).swapaxes(2, 3)
-    lens = Lens(1 / step, model.rho, 1.0, 0.0, 0.0, 0.0, 0.0, half, 1, weights_between(0.0), fine)
+    lens = StampLens(1 / step, half, weights_between(0.0), fine)
     return lens, np.ascontiguousarray(phased.reshape(2, nodes.size, -1))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.hessian import ROWS, signal_hessian
-from iscat_analysis._kernels.image import Lens, Pixels, signal_image
+from iscat_analysis._kernels.image import Pixels, signal_image
 from iscat_analysis._kernels.lattice import (
     LATTICE_STEP,
     lattice_half,
@@ -26,6 +26,7 @@ from iscat_analysis._kernels.lattice import (
     sum_waves,
     window,
 )
+from iscat_analysis._kernels.lens import LatticeLens, RoundLens
 from iscat_analysis._kernels.peak import largest_signal
 from iscat_analysis._kernels.radial import (
     POWERS,
@@ -117,13 +118,13 @@ class RadialField:
         """Numbers in the profile of one order."""
         return 24 * (int(self.table.shape[3]) - 1)
 
-    def lens(self, rho: float) -> Lens:
+    def lens(self, rho: float) -> RoundLens:
         """How the kernels make a signal of a profile, with the reference ρ."""
         seen = 0.0 if self.analyzer else 1.0
         linear = 0.0 if self.circular else 1.0
-        return Lens(
+        return RoundLens(
             1 / self.step_nm, rho, math.cos(self.psi), math.sin(self.psi),
-            linear, linear * seen, (1 - linear) * seen, 0, 2, window()[0],
+            linear, linear * seen, (1 - linear) * seen,
         )  # fmt: skip
 
     def profile(self, z_nm: float, orders: int) -> FloatArray:
@@ -222,12 +223,9 @@ class LatticeField:
         """Numbers in the profile of one order."""
         return 2 * len(self.harmonics) * (2 * self.half + 1) ** 2
 
-    def lens(self, rho: float) -> Lens:
+    def lens(self, rho: float) -> LatticeLens:
         """How the kernels make a signal of a profile, with the reference ρ."""
-        return Lens(
-            1 / self.step_nm, rho, 1.0, 0.0, 0.0, 0.0, 0.0,
-            self.half, len(self.harmonics), window()[0],
-        )  # fmt: skip
+        return LatticeLens(1 / self.step_nm, rho, self.half, len(self.harmonics), window()[0])
 
     def profile(self, z_nm: float, orders: int) -> FloatArray:
         """Profile at a height, shape (channels, nodes, nodes); the last few are kept."""

@@ -80,6 +80,6 @@ class Run:
 
     def warm_up(self, scene: Scene) -> None:
         """Load the compiled kernels of fits, or compile them."""
-        compile_maximisation(scene.model)
+        compile_maximisation(scene.model, self.compilation.parts)
         self.compilation.wait()
         compile_values(scene.model, self.compilation.parts)

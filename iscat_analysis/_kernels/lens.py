@@ -1,0 +1,96 @@
+"""What turns the profile of a particle into its signal: three kinds, each a type of its own.
+
+A kernel that takes a lens asks for its length.  Numba knows it from the type and leaves out, before
+it looks at them, the branches of other kinds: a movie has one kind of picture, and the others would
+take half of the time of a first run.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+class RoundLens(NamedTuple):
+    """Of a round pupil, whose fields are radial profiles.
+
+    Attributes
+    ----------
+    inv_step : float
+        One over the step of the profile [1/nm].
+    rho : float
+        1 with a reference, 0 in dark field.
+    cos_psi, sin_psi : float
+        Polarisation angle.
+    co, cross, ring : float
+        How a profile makes the components; see `iscat_analysis._kernels.radial_rows`.
+    """
+
+    inv_step: float
+    rho: float
+    cos_psi: float
+    sin_psi: float
+    co: float
+    cross: float
+    ring: float
+
+
+class LatticeLens(NamedTuple):
+    """Of any pupil, whose fields are on a lattice.
+
+    Attributes
+    ----------
+    inv_step : float
+        One over the step of the lattice [1/nm].
+    rho : float
+        1 with a reference, 0 in dark field.
+    half : int
+        Nodes on either side of the particle.
+    components : int
+        Of the field.
+    window : ndarray, shape (degree + 1, TAPS)
+        Weights of the nodes.
+    """
+
+    inv_step: float
+    rho: float
+    half: int
+    components: int
+    window: FloatArray
+
+
+class StampLens(NamedTuple):
+    """Of any pupil at one height, whose picture was sampled.
+
+    Attributes
+    ----------
+    inv_step : float
+        One over the step of the samples [1/nm].
+    half : int
+        Samples on either side of the particle.
+    window : ndarray, shape (degree + 1, TAPS)
+        Weights of the samples.
+    fine : int
+        Samples per pixel.
+    """
+
+    inv_step: float
+    half: int
+    window: FloatArray
+    fine: int
+
+
+Lens: TypeAlias = RoundLens | LatticeLens | StampLens
+
+ROUND: Final = 7
+"""Fields of a round lens."""
+
+LATTICE: Final = 5
+"""Fields of the lens of a lattice."""
+
+STAMP: Final = 4
+"""Fields of the lens of a sampled picture."""
