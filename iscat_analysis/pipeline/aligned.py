@@ -138,6 +138,7 @@ class Aligned:
             grid=likelihood.grid, kind=likelihood.kind, data=likelihood.data,
             x_nm=x, y_nm=y, z_nm=z, mass_kda=float(scene.model.scale.mass(theta[3])),
             snr=float(np.sqrt(np.sum(signal**2 * likelihood.signal_information(signal)))),
+            owner=int(self.track[number]),
         )  # fmt: skip
 
 

@@ -72,6 +72,7 @@ def calibrate_sights(
     *,
     focus_step_nm: float | None = None,
     least: int = LEAST_SIGHTS,
+    known: Settings | None = None,
     mapper: Mapper = map,
 ) -> OpticsCalibration:
     """Measure the optics from pictures.
@@ -92,6 +93,8 @@ def calibrate_sights(
         Of a scan: rise of the focus from frame to frame, from which the search starts [nm].
     least : int
         Pictures needed.
+    known : mapping, optional
+        As for `measure_microscope`.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -130,6 +133,7 @@ def calibrate_sights(
         landing=1,
         others=others,
         build_wide=rings_of(config, sights[0]),
+        known=known,
         mapper=mapper,
     )
     estimate = measured.estimate

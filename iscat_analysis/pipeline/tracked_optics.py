@@ -15,8 +15,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from iscat_analysis.calibration.optics import FREE, MOST_SIGHTS, OpticsCalibration
-from iscat_analysis.calibration.optics.settings import with_settings
+from iscat_analysis.calibration.optics import FREE, MOST_SIGHTS, OpticsCalibration, Settings
+from iscat_analysis.calibration.optics.settings import settings_of, with_settings
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.cause import PIXEL, Cause, likely_cause
@@ -25,6 +25,7 @@ from iscat_analysis.pipeline.block_store import Block
 from iscat_analysis.pipeline.learning import taken, usable
 from iscat_analysis.pipeline.microscope import calibrate_sights, with_sign
 from iscat_analysis.pipeline.scene import Scene
+from iscat_analysis.pipeline.settling_optics import Round, Rounds
 from iscat_analysis.units import count
 
 REJECTED_SHARE = 0.04
@@ -39,9 +40,9 @@ MASS_SHARE = 0.4
 """Error of masses over what optics that are wrong leave over of the pictures: root mean square of
 eleven such microscopes, 0 to 0.97."""
 
-ROUNDS = 4
-"""Of optics learned from tracks, and tracks followed with them.  What is learned from tracks that
-were followed with wrong optics is only near the truth: it is taken from the round after."""
+ROUNDS = 8
+"""Of optics learned from tracks, and tracks followed with them, at most.  What is learned from
+tracks that were followed with wrong optics is only near the truth, as `settling_optics` says."""
 
 _NOISE = "the noise is not what the camera's numbers predict, and may be what is left over"
 _LOOKED_AT = 24  # pictures in which the cause is looked for
@@ -197,7 +198,9 @@ def learn_from_tracks(
                 return begin(learned), told
             if trouble is not None and near is not None:
                 tell(f"{left.verdict}; others are used that describe them better, but: {why}")
-                return near, tested | {"calibrated": True, "reason": why}
+                rest = near.left.share if near.left is not None else 0.0
+                told = {"calibrated": True, "reason": why, "left_over_then": rest}
+                return near, tested | told
         except DataError as error:
             why = str(error)
         reason = reason or why
@@ -234,18 +237,30 @@ def _described(
     """
     reason = "what was learned does not describe them either"
     near = trial if trial.described else None
-    for _ in range(ROUNDS):
-        found = _measured(trial, _start(config, cause), name, pool)
+    best: tuple[Round, Begun] | None = None
+    rounds = Rounds()
+    for number in range(ROUNDS):
+        known = None
+        if number:
+            trial, trouble = _first(rounds.next if near else rounds.all[-1].after, begin)
+            if trouble is not None and best is not None:
+                break
+            near = trial if trouble is None and trial.described else None
+            known = settings_of(trial.config) if near else None
+        found = _measured(trial, _start(config, cause), name, pool, known=known)
         learned, refusal = usable(found, config)
-        if learned is not None and near is not None:
-            return found, near, ""
         guess = learned or with_sign(with_settings(config, found.measured.settings))[0]
         reason = refusal or reason
         if guess is None:
             break
-        trial, trouble = _first(guess, begin)
-        near = trial if trouble is None and trial.described else None
-    return None, near, reason
+        rounds = rounds.with_one(Round(trial.config, guess, found))
+        if learned is not None and near is not None:
+            best = rounds.all[-1], near
+        if near is not None and rounds.settled:
+            break
+    if best is None:
+        return None, near, reason
+    return best[0].found.less_sure(rounds.error_of(best[0])), best[1], ""
 
 
 def mass_error(summary: Mapping[str, Any]) -> float:
@@ -259,8 +274,10 @@ def mass_error(summary: Mapping[str, Any]) -> float:
     Returns
     -------
     float
-        0 where the optics were not rejected, or others learned.
+        0 where the optics were not rejected, or others learned whose own errors are known.
     """
+    if "left_over_then" in summary:
+        return MASS_SHARE * float(summary["left_over_then"])
     share = float(summary.get("left_over", 0.0))
     rejected = share > REJECTED_SHARE and "reason" in summary and not summary["calibrated"]
     return MASS_SHARE * share if rejected else 0.0
@@ -330,11 +347,16 @@ def _start(config: Config, cause: Cause | None) -> Config:
 
 
 def _measured(
-    begun: Begun, start: Config, name: str, pool: ThreadPoolExecutor
+    begun: Begun,
+    start: Config,
+    name: str,
+    pool: ThreadPoolExecutor,
+    *,
+    known: Settings | None = None,
 ) -> OpticsCalibration:
-    """Measure the microscope from the pictures of tracks."""
+    """Measure the microscope from the pictures of tracks; `known` as in `measure_microscope`."""
     aligned, scene = begun.block.aligned, begun.scene
     shown = [] if aligned is None else _brightest(aligned, MOST_SIGHTS)
     sights = [aligned.sight(scene, n) for n in shown] if aligned is not None else []
     source: Mapping[str, str] = {"movie": name}
-    return calibrate_sights(sights, (), start, tuple(FREE), source, mapper=pool.map)
+    return calibrate_sights(sights, (), start, tuple(FREE), source, known=known, mapper=pool.map)

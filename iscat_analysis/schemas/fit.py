@@ -281,6 +281,9 @@ class Learned(Closed):
         "Of the pictures of tracks, what the configured optics leave over beyond the noise, over "
         "the picture (root mean square)"
     )
+    left_over_then: Number = maybe(
+        "The same of learned optics that are used though pictures that were not fitted reject them"
+    )
     calibrated: bool = key("Whether the analysis used learned optics")
     reason: str = maybe("Why it did not, where the test asked for it or could not be made")
     accepted: bool = maybe("Whether what was learned could be used")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,18 @@ from instruments import Instrument
 from wanderers import SETTINGS, Wanderers, wander
 
 import iscat_analysis as ia
+from iscat_analysis.calibration.optics.estimate import _excess
+from iscat_analysis.calibration.optics.settings import settings_of, with_settings
+from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.pipeline.tracked_optics import REJECTED_SHARE, LeftOver, _said
+from iscat_analysis.pipeline.settling_optics import Round, Rounds
+from iscat_analysis.pipeline.tracked_optics import (
+    MASS_SHARE,
+    REJECTED_SHARE,
+    LeftOver,
+    _said,
+    mass_error,
+)
 
 pytestmark = pytest.mark.usefixtures("sketched")
 
@@ -100,9 +110,71 @@ def test_rings_that_are_left_over_do_not_hide_an_aberration(ringed: Wanderers) -
     assert result.summary["optics"]["calibrated"]
     learned = tomllib.loads(result.config_toml)["optics"]["aberrations_nm"]
     assert learned["z11"] == pytest.approx(-20.0, abs=2.0)
+    # what is left over has gone into the light in part: the first phase that fits is 4° off
+    assert abs(tomllib.loads(result.config_toml)["optics"]["reference_phase_deg"]) < 1.5
     tracks = result.tracks[result.tracks["status"] == "ok"]
     assert len(tracks) >= 2
     assert tracks["mass_kda"].to_numpy() == pytest.approx(MASS_KDA, rel=0.05)
+    error = np.hypot(tracks["sigma_mass_kda"], tracks["systematic_mass_kda"])
+    assert np.abs((tracks["mass_kda"] - MASS_KDA) / error).max() < 4.0
+
+
+def test_optics_that_are_used_though_rejected_have_an_error() -> None:
+    used = {"calibrated": True, "reason": "not uniform", "left_over": 0.6, "left_over_then": 0.03}
+    assert mass_error(used) == pytest.approx(MASS_SHARE * 0.03)
+
+
+def test_what_pictures_of_one_owner_share_counts() -> None:
+    """Half of the variance of a score is its owner's."""
+    rng = np.random.default_rng(5)
+    owners = np.repeat(np.arange(400), 4)
+    scores = rng.normal(size=(1600, 3)) + rng.normal(size=(400, 3))[owners]
+    scatter = 2.0 * len(scores) * np.eye(3)
+    scores -= scores.mean(axis=0)
+    room = 5 * np.sqrt(2 / (3 * 400))
+    assert _excess(scatter, scores, np.arange(1600)) == pytest.approx(1.0, abs=room)
+    assert _excess(scatter, scores, owners) == pytest.approx((4 + 16) / 8, abs=2.5 * room)
+
+
+@dataclass(frozen=True)
+class _Learned:
+    """As much of a calibration as rounds look at."""
+
+    names: tuple[str, ...]
+    covariance: np.ndarray
+
+
+def _rounds(shares: tuple[float, float], count: int) -> Rounds:
+    """Give rounds that leave known shares of errors of focus and phase, first 30 nm and 9°."""
+    names = ("focus_nm", "reference_phase_deg")
+    error, rounds = np.array([30.0, 9.0]), Rounds()
+    wrong = {"focus_nm": -300.0 + error[0], "reference_phase_deg": error[1]}
+    config = Config.model_validate({"optics": wrong})
+    for _ in range(count):
+        values = settings_of(config)
+        error = np.array(shares) * np.array(
+            [values["focus_nm"] + 300.0, values["reference_phase_deg"]]
+        )
+        values["focus_nm"], values["reference_phase_deg"] = -300.0 + error[0], error[1]
+        after = with_settings(config, values)
+        found = _Learned(names, np.diag([0.4, 0.2]) ** 2)
+        rounds = rounds.with_one(Round(config, after, found))  # type: ignore[arg-type]
+        config = rounds.next
+    return rounds
+
+
+def test_rounds_go_on_until_little_is_to_come() -> None:
+    shares = (0.3, 0.65)
+    counts = [n for n in range(1, 12) if _rounds(shares, n).settled]
+    assert 3 <= counts[0] <= 8
+    rounds = _rounds(shares, counts[0])
+    last = rounds.all[-1]
+    wrong = np.array([last.after.optics.focus_nm + 300, last.after.optics.reference_phase_deg])
+    assert np.abs(wrong / [0.4, 0.2]).max() < 1.5
+    # of an early round the error is what came after it
+    early = rounds.all[0]
+    was = np.array([early.after.optics.focus_nm + 300, early.after.optics.reference_phase_deg])
+    assert rounds.error_of(early) == pytest.approx(-was, abs=0.6)
 
 
 def test_why_nothing_can_be_followed_is_named(ringed: Wanderers) -> None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iscat_analysis.calibration.optics.sights import (
     FOCUS_STEP,
@@ -75,8 +76,8 @@ class Estimate:
     information : ndarray, shape (n, n)
         Fisher information about the free parameters with every private unknown eliminated.
     scatter : ndarray, shape (n, n)
-        Covariance of the score as the residuals of the pixels have it; equal to `information` where
-        the noise is the camera's.
+        Covariance of the score as the residuals have it; equal to `information` where the noise is
+        the camera's.
     log_likelihood : float
         Relative to no particle.
     converged : bool
@@ -190,7 +191,7 @@ def maximise(
         values=values,
         sights=tuple(s.moved(p) for s, p in zip(sights, private, strict=True)),
         information=at.reduced(0.0)[0],
-        scatter=at.scatter(),
+        scatter=at.scatter([sight.owner for sight in sights]),
         log_likelihood=at.value,
         converged=converged,
         passes=used,
@@ -293,12 +294,22 @@ class _Point:
             np.where(both, squares, 0.0),
         )
 
-    def scatter(self) -> FloatArray:
-        """Covariance of the reduced score from the residuals, shape (k, k)."""
+    def scatter(self, owners: Sequence[int]) -> FloatArray:
+        """Covariance of the reduced score from the residuals, shape (k, k).
+
+        Its shape is what the pixels say.  What the scores of pictures with owners scatter more, or
+        those of all pictures of an owner together, is a common factor: there are too few for more.
+        """
         k = self.score.shape[1] - PRIVATE
         gains = np.einsum("eij,ejk->eik", self.fisher[:, :k, k:], self.reduced(0.0)[2])
         reduce = np.concatenate([np.broadcast_to(np.eye(k), (len(gains), k, k)), -gains], axis=2)
-        return np.asarray(np.einsum("eia,eab,ejb->ij", reduce, self.squares, reduce))
+        pixels = np.asarray(np.einsum("eia,eab,ejb->ij", reduce, self.squares, reduce))
+        whole = np.einsum("eia,ea->ei", reduce, self.score)
+        known = np.array(owners)
+        if not (known >= 0).all():
+            return pixels
+        groupings = (np.arange(len(known)), known)
+        return pixels * max((1.0, *(_excess(pixels, whole, each) for each in groupings)))
 
     def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Information and score of the shared parameters, and the private blocks inverted."""
@@ -332,6 +343,23 @@ class _Point:
         own[:, :2] = np.clip(own[:, :2], -_PLACE_STEP_NM, _PLACE_STEP_NM)
         own[:, 3] = np.clip(own[:, 3], -0.5, 0.5)
         return shared, own
+
+
+def _excess(scatter: FloatArray, scores: FloatArray, owners: NDArray[np.int64]) -> float:
+    """Say how many times more the scores of owners scatter than expected, over all parameters.
+
+    The scores of all add up to nothing, which takes one of them.
+    """
+    names, index = np.unique(owners, return_inverse=True)
+    k = len(scatter)
+    if not k or len(names) < 2:
+        return 1.0
+    sums = np.zeros((len(names), k))
+    np.add.at(sums, index, scores)
+    unit = 1 / np.sqrt(np.maximum(np.diag(scatter), np.finfo(float).tiny))
+    inverse = np.linalg.pinv(scatter * np.outer(unit, unit), hermitian=True)
+    squares = np.einsum("ei,ij,ej->", sums * unit, inverse, sums * unit)
+    return float(squares) / (k * (1 - 1 / len(names)))
 
 
 def _solve(

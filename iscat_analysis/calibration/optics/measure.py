@@ -184,6 +184,7 @@ def measure_microscope(
     landing: int = 0,
     others: Sequence[Sight] = (),
     build_wide: Build | None = None,
+    known: Settings | None = None,
     mapper: Mapper = map,
 ) -> Measured:
     """Measure the microscope from pictures of particles.
@@ -211,6 +212,9 @@ def measure_microscope(
         Every particle that `Sight.neighbours` counts, these sights among them.
     build_wide : callable, optional
         Makes the microscope as far as rings matter; needed where there are neighbours.
+    known : mapping, optional
+        A microscope of the same kind that is near it, in which the sights have their places and
+        masses; without it every kind is tried.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -221,7 +225,7 @@ def measure_microscope(
     """
     search = _Search(
         configured, build, judge_one, tuple(free), limits, side, landing, mapper,
-        tuple(others), build_wide,
+        tuple(others), build_wide, known,
     )  # fmt: skip
     return search.run(sorted(sights, key=lambda sight: -sight.snr))
 
@@ -250,9 +254,13 @@ class _Search:
     mapper: Mapper = map
     others: tuple[Sight, ...] = ()
     build_wide: Build | None = None
+    known: Settings | None = None
 
     def run(self, sights: Sequence[Sight]) -> Measured:
-        best, held_out = self._best_state(*average_sights(sights))
+        if self.known is None:
+            best, held_out = self._best_state(*average_sights(sights))
+        else:
+            best, held_out = self._of_known_kind(sights, self.known)
         best, held_out = self._cleared(best, held_out)
         best, held = self._identified(best)
         before = len(best.sights) + len(held_out)
@@ -335,6 +343,14 @@ class _Search:
         if not best.converged:
             best = self._fit(best.sights, best.values, best.names)
         return best, held_out
+
+    def _of_known_kind(
+        self, sights: Sequence[Sight], known: Settings
+    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        """Go on from a microscope that is near."""
+        names = free_names(self.free, known, FREE["zernike"])
+        best = self._fit(_fitted(sights), known, names)
+        return best, self._own(_held_out(sights), best.values)
 
     def _identified(self, best: Estimate) -> tuple[Estimate, dict[str, str]]:
         """Hold what the pictures do not determine within the plausible range."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -75,6 +75,29 @@ class OpticsCalibration:
         """Give the standard error of a parameter, NaN where it was not measured."""
         row = self.parameters.set_index("parameter").loc[name]
         return float(row["sigma"])
+
+    def less_sure(self, error: FloatArray) -> OpticsCalibration:
+        """Add an error of known size to the uncertainty.
+
+        Parameters
+        ----------
+        error : ndarray, shape (n,)
+            Of the measured parameters, one standard error in one direction.
+
+        Returns
+        -------
+        OpticsCalibration
+            With the same values.
+        """
+        covariance = self.covariance + np.outer(error, error)
+        parameters = self.parameters.copy()
+        sigmas = dict(zip(self.names, np.sqrt(np.diag(covariance)), strict=True))
+        sigma = parameters["parameter"].map(sigmas)
+        parameters["sigma"] = sigma.where(sigma.notna(), parameters["sigma"])
+        config = self.config
+        if self.accepted:
+            config = _with_covariance(config, *_of_optics(self.names, covariance))
+        return replace(self, config=config, parameters=parameters, covariance=covariance)
 
     def headline(self, pictures_of: str = "particles") -> str:
         """Say in one line what was found.

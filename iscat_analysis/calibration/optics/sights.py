@@ -89,6 +89,8 @@ class Sight:
         Factor of the expected light that was put into `data` for them.
     baseline : float
         What they add to the log-likelihood where there is no particle.
+    owner : int
+        Pictures of one owner share errors, as those of one track share its background; -1: none.
     """
 
     grid: PixelGrid
@@ -105,6 +107,7 @@ class Sight:
     neighbours: tuple[tuple[int, float], ...] = ()
     rings: FloatArray | float = 1.0
     baseline: float = 0.0
+    owner: int = -1
 
     @property
     def private(self) -> FloatArray:
