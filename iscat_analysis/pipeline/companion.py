@@ -20,6 +20,7 @@ import signal
 import struct
 import sys
 import threading
+import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
@@ -35,6 +36,7 @@ from iscat_analysis.threads import allotted, is_allotted
 _LENGTH = struct.Struct("<Q")
 _MMAP_THRESHOLD, _LARGE_BYTES = -3, 4 * 2**20  # GNU's name for it, and from where on
 _LOOK_S = 0.2  # between two looks at whether an interrupt has come
+_PATIENCE, _PATIENCE_S = 10.0, 30.0  # for its last item: times the longest of ours, and more
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -90,7 +92,8 @@ class Pair:
     def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
         """Do something with every item, in both processes; see `iscat_analysis.places.Place`.
 
-        What the second process was at when it was lost is done in the first.
+        What the second process was at when it was lost is done in the first.  So is what it does
+        not finish: a lock that another thread held when the copy was made is never released there.
         """
         waiting = deque(enumerate(items))
         done: queue.SimpleQueue[tuple[int, R] | Exception] = queue.SimpleQueue()
@@ -117,6 +120,7 @@ class Pair:
 
         driver = threading.Thread(target=drive, daemon=True, name="companion")
         driver.start()
+        longest, idle_since = 0.0, 0.0
         try:
             # whether it lives is asked first: what it leaves behind is there when it does not
             while driver.is_alive() or waiting or not done.empty():
@@ -128,9 +132,15 @@ class Pair:
                 try:
                     number, item = waiting.popleft()
                 except IndexError:
+                    idle_since = idle_since or time.monotonic()
                     driver.join(_LOOK_S)
+                    if time.monotonic() - idle_since > _PATIENCE * longest + _PATIENCE_S:
+                        other.end()
                     continue
-                yield number, work(item)
+                begun = time.monotonic()
+                result = work(item)
+                longest = max(longest, time.monotonic() - begun)
+                yield number, result
         finally:
             other.end()
             driver.join()
@@ -214,6 +224,7 @@ class _Copy:
             _serve(work, theirs, answers, (asking, telling))
         os.close(theirs)
         os.close(answers)
+        self._ended = False
         self._asking, self._telling = os.fdopen(asking, "wb"), os.fdopen(telling, "rb")
 
     def do(self, number: int) -> Any:
@@ -228,7 +239,10 @@ class _Copy:
         return result
 
     def end(self) -> None:
-        """End it, whatever it is at."""
+        """End it, whatever it is at; once, because its number may then be another's."""
+        if self._ended:
+            return
+        self._ended = True
         with suppress(OSError):  # somebody else has buried it
             os.kill(self.pid, signal.SIGKILL)
             os.waitpid(self.pid, 0)

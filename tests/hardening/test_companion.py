@@ -158,6 +158,19 @@ def test_what_a_lost_process_was_at_is_done_here() -> None:
     assert dict(both.each(work, items)) == {item: 2 * item for item in items}
 
 
+def test_what_a_process_that_hangs_was_at_is_done_here(monkeypatch) -> None:
+    monkeypatch.setattr(companion, "_PATIENCE_S", 0.5)
+    both, items = Pair(2), range(4)
+
+    def work(item: int) -> int:
+        if both.distant:
+            time.sleep(600)
+        time.sleep(0.02)
+        return 2 * item
+
+    assert dict(both.each(work, items)) == {item: 2 * item for item in items}
+
+
 def test_where_there_is_no_room_for_a_second_process_one_does_everything(monkeypatch) -> None:
     def full() -> int:
         raise BlockingIOError(11, "Resource temporarily unavailable")
