@@ -26,9 +26,9 @@ def main(parts: Collection[str]) -> None:
     parts : collection of str
         As in `iscat_analysis.inference.noise.compile_values`.
     """
-    gc.disable()  # the process is short, and what it makes stays
     compile_values(forward_model(Config(), _REACH_NM), parts)
 
 
 if __name__ == "__main__":
+    gc.disable()  # the process is short, and what it makes stays
     main(sys.argv[1:])

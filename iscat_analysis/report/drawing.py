@@ -116,7 +116,6 @@ def _gathered(
 
 def main() -> None:
     """Draw what stdin holds, where it holds anything."""
-    gc.disable()  # the process is short, and what it makes stays
     try:  # not until stdin ends: a copy of the other process may hold it open
         order = pickle.Unpickler(sys.stdin.buffer).load()
     except EOFError:
@@ -125,4 +124,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    gc.disable()  # the process is short, and what it makes stays
     main()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import subprocess
@@ -136,6 +137,7 @@ def test_the_second_process_compiles_what_the_first_needs():
     shared = (value_batch, signal_hessian, scan_heights, mode_statistic)
     others = set(maximize.signatures)  # of other tests
     ahead.main(PARTS)
+    assert gc.isenabled()  # only a process that is short does without
     made = [set(kernel.signatures) for kernel in shared]
     assert all(made)
     config = load_config(Path("sample_configs/joint.toml"), [])
