@@ -96,7 +96,8 @@ def refractive_index(
     }  # fmt: skip
     arrays = [real_array(name, value) for name, value in named.items()]
     for name, array in zip(named, arrays, strict=True):
-        wrong = array < 0 if name.startswith("sigma") else np.abs(array) > LARGEST
+        far = np.isfinite(array) & (np.abs(array) > LARGEST)  # D of 0 makes a diameter infinite
+        wrong = array < 0 if name.startswith("sigma") else far
         if wrong.any():
             raise DataError(f"{name} = {array[wrong].flat[0]:g}: no particle has that; check it")
     try:
