@@ -44,6 +44,7 @@ ROUNDS = 8
 """Of optics learned from tracks, and tracks followed with them, at most.  What is learned from
 tracks that were followed with wrong optics is only near the truth, as `settling_optics` says."""
 
+_ROUGH_ROUNDS = 4  # in which optics that describe the tracks at all are found, or never
 _NOISE = "the noise is not what the camera's numbers predict, and may be what is left over"
 _LOOKED_AT = 24  # pictures in which the cause is looked for
 _PLACE_AND_MASS = np.array([True, True, False, True, False])
@@ -240,6 +241,8 @@ def _described(
     best: tuple[Round, Begun] | None = None
     rounds = Rounds()
     for number in range(ROUNDS):
+        if number == _ROUGH_ROUNDS and near is None and best is None:
+            break
         known = None
         if number:
             trial, trouble = _first(rounds.next if near else rounds.all[-1].after, begin)
