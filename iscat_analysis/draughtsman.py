@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from iscat_analysis.threads import beside
+from iscat_analysis.threads import beside, processors
 
 if TYPE_CHECKING:
     from iscat_analysis.records import Analysis
@@ -108,7 +108,7 @@ def draughtsman() -> Iterator[Draughtsman | None]:
 
 def _started() -> subprocess.Popen[bytes] | None:
     """Start the process, where there is a processor for it."""
-    if (os.cpu_count() or 1) < 2 or not sys.executable or getattr(sys, "frozen", False):
+    if processors() < 2 or not sys.executable or getattr(sys, "frozen", False):
         return None
     try:
         return subprocess.Popen(

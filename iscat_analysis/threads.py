@@ -1,7 +1,8 @@
-"""Threads for independent work."""
+"""Threads for independent work, and the processors that are there for it."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -51,6 +52,19 @@ class _Watched(ThreadPoolExecutor):
             return task(*args, **options)
 
         return super().submit(watched, *args, **options)
+
+
+def processors() -> int:
+    """Count the processors that this process may use, which may be fewer than there are.
+
+    Returns
+    -------
+    int
+        At least one.
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def beside(work: Callable[..., T], *arguments: Any) -> Future[T]:

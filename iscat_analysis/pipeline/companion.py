@@ -31,7 +31,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.pipeline.chunk_work import ChunkSetting
 from iscat_analysis.places import Here, Place
 from iscat_analysis.records import Progress, silent
-from iscat_analysis.threads import allotted, is_allotted
+from iscat_analysis.threads import allotted, is_allotted, processors
 
 _LENGTH = struct.Struct("<Q")
 _MMAP_THRESHOLD, _LARGE_BYTES = -3, 4 * 2**20  # GNU's name for it, and from where on
@@ -172,7 +172,7 @@ def paired(place: Place, config: Config, setting: ChunkSetting, chunks: int) -> 
         and isinstance(place, Here)
         and not is_allotted()
         and chunks > 1
-        and min(config.compute.workers, _processors()) > 1
+        and min(config.compute.workers, processors()) > 1
     )
     if not wanted:
         return place
@@ -193,11 +193,6 @@ def _give_back_large_arrays() -> None:
         library = ctypes.CDLL(None)
         library.mallopt(_MMAP_THRESHOLD, _LARGE_BYTES)
         library.malloc_trim(0)
-
-
-def _processors() -> int:
-    """Count the processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
 
 
 class _Copy:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -23,7 +22,7 @@ from iscat_analysis.species import LEAST_EVENTS, Comparison
 from iscat_analysis.species.comparison import compare
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.tables import EventTable, event_table
-from iscat_analysis.threads import threads
+from iscat_analysis.threads import processors, threads
 from iscat_analysis.units import count
 
 COMPARISON_FILES = frozenset({"comparison.csv", "comparison.json", "figures"})
@@ -203,7 +202,7 @@ def compare_tables(
         progress("compare", done, len(read) - 1)
         return found
 
-    with threads(workers or os.cpu_count() or 1) as pool:
+    with threads(workers or processors()) as pool:
         found = list(pool.map(pair, read[1:]))
     notes = _notes(read, found)
     if notify is not None:

@@ -21,11 +21,12 @@ from iscat_analysis.report.event_figures import event_figures
 from iscat_analysis.report.page import page_context, page_of, page_sketches
 from iscat_analysis.report.style import Sketch, drawn, inline_svg, publish
 from iscat_analysis.report.tables import event_table
+from iscat_analysis.threads import processors
 
 _MOST_SHARED = 256  # figures that two processes take from each other: a number is one byte
 
 
-def draw(analysis: Analysis, folder: Path, most: int) -> str:
+def draw(analysis: Analysis, folder: Path, most: int, *, together: bool = False) -> str:
     """Draw all figures into a folder, and make the page.
 
     Parameters
@@ -36,31 +37,9 @@ def draw(analysis: Analysis, folder: Path, most: int) -> str:
         An existing folder.
     most : int
         Events whose images are drawn, at most.
-
-    Returns
-    -------
-    str
-        The page.
-    """
-    table = event_table(analysis)
-    about = page_context(analysis, table, folder)
-    publish(drawn(event_figures(analysis, most)), folder)
-    return page_of(about, publish(drawn(page_sketches(analysis, table)), folder))
-
-
-def draw_together(analysis: Analysis, folder: Path, most: int) -> str:
-    """Do the same as `draw`; on Linux a copy of this process draws as well.
-
-    Only for a process that has no threads, which a copy would lack.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    folder : Path
-        An existing folder.
-    most : int
-        Events whose images are drawn, at most.
+    together : bool
+        On Linux a copy of this process draws as well.  Only for a process that has no threads,
+        which a copy would lack.
 
     Returns
     -------
@@ -75,8 +54,20 @@ def draw_together(analysis: Analysis, folder: Path, most: int) -> str:
     table = event_table(analysis)
     shown = list(page_sketches(analysis, table))
     sketches = [*shown, *event_figures(analysis, most)]
-    if sys.platform != "linux" or len(sketches) > _MOST_SHARED:
-        return draw(analysis, folder, most)
+    copy, taken = None, iter(sketches)
+    if together and sys.platform == "linux" and len(sketches) <= _MOST_SHARED:
+        copy, taken = _copied(sketches, folder)
+    about = page_context(analysis, table, folder)
+    figures = publish(drawn(taken), folder)
+    if copy is not None:
+        _, status = os.waitpid(copy, 0)
+        if status:
+            raise RuntimeError(f"a process that drew figures ended with status {status}")
+    return page_of(about, dict(_gathered(shown, figures, folder)))
+
+
+def _copied(sketches: Sequence[Sketch], folder: Path) -> tuple[int, Iterator[Sketch]]:
+    """Start a copy of this process that draws; give its number, and the figures that it leaves."""
     reader, writer = os.pipe()
     os.write(writer, bytes(range(len(sketches))))
     os.close(writer)
@@ -88,12 +79,7 @@ def draw_together(analysis: Analysis, folder: Path, most: int) -> str:
             status = 0
         finally:
             os._exit(status)
-    about = page_context(analysis, table, folder)
-    figures = publish(drawn(_taken(sketches, reader)), folder)
-    _, status = os.waitpid(copy, 0)
-    if status:
-        raise RuntimeError(f"a process that drew figures ended with status {status}")
-    return page_of(about, dict(_gathered(shown, figures, folder)))
+    return copy, _taken(sketches, reader)
 
 
 def _taken(sketches: Sequence[Sketch], reader: int) -> Iterator[Sketch]:
@@ -120,7 +106,7 @@ def main() -> None:
         order = pickle.Unpickler(sys.stdin.buffer).load()
     except EOFError:
         return
-    sys.stdout.buffer.write(draw_together(*order).encode("utf-8"))
+    sys.stdout.buffer.write(draw(*order, together=processors() > 1).encode("utf-8"))
 
 
 if __name__ == "__main__":

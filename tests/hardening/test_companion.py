@@ -50,7 +50,7 @@ SETTINGS = {
 
 @pytest.fixture(autouse=True)
 def two_processors(monkeypatch) -> None:
-    monkeypatch.setattr(companion, "_processors", lambda: 2)
+    monkeypatch.setattr(companion, "processors", lambda: 2)
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_a_second_process_is_made_only_where_it_has_something_to_do(movie: Path)
 
 
 def test_one_processor_does_not_make_room_for_two(movie: Path, monkeypatch) -> None:
-    monkeypatch.setattr(companion, "_processors", lambda: 1)
+    monkeypatch.setattr(companion, "processors", lambda: 1)
     many, here = _configured(workers=2), Here()
     with open_stack(movie) as stack:
         given = ChunkSetting(stack, Camera(), many, (0, 1300), 10, 40, None, None, None)

@@ -17,12 +17,13 @@ from iscat_analysis import draughtsman as module
 from iscat_analysis.draughtsman import Draughtsman, draughtsman
 from iscat_analysis.records import Analysis
 from iscat_analysis.report import write_report
-from iscat_analysis.report.drawing import draw_together
+from iscat_analysis.report.drawing import draw
+from iscat_analysis.threads import processors
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from report_factory import make_analysis
 
-pytestmark = pytest.mark.skipif(os.cpu_count() == 1, reason="one processor: nothing is started")
+pytestmark = pytest.mark.skipif(processors() == 1, reason="one processor: nothing is started")
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +135,19 @@ def test_a_process_that_has_matplotlib_draws_itself() -> None:
         assert pen is None
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be bound")
+def test_a_job_on_one_processor_starts_none() -> None:
+    text = (
+        "import os, sys; from iscat_analysis.draughtsman import draughtsman\n"
+        "every = os.sched_getaffinity(0)\n"
+        "for allowed in ({min(every)}, every):\n"
+        "    os.sched_setaffinity(0, allowed)\n"
+        "    with draughtsman() as pen: print(pen is None)"
+    )
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "False"]
+
+
 def test_one_that_cannot_be_started_is_done_without(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "matplotlib")
     monkeypatch.setattr(module.sys, "executable", "/nowhere/python")
@@ -153,7 +167,7 @@ def test_what_the_copy_cannot_draw_is_an_error(
 
     monkeypatch.setattr("iscat_analysis.report.drawing.publish", fail)
     with pytest.raises(RuntimeError, match="ended with status"):
-        draw_together(analysis, tmp_path, 12)
+        draw(analysis, tmp_path, 12, together=True)
 
 
 def test_a_fit_loads_matplotlib_in_the_other_process_only() -> None:
