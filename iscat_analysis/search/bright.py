@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 from iscat_analysis.search.peaks import maxima
-from iscat_analysis.search.sliding import STRIDES, Chunk, locate_step
+from iscat_analysis.search.sliding import STRIDES, Chunk, Patch, locate_step
 
 THRESHOLD = 7.0
 """Excess of the smoothed energy over its noise; the noise of a movie of 10⁸ pixels stays below."""
@@ -262,12 +262,15 @@ def _cut(
             high = min(high, other.frame - margin)
     row, column = spot.row, spot.column
     step: BrightStep | None = None
+    patch: Patch | None = None
+    region: tuple[tuple[int, int], tuple[int, int]] | None = None
     frame = spot.frame
     for gap in (0, None, None):  # roughly, then dated with its own picture and centred
         rows, columns = _region(row, roi_px), _region(column, roi_px)
         if min(rows[0], columns[0]) < 0 or rows[1] > chunk.shape[0] or columns[1] > chunk.shape[1]:
             return None
-        patch = chunk.patch(low, high, rows, columns)
+        if patch is None or region != (rows, columns):  # the centre often stays where it is
+            region, patch = (rows, columns), chunk.patch(low, high, rows, columns)
         if gap is None and step is not None:
             dated = locate_step(patch, _core(step, pixel_nm), (low + 1, high))
             if dated.p_constant < CONSTANT_P:
@@ -324,9 +327,9 @@ def measured_contrast(step: BrightStep) -> tuple[FloatArray, FloatArray]:
 def _core(step: BrightStep, pixel_nm: float) -> FloatArray:
     """Give the smoothed contrast of a step around its centre, as the template that dates it."""
     contrast, _ = measured_contrast(step)
-    y, x = np.mgrid[slice(*step.rows), slice(*step.columns)]
-    distance = np.hypot(y - step.y_px, x - step.x_px) * pixel_nm
-    return np.asarray(gaussian_filter(contrast, 0.7) * (distance < _CORE_NM))
+    y, x = np.ogrid[slice(*step.rows), slice(*step.columns)]
+    apart2 = (y - step.y_px) ** 2 + (x - step.x_px) ** 2
+    return np.asarray(gaussian_filter(contrast, 0.7) * (apart2 < (_CORE_NM / pixel_nm) ** 2))
 
 
 def centre_of_energy(
@@ -349,13 +352,14 @@ def centre_of_energy(
         Root of the χ² in excess of noise.
     """
     energy = np.maximum(gaussian_filter(contrast**2 / variance - 1, 0.7), 0.0)
-    y, x = np.mgrid[: contrast.shape[0], : contrast.shape[1]]
+    y, x = np.arange(contrast.shape[0]), np.arange(contrast.shape[1])
     row, column = (contrast.shape[0] - 1) / 2, (contrast.shape[1] - 1) / 2
     for reach_nm in (900.0, 700.0, 600.0, 500.0):
-        weight = energy * (np.hypot(y - row, x - column) * pixel_nm < reach_nm)
+        apart2 = (y[:, None] - row) ** 2 + (x - column) ** 2
+        weight = energy * (apart2 < (reach_nm / pixel_nm) ** 2)
         total = float(weight.sum())
         if total <= 0:
             break
-        row, column = float((weight * y).sum()) / total, float((weight * x).sum()) / total
+        row, column = weight.sum(axis=1) @ y / total, weight.sum(axis=0) @ x / total
     excess = float(np.sum(contrast**2 / variance) - contrast.size)
-    return row, column, math.sqrt(max(excess, 0.0))
+    return float(row), float(column), math.sqrt(max(excess, 0.0))

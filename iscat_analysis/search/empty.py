@@ -99,9 +99,11 @@ class EmptyField:
         n, k, _ = slopes.shape
         half = k // 2
         self._shape = (rows, columns)
+        # of rows a multiple of the spacing, so that those between the places need no transform
         self._size = (
-            fft.next_fast_len(rows + half, real=True), fft.next_fast_len(columns + half, real=True)
-        )  # fmt: skip
+            spacing_px * fft.next_fast_len(math.ceil((rows + half) / spacing_px)),
+            fft.next_fast_len(columns + half, real=True),
+        )
         self._n_free = n_free
         self._spacing, self._tile_px = spacing_px, tile_px
         self._mean = mean_e
@@ -126,7 +128,7 @@ class EmptyField:
         full &= eigenvalues[..., -1] < 1e10 * eigenvalues[..., 0]
         self._known = full & (self._weight[inner] > 0)
         inverse = np.linalg.inv(np.where(full[..., None, None], fisher, np.eye(n)))
-        self._inverse = inverse[..., :n_free, :]
+        self._inverse = np.ascontiguousarray(np.moveaxis(inverse[..., :n_free, :], (2, 3), (0, 1)))
         self._variance = np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0)[:n_free]
         wide = math.ceil(columns / tile_px)
         row, column = np.indices(self._shape)
@@ -155,7 +157,7 @@ class EmptyField:
         if known is not None:
             rest = rest - known
         score = self._correlate(self._weight * rest, self._spectra)
-        errors: FloatArray = np.einsum("yxij,jyx->iyx", self._inverse, score)
+        errors: FloatArray = np.einsum("ijyx,jyx->iyx", self._inverse, score)
         return errors
 
     def left(self, particles: Sequence[tuple[float, float]]) -> FloatArray:
@@ -251,7 +253,9 @@ class EmptyField:
                 if len(parts) < 8:
                     continue
                 light = power.reshape(-1, joined).sum(axis=1)
-                lit = (power[:, None, None] * parts).reshape(-1, joined, *unit.shape).sum(axis=1)
+                lit = power[:, None, None] * parts
+                if joined > 1:
+                    lit = lit.reshape(-1, joined, *unit.shape).sum(axis=1)
                 lit /= light[:, None, None]
                 apart = lit[1::2] - lit[0::2]
                 expected = 1 / light[1::2] + 1 / light[0::2]
@@ -311,4 +315,13 @@ class EmptyField:
         padded = np.zeros(self._size, dtype=spectra.real.dtype)
         padded[: self._shape[0], : self._shape[1]] = image
         spectrum = fft.rfft2(padded)
-        return np.stack([fft.irfft2(spectrum * s, s=self._size)[self._places] for s in spectra])
+        step, (rows, columns) = self._spacing, self._size
+        shape = step, rows // step, -1
+        kept = slice(math.ceil(self._shape[0] / step)), self._places[1]
+        # every step-th row of what a spectrum stands for is the transform of its mean over aliases
+        return np.stack(
+            [
+                fft.irfft2((spectrum * s).reshape(shape).mean(axis=0), s=(rows // step, columns))[kept]
+                for s in spectra
+            ]
+        )

@@ -39,7 +39,8 @@ def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> N
     """
     at = np.argwhere(fields > least)
     last = np.array(fields.shape) - 1
-    for offset in product(*(range(-n, n + 1) for n in reach)):
+    offsets = product(*(range(-n, n + 1) for n in reach))
+    for offset in sorted(offsets, key=lambda o: sum(map(abs, o))):  # the nearest leave few others
         beside = np.clip(at + offset, 0, last)  # at an edge, the outermost pixel
         at = at[fields[tuple(at.T)] >= fields[tuple(beside.T)]]
     return at

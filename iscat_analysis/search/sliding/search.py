@@ -185,6 +185,7 @@ def sliding_maps(
         earlier = np.empty((count, rows, columns), dtype=np.float32), np.zeros(count)
         changed = range(count)
     snr, effective = earlier
+    root = np.sqrt(matched.norm)
 
     def one(j: int) -> None:
         low, middle, high = max(j + 1 - strides, 0), j + 1, min(j + 1 + strides, count + 1)
@@ -211,7 +212,7 @@ def sliding_maps(
         spectrum *= matched.spectrum
         overlap = fft.irfft2(spectrum, s=matched.size)[:rows, :columns]
         effective[j] = powers[0] * powers[1] / (powers[0] + powers[1])
-        np.divide(overlap * math.sqrt(effective[j]), np.sqrt(matched.norm), out=snr[j])
+        np.divide(overlap * math.sqrt(effective[j]), root, out=snr[j])
 
     for _ in mapper(one, changed):
         pass
