@@ -110,9 +110,16 @@ def _of_spots(
 
 def _median_deviation(values: NDArray[np.floating]) -> float:
     """Median of the magnitudes of deviations from the median."""
-    deviation = values - np.median(values)
-    np.abs(deviation, out=deviation)
-    return float(np.median(deviation, overwrite_input=True))
+    deviation = values.ravel() - _middle(values.flatten())
+    return _middle(np.abs(deviation, out=deviation))
+
+
+def _middle(values: NDArray[np.floating]) -> float:
+    """Give the median of finite values, and sort them by halves: NumPy looks for NaN as long."""
+    half = values.size // 2
+    values.partition(half)
+    upper = values[half]
+    return float(upper if values.size % 2 else (values[:half].max() + upper) / 2)
 
 
 def spot_of(wavelength_nm: float, na: float, pixel_nm: float) -> float:

@@ -316,12 +316,9 @@ class EmptyField:
         padded[: self._shape[0], : self._shape[1]] = image
         spectrum = fft.rfft2(padded)
         step, (rows, columns) = self._spacing, self._size
-        shape = step, rows // step, -1
+        folded, size = (step, rows // step, -1), (rows // step, columns)
         kept = slice(math.ceil(self._shape[0] / step)), self._places[1]
         # every step-th row of what a spectrum stands for is the transform of its mean over aliases
         return np.stack(
-            [
-                fft.irfft2((spectrum * s).reshape(shape).mean(axis=0), s=(rows // step, columns))[kept]
-                for s in spectra
-            ]
+            [fft.irfft2((spectrum * s).reshape(folded).mean(axis=0), s=size)[kept] for s in spectra]
         )
