@@ -187,6 +187,7 @@ class ChunkFitter:
             kept = {id(s) for s in credible}
             rejected += [s for s in steps if id(s) not in kept]
             steps = credible
+        self._maps = None  # fits need their memory
         if not steps:
             return []
         lobes = [self._begin(peak) for peak in self._doubtful]

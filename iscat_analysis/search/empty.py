@@ -9,10 +9,10 @@ windows.  Disjoint parts of an event's own frames, which are shorter, cannot sho
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,12 +114,12 @@ class EmptyField:
         scale = np.sqrt(np.einsum("iyx,iyx->i", slopes, slopes))
         unit = slopes / scale[:, None, None]
         pairs = [(i, j) for i in range(n) for j in range(i, n)]
-        products = np.stack([unit[i] * unit[j] for i, j in pairs])
         # residuals are small numbers, of which single precision keeps a millionth
-        self._spectra = self._reversed(unit).astype(np.complex64)
+        self._spectra = [self._reversed(image).astype(np.complex64) for image in unit]
         inner = (slice(0, rows, spacing_px), slice(0, columns, spacing_px))
         self._places = inner
-        information = self._correlate(self._weight * light, self._reversed(products))
+        products = (self._reversed(unit[i] * unit[j]) for i, j in pairs)  # one at a time in memory
+        information = self._correlate(self._weight * light, products)
         fisher = np.empty((*information.shape[1:], n, n))
         for (i, j), value in zip(pairs, information, strict=True):
             fisher[..., i, j] = fisher[..., j, i] = value
@@ -156,7 +156,7 @@ class EmptyField:
         rest = sum_e / power - self._mean
         if known is not None:
             rest = rest - known
-        score = self._correlate(self._weight * rest, self._spectra)
+        score = self._correlate((self._weight * rest).astype(np.float32), self._spectra)
         errors: FloatArray = np.einsum("ijyx,jyx->iyx", self._inverse, score)
         return errors
 
@@ -227,12 +227,9 @@ class EmptyField:
         nothing = EmptySpread(squares, counts, self.shared)
         if kept.sum() < FEWEST_PLACES:
             return nothing
-        sides = [np.stack(parts)[:, :, kept] for parts in (before, after)]
+        sides = [[part[:, kept] for part in parts] for parts in (before, after)]
         unit, tile = self._variance[:, kept], self._tile[kept]
-        means = [
-            np.einsum("j,jip->ip", power / power.sum(), parts)
-            for power, parts in zip(powers, sides, strict=True)
-        ]
+        means = [_mean(power, parts) for power, parts in zip(powers, sides, strict=True)]
         noise = unit * sum(1 / power.sum() for power in powers)
         if left is not None:
             noise = noise * left[:, kept]
@@ -244,24 +241,23 @@ class EmptyField:
         found = [(whole**2 / _KEPT_VARIANCE, 1)]
         parts_squares, degrees = np.zeros(unit.shape), 0
         for power, parts, mean in zip(powers, sides, means, strict=True):
-            parts_squares += np.einsum("j,jip->ip", power, (parts - mean) ** 2) / unit
+            for light, part in zip(power, parts, strict=True):
+                parts_squares += light * (part - mean) ** 2
             degrees += len(parts) - 1
+        parts_squares /= unit
         found.append((parts_squares, degrees))
         for joined in (1, 2, 4):
             total, pairs = np.zeros(unit.shape), 0
             for power, parts in zip(powers, sides, strict=True):
                 if len(parts) < 8:
                     continue
-                light = power.reshape(-1, joined).sum(axis=1)
-                lit = power[:, None, None] * parts
-                if joined > 1:
-                    lit = lit.reshape(-1, joined, *unit.shape).sum(axis=1)
-                lit /= light[:, None, None]
-                apart = lit[1::2] - lit[0::2]
-                expected = 1 / light[1::2] + 1 / light[0::2]
-                total += np.einsum("j,jip->ip", 1 / expected, apart**2) / unit
-                pairs += len(apart)
-            found.append((total, pairs))
+                for start in range(0, len(parts), 2 * joined):
+                    ends = start, start + joined, start + 2 * joined
+                    one, two = (slice(*pair) for pair in pairwise(ends))
+                    apart = _mean(power[two], parts[two]) - _mean(power[one], parts[one])
+                    total += apart**2 / (1 / power[one].sum() + 1 / power[two].sum())
+                    pairs += 1
+            found.append((total / unit, pairs))
         for k, (square, number) in enumerate(found):
             for i, row in enumerate(square):
                 squares[k, i] = np.bincount(tile[quiet], row[quiet], minlength=self.tiles)
@@ -303,16 +299,18 @@ class EmptyField:
         """Places at which there is a linear estimate."""
         return int(self._known.sum())
 
-    def _reversed(self, images: FloatArray) -> NDArray[Any]:
-        """Spectra that correlate with images whose centre is at the place."""
-        half = images.shape[1] // 2
-        padded = np.zeros((len(images), *self._size))
-        padded[:, : images.shape[1], : images.shape[2]] = images[:, ::-1, ::-1]
-        rolled = np.roll(padded, (-half, -half), axis=(1, 2))
-        return np.asarray(fft.rfft2(rolled))
+    def _reversed(self, image: FloatArray) -> NDArray[np.complexfloating]:
+        """Spectrum that correlates with an image whose centre is at the place."""
+        side, half = len(image), len(image) // 2
+        padded = np.zeros(self._size)
+        padded[:side, :side] = image[::-1, ::-1]
+        return np.asarray(fft.rfft2(np.roll(padded, (-half, -half), axis=(0, 1))))
 
-    def _correlate(self, image: FloatArray, spectra: NDArray[Any]) -> FloatArray:
-        padded = np.zeros(self._size, dtype=spectra.real.dtype)
+    def _correlate(
+        self, image: NDArray[np.floating], spectra: Iterable[NDArray[np.complexfloating]]
+    ) -> FloatArray:
+        """Correlate at the places, in the precision of the image."""
+        padded = np.zeros(self._size, dtype=image.dtype)
         padded[: self._shape[0], : self._shape[1]] = image
         spectrum = fft.rfft2(padded)
         step, (rows, columns) = self._spacing, self._size
@@ -322,3 +320,11 @@ class EmptyField:
         return np.stack(
             [fft.irfft2((spectrum * s).reshape(folded).mean(axis=0), s=size)[kept] for s in spectra]
         )
+
+
+def _mean(power: FloatArray, parts: Sequence[FloatArray]) -> FloatArray:
+    """Average parts, each with its light; one after the other, as all together take memory."""
+    mean = np.zeros_like(parts[0])
+    for share, part in zip(power / power.sum(), parts, strict=True):
+        mean += share * part
+    return mean
