@@ -19,7 +19,7 @@ from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens, StampLens
 from iscat_analysis._kernels.radial import AxialTable
 from iscat_analysis._kernels.scoring import picture_at, span
-from iscat_analysis._kernels.stamp import stamp_gradient, stamp_signal
+from iscat_analysis._kernels.stamp import add_stamp, stamp_gradient
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -165,27 +165,34 @@ def cut(pixels: Pixels, r0: int, r1: int, c0: int, c1: int) -> Pixels:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def draw(
-    pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
-    profile: FloatArray, out: FloatArray,
+def add_row(
+    pictures: Pictures, field: Field, group: int, theta: FloatArray, sign: float,
+    square: tuple[int, int, int, int], profile: FloatArray, image: FloatArray,
+    total: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Fill `out` with the signal of one row."""
+    """Add the signal of one row, times a sign, to a square of a frame; `image` is work space."""
+    r0, r1, c0, c1 = square
+    if r1 <= r0:
+        return
     table, lens = table_of(pictures, group), lens_of(pictures, group)
-    _draw(table, lens, pictures.nodes, theta, pixels, profile, out)
+    pixels = cut(field.pixels, r0, r1, c0, c1)
+    _add_row(table, lens, pictures.nodes, theta, sign, pixels, profile, image, total[r0:r1, c0:c1])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(
-    table: AxialTable, lens: Lens, nodes: NDArray[np.float32], theta: FloatArray, pixels: Pixels,
-    profile: FloatArray, out: FloatArray,
+def _add_row(
+    table: AxialTable, lens: Lens, nodes: NDArray[np.float32], theta: FloatArray, sign: float,
+    pixels: Pixels, profile: FloatArray, image: FloatArray, there: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Do the same as `draw`; what a lens leaves out depends on an argument's type."""
+    """Do the same as `add_row`; what a lens leaves out depends on an argument's type."""
     if len(lens) == STAMP:
-        stamp_signal(nodes, lens, pixels, theta[0], theta[1], theta[3], out)
+        add_stamp(nodes, lens, pixels, theta[0], theta[1], theta[3], sign, there)
         return
+    out = image[: there.size].reshape(there.shape)
     start, stop = span(lens, pixels, theta, table.heights.shape[3])
     picture = picture_at(table, lens, theta[2], start, stop, profile)
     signal_image(picture, lens, pixels, theta[0], theta[1], theta[3], out)
+    add(there, 0, 0, sign, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -265,21 +272,13 @@ def ready_frame(
     for r in range(first, last):
         if stale:
             canvas.rings[r] = canvas.squares[r] = theta[r]
-            r0, r1, c0, c1 = square_of(field, theta[r], field.drawn, rows, columns)
-            if r1 > r0:
-                out = image[: (r1 - r0) * (c1 - c0)].reshape(r1 - r0, c1 - c0)
-                pixels = cut(field.pixels, r0, r1, c0, c1)
-                draw(far, group[r], theta[r], pixels, far_profile, out)
-                add(total, r0, c0, 1.0, out)
+            there = square_of(field, theta[r], field.drawn, rows, columns)
+            add_row(far, field, group[r], theta[r], 1.0, there, far_profile, image, total)
         elif np.any(theta[r] != canvas.squares[r]):
-            r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
-            if r1 > r0:
-                out = image[: (r1 - r0) * (c1 - c0)].reshape(r1 - r0, c1 - c0)
-                pixels = cut(field.pixels, r0, r1, c0, c1)
-                draw(near, group[r], canvas.squares[r], pixels, near_profile, out)
-                add(total, r0, c0, -1.0, out)
-                draw(near, group[r], theta[r], pixels, near_profile, out)
-                add(total, r0, c0, 1.0, out)
+            there = square_of(field, canvas.rings[r], field.side, rows, columns)
+            before, now = canvas.squares[r], theta[r]
+            add_row(near, field, group[r], before, -1.0, there, near_profile, image, total)
+            add_row(near, field, group[r], now, 1.0, there, near_profile, image, total)
             canvas.squares[r] = theta[r]
 
 

@@ -20,7 +20,9 @@ from iscat_analysis._kernels.canvas import (
 )
 from iscat_analysis._kernels.dense import factorise
 from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.scoring import FLOOR, POISSON, blank_profile, image_score, image_value
+from iscat_analysis._kernels.lens import STAMP
+from iscat_analysis._kernels.place_score import place_score
+from iscat_analysis._kernels.scoring import FLOOR, blank_profile
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -167,8 +169,7 @@ def judge_frames(
             draw_gradient(near, group[r], p, pixels, profile, here)
             data = square[: 4 * ny * nx].reshape(4, ny, nx)
             stage(light, t, canvas.total[t], here, r0, c0, data)
-            value = image_value(POISSON, data, 1.0, here)
-            image_score(POISSON, data, 1.0, here, pull, known)
+            value = place_score(data, here, len(near.lens) != STAMP, pull, known)
             for i in range(4):
                 score[r, i] = pull[i]
                 for j in range(4):

@@ -33,13 +33,13 @@ from iscat_analysis._kernels.canvas import (
 from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lens import STAMP
+from iscat_analysis._kernels.place_score import place_score
 from iscat_analysis._kernels.scoring import (
     CONVERGED,
     POISSON,
     STALLED,
     blank_profile,
-    image_score,
-    image_value,
     maximize,
     scoring_step,
 )
@@ -192,18 +192,17 @@ def _climb(
     for i in range(5):
         lower[i] = max(search.lower[i], p[i] - search.reach[i])
         upper[i] = min(search.upper[i], p[i] + search.reach[i])
-    at, value = 0, np.nan
+    with_z = len(near.lens) != STAMP
+    at, value = 0, place_score(data, both[0], with_z, score, fisher)
     for _ in range(search.passes):
-        gain = _step(search, data, both[at], p, lower, upper, score, fisher, step, trial)
+        gain = _step(search, p, lower, upper, score, fisher, step, trial)
         if gain == np.inf:
             break
-        if np.isnan(value):
-            value = image_value(POISSON, data, 1.0, both[at])
         if gain < search.tolerance:
             p[:] = trial
             return CONVERGED, at, value + gain
         draw_gradient(near, group, trial, pixels, profile, both[1 - at])
-        there = image_value(POISSON, data, 1.0, both[1 - at])
+        there = place_score(data, both[1 - at], with_z, score, fisher)
         if not there > value:
             break
         p[:], value, at = trial, there, 1 - at
@@ -215,21 +214,20 @@ def _climb(
         upper, search.max_step, search.tolerance, search.passes, p, score, fisher,
     )  # fmt: skip
     draw_gradient(near, group, p, pixels, profile, both[0])
-    image_score(POISSON, data, 1.0, both[0], score, fisher)
+    place_score(data, both[0], with_z, score, fisher)
     step[:] = 0.0
     return outcome, 0, value
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _step(
-    search: Search, data: FloatArray, here: FloatArray, p: FloatArray, lower: FloatArray,
-    upper: FloatArray, score: FloatArray, fisher: FloatArray, step: FloatArray, trial: FloatArray,
+    search: Search, p: FloatArray, lower: FloatArray, upper: FloatArray, score: FloatArray,
+    fisher: FloatArray, step: FloatArray, trial: FloatArray,
 ) -> float:  # fmt: skip
     """Fill the step of Fisher scoring and where it leads; return the gain that it promises.
 
     It is infinite where the step is no good as it is: too long, out of the box, or undetermined.
     """
-    image_score(POISSON, data, 1.0, here, score, fisher)
     if not scoring_step(score, fisher, search.free, 0.0, step):
         return np.inf
     gain = 0.0

@@ -49,7 +49,7 @@ _TOGETHER = 256
 
 
 @njit(inline="always")
-def _twice_artanh(w: float) -> float:
+def twice_artanh(w: float) -> float:
     """ln(1+x) for w = x/(2+x), by its series; 1e-16 for |x| < SERIES."""
     w2 = w * w
     tail = 1 / 3 + w2 * (1 / 5 + w2 * (1 / 7 + w2 * (1 / 9 + w2 * (1 / 11 + w2 / 13))))
@@ -73,7 +73,7 @@ def _some_value(
                 part = change * c2[j]
                 one, other = 2.0 + change, 2.0 * (1.0 + c2[j]) + part
                 per = 1.0 / (one * other)  # of both quotients, as it takes longer than the rest
-                now, later = _twice_artanh(change * other * per), _twice_artanh(part * one * per)
+                now, later = twice_artanh(change * other * per), twice_artanh(part * one * per)
                 total += c3[j] * (c0[j] * now - c1[j] * later)
         else:
             for j in range(c0.size):
@@ -91,7 +91,7 @@ def _some_value(
         for j in range(c0.size):
             base = max(c1[j] + c3[j], FLOOR)
             change = level * (c1[j] + c2[j] * s[j]) + c3[j] - base
-            total += c0[j] * _twice_artanh(change / (2.0 * base + change)) - change
+            total += c0[j] * twice_artanh(change / (2.0 * base + change)) - change
     else:
         for j in range(c0.size):
             base = max(c1[j] + c3[j], FLOOR)

@@ -231,3 +231,29 @@ def _fill_signal(
         begin += line
         for j in range(n):
             here[j] = amplitude * s[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_stamp(
+    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
+    amplitude: float, sign: float, out: AnyFloatArray,
+) -> None:  # fmt: skip
+    """Add the signal of an image, times a sign, to `out` (ny, nx), in the latter's precision."""
+    f = _begin(profile, lens, pixels, x_p, y_p, amplitude)
+    _add_stamp(profile, lens, sign * amplitude, np.empty(TAPS, dtype=np.int64), f, out)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+def _add_stamp(
+    profile: AnyFloatArray, lens: StampLens, factor: float, at: IntArray, f: AnyFloatArray,
+    out: AnyFloatArray,
+) -> None:  # fmt: skip
+    rows, n = out.shape
+    line = _sizes(lens, n)[0]
+    for row in range(rows):
+        if row % STRIP == 0:
+            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, False, at, f)
+        s, here = f[begin : begin + n], out[row]
+        begin += line
+        for j in range(n):
+            here[j] += factor * s[j]

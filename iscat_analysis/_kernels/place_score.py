@@ -1,0 +1,100 @@
+"""Score, information and likelihood of a particle in a frame, in one pass over its square.
+
+The same as `image_score` and `image_value` of `iscat_analysis._kernels.scoring` say of a POISSON
+image at level 1, without what no fit of a frame asks for: the level and, of a picture at one
+height, z.  All three share the expected counts and one division per pixel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.scoring import (
+    POISSON,
+    SERIES,
+    image_score,
+    image_value,
+    twice_artanh,
+)
+
+FloatArray = NDArray[np.float64]
+
+_LEAST = 1e-100
+"""Least expected count, as `FLOOR` of `scoring`, but its square is a number too."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def place_score(
+    data: FloatArray, here: FloatArray, with_z: bool, score: FloatArray, fisher: FloatArray
+) -> float:
+    """Fill score and Fisher matrix of (x, y, z, a), and give the log-likelihood.
+
+    Parameters
+    ----------
+    data : ndarray, shape (4, ny, nx)
+        Constants of the likelihood.
+    here : ndarray, shape (ny, 5, nx)
+        Signal and its gradient.
+    with_z : bool
+        Whether the picture changes with z; where not, what belongs to z is 0.
+    score, fisher : ndarray, shape (5,), (5, 5)
+        Filled; 0 for the level.
+
+    Returns
+    -------
+    float
+        Over that without the particle.
+    """
+    if with_z:
+        image_score(POISSON, data, 1.0, here, score, fisher)
+        score[4] = 0.0
+        for i in range(5):
+            fisher[i, 4] = fisher[4, i] = 0.0
+        value: float = image_value(POISSON, data, 1.0, here)
+        return value
+    value, beyond = _flat_score(data, here, score, fisher)
+    if beyond:
+        value = image_value(POISSON, data, 1.0, here)
+    return value
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+def _flat_score(
+    data: FloatArray, here: FloatArray, score: FloatArray, fisher: FloatArray
+) -> tuple[float, int]:
+    """Do it without z; tell as well in how many pixels the series of the logarithm is no good."""
+    b0 = b1 = b3 = f00 = f01 = f03 = f11 = f13 = f33 = value = 0.0
+    beyond = 0
+    for i in range(data.shape[1]):
+        c0, c1, c2, c3 = data[0, i], data[1, i], data[2, i], data[3, i]
+        s, gx, gy, ga = here[i, 0], here[i, 1], here[i, 2], here[i, 4]
+        for j in range(s.size):
+            base, change = max(c1[j] + c3[j], _LEAST), c2[j] * s[j]
+            rate, middle = max(base + change, _LEAST), 2.0 * base + change
+            per = 1.0 / (rate * middle)  # of both quotients, as it takes longer than the rest
+            beyond += abs(change) >= SERIES * base
+            value += c0[j] * twice_artanh(change * (rate * per)) - change
+            bend = c2[j] * (middle * per)
+            pull = c0[j] * bend - c2[j]
+            bend *= c2[j]
+            b0 += pull * gx[j]
+            b1 += pull * gy[j]
+            b3 += pull * ga[j]
+            hx, hy, ha = bend * gx[j], bend * gy[j], bend * ga[j]
+            f00 += hx * gx[j]
+            f01 += hx * gy[j]
+            f03 += hx * ga[j]
+            f11 += hy * gy[j]
+            f13 += hy * ga[j]
+            f33 += ha * ga[j]
+    score[:] = 0.0
+    fisher[:] = 0.0
+    score[0], score[1], score[3] = b0, b1, b3
+    fisher[0, 0], fisher[1, 1], fisher[3, 3] = f00, f11, f33
+    fisher[0, 1] = fisher[1, 0] = f01
+    fisher[0, 3] = fisher[3, 0] = f03
+    fisher[1, 3] = fisher[3, 1] = f13
+    return value, beyond

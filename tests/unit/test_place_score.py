@@ -1,0 +1,39 @@
+"""Score, information and likelihood of a frame's square in one pass, against those of an image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from iscat_analysis._kernels.place_score import place_score
+from iscat_analysis._kernels.scoring import POISSON, image_score, image_value
+
+ROUNDING = 1e-11  # of sums over pixels in another order
+
+
+@pytest.mark.parametrize("with_z", [False, True])
+@pytest.mark.parametrize("contrast", [0.01, 0.6], ids=["faint", "beyond the series"])
+@pytest.mark.parametrize("read_e2", [0.0, 900.0])
+def test_one_pass_says_what_three_say(with_z, contrast, read_e2):
+    rng = np.random.default_rng(3)
+    side = 13
+    here = rng.uniform(-contrast, contrast, (side, 5, side))
+    here[:, 3] *= with_z
+    light = rng.uniform(3e3, 5e3, (side, side))
+    read = np.full_like(light, read_e2)
+    seen = rng.poisson(light * (1 + here[:, 0])) + read
+    data = np.stack([seen, light * (1 + rng.uniform(0, 0.02, light.shape)), light, read])
+    data[:, 4, 2:5] = 0.0  # pixels that are not used
+
+    score, fisher = np.full(5, np.nan), np.full((5, 5), np.nan)
+    value = place_score(data, here, with_z, score, fisher)
+
+    wanted_score, wanted = np.empty(5), np.empty((5, 5))
+    image_score(POISSON, data, 1.0, here, wanted_score, wanted)
+    wanted_score[4] = wanted[4] = wanted[:, 4] = 0.0
+    scale = np.sqrt(np.diag(wanted))
+    assert value == pytest.approx(image_value(POISSON, data, 1.0, here), rel=ROUNDING)
+    np.testing.assert_allclose(score, wanted_score, rtol=0, atol=ROUNDING * scale.max() * side)
+    np.testing.assert_allclose(fisher, wanted, rtol=0, atol=ROUNDING * np.abs(wanted).max())
+    assert np.isfinite(value)
+    assert fisher[2, 2] > 0 if with_z else not fisher[2].any()
