@@ -16,7 +16,7 @@ from iscat_analysis.pipeline.results import Compared
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status, free_parameters
 from iscat_analysis.report.spread import rejection
-from iscat_analysis.species import describe
+from iscat_analysis.species import LEAST_EVENTS, describe
 from iscat_analysis.species.tables import filter_efficiency, shared_error
 
 _HEIGHTS = 65
@@ -131,10 +131,13 @@ def _distribution(scene: Scene, good: pd.DataFrame) -> dict[str, Any] | None:
     if "mass_kda" not in FREE_PARAMETERS[scene.mode] or scene.mode == "track":
         return None
     mass, sigma = (good[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
+    efficiency = None
+    if len(good) >= LEAST_EVENTS:  # fewer have no species whose numbers it would correct
+        efficiency = filter_efficiency(good, scene.templates.threshold)
     found = describe(
         mass,
         sigma,
-        efficiency=filter_efficiency(good, scene.templates.threshold),
+        efficiency=efficiency,
         seed=scene.config.compute.seed,
         scale_error=shared_error(good),
         window_frames=int(good["n_after"].max()) if len(good) else None,
