@@ -152,9 +152,10 @@ def mass(
     with failures(messages, debug=debug):
         masses, errors = _standards(standards)
 
+        from iscat_analysis.movie.addresses import beside
         from iscat_analysis.pipeline.calibrations import mass_calibration
 
-        folder = out if out is not None else events.with_suffix(".calibration")
+        folder = out if out is not None else beside(events, ".calibration")
         found = mass_calibration(
             events,
             masses,

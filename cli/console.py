@@ -210,6 +210,7 @@ _OPTIONS = {
     },
     "above_kda": "above",
     "settings": "set",
+    "focus_step_nm": "focus-step",
     "frame_rate_hz": "frame-rate",
     "interval_s": "interval",
     "landing_power": "landing",

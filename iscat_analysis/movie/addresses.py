@@ -12,6 +12,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from iscat_analysis.errors import DataError
+
 MARK = "::"
 _END_BYTES = 2**20  # that are read of a file; many files share them
 _LEAST_END_BYTES = 2**8
@@ -71,8 +73,17 @@ def beside(address: Path, suffix: str) -> Path:
     -------
     Path
         The movie's, with another suffix; the name of a dataset stays in it.
+
+    Raises
+    ------
+    DataError
+        It is the root of all folders, which has no name.
     """
     path, part = split_address(address)
+    if path.name in ("", ".."):  # the folder one is in, or the one above, has its name elsewhere
+        path = path.resolve()
+    if not path.name:
+        raise DataError(f"{path}: is not a movie or a table; give the path of one")
     if not part or layout(part) is not None:
         return path.with_suffix(suffix)
     return path.with_name(".".join([path.stem, *part.strip("/").split("/")]) + suffix)

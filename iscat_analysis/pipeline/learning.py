@@ -28,7 +28,8 @@ from iscat_analysis.calibration.optics import (
 )
 from iscat_analysis.calibration.optics.starts import average_sights, with_masses
 from iscat_analysis.config import Config
-from iscat_analysis.errors import DataError
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera, camera_from_config
 from iscat_analysis.movie.metadata import resolve_metadata
@@ -59,6 +60,8 @@ LEAST_TESTED = 4
 """Bright particles without which the optics are not even tested."""
 
 _TESTED = 24
+_MOST_STEP_NM = 5e3  # farther than the model's pictures reach
+_LEAST_SCAN_NM = 10.0  # over all frames; a step in µm stays below it
 _NOISE = "its noise is not what the camera's numbers predict; the analysis goes on as configured"
 _STUCK = 0.02  # share of frames that repeat another, which sums of frames count
 _STARTS_NM = tuple(range(-400, 401, 100))  # along each axis; rings are some 200 nm apart
@@ -225,6 +228,8 @@ def calibrate_movie(
         The configuration cannot be calibrated.
     """
     groups = free_groups(free)
+    if focus_step_nm is not None:
+        _check_step(focus_step_nm, movie.shape[0])
     config, notes = resolve_metadata(config, movie.metadata)
     for note in notes:
         if notify is not None:
@@ -251,6 +256,17 @@ def calibrate_movie(
             sights, others, config, groups, source,
             focus_step_nm=focus_step_nm, mapper=pool.map,
         )  # fmt: skip
+
+
+def _check_step(step_nm: float, frames: int) -> None:
+    """Refuse steps that make no scan: another unit is likely."""
+    number_in("`focus_step_nm`", step_nm, least=-_MOST_STEP_NM, most=_MOST_STEP_NM)
+    travel = abs(step_nm) * (frames - 1)
+    if travel < _LEAST_SCAN_NM:
+        raise ConfigError(
+            f"`focus_step_nm` = {step_nm:g}: over {count(frames, 'frame')} the focus rises by "
+            f"{travel:.3g} nm, which no picture shows; give the step from frame to frame in nm"
+        )
 
 
 def _learned(

@@ -124,3 +124,35 @@ def test_free_names_are_checked(movie: Path, tmp_path: Path, capsys: Captured) -
     ]
     assert main(given) == 2
     assert "'fokus' cannot be set free" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("step", "said"),
+    [
+        ("nan", "--focus-step nan"),
+        ("1e9", "--focus-step 1e+09"),
+        ("0", "--focus-step 0: over 60 frames the focus rises by 0 nm"),
+        ("0.02", "--focus-step 0.02: over 60 frames the focus rises by 1.18 nm"),
+    ],
+)
+def test_a_step_that_makes_no_scan_is_refused_by_its_name(
+    step: str, said: str, tmp_path: Path, capsys: Captured
+) -> None:
+    tifffile.imwrite(tmp_path / "m.tif", np.full((60, 64, 64), 500, dtype=np.uint16))
+    given = ["calibrate", "optics", str(tmp_path / "m.tif"), "--focus-step", step, "--quiet"]
+    assert main([*given, "--set", "camera.pixel_size_nm=84.4"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def test_the_folder_one_is_in_is_no_movie_and_no_table(
+    tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its name, from which that of the results is made, is empty."""
+    monkeypatch.chdir(tmp_path)
+    optics = ["calibrate", "optics", ".", "--set", "camera.pixel_size_nm=84.4", "--quiet"]
+    for given in (optics, ["calibrate", "mass", ".", "--standards", "66,146"]):
+        assert main(given) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "unexpected" not in line
+        assert ": error: .: " in line

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,12 +18,14 @@ from iscat_analysis.calibration.optics.estimate import _excess
 from iscat_analysis.calibration.optics.settings import settings_of, with_settings
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.pipeline import tracked_optics
 from iscat_analysis.pipeline.settling_optics import Round, Rounds
 from iscat_analysis.pipeline.tracked_optics import (
     MASS_SHARE,
     REJECTED_SHARE,
     LeftOver,
     _said,
+    learn_from_tracks,
     mass_error,
 )
 
@@ -188,3 +192,33 @@ def test_a_flood_of_places_is_refused_before_all_are_fitted() -> None:
     movie = wander((120, 80, 80), seed=3, species=species, drift_nm_per_frame=(5.0, 0.0))
     with pytest.raises(DataError, match=r"places in every frame of 45 um2 .* the light changes"):
         ia.fit_movie(movie.counts, settings=SETTINGS)
+
+
+@pytest.mark.parametrize(("described_from", "rounds"), [(None, 4), (3, 8)])
+def test_rounds_end_where_the_first_four_describe_nothing(
+    described_from: int | None, rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tracks followed with optics of every round are described from one of them on, or never."""
+    measured: list[float] = []
+    told: list[str] = []
+
+    def begin(config: Config, **_: bool) -> Any:
+        described = described_from is not None and len(measured) % rounds >= described_from
+        left = LeftOver(share=0.0 if described else 0.2, chi2=9.0, tracks=3)
+        block = SimpleNamespace(gain_message=None)
+        return SimpleNamespace(config=config, block=block, left=left, described=described)
+
+    def measure(*_: Any, **__: Any) -> Any:
+        measured.append(-300.0 + 50 * len(measured))
+        settings = SimpleNamespace(settings={"focus_nm": measured[-1]})
+        return SimpleNamespace(names=("focus_nm",), covariance=np.eye(1), measured=settings)
+
+    monkeypatch.setattr(tracked_optics, "_cause", lambda _: None)
+    monkeypatch.setattr(tracked_optics, "_measured", measure)
+    monkeypatch.setattr(tracked_optics, "usable", lambda *_: (None, "not yet"))
+    with ThreadPoolExecutor(1) as pool:
+        config = Config.model_validate({"optics": {"calibrate": "auto"}})
+        _, summary = learn_from_tracks(config, begin, name="m", pool=pool, tell=told.append)
+    assert len(measured) == 2 * rounds  # of all particles, and of those that stand alone
+    assert not summary["calibrated"]
+    assert "other optics were not learned: not yet" in told[0]
