@@ -192,7 +192,7 @@ def _add_row(
     start, stop = span(lens, pixels, theta, table.heights.shape[3])
     picture = picture_at(table, lens, theta[2], start, stop, profile)
     signal_image(picture, lens, pixels, theta[0], theta[1], theta[3], out)
-    add(there, 0, 0, sign, out)
+    add(there, sign, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -220,11 +220,11 @@ def _draw_gradient(
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
-def add(total: NDArray[np.float32], r0: int, c0: int, sign: float, image: FloatArray) -> None:
-    """Add an image, times a sign, to the part of a frame that begins at (r0, c0)."""
+def add(there: NDArray[np.float32], sign: float, image: FloatArray) -> None:
+    """Add an image, times a sign, to the square of a frame where it belongs."""
     for i in range(image.shape[0]):
         for j in range(image.shape[1]):
-            total[r0 + i, c0 + j] += np.float32(sign * image[i, j])
+            there[i, j] += np.float32(sign * image[i, j])
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)

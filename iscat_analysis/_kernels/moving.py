@@ -165,7 +165,7 @@ def fit_frames(
                 )
                 here = both[last_one]
                 _add_signal(here, step, moved)
-                add(total, r0, c0, 1.0, moved)
+                add(total[r0:r1, c0:c1], 1.0, moved)
                 canvas.squares[r] = p
                 information[r] = fisher[:4, :4]
                 if slopes.values.size:

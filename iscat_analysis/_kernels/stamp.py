@@ -214,23 +214,7 @@ def stamp_signal(
 ) -> None:  # fmt: skip
     """Fill `out` (ny, nx) with the signal of an image."""
     f = _begin(profile, lens, pixels, x_p, y_p, amplitude)
-    _fill_signal(profile, lens, amplitude, np.empty(TAPS, dtype=np.int64), f, out)
-
-
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
-def _fill_signal(
-    profile: AnyFloatArray, lens: StampLens, amplitude: float, at: IntArray, f: AnyFloatArray,
-    out: FloatArray,
-) -> None:  # fmt: skip
-    rows, n = out.shape
-    line = _sizes(lens, n)[0]
-    for row in range(rows):
-        if row % STRIP == 0:
-            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, False, at, f)
-        s, here = f[begin : begin + n], out[row]
-        begin += line
-        for j in range(n):
-            here[j] = amplitude * s[j]
+    _put_signal(profile, lens, amplitude, False, np.empty(TAPS, dtype=np.int64), f, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -240,14 +224,15 @@ def add_stamp(
 ) -> None:  # fmt: skip
     """Add the signal of an image, times a sign, to `out` (ny, nx), in the latter's precision."""
     f = _begin(profile, lens, pixels, x_p, y_p, amplitude)
-    _add_stamp(profile, lens, sign * amplitude, np.empty(TAPS, dtype=np.int64), f, out)
+    _put_signal(profile, lens, sign * amplitude, True, np.empty(TAPS, dtype=np.int64), f, out)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
-def _add_stamp(
-    profile: AnyFloatArray, lens: StampLens, factor: float, at: IntArray, f: AnyFloatArray,
-    out: AnyFloatArray,
+def _put_signal(
+    profile: AnyFloatArray, lens: StampLens, factor: float, adds: bool, at: IntArray,
+    f: AnyFloatArray, out: AnyFloatArray,
 ) -> None:  # fmt: skip
+    """Write the signal into `out`, or add it to what is there."""
     rows, n = out.shape
     line = _sizes(lens, n)[0]
     for row in range(rows):
@@ -255,5 +240,9 @@ def _add_stamp(
             begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, False, at, f)
         s, here = f[begin : begin + n], out[row]
         begin += line
-        for j in range(n):
-            here[j] += factor * s[j]
+        if adds:
+            for j in range(n):
+                here[j] += factor * s[j]
+        else:
+            for j in range(n):
+                here[j] = factor * s[j]

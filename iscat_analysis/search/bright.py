@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 from iscat_analysis.search.peaks import maxima
-from iscat_analysis.search.sliding import STRIDES, Chunk, Patch, locate_step
+from iscat_analysis.search.sliding import STRIDES, Chunk, locate_step
 
 THRESHOLD = 7.0
 """Excess of the smoothed energy over its noise; the noise of a movie of 10⁸ pixels stays below."""
@@ -262,15 +262,13 @@ def _cut(
             high = min(high, other.frame - margin)
     row, column = spot.row, spot.column
     step: BrightStep | None = None
-    patch: Patch | None = None
-    region: tuple[tuple[int, int], tuple[int, int]] | None = None
     frame = spot.frame
     for gap in (0, None, None):  # roughly, then dated with its own picture and centred
         rows, columns = _region(row, roi_px), _region(column, roi_px)
         if min(rows[0], columns[0]) < 0 or rows[1] > chunk.shape[0] or columns[1] > chunk.shape[1]:
             return None
-        if patch is None or region != (rows, columns):  # the centre often stays where it is
-            region, patch = (rows, columns), chunk.patch(low, high, rows, columns)
+        if step is None or (rows, columns) != (step.rows, step.columns):  # often it stays
+            patch = chunk.patch(low, high, rows, columns)
         if gap is None and step is not None:
             dated = locate_step(patch, _core(step, pixel_nm), (low + 1, high))
             if dated.p_constant < CONSTANT_P:
