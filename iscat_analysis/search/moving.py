@@ -135,7 +135,7 @@ class FrameFilter:
         Sightings
             Above the threshold, strongest first in each frame, side lobes left out.
         """
-        found: list[tuple[float, ...]] = []
+        parts: list[FloatArray] = []
         threshold = self._templates.threshold
         together = max(_FIELDS // len(self._layers), 1)
         for start in range(0, len(residual_e), together):
@@ -149,38 +149,57 @@ class FrameFilter:
             dy, dx, above = summits(
                 snr.reshape(-1, *snr.shape[2:]), np.stack([field, row, column], 1)
             )
-            tops = [best[frame, row, column] + above, layer, row, column, row + dy, column + dx]
-            each = list(zip(*(t.tolist() for t in tops), strict=True))
-            edges = np.searchsorted(frame, np.arange(len(snr) + 1))
-            for i, (low, high) in enumerate(pairwise(edges), start):
-                kept: list[tuple[float, float, float]] = []
-                for height, k, y_px, x_px, y, x in sorted(each[low:high], reverse=True):
-                    if height <= threshold:
-                        break
-                    if self._is_lobe(height, x, y, kept):
-                        continue
-                    if self._is_left_over(height, x, y, known[i]):
-                        continue
-                    kept.append((height, x, y))
-                    strength = height / (np.sqrt(power[i]) * self._norm[k, y_px, x_px])
-                    z = float(self._templates.z_nm[self._layers[k]])
-                    found.append((first + i, x, y, z, float(strength), height))
-        columns = np.array(found).reshape(-1, 6).T
-        return Sightings(columns[0].astype(np.int64), *columns[1:])
+            height = best[frame, row, column] + above
+            order = np.lexsort((-column, -row, -layer, -height, frame))
+            order = order[height[order] > threshold]
+            tops = np.stack([frame + start, height, column + dx, row + dy])[:, order]
+            kept = self._alone(*tops, known)
+            at, layer = at[order][kept], layer[order][kept]
+            frames, heights, x, y = tops[:, kept]
+            norm = self._norm[layer, at[:, 1], at[:, 2]]
+            strength = heights / (np.sqrt(power[frames.astype(np.int64)]) * norm)
+            z = self._templates.z_nm[self._layers[layer]]
+            parts.append(np.stack([first + frames, x, y, z, strength, heights]))
+        frames, *others = np.concatenate(parts, axis=1)
+        return Sightings(frames.astype(np.int64), *others)
+
+    def _alone(
+        self,
+        frame: FloatArray,
+        height: FloatArray,
+        x: FloatArray,
+        y: FloatArray,
+        known: list[FloatArray],
+    ) -> BoolArray:
+        """Tell which peaks, the highest of each frame first, are no side lobes nor left over.
+
+        In each round the first of every frame that remains is taken, and its side lobes go.
+        """
+        kept = np.zeros(len(frame), dtype=bool)
+        left = np.arange(len(frame))
+        while left.size:
+            begins = np.diff(frame[left], prepend=-1) > 0
+            tops = left[begins]
+            if any(map(len, known)):
+                mine = zip(frame[tops].tolist(), *(v[tops].tolist() for v in (height, x, y)))
+                sure = np.array([not self._is_left_over(*v, known[int(t)]) for t, *v in mine])
+            else:
+                sure = np.ones(len(tops), dtype=bool)
+            kept[tops[sure]] = True
+            of = np.cumsum(begins) - 1
+            hides = sure[of] & self._is_lobe(height, x, y, left, tops[of])
+            left = left[~(begins | hides)]
+        return kept
 
     def _is_lobe(
-        self, height: float, x: float, y: float, kept: list[tuple[float, float, float]]
-    ) -> bool:
-        """Whether a peak may be a side lobe of a higher one."""
-        for other, ox, oy in kept:
-            away = max(abs(x - ox), abs(y - oy))
-            if height < other * (SIDELOBE if away < self._roi_px else FAR_LOBE):
-                return True
-            if self._cautious and away < self._roi_px:
-                return True
-            if np.hypot(x - ox, y - oy) < NEAR * self._roi_px:
-                return True
-        return False
+        self, height: FloatArray, x: FloatArray, y: FloatArray, one: IntArray, other: IntArray
+    ) -> BoolArray:
+        """Whether peaks may be side lobes of others, which are higher."""
+        apart_x, apart_y = x[one] - x[other], y[one] - y[other]
+        beside = np.maximum(np.abs(apart_x), np.abs(apart_y)) < self._roi_px
+        lobe = height[one] < height[other] * np.where(beside, SIDELOBE, FAR_LOBE)
+        lobe |= np.hypot(apart_x, apart_y) < NEAR * self._roi_px
+        return np.asarray(lobe | beside if self._cautious else lobe)
 
     def _is_left_over(self, height: float, x: float, y: float, known: FloatArray) -> bool:
         """Whether a peak may be what the model leaves over of a particle that is known."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from itertools import product
 from typing import Any
@@ -37,13 +38,19 @@ def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> N
     ndarray of int, shape (n, 3)
         Field, row and column of each, in this order; of equal neighbours all.
     """
-    at = np.argwhere(fields > least)
-    last = np.array(fields.shape) - 1
+    values = np.ascontiguousarray(fields).ravel()
+    at = np.flatnonzero(values > least)
+    place = np.stack(np.unravel_index(at, fields.shape))
+    apart = [math.prod(fields.shape[axis + 1 :]) for axis in range(fields.ndim)]
     offsets = product(*(range(-n, n + 1) for n in reach))
     for offset in sorted(offsets, key=lambda o: sum(map(abs, o))):  # the nearest leave few others
-        beside = np.clip(at + offset, 0, last)  # at an edge, the outermost pixel
-        at = at[fields[tuple(at.T)] >= fields[tuple(beside.T)]]
-    return at
+        beside = at
+        for axis in np.flatnonzero(offset):  # at an edge, the outermost pixel
+            moved = np.clip(place[axis] + offset[axis], 0, fields.shape[axis] - 1)
+            beside = beside + apart[axis] * (moved - place[axis])
+        kept = values[at] >= values[beside]
+        at, place = at[kept], place[:, kept]
+    return place.T
 
 
 def summits(
