@@ -15,15 +15,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import scipy
+from numpy.typing import NDArray
 
 from iscat_analysis.records import (
     TRACK_COLUMNS,
+    BoolArray,
     FloatArray,
     Progress,
     Status,
@@ -148,24 +150,19 @@ def describe_tracks(
         Columns `TRACK_COLUMNS`, one row per track in the order of their numbers, and
         ``systematic_mass_kda`` where `fits` has it.
     """
-    numbers = track_numbers(fits)
-    groups = {
-        int(track): rows.sort_values("frame")
-        for track, rows in fits[numbers.notna()].groupby(numbers[numbers.notna()])
-    }
+    groups = _by_track(fits)
+    massive = {track: _massive(rows) for track, rows in groups.items()}
     power = information_power(
-        [
-            (good["mass_kda"].to_numpy(float), good["sigma_mass_kda"].to_numpy(float))
-            for rows in groups.values()
-            if len(good := _massive(rows)) > 1
-        ]
+        [(good.mass_kda, good.sigma_mass_kda) for good in massive.values() if len(good.frame) > 1]
     )
-    nearest = _nearest(fits[numbers.notna()], numbers.dropna())
+    nearest = _nearest(groups)
+    exact = {} if masses is None else masses.to_dict("index")
     records, places = [], {}
     for track, rows in groups.items():
-        exact = masses.loc[track].to_dict() if masses is not None and track in masses.index else {}
-        placed = _placed(rows)
-        record = _record(track, rows, placed, setup, power, correlation, exact)
+        good, placed = massive[track], _placed(rows)
+        record = _record(
+            track, rows, good, placed, setup, power, correlation, exact.get(track, {})
+        )  # fmt: skip
         record["nearest_nm"] = nearest.get(track, np.inf)
         records.append(record)
         if np.isfinite(record["d_um2_s"]):
@@ -180,46 +177,93 @@ def describe_tracks(
     return _table(records, fits)
 
 
-def _massive(rows: pd.DataFrame) -> pd.DataFrame:
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of one track, or some of them, in the order of their frames; columns of ``fits.csv``."""
+
+    frame: FloatArray
+    x_nm: FloatArray
+    y_nm: FloatArray
+    z_nm: FloatArray
+    mass_kda: FloatArray
+    contrast: FloatArray
+    sigma_x_nm: FloatArray
+    sigma_y_nm: FloatArray
+    sigma_mass_kda: FloatArray
+    crb_mass_kda: FloatArray
+    status: NDArray[np.object_]
+
+    def only(self, kept: BoolArray | NDArray[np.int64]) -> _Rows:
+        return _Rows(*(getattr(self, column.name)[kept] for column in fields(self)))
+
+
+def _by_track(fits: pd.DataFrame) -> dict[int, _Rows]:
+    """Rows of each track, by their numbers."""
+    numbers = track_numbers(fits)
+    known, track = fits[numbers.notna()], numbers.dropna().to_numpy(int)
+    columns = {column.name: known[column.name] for column in fields(_Rows)}
+    status = columns.pop("status").to_numpy(object)
+    rows = _Rows(**{name: values.to_numpy(float) for name, values in columns.items()}, status=status)
+    order = np.lexsort((rows.frame, track))
+    edges = np.flatnonzero(np.diff(track[order], prepend=-1, append=-1))
+    return {int(track[order[a]]): rows.only(order[a:b]) for a, b in pairwise(edges)}
+
+
+def _massive(rows: _Rows) -> _Rows:
     """Rows whose mass counts."""
-    known = rows["sigma_mass_kda"].notna() & rows["crb_mass_kda"].notna() & (rows["mass_kda"] != 0)
-    return rows[known & (rows["status"] == Status.OK)]
+    known = np.isfinite(rows.sigma_mass_kda) & np.isfinite(rows.crb_mass_kda)
+    return rows.only(known & (rows.mass_kda != 0) & (rows.status == Status.OK))
 
 
-def _placed(rows: pd.DataFrame) -> pd.DataFrame:
+def _placed(rows: _Rows) -> _Rows:
     """Rows whose place counts.
 
     A status that motion itself makes more likely must not choose, or fast steps would be missing.
     """
-    errors = rows[["sigma_x_nm", "sigma_y_nm"]].max(axis=1)
-    useful = errors <= _USELESS * errors.median()
-    return rows[useful & ~rows["status"].isin(NO_PLACE) & ~rows["frame"].duplicated()]
+    errors = np.fmax(rows.sigma_x_nm, rows.sigma_y_nm)
+    useful = errors <= _USELESS * _median(errors)
+    useful &= np.diff(rows.frame, prepend=-1) > 0
+    for status in NO_PLACE:
+        useful &= rows.status != status
+    return rows.only(useful)
+
+
+def _median(values: FloatArray) -> float:
+    """Give the median of what is known, NaN where nothing is."""
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if known.size else np.nan
+
+
+def _mean(values: FloatArray) -> float:
+    """Give the mean of what is known, NaN where nothing is."""
+    known = values[~np.isnan(values)]
+    return float(np.mean(known)) if known.size else np.nan
 
 
 def _record(
     track: int,
-    rows: pd.DataFrame,
-    placed: pd.DataFrame,
+    rows: _Rows,
+    good: _Rows,
+    placed: _Rows,
     setup: TrackSetup,
     power: float,
     correlation: Correlation | None,
     exact: Mapping[str, float],
 ) -> dict[str, Any]:
     """Describe one track, but for the tests of its motion."""
-    good = _massive(rows)
     record: dict[str, Any] = dict.fromkeys(TRACK_COLUMNS, np.nan)
     record |= {
         "track": track,
-        "first_frame": int(rows["frame"].iloc[0]),
-        "last_frame": int(rows["frame"].iloc[-1]),
-        "n_frames": len(rows),
-        "n_mass_frames": len(good),
-        "n_d_frames": len(placed),
-        "x_nm": rows["x_nm"].mean(),
-        "y_nm": rows["y_nm"].mean(),
-        "z_nm": rows["z_nm"].mean(),
+        "first_frame": int(rows.frame[0]),
+        "last_frame": int(rows.frame[-1]),
+        "n_frames": len(rows.frame),
+        "n_mass_frames": len(good.frame),
+        "n_d_frames": len(placed.frame),
+        "x_nm": _mean(rows.x_nm),
+        "y_nm": _mean(rows.y_nm),
+        "z_nm": _mean(rows.z_nm),
     }
-    if len(good):
+    if len(good.frame):
         mass = _mass(good, power, correlation)
         record |= {
             "mass_kda": mass.mass_kda,
@@ -230,7 +274,7 @@ def _record(
         }
     if all(np.isfinite(value) for value in exact.values()):
         record |= exact
-    record["contrast"] = record["mass_kda"] * float((rows["contrast"] / rows["mass_kda"]).median())
+    record["contrast"] = record["mass_kda"] * _median(rows.contrast / rows.mass_kda)
     found = _diffusion(placed, setup)
     if setup.frame_rate_hz is not None:
         record["n_d_frames"] = 0 if found is None else found.n_positions
@@ -248,21 +292,21 @@ def _record(
     return record | _ends(rows, setup, record["d_um2_s"])
 
 
-def _mass(good: pd.DataFrame, power: float, correlation: Correlation | None) -> CommonMass:
-    columns = (good[f"{kind}mass_kda"].to_numpy(float) for kind in ("", "sigma_", "crb_"))
+def _mass(good: _Rows, power: float, correlation: Correlation | None) -> CommonMass:
     among = None
     if correlation is not None:
-        among = correlation(good[["x_nm", "y_nm"]].to_numpy(float))
-    return combine_masses(*columns, power=power, correlation=among)
+        among = correlation(np.stack([good.x_nm, good.y_nm], axis=1))
+    masses = good.mass_kda, good.sigma_mass_kda, good.crb_mass_kda
+    return combine_masses(*masses, power=power, correlation=among)
 
 
-def _diffusion(placed: pd.DataFrame, setup: TrackSetup) -> Diffusion | None:
+def _diffusion(placed: _Rows, setup: TrackSetup) -> Diffusion | None:
     """Fit D to the displacements that begin so far inside that they cannot have left the field."""
     least = max(LEAST_POSITIONS, setup.min_frames)
-    if setup.frame_rate_hz is None or len(placed) < least:
+    if setup.frame_rate_hz is None or len(placed.frame) < least:
         return None
     room = _room(placed, setup)[:-1]
-    gaps_s = np.diff(placed["frame"].to_numpy(float)) / setup.frame_rate_hz
+    gaps_s = np.diff(placed.frame) / setup.frame_rate_hz
     counted, found, positions = np.ones(room.size, dtype=bool), None, _positions(placed)
     for _ in range(_LOOKS):
         found = fit_diffusion(
@@ -281,19 +325,15 @@ def _diffusion(placed: pd.DataFrame, setup: TrackSetup) -> Diffusion | None:
     return found
 
 
-def _room(rows: pd.DataFrame, setup: TrackSetup) -> FloatArray:
+def _room(rows: _Rows, setup: TrackSetup) -> FloatArray:
     """Distance of every position from the border of the field [nm]."""
-    x, y = (rows[name].to_numpy(float) for name in ("x_nm", "y_nm"))
-    height, width = setup.field_nm
+    (height, width), x, y = setup.field_nm, rows.x_nm, rows.y_nm
     return np.asarray(np.minimum.reduce([x, y, width - x, height - y]))
 
 
-def _positions(placed: pd.DataFrame) -> tuple[FloatArray, FloatArray, FloatArray]:
-    return (
-        placed["frame"].to_numpy(float),
-        placed[["x_nm", "y_nm"]].to_numpy(float),
-        placed[["sigma_x_nm", "sigma_y_nm"]].to_numpy(float),
-    )
+def _positions(placed: _Rows) -> tuple[FloatArray, FloatArray, FloatArray]:
+    places, errors = (placed.x_nm, placed.y_nm), (placed.sigma_x_nm, placed.sigma_y_nm)
+    return placed.frame, np.stack(places, axis=1), np.stack(errors, axis=1)
 
 
 def _size(record: Mapping[str, Any], setup: TrackSetup) -> dict[str, float]:
@@ -326,7 +366,7 @@ def _size(record: Mapping[str, Any], setup: TrackSetup) -> dict[str, float]:
 
 
 def _tested(
-    places: Mapping[int, pd.DataFrame],
+    places: Mapping[int, _Rows],
     setup: TrackSetup,
     seed: int,
     workers: int,
@@ -345,7 +385,7 @@ def _tested(
     return tested
 
 
-def _tests(placed: pd.DataFrame, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:
+def _tests(placed: _Rows, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:
     """Ask whether the motion is free, two tests of the first positions of a long track."""
     whole = _positions(placed)
     track = tuple(part[:TESTED_POSITIONS] for part in whole)
@@ -377,32 +417,35 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
     return [status for status in TrackStatus if seen.get(status, False)]
 
 
-def _ends(rows: pd.DataFrame, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:
+def _ends(rows: _Rows, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:
     """Say whether the track begins and ends with the movie, at the border, or inside the field."""
     step_nm = 0.0
     if setup.frame_rate_hz is not None and np.isfinite(d_um2_s):
         step_nm = 3 * float(np.sqrt(2 * d_um2_s * _UM2 / setup.frame_rate_hz))
-    border = setup.near_nm + step_nm
+    border, room = setup.near_nm + step_nm, _room(rows, setup)
     said = {}
     for which, at, frame in (("begins", 0, setup.frames[0]), ("ends", -1, setup.frames[1] - 1)):
-        row = rows.iloc[at]
-        where = "border" if _room(rows, setup)[at] < border else "inside"
-        said[which] = "movie" if row["frame"] == frame else where
+        where = "border" if room[at] < border else "inside"
+        said[which] = "movie" if rows.frame[at] == frame else where
     return said
 
 
-def _nearest(fits: pd.DataFrame, numbers: pd.Series[int]) -> dict[int, float]:
+def _nearest(groups: Mapping[int, _Rows]) -> dict[int, float]:
     """Smallest distance of each track from any other in the same frame [nm]."""
-    closest: dict[int, float] = {}
-    places, tracks = fits[["x_nm", "y_nm"]].to_numpy(float), numbers.to_numpy(int)
-    for rows in fits.reset_index(drop=True).groupby("frame").indices.values():
-        if len(rows) < 2:
-            continue
-        apart = scipy.spatial.distance.cdist(places[rows], places[rows])
-        apart[tracks[rows][:, None] == tracks[rows]] = np.inf
-        for track, distance in zip(tracks[rows], apart.min(axis=1), strict=True):
-            closest[int(track)] = min(closest.get(int(track), np.inf), float(distance))
-    return closest
+    closest = np.full(len(groups), np.inf)
+    own = np.repeat(np.arange(len(groups)), [len(rows.frame) for rows in groups.values()])
+    frame, x, y = (
+        np.concatenate([getattr(rows, name) for rows in groups.values()] or [[]])
+        for name in ("frame", "x_nm", "y_nm")
+    )
+    order = np.argsort(frame, kind="stable")
+    edges = np.flatnonzero(np.diff(frame[order], prepend=-1, append=np.inf))
+    for a, b in pairwise(edges):
+        here = order[a:b]
+        apart = np.hypot(x[here, None] - x[here], y[here, None] - y[here])
+        apart[own[here, None] == own[here]] = np.inf
+        np.fmin.at(closest, own[here], apart.min(axis=1))
+    return dict(zip(groups, closest.tolist(), strict=True))
 
 
 def _table(records: Iterable[Mapping[str, Any]], fits: pd.DataFrame) -> pd.DataFrame:
