@@ -45,6 +45,7 @@ FILMS = 3
 FILM_FRAMES = 40
 """Frames of such a film, at most."""
 
+_PLACE = ("frame", "x_nm", "y_nm", "z_nm", "mass_kda")
 _ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
 _NAMED = 3  # of pairs of tracks that met, in a message
 _TRUNCATED = 0.01  # of D, that is lost with the steps that are too long to be linked
@@ -334,16 +335,18 @@ def make_films(
     """
     numbers = track_numbers(fits)
     models = _models(scene, tracks)
+    chosen = [
+        (track, why, _shown(fits[numbers == track].sort_values("frame"), worst))
+        for track, why, worst in _chosen(tracks)
+    ]
+    chosen = [film for film in chosen if len(film[2])]
+    frames = np.unique([t for *_, rows in chosen for t in rows["frame"]])
+    known = fits["frame"].isin(frames) & numbers.isin(models.keys()) & fits["mass_kda"].notna()
+    columns = [fits.loc[known, name].tolist() for name in _PLACE]
     seen: dict[int, list[_Seen]] = defaultdict(list)
-    known = fits[numbers.isin(models.keys()) & fits["mass_kda"].notna()]
-    columns = [known[name].tolist() for name in ("frame", "x_nm", "y_nm", "z_nm", "mass_kda")]
-    for track, frame, *theta in zip(numbers[known.index], *columns, strict=True):
+    for track, frame, *theta in zip(numbers[known], *columns, strict=True):
         seen[frame].append(_Seen(models[track], *theta))
-    films = []
-    for track, why, worst in _chosen(tracks):
-        rows = fits[numbers == track].sort_values("frame")
-        films.append(_film(scene, movie, camera, windows, seen, rows, track, why, worst))
-    return tuple(film for film in films if film is not None)
+    return tuple(_film(scene, movie, camera, windows, seen, *film) for film in chosen)
 
 
 def _models(scene: Scene, tracks: pd.DataFrame) -> dict[int, ForwardModel]:
@@ -379,26 +382,28 @@ def _chosen(tracks: pd.DataFrame) -> Iterator[tuple[int, str, bool]]:
         yield int(row.track), text, True
 
 
+def _shown(rows: pd.DataFrame, worst: bool) -> pd.DataFrame:
+    """Take the first frames of a track, or of a bad one those around its worst fit."""
+    if len(rows) < 2:  # not enough for a film
+        return rows[:0]
+    start = 0
+    if worst and rows["chi2_reduced"].notna().any():
+        start = int(np.nanargmax(rows["chi2_reduced"].to_numpy(float))) - FILM_FRAMES // 2
+    start = max(0, min(start, len(rows) - FILM_FRAMES))
+    return rows.iloc[start : start + FILM_FRAMES]
+
+
 def _film(
     scene: Scene,
     movie: FrameSource,
     camera: Camera,
     windows: Sequence[Windows],
     seen: Mapping[int, Sequence[_Seen]],
-    rows: pd.DataFrame,
     track: int,
     why: str,
-    worst: bool,
-) -> Film | None:
-    """Draw the first frames of a track, or of a bad one those around its worst fit."""
-    frames = rows["frame"].to_numpy(int)
-    if frames.size < 2:
-        return None
-    start = 0
-    if worst and rows["chi2_reduced"].notna().any():
-        start = int(np.nanargmax(rows["chi2_reduced"].to_numpy(float))) - FILM_FRAMES // 2
-    start = max(0, min(start, frames.size - FILM_FRAMES))
-    shown = rows.iloc[start : start + FILM_FRAMES]
+    shown: pd.DataFrame,
+) -> Film:
+    """Draw some frames of a track."""
     region = _square(scene, windows[0], shown)
     pictures = []
     for frame in shown["frame"].to_numpy(int):
