@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from iscat_analysis.records import Analysis
 from iscat_analysis.report.event_figures import event_figures
-from iscat_analysis.report.page import page_context, page_of, page_sketches
+from iscat_analysis.report.page import page_context, page_of, page_sketches, templates
 from iscat_analysis.report.style import Sketch, drawn, inline_svg, publish
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.threads import processors
@@ -102,6 +102,7 @@ def _gathered(
 
 def main() -> None:
     """Draw what stdin holds, where it holds anything."""
+    templates()  # compiled while the other process is still at work
     try:  # not until stdin ends: a copy of the other process may hold it open
         order = pickle.Unpickler(sys.stdin.buffer).load()
     except EOFError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,24 @@ def render_page(template: str, context: Mapping[str, Any]) -> str:
     jinja2.UndefinedError
         The context lacks something that the template needs.
     """
+    defaults = {
+        "kicker": "iscat-analysis",
+        "subtitle": None,
+        "footer": "iscat-analysis",
+        "nav": [(part["id"], part["title"]) for part in context.get("sections", ())],
+    }
+    return templates().get_template(template).render({**defaults, **context})
+
+
+@cache
+def templates() -> jinja2.Environment:
+    """Compile the templates, once in a process.
+
+    Returns
+    -------
+    jinja2.Environment
+        That holds all of them.
+    """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("iscat_analysis.report"),
         autoescape=True,
@@ -56,13 +74,9 @@ def render_page(template: str, context: Mapping[str, Any]) -> str:
         undefined=_AskableUndefined,
     )
     environment.filters["cell"] = _cell
-    defaults = {
-        "kicker": "iscat-analysis",
-        "subtitle": None,
-        "footer": "iscat-analysis",
-        "nav": [(part["id"], part["title"]) for part in context.get("sections", ())],
-    }
-    return environment.get_template(template).render({**defaults, **context})
+    for name in environment.list_templates():
+        environment.get_template(name)
+    return environment
 
 
 def render_report(analysis: Analysis, *, folder: Path | None = None) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import scipy
+from scipy.special import bdtrc
 
 from iscat_analysis.report.numbers import decimals_for, fixed, number
 
@@ -49,7 +49,7 @@ def rejection(table: pd.DataFrame) -> str:
     p = table["p_value"].to_numpy(float)
     p = p[np.isfinite(p)]
     poor = int(np.count_nonzero(p < _POOR))
-    if not p.size or float(scipy.special.bdtrc(poor - 1, p.size, _POOR)) > _CHANCE:
+    if not p.size or float(bdtrc(poor - 1, p.size, _POOR)) > _CHANCE:
         return ""
     return (
         f"The model is rejected: {poor} of {p.size} fits have a p-value below {_POOR:g}, where "
