@@ -19,7 +19,7 @@ from iscat_analysis.pipeline.aligned import Aligned, align
 from iscat_analysis.pipeline.linking import typical_error
 from iscat_analysis.pipeline.moving import follow
 from iscat_analysis.pipeline.moving_table import common_masses, moving_table
-from iscat_analysis.pipeline.noise import judge_beside
+from iscat_analysis.pipeline.noise import Noise, judge_beside
 from iscat_analysis.pipeline.resume import Shelf, packed_views, unpacked_views
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import BoolArray, EventView, FloatArray, FrameSource, Progress, Windows
@@ -53,8 +53,10 @@ class Block:
         Sum of the frames [e].
     used, saturated : ndarray of bool, shape (y, x)
         Pixels that were used, and those that were not because they were too bright in some frame.
-    gain_message : str
-        What the noise says of the gain; empty where they agree, and in all blocks but the first.
+    noise : tuple of str
+        What the noise says of the camera; empty where they agree, and in all blocks but the first.
+    noise_differs : bool
+        As `iscat_analysis.pipeline.noise.Noise.differs`.
     aligned : Aligned or None
         Pictures of the brightest tracks; None in all blocks but the first.
     """
@@ -71,7 +73,8 @@ class Block:
     total_e: FloatArray
     used: BoolArray
     saturated: BoolArray
-    gain_message: str = ""
+    noise: tuple[str, ...] = ()
+    noise_differs: bool = False
     aligned: Aligned | None = None
 
     @property
@@ -166,10 +169,10 @@ def analyse_block(
         light: FloatArray = ground.level * ground.power[:count, None, None]
         return light + field.residual(ground, rows, 0, count)
 
-    gain_message = ""
+    noise = Noise()
     if not goes_on[0]:
         seen = rows.frame + first, rows.theta[:, :2]
-        gain_message = judge_beside(scene, movie, camera, span, seen, field.used, without)
+        noise = judge_beside(scene, movie, camera, span, seen, field.used, without)
     return Block(
         span=span,
         rows=replace(rows, frame=rows.frame + first),
@@ -185,7 +188,8 @@ def analyse_block(
         total_e=field.total_e,
         used=field.used,
         saturated=field.saturated,
-        gain_message=gain_message,
+        noise=noise.messages,
+        noise_differs=noise.differs,
         aligned=None if goes_on[0] else align(scene, moving),
     )
 
@@ -271,7 +275,8 @@ class BlockStore(Shelf):
                 total_e=data["total_e"],
                 used=data["used"],
                 saturated=data["saturated"],
-                gain_message=str(data["gain_message"]),
+                noise=tuple(str(text) for text in data["noise"]),
+                noise_differs=bool(data["noise_differs"]),
                 aligned=Aligned.unpacked(data),
             )
         except (ValueError, KeyError):
@@ -299,7 +304,8 @@ class BlockStore(Shelf):
             **packed_views(block.views),
             "level": block.level, "power": block.power, "total_e": block.total_e,
             "used": block.used, "saturated": block.saturated,
-            "gain_message": np.array(block.gain_message),
+            "noise": np.array(block.noise, dtype=np.str_),
+            "noise_differs": np.array(block.noise_differs),
             **({} if block.aligned is None else block.aligned.packed()),
         }  # fmt: skip
         self.write(number, block.table, arrays)

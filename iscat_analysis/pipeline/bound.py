@@ -79,9 +79,9 @@ def find_bound(ready: Prepared, run: Run) -> Found:
                 scene, movie, camera, windows, summary,
                 check=checked(movie, camera), pool=pool, progress=run.progress,
             )  # fmt: skip
-            wrong = "" if windows.n_before else _judged_beside(ready, scene, windows, found.fits)
-            if wrong:
-                run.tell(wrong)
+            if not windows.n_before:
+                for text in _judged_beside(ready, scene, windows, found.fits).messages:
+                    run.tell(text)
         else:
             found = _together(ready, run, scene, windows, noise, summary, pool)
     run.clock.lap("results")
@@ -97,7 +97,8 @@ def _background(ready: Prepared, run: Run) -> tuple[Scene, Windows, Noise, dict[
     run.warm_up(scene)
     run.clock.lap("model")
     windows = measured_windows(movie, config, camera, before, after, progress=run.progress)
-    noise = judge_background(movie, camera, windows, still=config.fit.mode != "track")
+    still = config.fit.mode != "track"
+    noise = judge_background(movie, camera, windows, still=still, additive=scene.additive)
     if noise.spectrum is not None:
         scene = make_scene(
             config, ready.shape, searches=searches, noise=noise.spectrum, lines=ready.lines
@@ -118,8 +119,8 @@ def _background(ready: Prepared, run: Run) -> tuple[Scene, Windows, Noise, dict[
     return scene, windows, noise, summary
 
 
-def _judged_beside(ready: Prepared, scene: Scene, windows: Windows, table: pd.DataFrame) -> str:
-    """Judge the gain where the background is known and all frames hold particles that move."""
+def _judged_beside(ready: Prepared, scene: Scene, windows: Windows, table: pd.DataFrame) -> Noise:
+    """Judge the camera where the background is known and all frames hold particles that move."""
     movie, camera, (first, last) = ready.steady, ready.camera, windows.frames_after
     frame = table["frame"].to_numpy(np.int64)
     particles = table[["x_nm", "y_nm", "z_nm", "mass_kda"]].to_numpy(float)

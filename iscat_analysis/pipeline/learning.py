@@ -325,7 +325,7 @@ def _noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
     counts = movie.read(first, min(last, first + SPECTRUM_FRAMES, movie.shape[0]))
     light, repeats = measure_frames(counts, camera)
     stuck = way_of(config) != "sliding" and repeats.mean() > _STUCK
-    return bool(stuck or judge_counts(counts[np.isfinite(light) & ~repeats], camera).gain_message)
+    return bool(stuck or judge_counts(counts[np.isfinite(light) & ~repeats], camera).differs)
 
 
 def _centre(

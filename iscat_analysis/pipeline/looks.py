@@ -245,6 +245,7 @@ class BoundSearch:
             camera,
             replace(self._windows, n_after=self.longest, frames_after=after),
             still=not tracked,
+            additive=config.optics.scheme == "darkfield",
         )
         searches = self.longest if tracked else 1
         self._scene = make_scene(

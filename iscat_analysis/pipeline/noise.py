@@ -1,7 +1,9 @@
-"""The noise before anything is searched: gain, correlation of pixels, length of the windows."""
+"""The noise before anything is searched: camera, correlation of pixels, length of the windows."""
 
 from __future__ import annotations
 
+import contextlib
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,6 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from iscat_analysis.calibration.camera import LightZero, find_zero
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
@@ -34,6 +37,9 @@ SPECTRUM_FRAMES = 128
 
 _GAIN_FRAMES = 64  # on which the gain is judged
 _FEWEST_FRAMES = 8  # on which it is judged beside particles that move
+_SUSPICIOUS = 0.03  # of the noise, and of masses if it is the offset, that is not left unsaid
+_MOST_LEFT = 1.1  # of the noise that the light has, with an offset that the noise alone tells
+_SUBTRACTED = 4.0  # standard errors below no counts, where no camera has its offset
 _FREE = 0.25  # share of the pixels that no particle may come near in the frames judged
 _AWAY = 1.5  # λ/NA from a particle, from where its light changes the variance by some per cent
 
@@ -44,15 +50,18 @@ class Noise:
 
     Attributes
     ----------
-    gain_message : str
-        One line where the noise does not agree with the configured gain, else empty.
+    messages : tuple of str
+        One line for each number of the camera that the noise does not agree with.
+    differs : bool
+        Whether p-values, which rest on the camera's numbers, cannot be right.
     excess : ExcessNoise or None
         None where the noise is as expected.
     spectrum : NoiseSpectrum or None
         Of the noise between neighbouring frames, where it is not white and of the expected size.
     """
 
-    gain_message: str = ""
+    messages: tuple[str, ...] = ()
+    differs: bool = False
     excess: ExcessNoise | None = None
     spectrum: NoiseSpectrum | None = None
 
@@ -71,8 +80,7 @@ class Noise:
         """
         if self.spectrum is not None and self.spectrum.message:
             yield f"{name}: {self.spectrum.message}"
-        if self.gain_message:
-            yield self.gain_message
+        yield from self.messages
 
     @property
     def summary(self) -> dict[str, Any] | None:
@@ -85,6 +93,7 @@ def judge_counts(
     camera: Camera,
     *,
     masked: BoolArray | None = None,
+    additive: bool = False,
     mapper: Mapper = map,
 ) -> Noise:
     """Compare the noise between neighbouring frames with the camera's.
@@ -97,13 +106,16 @@ def judge_counts(
         Counts → photoelectrons.
     masked : ndarray of bool, shape (y, x), optional
         Pixels to leave out.
+    additive : bool
+        Whether particles add light to a background that says nothing of their masses; its zero is
+        then not looked for.
     mapper : callable
         `map`, or the one of a pool.
 
     Returns
     -------
     Noise
-        Silent of the gain where it is too dark to tell.
+        Silent of the camera where it is too dark to tell.
     """
     spectrum = measure_spectrum(counts, camera, masked=masked, mapper=mapper)
     try:
@@ -111,12 +123,96 @@ def judge_counts(
     except DataError:  # too dark to tell
         return Noise(spectrum=spectrum)
     gain = allow_for_correlation(gain, spectrum)
-    message = gain.message or ""
-    excess = ExcessNoise(gain.noise_ratio, message) if message and gain.noise_ratio > 1 else None
-    return Noise(message, excess, spectrum)
+    excess = (
+        ExcessNoise(gain.noise_ratio, gain.message)
+        if gain.message and gain.noise_ratio > 1
+        else None
+    )
+    zero = None if additive else find_zero(counts, camera, masked=masked)
+    if zero is None or not _tells(zero, gain):
+        said = (gain.message, "" if additive else _undecided(gain, zero, camera))
+        return Noise(tuple(text for text in said if text), gain.off, excess, spectrum)
+    messages = [_wrong_offset(zero, camera)]
+    moved = replace(camera, offset_adu=camera.offset_adu + zero.electrons / camera.gain_e_per_adu)
+    with contextlib.suppress(DataError):  # too dark to tell
+        rest = diagnose_gain(counts[:_GAIN_FRAMES], moved, masked=masked)
+        rest = allow_for_correlation(rest, measure_spectrum(counts, moved, masked=masked))
+        messages += [f"with that offset, {rest.message}"] if rest.message else []
+    return Noise(tuple(messages), True, excess, spectrum)
 
 
-def judge_background(movie: Stack, camera: Camera, windows: Windows, *, still: bool) -> Noise:
+def _tells(zero: LightZero, gain: GainDiagnosis) -> bool:
+    """Whether it is the offset that is wrong, where the noise is not the only one to say so.
+
+    Light that is noisy by itself, or shakes, bends the line of variance against mean, which then
+    meets zero elsewhere; but it leaves more noise than the light has, whatever the offset.
+    """
+    if not zero.off or gain.shakes:
+        return False
+    if zero.flickers:
+        return True
+    left = gain.noise_ratio / (1 - zero.share)
+    return left < _MOST_LEFT and not (zero.share > 0 and gain.noise_ratio > 1)
+
+
+def _offset_of(camera: Camera) -> str:
+    offset = camera.offset_adu
+    if np.ndim(offset):
+        return f"the map camera.offset_adu, {np.mean(offset):.4g} on average,"
+    return f"camera.offset_adu = {offset:.4g}"
+
+
+def _effect(share: float) -> str:
+    """Say what a part of the light that is none does to masses."""
+    return f"masses {100 * abs(share):.2g} % too {'small' if share > 0 else 'large'}"
+
+
+def _wrong_offset(zero: LightZero, camera: Camera) -> str:
+    """Say where the light is zero, and what a wrong offset does."""
+    per_count = float(np.mean(camera.gain_e_per_adu))
+    counts = zero.electrons / per_count
+    se = zero.se * counts / zero.share
+    found = float(np.mean(camera.offset_adu)) + counts
+    how = "pixels follow the laser's power" if zero.flickers else "the noise grows with the light"
+    read = zero.electrons < 0 and not zero.flickers
+    said = (
+        f"{_offset_of(camera)} is too {'low' if zero.share > 0 else 'high'} by {abs(counts):.4g} ± "
+        f"{se:.2g} counts, as {how}, and makes {_effect(zero.share)}: "
+    )
+    if np.ndim(camera.offset_adu):
+        said += "record a dark for `iscat calibrate camera --maps`"
+    elif found < -_SUBTRACTED * se:
+        said += "see whether counts were subtracted from the movie; record raw counts"
+    else:
+        said += f"set camera.offset_adu = {max(found, 0.0):.4g}, or the mean of a dark"
+    if read:
+        missing = math.sqrt(-zero.electrons)
+        said += f" (unless {missing:.3g} e of read noise are missing in camera.read_noise_e)"
+    return said
+
+
+def _undecided(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> str:
+    """Say that an offset may be as wrong as a gain, where the noise fits both.
+
+    An offset that is wrong by a share s of the light leaves 1 − s of the noise that is expected.
+    """
+    share = 1 - gain.noise_ratio
+    if gain.shakes or gain.noise_counts < 1 or abs(share) < _SUSPICIOUS + 3 * gain.noise_ratio_se:
+        return ""
+    if zero is not None and not zero.may_be(share):
+        return ""
+    cause = "its gain, or light that is noisy by itself" if gain.noise_ratio > 1 else "its gain"
+    return (
+        f"the noise variance is {gain.noise_ratio:.3g} ± {gain.noise_ratio_se:.1g} times what the "
+        f"camera's numbers predict, and this movie does not tell whether by {cause} or by "
+        f"{_offset_of(camera)}, which would make {_effect(share)}: record a dark, and measure both "
+        "with `iscat calibrate camera`"
+    )
+
+
+def judge_background(
+    movie: Stack, camera: Camera, windows: Windows, *, still: bool, additive: bool
+) -> Noise:
     """Judge the noise of the background frames; where it is known, of those with the particles.
 
     Parameters
@@ -130,6 +226,8 @@ def judge_background(movie: Stack, camera: Camera, windows: Windows, *, still: b
     still : bool
         Whether particles stay where they are in these; otherwise nothing is judged where the
         background is known, and `judge_beside` does once they are found.
+    additive : bool
+        As in `judge_counts`.
 
     Returns
     -------
@@ -141,7 +239,7 @@ def judge_background(movie: Stack, camera: Camera, windows: Windows, *, still: b
         return Noise()
     counts = first_counts(movie, windows, SPECTRUM_FRAMES)
     repeats = measure_frames(counts, camera)[1]
-    return judge_counts(counts[~repeats], camera, masked=windows.masked)
+    return judge_counts(counts[~repeats], camera, masked=windows.masked, additive=additive)
 
 
 def judge_beside(
@@ -152,12 +250,12 @@ def judge_beside(
     seen: tuple[NDArray[np.int64], FloatArray],
     used: BoolArray,
     without: Callable[[int], FloatArray],
-) -> str:
-    """Judge the gain by frames in which particles move, from pixels that none of them comes near.
+) -> Noise:
+    """Judge the camera by frames in which particles move, from pixels that none comes near.
 
     Particles that move add to the variance between frames.  Where they are near, pixels are left
     out; farther away their rings are taken off as they were fitted, and where a fit went astray
-    that adds as well: the gain is called wrong only where it seems so with the rings and without.
+    that adds as well: a number is called wrong only where one seems so with the rings and without.
 
     Parameters
     ----------
@@ -179,8 +277,8 @@ def judge_beside(
 
     Returns
     -------
-    str
-        As `Noise.gain_message`; empty where particles leave too few pixels free.
+    Noise
+        Without its spectrum; silent where particles leave too few pixels free.
     """
     optics = scene.config.optics
     away = _AWAY * optics.wavelength_nm / optics.na
@@ -193,12 +291,13 @@ def judge_beside(
         free = used & (near.query(pixels)[0] > away).reshape(used.shape)
         if free.any() and free.sum() >= _FREE * used.sum():
             counts = movie.read(span[0], span[0] + count)
-            if not judge_counts(counts, camera, masked=~free).gain_message:
-                return ""
-            counts = camera.to_counts(without(count))
-            return judge_counts(counts, camera, masked=~free).gain_message
+            additive = scene.additive
+            if judge_counts(counts, camera, masked=~free, additive=additive).messages:
+                counts = camera.to_counts(without(count))
+                return judge_counts(counts, camera, masked=~free, additive=additive)
+            return Noise()
         count //= 2
-    return ""
+    return Noise()
 
 
 def judge_opening(
@@ -230,7 +329,8 @@ def judge_opening(
         The movie is shorter than two windows, or holds no two frames that differ.
     """
     opening, curve, window = judge_window(reader, config, mapper)
-    noise = judge_counts(opening, reader.camera, mapper=mapper)
+    additive = config.optics.scheme == "darkfield"
+    noise = judge_counts(opening, reader.camera, additive=additive, mapper=mapper)
     if noise.excess is None:
         ratio = curve.at(window)
         message = (

@@ -171,7 +171,7 @@ def learn_from_tracks(
     if not left.rejected and optics.calibrate != "always":
         return begun, tested | {"calibrated": False}
     cause = _cause(begun) if left.rejected else None
-    noisy = bool(begun.block.gain_message) and trouble is None
+    noisy = begun.block.noise_differs and trouble is None
     if noisy and cause is None and optics.calibrate != "always":
         return begun, tested | {"calibrated": False, "reason": _NOISE}
 

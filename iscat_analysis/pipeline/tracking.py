@@ -101,8 +101,8 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         )  # fmt: skip
     joined = join_blocks(config, blocks, camera)
     windows = joined.followed.windows
-    if blocks[0].gain_message and not shaken:
-        run.tell(blocks[0].gain_message)
+    for text in () if shaken else blocks[0].noise:
+        run.tell(text)
     for text in pixel_warnings(*windows.left_out):
         run.tell(text)
     run.clock.lap("track")

@@ -106,7 +106,7 @@ def test_particles_that_go_everywhere_leave_nothing_to_judge(wandering: Counts) 
             judge_beside(
                 scene, movie, camera, (0, 60), (frame, places), used,
                 lambda count: camera.to_electrons(wandering[:count]),
-            )
+            ).messages
             for places in (everywhere, everywhere + 1e5)
         ]  # fmt: skip
     assert not said[0]

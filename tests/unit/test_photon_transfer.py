@@ -396,7 +396,7 @@ def test_read_noise_that_is_reported_is_not_selected(monkeypatch: pytest.MonkeyP
     check_unselected(reported_read_noise(truth_e, 300), truth_e)
 
     def whole(found: Any, used: Any, given: float) -> Estimate:
-        line = regression._line(*regression._pooled(found, used))
+        line = regression.variance_line(*regression._pooled(found, used))
         return regression._read_variance((*line[0], line[1]), Estimate(given, 0.0)).adu2
 
     monkeypatch.setattr(regression, "_half", whole)

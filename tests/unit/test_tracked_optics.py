@@ -205,7 +205,7 @@ def test_rounds_end_where_the_first_four_describe_nothing(
     def begin(config: Config, **_: bool) -> Any:
         described = described_from is not None and len(measured) % rounds >= described_from
         left = LeftOver(share=0.0 if described else 0.2, chi2=9.0, tracks=3)
-        block = SimpleNamespace(gain_message=None)
+        block = SimpleNamespace(noise_differs=False)
         return SimpleNamespace(config=config, block=block, left=left, described=described)
 
     def measure(*_: Any, **__: Any) -> Any:

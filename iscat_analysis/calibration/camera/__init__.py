@@ -18,7 +18,8 @@ frame, which needs no offset.  Rounding to whole counts is part of the read nois
 
 `measure` is the whole measurement.  On its way, `moments` reads the stacks, `pixels` says what
 to leave out, `regression` makes a camera of the rest, and `averaging` sets its noise beside
-shot noise; `result` is what comes out.
+shot noise; `result` is what comes out.  `zero` looks at the offset alone, for a movie that is
+analysed.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from iscat_analysis.calibration.camera.measure import (
     measure_camera,
 )
 from iscat_analysis.calibration.camera.result import CameraCalibration, Estimate
+from iscat_analysis.calibration.camera.zero import LightZero, find_zero
 
 __all__ = [
     "EXCESS",
@@ -37,5 +39,7 @@ __all__ = [
     "LEAST_FRAMES_FOR_MAPS",
     "CameraCalibration",
     "Estimate",
+    "LightZero",
+    "find_zero",
     "measure_camera",
 ]

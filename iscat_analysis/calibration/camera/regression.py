@@ -8,12 +8,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from iscat_analysis.calibration.camera.moments import Moments, robust_sigma
 from iscat_analysis.calibration.camera.result import Estimate
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, FloatArray
+
+LEAST_RELIABILITY = 0.9
+"""Of the spread of the means of pixels, what must not be their own noise."""
 
 _Z95_ONE_SIDED = 1.644854
 _SIGMAS = 3.0
@@ -24,7 +28,6 @@ _STEADY = 2.0  # robust χ² of the flicker line beyond which the scene has move
 _SEEN = 3.5  # of half of the pixels, standard errors from which read noise is not chance
 _LEAST_HALF = 32  # pixels
 _TILE_PX = 8  # side of the tiles that the halves are made of; noise is correlated less far
-_LEAST_RELIABILITY = 0.9  # of the spread of the means that is not their own noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +98,8 @@ def solve(
     own = float((variance / (frames + 1)).mean())
     reliability = 1 - own / float(mean.var()) if mean.var() > 0 else 0.0
     line = None
-    if reliability > _LEAST_RELIABILITY:
-        (intercept, slope), cov = _line(mean, variance, frames)
+    if reliability > LEAST_RELIABILITY:
+        (intercept, slope), cov = variance_line(mean, variance, frames)
         if slope > 0 and math.sqrt(cov[1, 1]) / slope < _USABLE_SLOPE:
             line = intercept, slope, cov
         elif slope <= 0 and -slope > _SIGMAS * math.sqrt(cov[1, 1]):
@@ -179,7 +182,7 @@ def _half(found: Sequence[Moments], used: BoolArray, given: float | None) -> Est
     offset, _ = _offset(found, part, given, [])
     if offset is None:
         return None
-    (intercept, slope), cov = _line(*_pooled(found, part))
+    (intercept, slope), cov = variance_line(*_pooled(found, part))
     return _read_variance((intercept, slope, cov), offset).adu2 if slope > 0 else None
 
 
@@ -327,8 +330,27 @@ def _ratio(
     )  # fmt: skip
 
 
-def _line(x: FloatArray, y: FloatArray, frames: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Fit y = a + b·x with the variance of y as (fit)²/frames; sandwich covariance."""
+def variance_line(
+    x: FloatArray, y: FloatArray, frames: FloatArray, tiles: NDArray[np.int64] | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Fit y = a + b·x with the variance of y as (fit)²/frames.
+
+    Parameters
+    ----------
+    x, y : ndarray, shape (n,)
+        Mean and variance of each pixel.
+    frames : ndarray, shape (n,)
+        Degrees of freedom of each variance.
+    tiles : ndarray of int, shape (n,), optional
+        Which pixels may differ from the line together; default each by itself.
+
+    Returns
+    -------
+    theta : ndarray, shape (2,)
+        a and b.
+    covariance : ndarray, shape (2, 2)
+        Sandwich covariance.
+    """
     centre, scale = float(x.mean()), float(x.std())
     design = np.stack([np.ones_like(x), (x - centre) / scale], axis=1)
     fit = np.full(x.shape, y.mean())
@@ -342,7 +364,7 @@ def _line(x: FloatArray, y: FloatArray, frames: FloatArray) -> tuple[FloatArray,
         if done:
             break
     inverse = np.linalg.inv(normal)
-    score = design * (weight * (y - fit))[:, np.newaxis]
+    score = _together(design * (weight * (y - fit))[:, np.newaxis], tiles)
     cov = inverse @ (score.T @ score) @ inverse
     back = np.array([[1.0, -centre / scale], [0.0, 1 / scale]])
     return back @ theta, back @ cov @ back.T
@@ -355,7 +377,8 @@ def _offset(
     if given is not None:
         return Estimate(given, 0.0), "given"
     estimates = [
-        _zero(item.slope[used], item.slope_variance[used], item.mean[used]) for item in found
+        zero_of_flicker(item.slope[used], item.slope_variance[used], item.mean[used])
+        for item in found
     ]
     order = sorted(found, key=lambda item: float(item.mean[used].mean()))
     for low, high in pairwise(order):
@@ -363,7 +386,7 @@ def _offset(
         noise = (low.variance / low.n_frames + high.variance / high.n_frames)[used]
         if rise > 0:
             slope = (high.mean - low.mean)[used] / rise
-            estimates.append(_zero(slope, noise / rise**2, low.mean[used]))
+            estimates.append(zero_of_flicker(slope, noise / rise**2, low.mean[used]))
     known = [item for item in estimates if item is not None]
     if not known:
         return None, "line"
@@ -380,8 +403,35 @@ def _offset(
     return Estimate(value, se), "flicker"
 
 
-def _zero(slope: FloatArray, variance: FloatArray, mean: FloatArray) -> Estimate | None:
-    """Mean at which the slope is zero, from a weighted line of slope against mean."""
+def _together(score: FloatArray, tiles: NDArray[np.int64] | None) -> FloatArray:
+    """Add up the scores (n, k) of pixels that may differ from a line together."""
+    if tiles is None:
+        return score
+    return np.stack([np.bincount(tiles, weights=column) for column in score.T], axis=1)
+
+
+def zero_of_flicker(
+    slope: FloatArray,
+    variance: FloatArray,
+    mean: FloatArray,
+    tiles: NDArray[np.int64] | None = None,
+) -> Estimate | None:
+    """Find the mean at which pixels follow the power no more, from a weighted line.
+
+    Parameters
+    ----------
+    slope, variance : ndarray, shape (n,)
+        How strongly each pixel follows the power, and the variance of that.
+    mean : ndarray, shape (n,)
+        Of each pixel.
+    tiles : ndarray of int, shape (n,), optional
+        As in `variance_line`.
+
+    Returns
+    -------
+    Estimate or None
+        None where nothing flickers enough, or the scene has moved.
+    """
     if not np.isfinite(slope).all() or mean.std() == 0:
         return None
     weight = 1 / variance
@@ -397,9 +447,10 @@ def _zero(slope: FloatArray, variance: FloatArray, mean: FloatArray) -> Estimate
         kept = np.abs(residual) < 5 * max(robust, 1e-12)
     if robust**2 > _STEADY or gradient <= 0:
         return None
-    score_level = w * (slope - level - gradient * x)
-    gradient_se = math.sqrt(float(np.sum((score_level * x) ** 2))) / float(np.sum(w * x * x))
-    level_se = math.sqrt(float(np.sum(score_level**2))) / float(w.sum())
+    rest = w * (slope - level - gradient * x)
+    by_level, by_gradient = _together(np.stack([rest, rest * x], axis=1), tiles).T
+    gradient_se = math.sqrt(float(np.sum(by_gradient**2))) / float(np.sum(w * x * x))
+    level_se = math.sqrt(float(np.sum(by_level**2))) / float(w.sum())
     if gradient < 5 * gradient_se:
         return None
     zero = centre - level / gradient
