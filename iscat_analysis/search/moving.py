@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
+from iscat_analysis._kernels.links import link_surely
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.search.peaks import SAMPLED, maxima, summits
@@ -153,7 +154,7 @@ class FrameFilter:
             order = np.lexsort((-column, -row, -layer, -height, frame))
             order = order[height[order] > threshold]
             tops = np.stack([frame + start, height, column + dx, row + dy])[:, order]
-            kept = self._alone(*tops, known)
+            kept = self._alone(tops[0], tops[1], tops[2], tops[3], known)
             at, layer = at[order][kept], layer[order][kept]
             frames, heights, x, y = tops[:, kept]
             norm = self._norm[layer, at[:, 1], at[:, 2]]
@@ -181,8 +182,11 @@ class FrameFilter:
             begins = np.diff(frame[left], prepend=-1) > 0
             tops = left[begins]
             if any(map(len, known)):
-                mine = zip(frame[tops].tolist(), *(v[tops].tolist() for v in (height, x, y)))
-                sure = np.array([not self._is_left_over(*v, known[int(t)]) for t, *v in mine])
+                columns = (v[tops].tolist() for v in (height, x, y, frame))
+                sure = np.array([
+                    not self._is_left_over(peak, px, py, known[int(t)])
+                    for peak, px, py, t in zip(*columns, strict=True)
+                ])  # fmt: skip
             else:
                 sure = np.ones(len(tops), dtype=bool)
             kept[tops[sure]] = True
@@ -251,32 +255,51 @@ def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int
 
     Notes
     -----
+    What has no choice is linked at once, and the rest of each frame by
     trackpy (D. B. Allan et al., doi:10.5281/zenodo.4682814), after J. C. Crocker and D. G. Grier,
     J. Colloid Interface Sci. 179, 298 (1996).
     """
-    tracks = np.zeros(len(frame), dtype=np.int64)
-    if not len(frame):
-        return tracks
+    n = len(frame)
+    track = np.zeros(n, dtype=np.int64)
+    if not n:
+        return track
+    places = np.ascontiguousarray(places_nm, dtype=np.float64)
+    starts = np.searchsorted(frame, np.arange(frame[0], frame[-1] + 2)).astype(np.int64)
+    taken, waiting, doubtful = np.zeros(n, dtype=bool), track.copy(), track.copy()
+    state, t = np.zeros(4, dtype=np.int64), 0
+    with _uncollected():
+        while True:
+            t = link_surely(
+                places, starts, t, reach_nm, memory, track, taken, waiting, state, doubtful
+            )
+            if t == starts.size - 1:
+                break
+            _, number, some, others = state.tolist()
+            old, new = doubtful[:some], doubtful[some : some + others]
+            before = _chosen(places[old], places[new], reach_nm)
+            begun = before < 0
+            track[new[begun]] = number + np.arange(np.count_nonzero(begun))
+            last = old[before[~begun]]
+            track[new[~begun]], taken[last] = track[last], True
+            state[1] += np.count_nonzero(begun)
+            t += 1
+    _, first, numbers = np.unique(track, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[numbers]
+
+
+def _chosen(old: FloatArray, new: FloatArray, reach_nm: float) -> IntArray:
+    """Say which of the old places each new one follows, -1 where it follows none."""
     trackpy = _trackpy()
-    frames = np.arange(frame[0], frame[-1] + 1)
-    edges = np.searchsorted(frame, np.append(frames, frames[-1] + 1))
-    spans = [slice(a, b) for a, b in pairwise(edges)]
-    linked = trackpy.link_iter(
-        ((int(t), places_nm[span]) for t, span in zip(frames, spans, strict=True)),
-        search_range=reach_nm,
-        memory=memory,
-    )
     try:
-        with _uncollected():
-            for span, (_, numbers) in zip(spans, linked, strict=True):
-                tracks[span] = numbers
+        (_, one), (_, two) = trackpy.link_iter(iter([(0, old), (1, new)]), search_range=reach_nm)
     except trackpy.SubnetOversizeException as trouble:
         raise DataError(
             f"too many particles are within track.max_step_nm = {reach_nm:g} of each other to tell "
             "which is which from frame to frame: lower it to the farthest that one goes, or record "
             "fewer particles or more frames a second"
         ) from trouble
-    return tracks
+    where = {number: i for i, number in enumerate(one)}
+    return np.array([where.get(number, -1) for number in two], dtype=np.int64)
 
 
 @cache

@@ -201,9 +201,10 @@ def _by_track(fits: pd.DataFrame) -> dict[int, _Rows]:
     """Rows of each track, by their numbers."""
     numbers = track_numbers(fits)
     known, track = fits[numbers.notna()], numbers.dropna().to_numpy(int)
-    columns = {column.name: known[column.name] for column in fields(_Rows)}
-    status = columns.pop("status").to_numpy(object)
-    rows = _Rows(**{name: values.to_numpy(float) for name, values in columns.items()}, status=status)
+    rows = _Rows(
+        *(known[part.name].to_numpy(object if part.name == "status" else float)
+          for part in fields(_Rows))
+    )  # fmt: skip
     order = np.lexsort((rows.frame, track))
     edges = np.flatnonzero(np.diff(track[order], prepend=-1, append=-1))
     return {int(track[order[a]]): rows.only(order[a:b]) for a, b in pairwise(edges)}

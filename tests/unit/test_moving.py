@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+import trackpy
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis._kernels.canvas import Light
@@ -476,6 +477,37 @@ def test_links_survive_gaps() -> None:
     assert np.all(track[before] == track[after])
     between = (1 - share) * places[before, 0] + share * places[after, 0]
     assert np.all((between >= 50) & (between <= 60) | (between >= 930) & (between <= 940))
+
+
+def _linked_by_trackpy(frame, places, reach_nm, memory) -> np.ndarray:
+    """Give every frame to trackpy as it is."""
+    frames = range(frame[0], frame[-1] + 1)
+    linked = trackpy.link_iter(
+        ((t, places[frame == t]) for t in frames), search_range=reach_nm, memory=memory
+    )
+    return np.concatenate([numbers for _, numbers in linked])
+
+
+@pytest.mark.parametrize("memory", [0, 1, 3])
+@pytest.mark.parametrize("side", [3.0, 6.0, 12.0])
+def test_links_are_those_of_trackpy(memory: int, side: float) -> None:
+    """Where there is no choice too, in fields that are full or empty, with places that are none."""
+    trackpy.quiet()
+    rng = np.random.default_rng([memory, int(side)])
+    for _ in range(5):
+        x, frame, places = rng.uniform(0, side, (rng.integers(3, 12), 3)), [], []
+        for t in range(60):
+            x = (x + rng.normal(0, 0.3, x.shape)) % side
+            seen = [x[rng.random(len(x)) < 0.9], rng.uniform(0, side, (rng.poisson(0.5), 3))]
+            places.append(np.concatenate(seen))
+            frame += [t] * len(places[-1])
+        at, where = np.array(frame), np.concatenate(places)
+        track = link(at, where, reach_nm=1.0, memory=memory)
+        expected = _linked_by_trackpy(at, where, 1.0, memory)
+        pairs = set(zip(track.tolist(), expected.tolist(), strict=True))
+        assert len(pairs) == len(set(track)) == len(set(expected))
+        _, first = np.unique(track, return_index=True)
+        assert np.all(np.diff(first) > 0)
 
 
 # ---- the whole job ---------------------------------------------------------------------------

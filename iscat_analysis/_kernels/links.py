@@ -1,0 +1,106 @@
+"""Positions in successive frames that are one particle because nothing else is in reach."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+_ROUNDING = 1e-9  # of the reach, within which another sum may find a distance on its other side
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def link_surely(
+    places: FloatArray, starts: IntArray, first: int, reach: float, memory: int, track: IntArray,
+    taken: BoolArray, waiting: IntArray, state: IntArray, doubtful: IntArray,
+) -> int:  # fmt: skip
+    """Link positions from frame to frame until there is a choice.
+
+    A particle waits at its last position until it is linked, at most `memory` frames longer than
+    one.  Where it has one new position in reach, and this has no other particle, they are linked; a
+    position without any begins a track.
+
+    Parameters
+    ----------
+    places : ndarray, shape (n, axes)
+        Positions, in the order of their frames.
+    starts : ndarray of int, shape (t + 1,)
+        First position of each frame.
+    first : int
+        Frame to go on with.
+    reach : float
+        Farthest from a position to the next one.
+    memory : int
+        Frames in which a particle may be missed.
+    track : ndarray of int, shape (n,)
+        Filled with the number of the track of each.
+    taken : ndarray of bool, shape (n,)
+        Which positions are linked to later ones.
+    waiting : ndarray of int, shape (n,)
+        The last positions of the particles that wait.
+    state : ndarray of int, shape (4,)
+        How many wait; the next number of a track; of the frame in which there is a choice, how many
+        of those that wait and how many new positions are left to be linked.
+    doubtful : ndarray of int, shape (n,)
+        Filled with these, one after the other.
+
+    Returns
+    -------
+    int
+        The first frame with a choice, all of whose other positions are linked, or the number of
+        frames.
+    """
+    onward, backward = np.empty(len(places), dtype=np.int64), np.empty(len(places), dtype=np.int64)
+    only = np.empty(len(places), dtype=np.int64)
+    for t in range(first, starts.size - 1):
+        begin, end = starts[t], starts[t + 1]
+        oldest, count = starts[max(t - 1 - memory, 0)], 0
+        for k in range(state[0]):
+            i = waiting[k]
+            if i >= oldest and not taken[i]:
+                waiting[count] = i
+                count += 1
+        onward[:count], backward[begin:end] = 0, 0
+        for k in range(count):
+            for j in range(begin, end):
+                if _within(places, waiting[k], j, reach * (1 + _ROUNDING)):
+                    onward[k] += 1
+                    backward[j] += 1
+                    only[j] = k
+        for j in range(begin, end):
+            if backward[j] == 0:
+                track[j] = state[1]
+                state[1] += 1
+            elif backward[j] == 1 and onward[only[j]] == 1:
+                i = waiting[only[j]]
+                if _within(places, i, j, reach * (1 - _ROUNDING)):
+                    track[j], taken[i] = track[i], True
+                    backward[j] = 0
+        left = 0
+        for k in range(count):
+            if onward[k] > 0 and not taken[waiting[k]]:
+                doubtful[left] = waiting[k]
+                left += 1
+        state[2] = left
+        for j in range(begin, end):
+            waiting[count] = j
+            count += 1
+            if backward[j] > 0:
+                doubtful[left] = j
+                left += 1
+        state[0], state[3] = count, left - state[2]
+        if left > 0:
+            return t
+    return starts.size - 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _within(places: FloatArray, i: int, j: int, reach: float) -> bool:
+    square = 0.0
+    for k in range(places.shape[1]):
+        square += (places[i, k] - places[j, k]) ** 2
+    return square <= reach**2
