@@ -28,6 +28,8 @@ MARGIN_PX = REACH_PX + 2
 _PAIRS = 64  # of frames that are compared
 _LIGHT_E = 20.0  # mean photoelectrons of a pixel and frame below which noise is far from normal
 _OUTLIER = 5.0  # robust standard deviations beyond which a pixel's change is no noise
+_LANDED = 4  # such pixels more than in most pairs of frames, where something has landed
+_GLANCES = 9  # pairs whose median number of such pixels is that of a pair in which nothing lands
 _SIGNIFICANT = 4.5  # standard errors beyond which a correlation is one
 _NEGLIGIBLE = 0.01  # of the expected variance, below which nothing is corrected
 _LEAST = 0.05  # of the variance, that every frequency is taken to have
@@ -211,19 +213,39 @@ def measure_spectrum(
     if light < _LIGHT_E:
         return None
 
-    def periodogram(start: int) -> FloatArray:
+    def change(start: int) -> tuple[FloatArray, float] | None:
+        # in its expected errors, with the size beyond which it is no noise
         before, after = (gain * (counts[k] - offset) for k in (start, start + 1))
         powers = [float(frame[used].mean()) / light for frame in (before, after)]
         if min(powers) <= 0:
-            return np.zeros((rows, columns // 2 + 1))
+            return None
         variance = sum((q * mean + read) / q**2 for q in powers)
         z = np.where(used, (after / powers[1] - before / powers[0]), 0.0)
         z /= np.sqrt(np.where(used, variance, 1.0))
-        limit = _OUTLIER * float(np.median(np.abs(z[used]))) / _NORMAL_QUARTILE
+        return z, _OUTLIER * float(np.median(np.abs(z[used]))) / _NORMAL_QUARTILE
+
+    def outliers(found: tuple[FloatArray, float] | None) -> int:
+        return 0 if found is None else int(np.count_nonzero(np.abs(found[0]) > found[1]))
+
+    # a pixel that blinks is in every pair; where something bright lands, its rings are no noise
+    few = starts[:: max(1, pairs // _GLANCES)].tolist()
+    most = float(np.median([outliers(change(start)) for start in few])) + _LANDED
+
+    def periodogram(start: int) -> FloatArray | None:
+        found = change(start)
+        if found is None:
+            return np.zeros((rows, columns // 2 + 1))
+        if outliers(found) > most:
+            return None
+        z, limit = found
         spectrum: FloatArray = np.abs(fft.rfft2(np.clip(z, -limit, limit))) ** 2
         return spectrum
 
-    total = sum(mapper(periodogram, starts.tolist()))
+    total, pairs = np.zeros((rows, columns // 2 + 1)), 0
+    for spectrum in mapper(periodogram, starts.tolist()):
+        if spectrum is not None:
+            total += spectrum
+            pairs += 1
     # in how many pairs of frames and of used pixels each distance occurs
     alike = fft.irfft2(np.abs(fft.rfft2(used.astype(np.float64))) ** 2, s=(rows, columns))
     covariance = fft.irfft2(total, s=(rows, columns)) / (pairs * np.maximum(np.rint(alike), 1.0))

@@ -64,6 +64,29 @@ class MassScale:
         rise = self.linear + 2 * self.quadratic * amplitude
         return rise / self.calibration.gradient_per_kda
 
+    def bend(self, mass_kda: FloatArray) -> FloatArray:
+        """Give how far a line of faint standards is from heavy particles.
+
+        The scattered field is in proportion to the mass, and the contrast has its square: what a
+        line makes of C = L·a + Q·a² is too small by −Q·a/L, where the standards are faint.
+
+        Parameters
+        ----------
+        mass_kda : ndarray
+            Masses by the line [kDa].
+
+        Returns
+        -------
+        ndarray, same shape
+            True mass over that of the line, less 1; 0 without a calibration.
+        """
+        sizes = np.abs(np.asarray(mass_kda, dtype=float))
+        if self.calibration is None:
+            return np.zeros(sizes.shape)
+        amplitude = np.array([self.amplitude(mass) for mass in sizes.ravel().tolist()])
+        whole = self.linear + self.quadratic * amplitude
+        return np.asarray(self.linear / whole - 1).reshape(sizes.shape)
+
     def off_line(
         self, amplitude: FloatArray, sigma_kda: FloatArray, errors: float
     ) -> NDArray[np.bool_]:

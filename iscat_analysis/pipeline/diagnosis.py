@@ -19,8 +19,10 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import follow_pattern
 from iscat_analysis.movie.lines import Lines, find_lines
 from iscat_analysis.movie.metadata import diagnose_gain
+from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, first_counts, is_lit
+from iscat_analysis.pipeline.systematic import is_bent
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import Status, Windows
 from iscat_analysis.search.sliding import measure_frames, measure_noise
@@ -320,6 +322,37 @@ def line_warning(config: Config, table: pd.DataFrame) -> str:
     return (
         f"[calibration] does not tell the mass of {count(number, 'fit')}, flagged at_bound: {why}; "
         "measure it with lighter standards, or set calibration.offset = 0 if its error allows it"
+    )
+
+
+def bend_warning(scale: MassScale, table: pd.DataFrame) -> str:
+    """Say which particles are too heavy for a line that faint standards gave.
+
+    Parameters
+    ----------
+    scale : MassScale
+        Of the fits.
+    table : pandas.DataFrame
+        Rows of ``fits.csv``.
+
+    Returns
+    -------
+    str
+        One line; empty where there are none.
+    """
+    bent = is_bent(scale, table)
+    if not bent.any():
+        return ""
+    masses = table["mass_kda"].abs().to_numpy(float)[bent]
+    most = float(masses.max())
+    share = float(scale.bend(np.array([most]))[0])
+    verb = "is" if len(masses) == 1 else "are"
+    return (
+        f"{count(len(masses), 'particle')}, of up to {most:.4g} kDa, {verb} so heavy that contrast "
+        "is not in proportion to the mass: it has the square of the scattered light, and the line "
+        "of [calibration], where its standards are light, makes the heaviest "
+        f"{100 * abs(share):.2g} % too {'light' if share > 0 else 'heavy'}; systematic_mass_kda "
+        "has that; calibrate with standards as heavy as these"
     )
 
 

@@ -11,7 +11,12 @@ import pandas as pd
 from iscat_analysis.config import config_to_toml
 from iscat_analysis.movie.stack import printable
 from iscat_analysis.pipeline.achieved import spread_verdict
-from iscat_analysis.pipeline.diagnosis import line_warning, plane_warning, sign_warning
+from iscat_analysis.pipeline.diagnosis import (
+    bend_warning,
+    line_warning,
+    plane_warning,
+    sign_warning,
+)
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.results import Found
 from iscat_analysis.pipeline.rows import reported_rows
@@ -71,7 +76,11 @@ def gather(
         further["optics"] = found.optics
     further |= extra
     table, achieved = reported_rows(found)
-    for doubt in (line_warning(config, table), sign_warning(config, table)):
+    for doubt in (
+        line_warning(config, table),
+        bend_warning(scene.model.scale, table),
+        sign_warning(config, table),
+    ):
         if doubt:
             run.tell(doubt)
     scaled = config.fit.sigma == "measured"

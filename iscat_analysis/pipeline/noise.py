@@ -129,6 +129,9 @@ def judge_counts(
         else None
     )
     zero = None if additive else find_zero(counts, camera, masked=masked)
+    leaks = spectrum is not None and spectrum.correlated
+    if zero is not None and leaks and not zero.flickers:
+        zero = None  # the variance of a pixel is then of its neighbours' light as well
     if zero is None or not _tells(zero, gain):
         said = (gain.message, "" if additive else _undecided(gain, zero, camera))
         return Noise(tuple(text for text in said if text), gain.off, excess, spectrum)

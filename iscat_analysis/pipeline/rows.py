@@ -41,7 +41,7 @@ def reported_rows(found: Found) -> tuple[pd.DataFrame, dict[str, Achieved]]:
     for name in fits:
         columns[name] = fits[name] * scale[name] if name in scale else fits[name]
         if name == "flags":
-            shared = systematic(config, fits, mass_error(found.optics))
+            shared = systematic(config, fits, mass_error(found.optics), found.scene.model.scale)
             columns |= {f"systematic_{key}": sigma for key, sigma in shared.items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)

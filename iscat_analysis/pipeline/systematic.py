@@ -26,6 +26,7 @@ from iscat_analysis.optics.measured import Template
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Status
 
 _AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
+_BENT = 0.01  # of a mass; beneath, any line of standards is as wrong
 _HEIGHTS_PER_FRINGE = 10  # between them it is interpolated
 
 Source = Callable[[Config, pd.DataFrame], Mapping[str, FloatArray]]
@@ -37,7 +38,10 @@ _COMMON = (*PARAMETERS, "contrast")
 
 
 def systematic(
-    config: Config, table: pd.DataFrame, mass_share: float = 0.0
+    config: Config,
+    table: pd.DataFrame,
+    mass_share: float = 0.0,
+    scale: MassScale | None = None,
 ) -> dict[str, FloatArray]:
     """Add up the errors that all events of a movie share.
 
@@ -49,6 +53,8 @@ def systematic(
         Events, with the columns of ``fits.csv``.
     mass_share : float
         Share of its mass by which every event may be wrong, for what the model leaves over.
+    scale : MassScale, optional
+        Of the fits, whose line of faint standards may not hold for heavy particles.
 
     Returns
     -------
@@ -58,6 +64,8 @@ def systematic(
     """
     squares: dict[str, FloatArray] = {}
     sources: tuple[Source, ...] = (*_SOURCES, partial(_of_what_is_left_over, mass_share))
+    if scale is not None:
+        sources += (partial(_of_heavy_particles, scale),)
     for source in sources:
         for name, sigma in source(config, table).items():
             squares[name] = squares.get(name, np.zeros(len(table))) + np.square(sigma)
@@ -70,6 +78,37 @@ def _of_what_is_left_over(
     """Give what masses are wrong by where the optics were rejected, and no others learned."""
     del config
     return {"mass_kda": mass_share * table["mass_kda"].to_numpy(float)} if mass_share else {}
+
+
+def _of_heavy_particles(
+    scale: MassScale, config: Config, table: pd.DataFrame
+) -> Mapping[str, FloatArray]:
+    """Give what a line of faint standards makes of particles that are not, where it matters."""
+    if "mass_kda" not in FREE_PARAMETERS[config.fit.mode] or not is_bent(scale, table).any():
+        return {}
+    mass = table["mass_kda"].to_numpy(float)
+    return {"mass_kda": np.abs(mass * scale.bend(mass))}
+
+
+def is_bent(scale: MassScale, table: pd.DataFrame) -> NDArray[np.bool_]:
+    """Tell which masses a line of faint standards is wrong about, by more than chance hides.
+
+    Parameters
+    ----------
+    scale : MassScale
+        Of the fits.
+    table : pandas.DataFrame
+        Rows of ``fits.csv``.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows,)
+        Of the rows that are ok.
+    """
+    mass, sigma = (table[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
+    share = np.abs(scale.bend(mass))
+    good = (table["status"] == Status.OK.value).to_numpy()
+    return np.asarray(good & (share > _BENT) & (share * np.abs(mass) > sigma / 2))
 
 
 def _of_the_line(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
