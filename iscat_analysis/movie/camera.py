@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ CEILING_REPEATS = 4
 
 _RATIO_TOLERANCE = 0.1  # of a mean of 1; a power that was not divided out is within it
 _RATIO_MOST_E = 10.0  # photoelectrons in a pixel, of which no interferometric image is made
+_LEAP = 0.75  # of the largest number, from one frame to the next
+_OVERFLOWN = 1e-4  # of a frame's pixels that leap; more than blink
 _NEGATIVE_SIGMAS = 6.0  # 1e-9 of pixels in the dark
 _NEGATIVE_FRACTION = 0.01  # more pixels below the offset than a sensor has dead ones
 
@@ -333,6 +336,41 @@ def refuse_ratio(frame: NDArray[Any], where: str, camera: Camera) -> None:
             f"{where} is ratiometric (floats around {int(ratio)}): its shot noise cannot be known "
             "any more; give the camera's raw counts, which are divided here"
         )
+
+
+def refuse_overflow(counts: NDArray[Any], name: str) -> None:
+    """Refuse a movie whose counts went beyond the largest number of their type and began at zero.
+
+    A pixel there leaps over nearly the whole range of the type from one frame to the next, as no
+    light does in some pixels of a frame and not in the others.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Successive frames, as stored [counts].
+    name : str
+        What the message calls the movie.
+
+    Raises
+    ------
+    DataError
+        More than one in ten thousand do.
+    """
+    if not np.issubdtype(counts.dtype, np.unsignedinteger) or counts.dtype.itemsize > 2:
+        return
+    largest = int(np.iinfo(counts.dtype).max)
+    if not counts.size or int(counts.max()) - int(counts.min()) < _LEAP * largest:
+        return
+    for before, after in pairwise(counts):
+        leap = np.maximum(before, after) - np.minimum(before, after) > _LEAP * largest
+        if _OVERFLOWN < leap.mean() < 1 / 2:
+            y, x = np.unravel_index(int(np.argmax(leap)), leap.shape)
+            raise DataError(
+                f"{name}: counts have overflowed {8 * counts.dtype.itemsize} bits: pixels leap "
+                f"between 0 and {largest} from one frame to the next, as from {before[y, x]} to "
+                f"{after[y, x]} at y = {y}, x = {x}; record or export the movie without "
+                "multiplying counts, with less light, or with more bits"
+            )
 
 
 def converter_ceiling(counts: NDArray[Any]) -> float:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import Stack
-from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_ratio
+from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_overflow, refuse_ratio
 from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pieces.setups import darkfield_photons
@@ -125,6 +125,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     opening = movie.read(start, max(start, stop))
     if way != "sliding":  # windows that slide pass over frames that repeat
         _refuse_still(opening, f"{movie.name}: frames {start} to {stop - 1}")
+    refuse_overflow(opening, movie.name)
     digest = beside(movie.sha256)
     swapped = axes_warning(movie.name, opening)
     if swapped:

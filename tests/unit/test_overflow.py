@@ -1,0 +1,54 @@
+"""Counts that began at zero again beyond the largest of their type are named, in every mode."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from wanderers import SETTINGS, wander
+
+import iscat_analysis as ia
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie.camera import refuse_overflow
+
+LANDING = {"fit.mode": "mass", "background.method": "sliding"}
+
+
+@pytest.fixture(scope="module")
+def counts() -> NDArray[np.uint16]:
+    return wander((60, 48, 48), seed=5, species=((400.0, 0.05, 1),)).counts
+
+
+@pytest.mark.parametrize("settings", [{}, LANDING], ids=["track", "landing"])
+def test_a_movie_that_overflowed_is_refused_by_name(
+    settings: dict[str, Any], counts: NDArray[np.uint16]
+) -> None:
+    overflowed = (3 * counts.astype(np.int64)).astype(np.uint16)
+    with pytest.raises(
+        DataError, match="counts have overflowed 16 bits: pixels leap between 0 and"
+    ):
+        ia.fit_movie(overflowed, settings={**SETTINGS, **settings})
+
+
+def test_what_else_is_bright_and_dark_is_not_taken_for_it(counts: NDArray[np.uint16]) -> None:
+    stops = 2 * counts.astype(np.int64)
+    stops[:, :, :10], stops[:, :, 10:12] = 0, 65535  # a field stop beside saturated light
+    blinking = np.full((20, 192, 192), 20_000, dtype=np.uint16)
+    blinking[::2, 5, 6], blinking[1::2, 5, 6] = 65535, 0  # one pixel
+    flashes = counts.copy()
+    flashes[::2] = 65535
+    flashes[1::2] = 0
+    for right in (
+        counts,
+        stops.astype(np.uint16),
+        blinking,
+        flashes,
+        3.0 * counts,
+        counts[:1],
+        counts[:0],
+    ):
+        refuse_overflow(right, "movie")
+    with pytest.raises(DataError, match="8 bits"):
+        refuse_overflow((counts // 64).astype(np.uint8), "movie")
