@@ -10,8 +10,12 @@ import atexit
 import os
 import shutil
 import tempfile
+from collections.abc import Callable
+from typing import Any
 
 from numba import config, njit
+from numba.core.caching import FunctionCache
+from numba.core.runtime import rtsys
 
 from iscat_analysis.errors import ConfigError
 
@@ -51,3 +55,43 @@ def environment() -> dict[str, str]:
         For `subprocess.Popen`.
     """
     return os.environ | ({"NUMBA_CACHE_DIR": config.CACHE_DIR} if TEMPORARY else {})
+
+
+class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba is not typed
+    """Numba's compiled functions on disk, of which one is loaded without what only compiling needs.
+
+    Numba's own registers first how everything it knows is compiled, which takes as long as loading
+    all kernels of a small run.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        with self._guard_against_spurious_io_errors():
+            rtsys.initialize(target_context)
+            loaded = self._load_overload(sig, target_context)
+            if loaded is not None:
+                return loaded
+        return super().load_overload(sig, target_context)
+
+
+def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a function by Numba when it is first called, and keep what was compiled.
+
+    It runs without the interpreter's lock, and divides by zero as NumPy does.
+
+    Parameters
+    ----------
+    **options
+        Further ones of `numba.njit`.
+
+    Returns
+    -------
+    callable
+        The decorator.
+    """
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        dispatcher = njit(nogil=True, error_model="numpy", **options)(function)
+        dispatcher._cache = _KernelCache(function)
+        return dispatcher
+
+    return compiled

@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens, StampLens
@@ -114,14 +114,14 @@ class Canvas(NamedTuple):
     drawn: BoolArray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def table_of(pictures: Pictures, group: int) -> AxialTable:
     """Table of one blur."""
     k = min(group, pictures.heights.shape[0] - 1)
     return AxialTable(pictures.heights[k], pictures.first_nm, pictures.step_nm, pictures.kappa)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def lens_of(pictures: Pictures, group: int) -> Lens:
     """Lens of one blur."""
     window = pictures.windows[min(group, pictures.windows.shape[0] - 1)]
@@ -129,7 +129,7 @@ def lens_of(pictures: Pictures, group: int) -> Lens:
     return lens
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _with_window(lens: Lens, window: FloatArray) -> Lens:
     """Give a lens another window; a round one has none."""
     if len(lens) == ROUND:
@@ -139,14 +139,14 @@ def _with_window(lens: Lens, window: FloatArray) -> Lens:
     return StampLens(lens.inv_step, lens.half, window, lens.fine)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def box_of(centre_nm: float, pixel_nm: float, side: int, size: int) -> tuple[int, int]:
     """Half-open range of pixels around a place, cut off at the edge of the field."""
     first = int(np.rint(centre_nm / pixel_nm - (side - 1) / 2))
     return max(first, 0), min(first + side, size)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def square_of(
     field: Field, theta: FloatArray, side: int, rows: int, columns: int
 ) -> tuple[int, int, int, int]:
@@ -158,13 +158,13 @@ def square_of(
     return r0, r1, c0, c1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def cut(pixels: Pixels, r0: int, r1: int, c0: int, c1: int) -> Pixels:
     """Pixels of a part of the field."""
     return Pixels(pixels.x[c0:c1], pixels.y[r0:r1], pixels.offsets, pixels.weights)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def add_row(
     pictures: Pictures, field: Field, group: int, theta: FloatArray, sign: float,
     square: tuple[int, int, int, int], profile: FloatArray, image: FloatArray,
@@ -179,7 +179,7 @@ def add_row(
     _add_row(table, lens, pictures.nodes, theta, sign, pixels, profile, image, total[r0:r1, c0:c1])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _add_row(
     table: AxialTable, lens: Lens, nodes: NDArray[np.float32], theta: FloatArray, sign: float,
     pixels: Pixels, profile: FloatArray, image: FloatArray, there: NDArray[np.float32],
@@ -195,7 +195,7 @@ def _add_row(
     add(there, sign, out)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def draw_gradient(
     pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
     profile: FloatArray, out: FloatArray,
@@ -205,7 +205,7 @@ def draw_gradient(
     _draw_gradient(table, lens, pictures.nodes, theta, pixels, profile, out)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _draw_gradient(
     table: AxialTable, lens: Lens, nodes: NDArray[np.float32], theta: FloatArray, pixels: Pixels,
     profile: FloatArray, out: FloatArray,
@@ -219,7 +219,7 @@ def _draw_gradient(
     signal_gradient(picture, lens, pixels, theta[0], theta[1], theta[3], out)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def add(there: NDArray[np.float32], sign: float, image: FloatArray) -> None:
     """Add an image, times a sign, to the square of a frame where it belongs."""
     for i in range(image.shape[0]):
@@ -227,7 +227,7 @@ def add(there: NDArray[np.float32], sign: float, image: FloatArray) -> None:
             there[i, j] += np.float32(sign * image[i, j])
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def stage(
     light: Light, t: int, total: NDArray[np.float32], own: FloatArray, r0: int, c0: int,
     data: FloatArray,
@@ -251,7 +251,7 @@ def stage(
             data[0, i, j] = seen + data[3, i, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def ready_frame(
     field: Field, near: Pictures, far: Pictures, starts: IntArray, t: int, theta: FloatArray,
     group: IntArray, canvas: Canvas, near_profile: FloatArray,
@@ -282,7 +282,7 @@ def ready_frame(
             canvas.squares[r] = theta[r]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def add_squares(
     light: Light, total: NDArray[np.float32], frame: IntArray, corner: IntArray, owner: IntArray,
     out: FloatArray,

@@ -8,9 +8,9 @@ and its second derivatives, as `signal_hessian` fills it.  Data and parameters a
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.dense import factorise
 from iscat_analysis._kernels.hessian import signal_hessian
 from iscat_analysis._kernels.image import Pixels
@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def derivatives_between(
     axial: AxialTable, lens: Lens, pixels: Pixels, theta: FloatArray, rows: FloatArray
 ) -> None:
@@ -34,7 +34,7 @@ def derivatives_between(
     signal_hessian(profile, lens, pixels, theta[0], theta[1], theta[3], rows)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _slopes(
     kind: int, data: FloatArray, row: int, level: float, s: FloatArray, t: FloatArray
 ) -> float:
@@ -66,7 +66,7 @@ def _slopes(
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _weighted(t: FloatArray, a: FloatArray) -> float:
     """Scalar product, shape (nx,) each."""
     total = 0.0
@@ -75,7 +75,7 @@ def _weighted(t: FloatArray, a: FloatArray) -> float:
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _products(t: FloatArray, g: FloatArray, sums: FloatArray) -> None:
     """Add Σ t g_i g_j to `sums` (10) in the order of `PAIRS`; g holds s and its gradient."""
     f00 = f01 = f11 = f02 = f12 = f22 = f03 = f13 = f23 = f33 = 0.0
@@ -104,7 +104,7 @@ def _products(t: FloatArray, g: FloatArray, sums: FloatArray) -> None:
     sums[9] += f33
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def observed_information(
     kind: int, data: FloatArray, level: float, rows: FloatArray, out: FloatArray
 ) -> None:
@@ -128,7 +128,7 @@ def observed_information(
         out[4, j] = out[j, 4] = -sums[10 + j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def invert(matrix: FloatArray, scale: FloatArray, active: BoolArray, out: FloatArray) -> bool:
     """Fill `out` (5, 5) with the inverse of a positive matrix on the active parameters, else 0.
 
@@ -157,7 +157,7 @@ def invert(matrix: FloatArray, scale: FloatArray, active: BoolArray, out: FloatA
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _row_bias(
     kind: int,
     data: FloatArray,
@@ -212,7 +212,7 @@ def _row_bias(
     sums[4] += b4
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def first_order_bias(
     kind: int,
     data: FloatArray,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from iscat_analysis._kernels import kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -13,7 +14,7 @@ LEAST = 1e-13
 """Pivot of a matrix with ones on its diagonal below which it is no information."""
 
 
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
+@kernel(forceinline=True)
 def factorise(
     matrix: FloatArray, index: IntArray, scale: FloatArray, damping: float, lower: FloatArray
 ) -> bool:

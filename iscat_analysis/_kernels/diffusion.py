@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
 
 FloatArray = NDArray[np.float64]
@@ -27,7 +27,7 @@ _LADDERS = 2  # between the neighbours of the highest rung of the one before
 _NEWTON, _FINE = 20, 1e-12  # steps at most; the last one's length over the scale of D
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def displacement_likelihood(
     steps: FloatArray,
     error: FloatArray,
@@ -96,7 +96,7 @@ def displacement_likelihood(
     return value, slope, curvature, -0.5 * total2, total0, total1
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def displacement_likelihoods(
     steps: FloatArray,
     error: FloatArray,
@@ -149,7 +149,7 @@ def displacement_likelihoods(
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def most_likely_diffusion(
     steps: FloatArray,
     error: FloatArray,

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from iscat_analysis._kernels import kernel
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _fade(share: float) -> float:
     """From 0 to 1, with two derivatives that vanish at either end."""
     return share**3 * (10 + share * (6 * share - 15))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def extend(image: FloatArray, out: FloatArray) -> None:
     """Continue an image beyond its edges so that opposite ends meet.
 
@@ -44,7 +45,7 @@ def extend(image: FloatArray, out: FloatArray) -> None:
             out[rows + k, j] = (1 - share) * out[near_row, j] + share * out[far_row, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def mismatch(
     pattern: FloatArray,
     image: FloatArray,
@@ -81,7 +82,7 @@ def mismatch(
                 out[i, j] = np.nan
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def shift_equations(
     pattern: FloatArray,
     pattern_read: FloatArray,

@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.canvas import Light
 from iscat_analysis._kernels.dense import factorise
 from iscat_analysis._kernels.lattice import FAST
@@ -64,7 +64,7 @@ class Clusters(NamedTuple):
     factors: FloatArray
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def keep_slopes(
     level: FloatArray, gradient: FloatArray, index: IntArray, out: NDArray[np.float32]
 ) -> None:
@@ -77,7 +77,7 @@ def keep_slopes(
                 out[k, i * nx + j] = level[i, j] * gradient[i, parameter, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def find_clusters(squares: IntArray, starts: IntArray, owner: IntArray) -> None:
     """Say which rows overlap by half their squares, directly or through others.
 
@@ -106,7 +106,7 @@ def find_clusters(squares: IntArray, starts: IntArray, owner: IntArray) -> None:
                         owner[q] = low
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def join_rows(
     slopes: Slopes, clusters: Clusters, light: Light, totals: NDArray[np.float32],
     information: FloatArray, first: int, last: int,
@@ -153,7 +153,7 @@ def join_rows(
                 low[i, j] /= scale[i]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _overlap(
     slopes: Slopes, light: Light, t: int, total: NDArray[np.float32], r: int, s: int,
     out: FloatArray,
@@ -184,7 +184,7 @@ def _overlap(
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _shift(slopes: Slopes, clusters: Clusters, c: int, move: FloatArray) -> FloatArray:
     """F⁻¹ G move of a cluster, shape (its rows × k,)."""
     rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
@@ -214,7 +214,7 @@ def _shift(slopes: Slopes, clusters: Clusters, c: int, move: FloatArray) -> Floa
     return step
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def follow_rows(
     slopes: Slopes, clusters: Clusters, first: int, last: int, move: FloatArray, out: FloatArray
 ) -> None:
@@ -247,7 +247,7 @@ def follow_rows(
                         here[j] += by * slope[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def shift_rows(
     slopes: Slopes, clusters: Clusters, first: int, last: int, move: FloatArray, index: IntArray,
     lower: FloatArray, upper: FloatArray, theta: FloatArray,

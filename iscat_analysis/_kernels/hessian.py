@@ -13,9 +13,9 @@ derivatives (`iscat_analysis._kernels.quintics`), and another contracts them to
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lattice_rows import lattice_fields
@@ -42,7 +42,7 @@ _STRIP = 64  # pixels: a fixed number, so that lines of scratch are known not to
 _NEAR = 1e-6  # of a step: here DF is F″
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def signal_hessian(
     profile: FloatArray,
     lens: Lens,
@@ -85,7 +85,7 @@ def signal_hessian(
         _copy(sums, first, out)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _place(
     inv_step: float, pixels: Pixels, first: int, x_p: float, y_p: float, f: FloatArray
 ) -> None:
@@ -103,7 +103,7 @@ def _place(
         f[_DISTANCE, j] = f[DISTANCE, j] = np.sqrt(dx[j] * dx[j] + dy[j] * dy[j]) * inv_step
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _copy(sums: FloatArray, first: int, out: FloatArray) -> None:
     """Fill the pixels of `out` (ny, ROWS, nx) from `first` on with a strip of sums."""
     ny, _, nx = out.shape
@@ -117,7 +117,7 @@ def _copy(sums: FloatArray, first: int, out: FloatArray) -> None:
         row, column, begin = row + 1, 0, end
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _lattice_hessian(
     profile: FloatArray, lens: LatticeLens, pixels: Pixels, x_p: float, y_p: float,
     amplitude: float, out: FloatArray,
@@ -138,7 +138,7 @@ def _lattice_hessian(
                     _contract(lens.rho, amplitude, weight, e, de, dde, out[row], j)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _bend(lens: RoundLens, amplitude: float, weight: float, f: FloatArray) -> None:
     """Add weight × all that needs no derivative in z; leave DF (4 to 7 in f) and (F″ − DF)/r²."""
     inv_step, rho, cos, sin = lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi
@@ -221,7 +221,7 @@ def _bend(lens: RoundLens, amplitude: float, weight: float, f: FloatArray) -> No
         f[(_SUMS + 14) * _STRIP + j] += weight * 2 * power
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _bend_z(lens: RoundLens, amplitude: float, weight: float, f: FloatArray) -> None:
     """Add weight × the derivatives in z, after `_bend`."""
     inv_step, rho, cos, sin = lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi
@@ -277,7 +277,7 @@ def _bend_z(lens: RoundLens, amplitude: float, weight: float, f: FloatArray) -> 
         )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _contract(
     rho: float,
     a: float,

@@ -17,9 +17,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice_rows import (
     interpolate_columns,
     lattice_gradient,
@@ -50,7 +50,7 @@ class Pixels(NamedTuple):
     weights: FloatArray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _begin_lattice(
     profile: FloatArray,
     lens: LatticeLens,
@@ -65,7 +65,7 @@ def _begin_lattice(
     return f
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def signal_parts(
     profile: FloatArray,
     lens: Lens,
@@ -93,7 +93,7 @@ def signal_parts(
             p[j], q[j] = (up - down) / (2 * unit), (up + down) / (2 * unit * unit)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def signal_image(
     profile: FloatArray,
     lens: Lens,
@@ -114,7 +114,7 @@ def signal_image(
         radial_signal(profile, lens, pixels, x_p, y_p, amplitude, out)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def signal_gradient(
     profile: FloatArray,
     lens: Lens,

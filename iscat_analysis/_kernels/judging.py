@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.canvas import (
     Canvas,
     Field,
@@ -35,7 +35,7 @@ _SINGULAR = 1e-9
 """Pivot of a matrix with ones on its diagonal below which a parameter is not known."""
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _score_of(data: FloatArray, g: FloatArray, score: FloatArray) -> None:
     """Fill the four scores of a square whose signal and gradient are g (ny, 5, nx)."""
     score[:] = 0.0
@@ -56,7 +56,7 @@ def _score_of(data: FloatArray, g: FloatArray, score: FloatArray) -> None:
         score[3] += s3
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _add_curvature(
     data: FloatArray, here: FloatArray, plus: FloatArray, minus: FloatArray, bias: FloatArray
 ) -> None:
@@ -79,7 +79,7 @@ def _add_curvature(
         bias[3] -= 0.5 * b3 / PART**2
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _left_over(data: FloatArray, here: FloatArray) -> tuple[float, float, float, float]:
     """χ², pixels, largest residual and light of a square."""
     chi2 = used = worst = light = 0.0
@@ -95,7 +95,7 @@ def _left_over(data: FloatArray, here: FloatArray) -> tuple[float, float, float,
     return chi2, used, np.sqrt(worst), light
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def judge_frames(
     light: Light,
     field: Field,
@@ -200,7 +200,7 @@ def judge_frames(
                     ways[r, a, k] = ways_here[a, k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _directions(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
     """Fill the columns of `out` (4, n) with V, V Vᵀ the inverse of F on the free parameters."""
     n = index.size

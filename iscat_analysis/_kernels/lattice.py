@@ -24,10 +24,11 @@ import math
 from functools import cache, lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import toeplitz
 from scipy.special import i0
+
+from iscat_analysis._kernels import kernel
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -140,7 +141,7 @@ def radial_waves(
     return powers
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _fill_quintics(nodes: FloatArray, powers: FloatArray) -> None:
     """Fill `powers` (n, 6, k) from value, slope and bend (3, n + 1, k) at the nodes."""
     for i in range(powers.shape[0]):
@@ -156,7 +157,7 @@ def _fill_quintics(nodes: FloatArray, powers: FloatArray) -> None:
             powers[i, 5, j] = 6 * rise - 3 * d0 - 3 * d1 - 0.5 * s0 + 0.5 * s1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def bessel_ladder(x: FloatArray, out: FloatArray) -> None:
     """Fill `out` (orders, n) with J_0, J_1, … of x ≥ 0 by Miller's downward recurrence."""
     orders = out.shape[0]
@@ -189,7 +190,7 @@ def bessel_ladder(x: FloatArray, out: FloatArray) -> None:
             out[m, k] /= total
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _quintic(powers: FloatArray, t: float, out: FloatArray) -> None:
     """Fill `out` (n) with the polynomials of `powers` (6, n) at t.
 
@@ -204,7 +205,7 @@ def _quintic(powers: FloatArray, t: float, out: FloatArray) -> None:
         out[j] = a[j] + t * (b[j] + t * c[j]) + cube * out[j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _sum_azimuths(value: FloatArray, cos: float, sin: float, sums: FloatArray) -> None:
     """Fill `sums` (2, 2, 2, k): cosine and sine terms, even and odd orders, real and imaginary."""
     sums[:] = 0.0
@@ -219,7 +220,7 @@ def _sum_azimuths(value: FloatArray, cos: float, sin: float, sums: FloatArray) -
         c, s = c * cos - s * sin, s * cos + c * sin
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def sum_waves(
     waves: FloatArray, inv_step: float, dx: FloatArray, dy: FloatArray, out: FloatArray
 ) -> None:
@@ -252,7 +253,7 @@ def sum_waves(
             out[j] = sums[0, 0] + sums[0, 1] + sums[1, 0] + sums[1, 1]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _sample(waves: FloatArray, inv_step: float, step: float, out: FloatArray) -> None:
     """Fill `out` (k, 2, side, side) with the fields at the nodes, eight mirror images at a time."""
     intervals, _, count, _, fields = waves.shape

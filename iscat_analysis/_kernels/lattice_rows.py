@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import DEGREE, FAST, TAPS
 from iscat_analysis._kernels.mixing import mix, mix_both
 
@@ -32,7 +32,7 @@ BEFORE = TAPS // 2 - 1
 """Nodes before the one at the floor of a position."""
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def taps(weights: FloatArray, t: float, value: FloatArray, slope: FloatArray) -> None:
     """Fill the weights of the nodes at distance t ∈ [0, 1) and their derivative."""
     for k in range(TAPS):
@@ -44,7 +44,7 @@ def taps(weights: FloatArray, t: float, value: FloatArray, slope: FloatArray) ->
         slope[k] = d
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def node_rows(lens: LatticeLens, pixels: Pixels, y_p: float) -> tuple[int, int]:
     """First row of nodes that an image needs, and how many."""
     margin = abs(pixels.offsets[-1])
@@ -54,7 +54,7 @@ def node_rows(lens: LatticeLens, pixels: Pixels, y_p: float) -> tuple[int, int]:
     return first, int(high) - BEFORE + TAPS - first
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def rows_needed(lens: LatticeLens, pixels: Pixels) -> int:
     """Rows of work space that an image needs, wherever the particle is."""
     span = pixels.y.max() - pixels.y.min() + 2 * abs(pixels.offsets[-1])
@@ -62,7 +62,7 @@ def rows_needed(lens: LatticeLens, pixels: Pixels) -> int:
     return FIELDS + pixels.offsets.size * 6 * lens.components * rows
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _blend(nodes: FloatArray, row: int, first: int, w: FloatArray, out: FloatArray) -> None:
     """Fill `out` (n) with the combination w of TAPS rows of `nodes`, n columns from the first."""
     last = first + out.size
@@ -72,7 +72,7 @@ def _blend(nodes: FloatArray, row: int, first: int, w: FloatArray, out: FloatArr
         mix(a, b, c, d, w, k, out)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _blend_both(
     nodes: FloatArray,
     row: int,
@@ -90,7 +90,7 @@ def _blend_both(
         mix_both(a, b, c, d, w, v, k, out, other)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _columns(
     plane: FloatArray,
     left: NDArray[np.int64],
@@ -114,7 +114,7 @@ def _columns(
                 out[r, start + j] = strip[j, r]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def interpolate_columns(
     profile: FloatArray,
     lens: LatticeLens,
@@ -147,7 +147,7 @@ def interpolate_columns(
                 here += rows
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _add_gradient(
     rho: float, amplitude: float, weight: float, f: FloatArray, part: int, out: FloatArray
 ) -> None:
@@ -169,7 +169,7 @@ def _add_gradient(
         out[4, j] += weight * (2 * rho * e_r[j] + 2 * a * power)
 
 
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
+@kernel(forceinline=True)
 def lattice_gradient(
     lens: LatticeLens,
     pixels: Pixels,
@@ -206,7 +206,7 @@ def lattice_gradient(
                 _add_gradient(0.0, amplitude, weight, f, 2, out)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _add_signal(
     rho: float, a: float, weight: float, e_r: FloatArray, e_i: FloatArray, out: FloatArray
 ) -> None:
@@ -215,7 +215,7 @@ def _add_signal(
         out[j] += weight * a * (2 * rho * e_r[j] + a * (e_r[j] * e_r[j] + e_i[j] * e_i[j]))
 
 
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
+@kernel(forceinline=True)
 def lattice_signal(
     lens: LatticeLens,
     pixels: Pixels,
@@ -246,7 +246,7 @@ def lattice_signal(
                 _add_signal(0.0, amplitude, weight, f[2], f[3], out)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _add_product(
     rho: float, weight: float, f: FloatArray, field: int, change: int, out: FloatArray
 ) -> None:
@@ -256,7 +256,7 @@ def _add_product(
         out[j] += weight * ((rho + e_r[j]) * d_r[j] + e_i[j] * d_i[j])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def lattice_values(
     stack: FloatArray,
     lens: LatticeLens,
@@ -315,7 +315,7 @@ def lattice_values(
                         _add_product(rho, 2 * a * weight, f, 2 * c, change, out[k, row])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def lattice_span(lens: LatticeLens, x: FloatArray, margin: float, x_p: float) -> tuple[int, int]:
     """Range of the flattened lattice that an image needs."""
     side = 2 * lens.half + 1
@@ -324,7 +324,7 @@ def lattice_span(lens: LatticeLens, x: FloatArray, margin: float, x_p: float) ->
     return max(first, 0) * side, min(last, side) * side
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def lattice_fields(
     profile: FloatArray,
     lens: LatticeLens,
@@ -370,7 +370,7 @@ def lattice_fields(
         dde[1, 0, c], dde[2, 0, c], dde[2, 1, c] = dde[0, 1, c], dde[0, 2, c], dde[1, 2, c]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _bent_taps(weights: FloatArray, t: float, h: float, out: FloatArray) -> None:
     """Fill the weights (3, TAPS) of the nodes for value, slope and second derivative."""
     for k in range(TAPS):

@@ -6,15 +6,15 @@ Against more arrays that might overlap, the compiler gives up on vectors.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=FAST)
 def mix(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, w: FloatArray, k: int,
     out: FloatArray,
@@ -29,7 +29,7 @@ def mix(
             out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=FAST)
 def mix_both(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, w: FloatArray, v: FloatArray,
     k: int, out: FloatArray, other: FloatArray,

@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from iscat_analysis._kernels import kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -19,7 +20,7 @@ _SURE = 9.0  # standard deviations above the threshold: a chance of 1 to the las
 _TINY = 1e-250  # a density below it is added up by logarithms
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def mixture_em(
     x: FloatArray,
     noise: FloatArray,
@@ -71,7 +72,7 @@ def mixture_em(
             weight[j] = size[j] / n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def mixture_score(
     x: FloatArray, noise: FloatArray, weight: FloatArray, mean: FloatArray, variance: FloatArray
 ) -> tuple[float, FloatArray]:
@@ -124,7 +125,7 @@ def mixture_score(
     return value, gradient
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _log_normal_cdf(a: float) -> float:
     """Logarithm of Φ(a); the asymptotic series where erfc would vanish."""
     if a > -20.0:
@@ -134,7 +135,7 @@ def _log_normal_cdf(a: float) -> float:
     return -0.5 * a * a - math.log(-a) - 0.5 * _LOG_2PI + math.log1p(series)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def detection_score(
     noise: FloatArray,
     threshold: float,

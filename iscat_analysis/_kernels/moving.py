@@ -13,9 +13,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.canvas import (
     Canvas,
     Field,
@@ -77,7 +77,7 @@ class Search(NamedTuple):
     passes: int
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def fit_frames(
     light: Light,
     field: Field,
@@ -174,7 +174,7 @@ def fit_frames(
         expected[t] = _add_stretch(light, t, total, stretch)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _climb(
     near: Pictures, group: int, pixels: Pixels, data: FloatArray, search: Search, p: FloatArray,
     both: FloatArray, profile: FloatArray, fisher: FloatArray, step: FloatArray,
@@ -219,7 +219,7 @@ def _climb(
     return outcome, 0, value
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _step(
     search: Search, p: FloatArray, lower: FloatArray, upper: FloatArray, score: FloatArray,
     fisher: FloatArray, step: FloatArray, trial: FloatArray,
@@ -241,7 +241,7 @@ def _step(
     return gain
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _add_signal(here: FloatArray, step: FloatArray, out: FloatArray) -> None:
     """Add the signal after a small step to `out`."""
     dx, dy, dz, da = step[0], step[1], step[2], step[3]
@@ -251,7 +251,7 @@ def _add_signal(here: FloatArray, step: FloatArray, out: FloatArray) -> None:
             out[i, j] += here[i, 0, j] + sideways + dz * here[i, 3, j] + da * here[i, 4, j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _add_stretch(light: Light, t: int, total: NDArray[np.float32], stretch: FloatArray) -> float:
     """Add w (1 + C) of a frame to `stretch`; return what the used pixels expect at power 1."""
     amount, w = 0.0, light.power[t]
@@ -264,7 +264,7 @@ def _add_stretch(light: Light, t: int, total: NDArray[np.float32], stretch: Floa
     return amount
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def common_modes(
     light: Light,
     field: Field,

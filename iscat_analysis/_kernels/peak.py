@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.quintics import DISTANCE, evaluate, padded
 from iscat_analysis._kernels.vectors import LANES
@@ -38,7 +39,7 @@ def _parts(
     return 2 * rho * a * re, a * a * (re * re + im * im)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _add_up(
     f: FloatArray, inv_step: float, a: float, rho: float, circular: bool, analyzer: bool, way: int,
     sums: FloatArray,
@@ -52,7 +53,7 @@ def _add_up(
         sums[j] = linear + quadratic
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def largest_signal(
     profile: FloatArray,
     inv_step: float,

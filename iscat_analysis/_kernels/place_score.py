@@ -8,9 +8,9 @@ height, z.  All three share the expected counts and one division per pixel.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.scoring import (
     POISSON,
@@ -26,7 +26,7 @@ _LEAST = 1e-100
 """Least expected count, as `FLOOR` of `scoring`, but its square is a number too."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def place_score(
     data: FloatArray, here: FloatArray, with_z: bool, score: FloatArray, fisher: FloatArray
 ) -> float:
@@ -61,7 +61,7 @@ def place_score(
     return value
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _flat_score(
     data: FloatArray, here: FloatArray, score: FloatArray, fisher: FloatArray
 ) -> tuple[float, int]:

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.radial import POWERS
 from iscat_analysis._kernels.vectors import LANES, Code, instructions
 
@@ -23,13 +23,13 @@ DISTANCE = 12
 """Row of the distances, after eight channels and four slopes."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def padded(pixels: int) -> int:
     """Give the length of a row of scratch."""
     return (pixels + LANES - 1) // LANES * LANES
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def evaluate(profile: FloatArray, f: FloatArray) -> None:
     """Evaluate the first four channels of a profile.
 
@@ -45,21 +45,21 @@ def evaluate(profile: FloatArray, f: FloatArray) -> None:
         _values(profile, f, j)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def evaluate_slopes(profile: FloatArray, f: FloatArray) -> None:
     """Evaluate eight channels as `evaluate` four, and in rows 8 to 11 slopes of the first four."""
     for j in range(0, f.shape[1], LANES):
         _with_slopes(profile, f, j)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def evaluate_last_slopes(profile: FloatArray, f: FloatArray) -> None:
     """Evaluate the last eight of twelve channels as `evaluate_slopes` eight."""
     for j in range(0, f.shape[1], LANES):
         _with_last_slopes(profile, f, j)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def evaluate_bends(profile: FloatArray, f: FloatArray) -> None:
     """Evaluate as `evaluate`, and in rows 4 to 7 slopes, in rows 8 to 11 second derivatives."""
     for j in range(0, f.shape[1], LANES):

@@ -25,10 +25,10 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.special import j0, j1
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.vectors import LANES, Code, instructions
 
 FloatArray = NDArray[np.float64]
@@ -133,7 +133,7 @@ def bessel_table(transverse: FloatArray, step_nm: float, intervals: int) -> Floa
     return table
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+@kernel(fastmath={"contract", "reassoc", "nsz"})
 def _add_four(
     w: FloatArray,
     a: FloatArray,
@@ -149,7 +149,7 @@ def _add_four(
         n1[j] += w[1, 0] * a[j] + w[1, 1] * b[j] + w[1, 2] * c[j] + w[1, 3] * d[j]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+@kernel(fastmath={"contract", "reassoc", "nsz"})
 def radial_profile(
     table: FloatArray,
     source: NDArray[np.complex128],
@@ -289,7 +289,7 @@ _radial_1, _radial_2, _radial_3, _lattice_1, _lattice_2, _lattice_3 = (
 )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def profile_at(axial: AxialTable, z_nm: float, start: int, stop: int, profile: FloatArray) -> None:
     """Fill a range of a flattened profile by interpolation along z.
 
@@ -344,7 +344,7 @@ def profile_at(axial: AxialTable, z_nm: float, start: int, stop: int, profile: F
                 _lattice_3(near, profile, begin + min(j, last), factors)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def profile_between(axial: AxialTable, z_nm: float, profile: FloatArray) -> None:
     """Fill a whole profile of one order or more by interpolation along z."""
     profile_at(axial, z_nm, 0, axial.heights.shape[3], profile)

@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.quintics import (
     DISTANCE,
@@ -34,7 +34,7 @@ _SCRATCH = _SUMS + 5
 _STRIP = 256  # pixels, or one row of more
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def intervals_needed(lens: RoundLens, pixels: Pixels, x_p: float, y_p: float, most: int) -> int:
     """Count the intervals of a radial profile that an image needs, of `most`, and one to round."""
     x, y, margin = pixels.x, pixels.y, abs(pixels.offsets[-1])
@@ -43,7 +43,7 @@ def intervals_needed(lens: RoundLens, pixels: Pixels, x_p: float, y_p: float, mo
     return min(int(np.sqrt(dx * dx + dy * dy) * lens.inv_step) + 2, most)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _place(
     inv_step: float, x: FloatArray, y: FloatArray, x_p: float, y_p: float, f: FloatArray
 ) -> None:
@@ -58,7 +58,7 @@ def _place(
         f[DISTANCE, j] = np.sqrt(f[_DX, j] * f[_DX, j] + f[_DY, j] * f[_DY, j]) * inv_step
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _add_gradient(
     inv_step: float, rho: float, cos_psi: float, sin_psi: float, co: float, cross: float,
     ring: float, amplitude: float, weight: float, f: FloatArray,
@@ -98,7 +98,7 @@ def _add_gradient(
         f[_SUMS + 4, j] += weight * (2 * rho * eu_r + 2 * a * power)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _add_parts(
     rho: float, cos_psi: float, sin_psi: float, co: float, cross: float, ring: float,
     weight: float, f: FloatArray,
@@ -114,14 +114,14 @@ def _add_parts(
         f[_SUMS + 1, j] += weight * (eu_r * eu_r + eu_i * eu_i + ev_r * ev_r + ev_i * ev_i)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def strip_scratch(pixels: Pixels) -> tuple[int, FloatArray]:
     """Rows of pixels in a strip, and its scratch."""
     together = min(max(_STRIP // pixels.x.size, 1), pixels.y.size)
     return together, np.empty((_SCRATCH, padded(together * pixels.x.size)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def radial_strip(
     profile: FloatArray, lens: RoundLens, pixels: Pixels, first: int, last: int, x_p: float,
     y_p: float, amplitude: float, count: int, f: FloatArray,
@@ -154,7 +154,7 @@ def radial_strip(
     return sums
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def radial_gradient(
     profile: FloatArray, lens: RoundLens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
     out: FloatArray,
@@ -173,7 +173,7 @@ def radial_gradient(
                     there[j] = here[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def radial_parts(
     profile: FloatArray, lens: RoundLens, pixels: Pixels, x_p: float, y_p: float, out: FloatArray
 ) -> None:
@@ -189,7 +189,7 @@ def radial_parts(
                 there[j] = here[j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def radial_signal(
     profile: FloatArray, lens: RoundLens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
     out: FloatArray,

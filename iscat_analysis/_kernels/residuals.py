@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR
 
@@ -22,7 +22,7 @@ _LEAST_COUNT = 1e-9  # of a tail
 _WHOLE = 1e-9  # rounding of whole counts
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _row_residuals(
     kind: int,
     data: FloatArray,
@@ -63,7 +63,7 @@ def _row_residuals(
             residual[j] = (c0[j] - rate[j]) / np.sqrt(rate[j]) if c2[j] > 0 else 0.0
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _row_totals(
     weight: FloatArray, rate: FloatArray, residual: FloatArray, kurtosis: FloatArray
 ) -> tuple[float, float, float, float, float]:
@@ -80,7 +80,7 @@ def _row_totals(
     return chi2, pixels, excess, largest, least
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def residuals(
     kind: int,
     data: FloatArray,
@@ -131,7 +131,7 @@ def residuals(
     return chi2, pixels, excess, largest, least
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _farthest(residual: FloatArray, index: IntArray) -> None:
     """Fill `index` (k) with the places of the residuals of largest size, largest first."""
     index[:] = 0
@@ -147,7 +147,7 @@ def _farthest(residual: FloatArray, index: IntArray) -> None:
             size[k], index[k] = here, i
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def suspects(
     kind: int, data: FloatArray, rate: FloatArray, residual: FloatArray, many: float,
     tails: FloatArray,

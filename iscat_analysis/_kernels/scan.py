@@ -7,9 +7,9 @@ and the amplitude is fitted with them.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.image import Pixels, signal_parts
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import Lens
@@ -19,7 +19,7 @@ from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, blank_profile, s
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def scan_heights(
     axial: AxialTable,
     lens: Lens,
@@ -59,7 +59,7 @@ def scan_heights(
         amplitudes[k] = a
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _amplitude(
     kind: int, data: FloatArray, level: float, a: float, p: FloatArray, q: FloatArray
 ) -> tuple[float, float]:

@@ -14,9 +14,9 @@ derivatives in (x, y, z, a), each row of pixels; `terms` are those that
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
 
 FloatArray = NDArray[np.float64]
@@ -24,7 +24,7 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _hermite(axis: FloatArray, centre: float, waist: float, order: int) -> FloatArray:
     """Hermite functions of order 0 to `order`, shape (order + 1, n), by their recurrence."""
     out = np.empty((order + 1, axis.size))
@@ -38,7 +38,7 @@ def _hermite(axis: FloatArray, centre: float, waist: float, order: int) -> Float
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _products(functions: FloatArray) -> FloatArray:
     """Products of all pairs i ≤ k of functions (n, size), at k (k + 1)/2 + i."""
     count, size = functions.shape
@@ -50,7 +50,7 @@ def _products(functions: FloatArray) -> FloatArray:
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _moments(lines: FloatArray, functions: FloatArray, out: FloatArray) -> None:
     """Fill `out` (m, n) with the scalar products of lines (m, size) and functions (n, size)."""
     for i in range(lines.shape[0]):
@@ -61,7 +61,7 @@ def _moments(lines: FloatArray, functions: FloatArray, out: FloatArray) -> None:
             out[i, k] = total
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _add_outer(moments: FloatArray, line: FloatArray, out: FloatArray) -> None:
     """Add the moments (m, n) times a line (k) to `out` (m, n, k)."""
     for i in range(moments.shape[0]):
@@ -71,14 +71,14 @@ def _add_outer(moments: FloatArray, line: FloatArray, out: FloatArray) -> None:
                 out[i, k, j] += t * line[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _pair(i: int, k: int) -> int:
     """Place of a pair among `_products`."""
     low, high = min(i, k), max(i, k)
     return high * (high + 1) // 2 + low
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _directions(
     rows: FloatArray, row: int, index: IntArray, relative: FloatArray, out: FloatArray
 ) -> None:
@@ -92,7 +92,7 @@ def _directions(
                 out[k, j] = rows[row, 1 + index[k], j] * relative[j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _add_fitted(
     directions: FloatArray,
     fitted: int,
@@ -118,7 +118,7 @@ def _add_fitted(
             matrix[f, g] += total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _mode_information(
     rows: FloatArray,
     terms: FloatArray,
@@ -177,7 +177,7 @@ def _mode_information(
             m += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _score_statistic(
     matrix: FloatArray, vector: FloatArray, fitted: int, dependent: float, used: BoolArray
 ) -> tuple[float, int]:
@@ -232,7 +232,7 @@ def _score_statistic(
     return chi2, freedom
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def _orthonormal(w: FloatArray, factor: FloatArray, used: BoolArray) -> None:
     """Turn directions (n, nx) into orthonormal ones, by their Cholesky factor."""
     for k in range(used.size):
@@ -248,7 +248,7 @@ def _orthonormal(w: FloatArray, factor: FloatArray, used: BoolArray) -> None:
             w[k, j] *= t
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _leverages(
     rows: FloatArray,
     terms: FloatArray,
@@ -285,7 +285,7 @@ def _leverages(
                     out[row, p] += w[k, p] * w[k, p]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def mode_statistic(
     x: FloatArray,
     y: FloatArray,

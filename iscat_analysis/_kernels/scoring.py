@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.dense import factorise
 from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.lattice import FAST
@@ -56,7 +57,7 @@ def twice_artanh(w: float) -> float:
     return 2.0 * w * (1.0 + w2 * tail)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _some_value(
     kind: int, data: FloatArray, first: int, last: int, level: float, s: FloatArray
 ) -> float:
@@ -100,7 +101,7 @@ def _some_value(
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def signal_value(kind: int, data: FloatArray, level: float, s: FloatArray) -> float:
     """Log-likelihood of signals s (ny·nx,), relative to that without a particle."""
     flat, total = data.reshape(4, s.size), 0.0
@@ -110,7 +111,7 @@ def signal_value(kind: int, data: FloatArray, level: float, s: FloatArray) -> fl
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _add_score(
     kind: int, data: FloatArray, first: int, last: int, level: float, g: FloatArray,
     sums: FloatArray,
@@ -186,7 +187,7 @@ def _add_score(
     sums[19] += f44
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def image_value(kind: int, data: FloatArray, level: float, rows: FloatArray) -> float:
     """Log-likelihood of an image; `rows` (ny, 5 or more, nx) holds s and its gradient."""
     ny, nx = rows.shape[0], rows.shape[2]
@@ -201,7 +202,7 @@ def image_value(kind: int, data: FloatArray, level: float, rows: FloatArray) -> 
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def image_score(
     kind: int,
     data: FloatArray,
@@ -218,7 +219,7 @@ def image_score(
     _unpack(sums, score, fisher)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _unpack(sums: FloatArray, score: FloatArray, fisher: FloatArray) -> None:
     """Fill score and Fisher matrix from the sums of `_add_score`."""
     k = 5
@@ -229,7 +230,7 @@ def _unpack(sums: FloatArray, score: FloatArray, fisher: FloatArray) -> None:
             k += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def score_pass(
     profile: FloatArray,
     lens: Lens,
@@ -260,7 +261,7 @@ def score_pass(
     return value
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def value_pass(
     profile: FloatArray,
     lens: Lens,
@@ -277,7 +278,7 @@ def value_pass(
     return value
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int, int]:
     """Range of the flattened profile, `width` long, that an image needs."""
     if len(lens) == STAMP:
@@ -288,7 +289,7 @@ def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int
     return 0, POWERS * intervals_needed(lens, pixels, theta[0], theta[1], width // POWERS)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def blank_profile(axial: AxialTable, lens: Lens, orders: int) -> FloatArray:
     """Profile for `picture_at` to fill."""
     channels, width = axial.heights.shape[2:]
@@ -300,7 +301,7 @@ def blank_profile(axial: AxialTable, lens: Lens, orders: int) -> FloatArray:
     return np.empty((width // POWERS, POWERS, orders * channels))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def picture_at(
     axial: AxialTable,
     lens: Lens,
@@ -318,7 +319,7 @@ def picture_at(
     return profile
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def value_batch(
     axial: AxialTable,
     lens: Lens,
@@ -342,7 +343,7 @@ def value_batch(
         out[k] = value_pass(profile, lens, pixels, kind, data, thetas[k])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def scoring_step(
     score: FloatArray, fisher: FloatArray, active: BoolArray, damping: float, step: FloatArray
 ) -> bool:
@@ -378,7 +379,7 @@ def scoring_step(
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def maximize(
     axial: AxialTable,
     lens: Lens,

@@ -5,15 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from iscat_analysis._kernels import kernel
 
 FloatArray = NDArray[np.float64]
 MapArray = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def block_sums(
     counts: NDArray[Any],
     good: BoolArray,
@@ -51,7 +52,7 @@ def block_sums(
             sums[i, j] = total[i, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def frame_totals(counts: NDArray[Any], zero: Any, out: NDArray[Any], same: BoolArray) -> None:
     """Sum every frame, and see whether it repeats the one before it.
 
@@ -85,7 +86,7 @@ def frame_totals(counts: NDArray[Any], zero: Any, out: NDArray[Any], same: BoolA
                     break
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def region_sum(counts: NDArray[Any], good: BoolArray, out: FloatArray) -> None:
     """Add the good frames to `out`.
 
@@ -105,7 +106,7 @@ def region_sum(counts: NDArray[Any], good: BoolArray, out: FloatArray) -> None:
                     out[i, j] += counts[t, i, j]
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True)
 def region_scores(counts: NDArray[Any], weights: FloatArray, out: FloatArray) -> None:
     """Weighted sum of every frame.
 
@@ -126,7 +127,7 @@ def region_scores(counts: NDArray[Any], weights: FloatArray, out: FloatArray) ->
         out[t] = total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def contrast_map(before: FloatArray, after: FloatArray, weight: MapArray, out: MapArray) -> float:
     """Weighted contrast of two sums over the field, with its weighted mean taken off.
 
@@ -162,7 +163,7 @@ def contrast_map(before: FloatArray, after: FloatArray, weight: MapArray, out: M
     return ratio
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def step_peaks(maps: MapArray, threshold: float) -> NDArray[np.int64]:
     """Local extremes of a stack of maps.
 

@@ -23,9 +23,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST, TAPS
 from iscat_analysis._kernels.lattice_rows import BEFORE, taps
 from iscat_analysis._kernels.mixing import mix, mix_both
@@ -44,7 +44,7 @@ STRIP = 16
 _WEIGHTS = 4 * TAPS + 3  # of x and y, their slopes, the first nodes, and the amplitude
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
     """Length of a line, of a block of nodes, of what is made of them, and of a strip's pixels."""
     more = (TAPS + lens.fine - 2) // lens.fine
@@ -52,7 +52,7 @@ def _sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
     return line, (STRIP + more) * line, STRIP * line + more, STRIP * line
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _begin(
     profile: AnyFloatArray,
     lens: StampLens,
@@ -76,7 +76,7 @@ def _begin(
     return w
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _copy(
     profile: AnyFloatArray, row: int, step: int, first: int, last: int, line: int,
     a: np.floating[Any], signal: AnyFloatArray, slope: AnyFloatArray,
@@ -98,7 +98,7 @@ def _copy(
                 d[j] = p[j] + twice * q[j]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _mix(nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArray) -> None:
     """Fill `out` with the combination w of what begins at TAPS places of `nodes`."""
     n = out.size
@@ -108,7 +108,7 @@ def _mix(nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArra
         mix(a, b, c, d, w, k, out)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _mix_both(
     nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, v: AnyFloatArray,
     out: AnyFloatArray, other: AnyFloatArray,
@@ -121,7 +121,7 @@ def _mix_both(
         mix_both(a, b, c, d, w, v, k, out, other)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel(_nrt=False)
 def _make_strip(
     profile: AnyFloatArray, lens: StampLens, row: int, rows: int, columns: int,
     gradient: bool, at: IntArray, w: AnyFloatArray,
@@ -174,7 +174,7 @@ def _make_strip(
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def stamp_gradient(
     profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
     amplitude: float, out: FloatArray,
@@ -184,7 +184,7 @@ def stamp_gradient(
     _fill_gradient(profile, lens, amplitude, np.empty(TAPS, dtype=np.int64), f, out)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _fill_gradient(
     profile: AnyFloatArray, lens: StampLens, amplitude: float, at: IntArray, f: AnyFloatArray,
     out: FloatArray,
@@ -207,7 +207,7 @@ def _fill_gradient(
         begin += line
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def stamp_signal(
     profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
     amplitude: float, out: FloatArray,
@@ -217,7 +217,7 @@ def stamp_signal(
     _put_signal(profile, lens, amplitude, False, np.empty(TAPS, dtype=np.int64), f, out)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def add_stamp(
     profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
     amplitude: float, sign: float, out: AnyFloatArray,
@@ -227,7 +227,7 @@ def add_stamp(
     _put_signal(profile, lens, sign * amplitude, True, np.empty(TAPS, dtype=np.int64), f, out)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@kernel(fastmath=FAST, _nrt=False)
 def _put_signal(
     profile: AnyFloatArray, lens: StampLens, factor: float, adds: bool, at: IntArray,
     f: AnyFloatArray, out: AnyFloatArray,

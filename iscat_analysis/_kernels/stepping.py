@@ -6,8 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from iscat_analysis._kernels import kernel
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -15,7 +16,7 @@ IntArray = NDArray[np.int64]
 Ends = tuple[int, int, int, int]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def part_sums(counts: NDArray[Any], good: BoolArray, edges: IntArray, out: FloatArray) -> None:
     """Sum the good frames of contiguous parts.
 
@@ -39,7 +40,7 @@ def part_sums(counts: NDArray[Any], good: BoolArray, edges: IntArray, out: Float
                         out[n, i, j] += counts[t, i, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def add_image(total: FloatArray, corner: tuple[int, int], image: FloatArray, scale: float) -> None:
     """Add a multiple of an image to a field.
 
@@ -59,7 +60,7 @@ def add_image(total: FloatArray, corner: tuple[int, int], image: FloatArray, sca
             total[corner[0] + i, corner[1] + j] += scale * image[i, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def times_change(
     ratio: FloatArray, here: Ends, image: FloatArray, inside: Ends, before: float, after: float
 ) -> None:  # fmt: skip
@@ -83,7 +84,7 @@ def times_change(
             ratio[i, j] *= (1.0 + after * value) / (1.0 + before * value)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def one_change(
     heights: FloatArray, weight: FloatArray, jump: FloatArray, gain: FloatArray
 ) -> tuple[float, int]:
@@ -128,7 +129,7 @@ def one_change(
     return largest, lit
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def projector(
     mean: FloatArray, read: FloatArray, used: BoolArray, image: FloatArray, weights: FloatArray
 ) -> float:
@@ -173,7 +174,7 @@ def projector(
     return max(scale, 1e-300)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True)
 def frame_scores(
     counts: NDArray[Any], lit: BoolArray, weights: FloatArray, out: FloatArray
 ) -> None:
@@ -203,7 +204,7 @@ def frame_scores(
         m += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def mean_of(
     values: FloatArray, power: FloatArray, shot: float, read: float, start: int, stop: int
 ) -> tuple[float, float]:
@@ -232,7 +233,7 @@ def mean_of(
     return total / light, (shot * light + read * (stop - start)) / light**2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def spreads(
     values: FloatArray, power: FloatArray, shot: FloatArray, read: FloatArray, edges: IntArray,
     lengths: IntArray, out: FloatArray,
@@ -283,7 +284,7 @@ def spreads(
         out[1 + m, last] += pairs
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def ring_heights(
     snr: NDArray[Any], centre: tuple[float, float], place: tuple[float, float], ring: float,
     patch: float, others: FloatArray, highest: FloatArray,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from iscat_analysis._kernels import kernel
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -13,7 +14,7 @@ SLACK_NM = 1e-6
 """Rounding of coordinates near the edge of the support."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def supported(
     thetas: FloatArray,
     x: FloatArray,
@@ -38,7 +39,7 @@ def supported(
     return inside
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def box_supported(
     start: FloatArray,
     free: BoolArray,

@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.diffusion import LOG_2PI, TOGETHER
 from iscat_analysis._kernels.lattice import FAST
 
@@ -24,7 +24,7 @@ _SETTLED = 1e-4  # of a log-likelihood, in the search for its maximum
 _MOST = 100  # rounds of the search
 
 
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@kernel(fastmath=FAST)
 def harmonic_likelihoods(
     positions: FloatArray,
     variance: FloatArray,
@@ -110,7 +110,7 @@ def harmonic_likelihoods(
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def most_likely_well(
     positions: FloatArray,
     variance: FloatArray,
@@ -182,7 +182,7 @@ def most_likely_well(
     return value, scale * math.exp(best[0]), math.exp(best[1])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _logarithmic(
     positions: FloatArray,
     variance: FloatArray,

@@ -188,6 +188,26 @@ def test_an_analysis_compiles_what_it_needs(monkeypatch, sample, changes, parts)
     assert any(free) == ("heights" in parts)
 
 
+def test_a_kept_kernel_is_loaded_without_what_compiling_needs(tmp_path):
+    script = (
+        "import sys, numpy as np\n"
+        "from iscat_analysis._kernels.support import supported\n"
+        "edge = np.array([-100.0, 100.0])\n"
+        "places = np.array([[0, 0, 50, 1, 0], [900, 0, 50, 1, 0]], dtype=float)\n"
+        "print(*supported(places, edge, edge, 5.0, 500.0, 0.0, 100.0, 1.0))\n"
+        "print('numba.cpython.setobj' in sys.modules)\n"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", script],
+            env=environment, capture_output=True, text=True, check=True,
+        ).stdout.split()
+        for _ in range(2)
+    ]  # fmt: skip
+    assert said == [["True", "False", "True"], ["True", "False", "False"]]
+
+
 def test_kernels_are_kept_where_nothing_can_be_written(tmp_path):
     package = tmp_path / "iscat_analysis"
     shutil.copytree(
