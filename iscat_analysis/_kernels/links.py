@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from iscat_analysis._kernels import kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -13,7 +14,7 @@ BoolArray = NDArray[np.bool_]
 _ROUNDING = 1e-9  # of the reach, within which another sum may find a distance on its other side
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def link_surely(
     places: FloatArray, starts: IntArray, first: int, reach: float, memory: int, track: IntArray,
     taken: BoolArray, waiting: IntArray, state: IntArray, doubtful: IntArray,
@@ -98,7 +99,7 @@ def link_surely(
     return starts.size - 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _within(places: FloatArray, i: int, j: int, reach: float) -> bool:
     square = 0.0
     for k in range(places.shape[1]):
