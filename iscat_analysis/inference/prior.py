@@ -58,7 +58,7 @@ class Prior:
         for name, (mean, width) in self.normal.items():
             value = thetas[:, PARAMETERS.index(name)]
             if name == "mass_kda":
-                slopes = [abs(scale.slope(float(a))) for a in value]
+                slopes = np.abs(scale.slopes(value))
                 total += np.log(np.maximum(slopes, 1e-300))
                 value = scale.mass(value)
             total -= 0.5 * ((value - mean) / width) ** 2

@@ -263,6 +263,7 @@ def check_counts(
     lowest, highest = counts.min(axis=(1, 2)), counts.max(axis=(1, 2))
     floor = _negative_floor_adu(camera, counts.dtype)
     ceiling = _ceiling_adu(camera)
+    lowest_floor, lowest_ceiling = float(np.max(floor)), float(np.min(ceiling))
     for number in range(len(counts)):
         frame = counts[number]
         where = f"{name}: frame {first_frame + number}"
@@ -278,10 +279,10 @@ def check_counts(
             raise DataError(
                 f"{where} is zero throughout; it was dropped by the camera: leave it out"
             )
-        if low < float(np.max(floor)):
+        if low < lowest_floor:
             _refuse_negative(frame, floor, where)
         full = low == high >= converter_ceiling(frame)
-        if full or (low >= float(np.min(ceiling)) and bool(np.all(frame >= ceiling))):
+        if full or (low >= lowest_ceiling and bool(np.all(frame >= ceiling))):
             raise DataError(
                 f"{where} is saturated throughout; lower the exposure or the laser power, "
                 "or correct camera.well_depth_e"

@@ -87,6 +87,14 @@ class MassScale:
         whole = self.linear + self.quadratic * amplitude
         return np.asarray(self.linear / whole - 1).reshape(sizes.shape)
 
+    def slopes(self, amplitude: FloatArray) -> FloatArray:
+        """`slope` of amplitudes of any shape."""
+        amplitude = np.asarray(amplitude, dtype=float)
+        if self.calibration is None:
+            return np.ones(amplitude.shape)
+        rise = self.linear + 2 * self.quadratic * amplitude
+        return np.asarray(rise / self.calibration.gradient_per_kda)
+
     def off_line(
         self, amplitude: FloatArray, sigma_kda: FloatArray, errors: float
     ) -> NDArray[np.bool_]:

@@ -34,7 +34,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory, follow_pattern, trusted
 from iscat_analysis.pipeline.moving_field import LEAST_FRAMES
 from iscat_analysis.pipeline.ranges import fitted_frames
-from iscat_analysis.records import FloatArray, FrameSource
+from iscat_analysis.records import FloatArray, FrameSource, Mapper
 
 BYTES = 16
 """Of memory for each pixel and frame of a block: counts, picture, slopes of the particles."""
@@ -128,6 +128,7 @@ def plan_blocks(
     *,
     check: Callable[[NDArray[Any], int], None],
     span: tuple[int, int] | None = None,
+    mapper: Mapper = map,
 ) -> Plan:
     """Divide a movie into blocks of frames that have a background each.
 
@@ -143,6 +144,8 @@ def plan_blocks(
         Refuses impossible counts.
     span : (int, int), optional
         Half-open range of frames; default ``fit.frames``, or all.
+    mapper : callable
+        `map`, or the one of a pool.
 
     Returns
     -------
@@ -170,7 +173,7 @@ def plan_blocks(
         )
     if given is not None or frames < 2 * SHORTEST or min(movie.shape[1:]) < _SMALLEST_PX:
         return Plan(_spans(first, last, count))
-    way, stiffness = follow_light(movie, camera, (first, last), config, check=check)
+    way, stiffness = follow_light(movie, camera, (first, last), config, check=check, mapper=mapper)
     if way is None:
         return Plan(_spans(first, last, count))
     shift = way.at(np.arange(first, last, dtype=float))
@@ -221,6 +224,7 @@ def follow_light(
     config: Config,
     *,
     check: Callable[[NDArray[Any], int], None],
+    mapper: Mapper = map,
 ) -> tuple[Trajectory | None, FloatArray]:
     """Follow the fixed pattern through a movie, and say how much light its motion moves.
 
@@ -236,6 +240,8 @@ def follow_light(
         ``compute.memory_limit_mb``.
     check : callable
         Refuses impossible counts.
+    mapper : callable
+        `map`, or the one of a pool.
 
     Returns
     -------
@@ -264,7 +270,7 @@ def follow_light(
         return None, np.zeros((2, 2))
     power = light * lengths.sum() / light.sum()
     middle = np.array([(low + high - 1) / 2 for low, high in spans])
-    way = follow_pattern(sums, power, middle, usable, read)
+    way = follow_pattern(sums, power, middle, usable, read, mapper=mapper)
     inside = trusted(usable)
     if way is None or not inside.any() or not np.isfinite(way.shift_px).all():
         return None, np.zeros((2, 2))
@@ -279,7 +285,7 @@ def _stiffness(
     for mean, n in zip(means_e, frames, strict=True):
         slopes = np.stack(np.gradient(mean))[:, used]
         weight = 1 / np.maximum(mean + read_e2, 1.0)[used]
-        total += np.einsum("ip,jp,p->ij", slopes, slopes, weight) / weight.size
+        total += (slopes * weight) @ slopes.T / weight.size
         total -= np.eye(2) / (2 * n)  # half the difference of two pixels has half their variance
     return total / len(means_e)
 

@@ -186,6 +186,8 @@ def _meetings(rows: Rows, near_nm: float) -> Iterator[_Meeting]:
     """Give the meetings of every pair of tracks."""
     each = [(k, rows.only(rows.track == k)) for k in np.unique(rows.track).tolist()]
     for (one, mine), (two, other) in combinations(each, 2):
+        if mine.frame[0] > other.frame[-1] or other.frame[0] > mine.frame[-1]:
+            continue
         frames, i, j = np.intersect1d(mine.frame, other.frame, return_indices=True)
         apart = np.hypot(*(mine.theta[i, :2] - other.theta[j, :2]).T)
         near = np.flatnonzero(apart < near_nm)

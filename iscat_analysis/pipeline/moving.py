@@ -50,7 +50,7 @@ from iscat_analysis.pipeline.moving_field import exposure_of, load_field, search
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress
 from iscat_analysis.search.moving import Sightings
-from iscat_analysis.species import fit_diffusion
+from iscat_analysis.species.diffusion import estimate_diffusion
 
 ROUNDS = 8
 """Searches of the whole movie; each sees what the fits so far leave over."""
@@ -365,12 +365,11 @@ def diffusion_of(config: Config, free: BoolArray, rows: Rows) -> FloatArray:
             mine &= error < _USELESS * np.nanmedian(error[mine])
         if mine.sum() < _LEAST_POSITIONS:
             continue
-        found = fit_diffusion(
+        out[k] = estimate_diffusion(
             rows.frame[mine], rows.theta[mine][:, axes], sigma[mine][:, axes],
             frame_rate_hz=rate,
             exposure_ms=1e3 * exposure,
         )  # fmt: skip
-        out[k] = found.d_um2_s, found.sigma_d_um2_s
     return out
 
 

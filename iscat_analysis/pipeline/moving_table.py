@@ -62,7 +62,7 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     model, pixel, free = scene.model, scene.pixel_nm, moving.field.free[:4]
     index = np.flatnonzero(free)
     n, amplitude = len(rows.frame), rows.theta[:, 3]
-    slope = np.array([abs(model.scale.slope(float(a))) for a in amplitude])
+    slope = np.abs(model.scale.slopes(amplitude))
     units = np.column_stack([np.ones((n, 3)), slope])
     sigma = np.sqrt(variances_left(judged.observed, index)) * units
     crb = np.sqrt(variances_left(judged.fisher, index)) * units
@@ -170,7 +170,7 @@ def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
     known = np.isfinite(common.amplitude)
     amplitude = np.where(known, common.amplitude, 1.0)
     mass = np.where(known, scale.mass(amplitude), np.nan)
-    slope = np.array([abs(scale.slope(float(a))) for a in amplitude])
+    slope = np.abs(scale.slopes(amplitude))
     tracks = np.arange(len(mass))
     group = np.zeros(len(mass), dtype=np.int64)
     group[moving.rows.track] = moving.rows.group
@@ -246,7 +246,7 @@ def _off_line(scene: Scene, moving: Moving, sigma_kda: FloatArray) -> BoolArray:
     track, common, scale = moving.rows.track, moving.common, scene.model.scale
     own, shared = moving.rows.theta[:, 3], common.amplitude[track]
     known = np.isfinite(shared)
-    slope = np.array([abs(scale.slope(float(a))) for a in np.where(known, shared, own)])
+    slope = np.abs(scale.slopes(np.where(known, shared, own)))
     sigma = np.where(known, np.sqrt(common.variance[track]) * slope, sigma_kda)
     return scale.off_line(np.where(known, shared, own), sigma, OUTWARD)
 

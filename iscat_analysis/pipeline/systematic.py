@@ -249,7 +249,7 @@ def _calibrated(
     """
     scale, names = model.scale, respond.names
     gradient = float(scale.slope(0.0))
-    slope = np.array([scale.slope(float(a)) for a in amplitude])
+    slope = scale.slopes(amplitude)
     shifts = slope[:, None] * moves + drift
     if config.optics.file is not None:
         faint = 1e-6 * np.abs(amplitude).max()

@@ -71,7 +71,8 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         run.tell(kept.message)
     run.clock.lap("model")
     check = checked(movie, camera)
-    plan = plan_blocks(movie, config, camera, check=check, span=kept.span)
+    with threads(config.compute.workers) as pool:
+        plan = plan_blocks(movie, config, camera, check=check, span=kept.span, mapper=pool.map)
     if message := plan.message(movie.name):
         run.tell(message)
     shaken = shaking_warning(movie, camera, (first, last))

@@ -136,10 +136,7 @@ def fit_diffusion(
     )  # fmt: skip
     if not 0 < number_in("level", level) < 1:
         raise ConfigError(f"level = {level!r}: give a coverage between 0 and 1")
-    best = most_likely(track)
-    there = track.likelihood(best)
-    crb = 1 / math.sqrt(there.information)
-    sigma = 1 / math.sqrt(-there.curvature) if best > 0 and there.curvature < 0 else crb
+    best, sigma, crb = _estimated(track)
     other, other_sigma = _covariance_based(track, best)
     spare = other_sigma**2 - crb**2
     return Diffusion(
@@ -148,12 +145,59 @@ def fit_diffusion(
         crb_d_um2_s=crb / _UM2,
         interval_um2_s=tuple(end / _UM2 for end in _interval(track, best, level)),  # type: ignore[arg-type]
         level=float(level),
-        log_likelihood=there.value,
+        log_likelihood=track.likelihood(best).value,
         n_positions=track.counted.size + 1,
         covariance_d_um2_s=other / _UM2,
         covariance_sigma_d_um2_s=other_sigma / _UM2,
         disagreement=(other - best) / math.sqrt(spare) if spare > 0 else math.nan,
     )
+
+
+def estimate_diffusion(
+    frames: ArrayLike,
+    positions_nm: ArrayLike,
+    sigma_nm: ArrayLike,
+    *,
+    frame_rate_hz: float,
+    exposure_ms: float | None = None,
+) -> tuple[float, float]:
+    """D of one track and its standard error, as in `fit_diffusion`, and nothing else.
+
+    Parameters
+    ----------
+    frames, positions_nm, sigma_nm : array_like
+        As there.
+    frame_rate_hz : float
+        Frames per second.
+    exposure_ms : float, optional
+        As there [ms].
+
+    Returns
+    -------
+    d_um2_s, sigma_d_um2_s : float
+        Of highest likelihood [µm²/s].
+
+    Raises
+    ------
+    ConfigError
+        The frame rate or exposure is impossible.
+    DataError
+        The arrays are not those of a track.
+    """
+    track = gather(
+        frames, positions_nm, sigma_nm, frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms
+    )
+    best, sigma, _ = _estimated(track)
+    return best / _UM2, sigma / _UM2
+
+
+def _estimated(track: Displacements) -> tuple[float, float, float]:
+    """D of highest likelihood, its standard error, and the bound there [nm²/s]."""
+    best = most_likely(track)
+    there = track.likelihood(best)
+    crb = 1 / math.sqrt(there.information)
+    sigma = 1 / math.sqrt(-there.curvature) if best > 0 and there.curvature < 0 else crb
+    return best, sigma, crb
 
 
 def hydrodynamic_diameter(
