@@ -16,6 +16,10 @@ MOST_TURNS = 12
 _SETTLED = 0.1  # step of the background, in its own standard deviations, that is the last one
 _FORESEEN = 0.02  # the same, of the next step if it shrinks as the last one did
 _ROUGHLY = 2.0  # step that is the last one while particles are still being looked for
+# Frames in fewer of which particles hardly leave their places: what lies between the background and
+# a particle is then a step of many pixels together, which is small in each.
+_SHORT = 60
+_MORE = 5  # times the turns, of so few frames
 _NEAR, _FAR = 0.5, 5.0  # a step below the one after one above the other calls for new rings
 _MEDIAN_FRAMES = 400  # that suffice: particles are found over it, and fitted over a better one
 _DAMPING = 0.01  # of Newton's step, at first
@@ -91,6 +95,9 @@ def settle(
         Which fits did.
     """
     sigma = 1 / np.sqrt(np.maximum(field.total_e, 1.0))
+    settled, foreseen, roughly = _SETTLED, _FORESEEN, _ROUGHLY
+    if field.frames < _SHORT:
+        turns, settled, foreseen, roughly = turns * _MORE, settled / 10, 0.0, roughly / 10
     largest, length, change, damping = 0.0, np.inf, 0.0, _DAMPING
     done, step = np.ones(len(rows.frame), dtype=bool), np.zeros(field.used.shape)
     for turn in range(turns):
@@ -113,7 +120,7 @@ def settle(
         if change < _NEAR and largest > _FAR and not coarse:
             field.draw_anew()
             largest = change
-        elif change < (_ROUGHLY if coarse else _SETTLED) or change**2 < _FORESEEN * before:
+        elif change < (roughly if coarse else settled) or change**2 < foreseen * before:
             break
     if follow_level:
         rows = field.followed(rows, step)

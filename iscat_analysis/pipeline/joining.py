@@ -35,7 +35,7 @@ from iscat_analysis.search.moving import link
 
 IntArray = NDArray[np.int64]
 
-_MASS = ["mass_kda", "sigma_mass_kda", "crb_mass_kda"]
+_MASS = ["mass_kda", "sigma_mass_kda", "crb_mass_kda", "told"]
 
 
 @dataclass(frozen=True)
@@ -177,9 +177,9 @@ def combine_masses(
     Returns
     -------
     pandas.DataFrame
-        ``mass_kda``, ``sigma_mass_kda`` and ``crb_mass_kda`` by track.  A part too short to tell
-        its blur, or whose mass is not that of most rows of its track, counts only where no other
-        does.
+        ``mass_kda``, ``sigma_mass_kda``, ``crb_mass_kda`` and ``told`` by track.  A part too short
+        to tell its blur, or whose mass is not that of most rows of its track, counts only where no
+        other does.
     """
     if len(masses) == 1:
         return masses[0][_MASS]
@@ -192,7 +192,8 @@ def combine_masses(
     weight = 1 / used["sigma_mass_kda"] ** 2
     total = weight.groupby(used["track"]).sum()
     out = pd.DataFrame(index=pd.Index(np.unique(parts["track"]), name="track"))
-    out["mass_kda"] = (weight * used["mass_kda"]).groupby(used["track"]).sum() / total
+    for name in ("mass_kda", "told"):
+        out[name] = (weight * used[name]).groupby(used["track"]).sum() / total
     out["sigma_mass_kda"] = out["crb_mass_kda"] = 1 / np.sqrt(total)
     return out
 

@@ -311,7 +311,8 @@ def _joined(scene: Scene, rows: Rows, found: Sightings) -> Rows:
 
 def _credible(scene: Scene, field: MovingField, rows: Rows, done: BoolArray) -> Rows:
     """Keep the rows that a particle explains, each particle once."""
-    known = np.isfinite(rows.theta).all(axis=1)  # of light that is no picture a fit may be lost
+    # of light that is no picture a fit may be lost
+    known = np.asarray(np.isfinite(rows.theta).all(axis=1), dtype=np.bool_)
     rows, done = rows.only(known), done[known]
     kept = done & (rows.theta[:, 3] > 0) & (rows.snr > AS_FOUND * scene.templates.threshold)
     near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na)

@@ -164,7 +164,8 @@ def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
     pandas.DataFrame
         By track: ``mass_kda``, ``sigma_mass_kda`` and ``crb_mass_kda``.  The errors hold what the
         background takes, the paths of single frames and the error of D, which sets the blur.
-        ``blur`` is 1 where D, and with it the blur, was told from 0, else 0.
+        ``blur`` is 1 where D, and with it the blur, was told from 0, else 0; ``told`` is the share
+        of the information on the mass that the background leaves.
     """
     common, scale = moving.common, scene.model.scale
     known = np.isfinite(common.amplitude)
@@ -187,6 +188,7 @@ def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
     sigma = np.sqrt(common.variance * slope**2 + mass**2 * (path + blur))
     table = pd.DataFrame({"mass_kda": mass, "sigma_mass_kda": sigma, "crb_mass_kda": sigma})
     table["blur"] = (d > 0).astype(float)
+    table["told"] = np.where(known, common.known / common.variance, np.nan)
     return table.set_index(pd.Index(tracks, name="track"))
 
 

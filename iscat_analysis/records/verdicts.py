@@ -80,6 +80,7 @@ class TrackStatus(StrEnum):
     FEW_FRAMES = "few_frames"
     POOR_FITS = "poor_fits"
     MASS_VARIES = "mass_varies"
+    SHORT_WAY = "short_way"
     NOT_FREE = "not_free"
     STANDS_STILL = "stands_still"
     NEAR_WALL = "near_wall"
@@ -98,6 +99,9 @@ _TRACK_ADVICE = {
     "selection: see the status of its rows in fits.csv.",
     TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors: motion blurs "
     "the picture, particles met, or the particle changed.",
+    TrackStatus.SHORT_WAY: "It went so short a way that it can hardly be told from the background "
+    "learnt with it: mass and D are wrong together, D as the mass to the power of -2; record for "
+    "longer, or give background frames without it.",
     TrackStatus.NOT_FREE: "It does not diffuse freely: p_confinement, p_anomalous and p_steady "
     "say which way, and D is that of free diffusion.",
     TrackStatus.STANDS_STILL: "Its D is not above zero within its error: take d_high_um2_s as an "

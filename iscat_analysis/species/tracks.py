@@ -13,6 +13,7 @@ that takes a neighbouring fringe makes a step that no particle made.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
@@ -22,6 +23,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from iscat_analysis.records import (
     TRACK_COLUMNS,
@@ -58,6 +60,8 @@ NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
 _FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
 _DOUBT = 0.1
 _ENOUGH = 3  # of the first that are as surprising leave none
+_LITTLE_TOLD = 0.05  # of the information on a mass is left by the background
+_VAGUE = 0.03  # of a mass, which the background makes too uncertain for the error to be trusted
 _FREE = ("p_confinement", "p_anomalous", "p_steady")
 _STEPS = 3.0  # standard deviations of a displacement within which it may end beyond the border
 _LOOKS = 3  # at D, on which it depends which displacements tell it
@@ -273,8 +277,11 @@ def _record(
             "mass_scatter": mass.scatter,
             "p_mass": mass.p_value,
         }
+    told = exact.get("told", 1.0)
     if all(np.isfinite(value) for value in exact.values()):
-        record |= exact
+        record |= {name: value for name, value in exact.items() if name != "told"}
+    scale = _scale_error(record, told)
+    record["short_way"] = told < _LITTLE_TOLD and scale > 2 * _VAGUE
     record["contrast"] = record["mass_kda"] * _median(rows.contrast / rows.mass_kda)
     found = _diffusion(placed, setup)
     if setup.frame_rate_hz is not None:
@@ -282,15 +289,35 @@ def _record(
     if found is not None:
         record |= {
             "d_um2_s": found.d_um2_s,
-            "sigma_d_um2_s": found.sigma_d_um2_s,
+            "sigma_d_um2_s": math.hypot(found.sigma_d_um2_s, scale * found.d_um2_s),
             "crb_d_um2_s": found.crb_d_um2_s,
-            "d_low_um2_s": found.interval_um2_s[0],
-            "d_high_um2_s": found.interval_um2_s[1],
+            "d_low_um2_s": _wider(found, 0, scale),
+            "d_high_um2_s": _wider(found, 1, scale),
             "d_disagreement": found.disagreement,
         }
         if setup.volume and found.interval_um2_s[0] > 0:
             record |= _size(record, setup)
     return record | _ends(rows, setup, record["d_um2_s"])
+
+
+def _scale_error(record: Mapping[str, Any], told: float) -> float:
+    """Relative error of D by a background that was learnt with the track.
+
+    What the frames of a particle that hardly moves have beyond their mean, which the background
+    takes, is its mass times its displacements: where the mass is too large by a share, all these
+    are too small by it, and D, as their square, by twice as much.
+    """
+    relative = record["sigma_mass_kda"] / (abs(record["mass_kda"]) or math.nan)
+    return 2 * relative * math.sqrt(1 - told) if np.isfinite(relative) else 0.0
+
+
+def _wider(found: Diffusion, end: int, scale: float) -> float:
+    """Give an end of the interval of D, with the error of its scale."""
+    value, best = found.interval_um2_s[end], found.d_um2_s
+    if value <= 0 or best <= 0:
+        return value
+    reach = math.hypot(math.log(value / best), scale * float(ndtri((1 + COVERAGE) / 2)))
+    return best * math.exp(reach if end else -reach)
 
 
 def _mass(good: _Rows, power: float, correlation: Correlation | None) -> CommonMass:
@@ -411,6 +438,7 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
         TrackStatus.FEW_FRAMES: record["n_d_frames"] < max(LEAST_POSITIONS, setup.min_frames),
         TrackStatus.POOR_FITS: record["n_mass_frames"] < record["n_frames"] / 2,
         TrackStatus.MASS_VARIES: record["p_mass"] < SURPRISING / 10,
+        TrackStatus.SHORT_WAY: record["short_way"],
         TrackStatus.NOT_FREE: min(record[name] for name in _FREE) <= SURPRISING,
         TrackStatus.STANDS_STILL: record["d_low_um2_s"] == 0,
         TrackStatus.NEAR_WALL: 9 / 32 * record["diameter_nm"] > SLOWED * record["z_nm"],

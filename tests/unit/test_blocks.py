@@ -253,7 +253,9 @@ def test_an_empty_block_is_passed_over() -> None:
 
 def _parts(*parts: tuple[list[float], list[float], list[float]]) -> list[pd.DataFrame]:
     return [
-        pd.DataFrame({"mass_kda": m, "sigma_mass_kda": s, "crb_mass_kda": s, "blur": b})
+        pd.DataFrame(
+            {"mass_kda": m, "sigma_mass_kda": s, "crb_mass_kda": s, "blur": b, "told": 0.5}
+        )
         for m, s, b in parts
     ]
 
