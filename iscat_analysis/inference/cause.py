@@ -25,6 +25,7 @@ from iscat_analysis.records import BoolArray, FloatArray
 WORTH_NAMING = 0.3
 """Share of χ² in excess that a parameter must explain to be named."""
 
+PIXEL = "camera.pixel_size_nm"
 _STEPS: Mapping[str, Mapping[str, float]] = {
     "focus": {"focus_nm": 20.0},
     "numerical aperture": {"na": 0.005},
@@ -35,9 +36,14 @@ _STEPS: Mapping[str, Mapping[str, float]] = {
     "coma": {"z7": 5.0, "z8": 5.0},
 }  # small enough for a first order, and for what a table of the field resolves
 _FAR: Mapping[str, Sequence[float]] = {
-    "numerical aperture": (-0.15, -0.12, -0.09, -0.06, -0.03, 0.03, 0.06, 0.09, 0.12, 0.15)
+    "numerical aperture": (-0.15, -0.12, -0.09, -0.06, -0.03, 0.03, 0.06, 0.09, 0.12, 0.15),
+    PIXEL: (-20.0, -15.0, -10.0, -5.0, 5.0, 10.0, 15.0, 20.0),
 }
-"""Steps that are tried whole: beside the critical angle a first order says little."""
+"""Steps that are tried whole.
+
+Beside the critical angle, and where rings have moved by half of their distance, a first order says
+little.
+"""
 
 _OTHERS: Mapping[str, Mapping[str, Any]] = {
     "polarisation, as if circular light passed an analyser": {
@@ -50,7 +56,6 @@ _OTHERS: Mapping[str, Mapping[str, Any]] = {
     'emission, as if it were "dong2021"': {"emission": "dong2021"},
     'emission, as if it were "reciprocal"': {"emission": "reciprocal"},
 }  # fmt: skip
-PIXEL = "camera.pixel_size_nm"
 _TURNED = "polarisation, as if turned by 90° (or the movie transposed)"
 _UNITS = {
     "focus": "nm", "reference phase": "degrees", "spherical aberration": "nm rms",
@@ -144,11 +149,11 @@ def likely_cause(
             except ConfigError:  # no microscope is there
                 pass
         for far in _FAR.get(name, ()):
-            if not 0 < config.optics.na + far < least_index:
+            if name != PIXEL and not 0 < config.optics.na + far < least_index:
                 continue
             larger, asked = _explained(left, _neighbours(config, name, reach, far), excess)
             if larger > share and _WHOLE_STEP < asked[0] / far < 1 / _WHOLE_STEP:
-                share, step = larger, asked
+                share, step = larger, np.array([far])
         if share > WORTH_NAMING and (best is None or share > best.share):
             size = float(step[0]) if name in _UNITS else None
             best = Cause(name, min(share, 1.0), size, _UNITS.get(name, ""), len(fits))

@@ -59,7 +59,7 @@ def test_the_wrong_number_is_named_with_its_error(name: str, key: str, off: floa
     assert f"off by about {math.copysign(1, off):+g}"[:-1] in cause.message
 
 
-@pytest.mark.parametrize("stretch", [0.95, 1.03, 1.1])
+@pytest.mark.parametrize("stretch", [0.8, 0.95, 1.03, 1.1, 1.2])
 def test_a_wrong_pixel_size_is_named(stretch: float) -> None:
     cause = _cause({}, stretch=stretch)
     assert cause is not None
