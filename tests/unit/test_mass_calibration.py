@@ -6,6 +6,7 @@ import math
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,6 +18,7 @@ from iscat_analysis.calibration.mass import (
     calibrate_mass,
     find_contrast_peaks,
     mass_from_contrast,
+    peaks,
     york_line,
 )
 from iscat_analysis.config import configure, parse_config
@@ -134,6 +136,39 @@ def test_the_line_is_recovered_in_standard_errors(known_errors: bool) -> None:
     assert np.all(table.std(axis=0, ddof=1) < 1.6), table.std(axis=0)
     # With the errors known, hardly any width is left beyond them.
     assert np.median(widths) < 0.3 if known_errors else 0.85 < np.median(widths) < 1.1
+
+
+@pytest.mark.parametrize("known_errors", [False, True])
+def test_a_peak_is_fitted_to_its_maximum(
+    known_errors: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From where fits end, a search with differences in place of the gradient gains nothing."""
+    fitted = []
+    fit = peaks._fit_peak
+
+    def recorded(*window: Any) -> peaks.ContrastPeak:
+        fitted.append((window, fit(*window)))
+        return fitted[-1][1]
+
+    monkeypatch.setattr(peaks, "_fit_peak", recorded)
+    for seed in range(3):
+        size = np.abs(events(np.random.default_rng(seed)))
+        find_contrast_peaks(size, np.full(size.shape, NOISE if known_errors else 0.0))
+    assert len(fitted) > 15
+    for (x, sigma, window, centre, width), peak in fitted:
+        share = peak.count / x.size
+        theta = np.array([
+            (peak.contrast - centre) / width,
+            math.log(peak.width / width),
+            math.log(share / (1 - share)),
+        ])  # fmt: skip
+
+        def loss(at: NDArray[np.float64], given: Any = (x, sigma, window, centre, width)) -> float:
+            return peaks._loss(*given, at)[0]
+
+        bounds = [(-1.5, 1.5), (-2.5, 1.0), (-3.0, 6.0)]
+        best = minimize(loss, theta, method="L-BFGS-B", bounds=bounds, options={"maxiter": 30})
+        assert loss(theta) - best.fun < 1e-3
 
 
 def test_peaks_are_unbiased_on_a_background() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -137,22 +138,11 @@ def _fit_peak(
     x: FloatArray, sigma: FloatArray, window: tuple[float, float], centre: float, width: float
 ) -> ContrastPeak:
     """Fit a normal distribution, truncated to the window, on a flat background."""
-    low, high = window
-
-    def loss(theta: FloatArray) -> float:
-        mean = centre + width * theta[0]
-        total = np.sqrt((width * math.exp(theta[1])) ** 2 + sigma**2)
-        share = 1 / (1 + math.exp(-theta[2]))
-        inside = ndtr((high - mean) / total) - ndtr((low - mean) / total)
-        peak = np.exp(-0.5 * ((x - mean) / total) ** 2) / (_ROOT_2PI * total)
-        peak /= np.maximum(inside, 1e-12)
-        density = share * peak + (1 - share) / (high - low)
-        return -float(np.sum(np.log(np.maximum(density * (high - low), 1e-300))))
-
+    loss = partial(_loss, x, sigma, window, centre, width)
     bounds = [(-1.5, 1.5), (-2.5, 1.0), (-3.0, 6.0)]
-    best = scipy.optimize.minimize(loss, [0.0, 0.0, 2.0], method="TNC", bounds=bounds)
+    best = scipy.optimize.minimize(loss, [0.0, 0.0, 2.0], jac=True, method="TNC", bounds=bounds)
     theta = np.asarray(best.x)
-    curvature = _hessian(loss, theta, bounds)
+    curvature = _hessian(lambda at: loss(at)[0], theta, bounds)
     free = np.array([lo + 1e-3 < t < hi - 1e-3 for t, (lo, hi) in zip(theta, bounds, strict=True)])
     free[0] = True
     spread = width * math.exp(theta[1])
@@ -164,6 +154,40 @@ def _fit_peak(
         inverse = np.array([[-1.0]])
     se = width * math.sqrt(inverse[0, 0]) if inverse[0, 0] > 0 else fallback
     return ContrastPeak(float(centre + width * theta[0]), max(se, fallback), spread, share * x.size)
+
+
+def _loss(
+    x: FloatArray,
+    sigma: FloatArray,
+    window: tuple[float, float],
+    centre: float,
+    width: float,
+    theta: FloatArray,
+) -> tuple[float, FloatArray]:
+    """Negative log-likelihood, and its gradient.
+
+    θ is the mean, from the centre in widths; ln of the peak's own spread in widths; the log odds of
+    the peak against the background.
+    """
+    low, high = window
+    mean, own = centre + width * theta[0], width * math.exp(theta[1])
+    share = 1 / (1 + math.exp(-theta[2]))
+    flat = 1 / (high - low)
+    total = np.sqrt(own**2 + sigma**2)
+    at, a, b = (x - mean) / total, (low - mean) / total, (high - mean) / total
+    at_a, at_b = (np.exp(-0.5 * k**2) / _ROOT_2PI for k in (a, b))
+    inside = np.maximum(ndtr(b) - ndtr(a), 1e-12)
+    peak = np.exp(-0.5 * at**2) / (_ROOT_2PI * total * inside)
+    density = np.maximum(share * peak + (1 - share) * flat, 1e-300 * flat)
+    weight = share * peak / density  # of the peak in each event
+    by_mean = (at - (at_a - at_b) / inside) / total
+    by_total = (at**2 - 1 - (a * at_a - b * at_b) / inside) / total
+    gradient = [
+        -width * float(weight @ by_mean),
+        -(own**2) * float(weight @ (by_total / total)),
+        -share * (1 - share) * float(np.sum((peak - flat) / density)),
+    ]
+    return -float(np.sum(np.log(density / flat))), np.array(gradient)
 
 
 def _hessian(
