@@ -7,7 +7,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -20,10 +20,6 @@ from kernel_cache import share_kernels  # noqa: E402
 
 share_kernels(ROOT)
 os.environ.setdefault("MPLBACKEND", "Agg")
-
-# A million objects of modules, which live to the end, would be looked through for cycles again and
-# again: a third of the time that it takes to collect the tests, and a tenth of that of the tests.
-gc.disable()
 
 # A shell starts what runs in its background with Ctrl-C ignored, and so would be every command that
 # the tests interrupt.
@@ -56,10 +52,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
-def pytest_collection_finish() -> None:
-    """Look for cycles from here on, among what the tests make."""
-    gc.freeze()
-    gc.enable()
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Leave out what is imported, a million objects that stay to the end, where cycles are sought.
+
+    That takes a third of the time of collecting the tests, and some percent of running them.
+    """
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.hookimpl(trylast=True)
