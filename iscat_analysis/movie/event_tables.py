@@ -23,6 +23,7 @@ import pandas as pd
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
+from iscat_analysis.movie.text_tables import decimal_mark, separator
 from iscat_analysis.records import FloatArray
 
 if TYPE_CHECKING:
@@ -306,12 +307,16 @@ def _calibration(reader: Hdf5Reader, group: str, path: Path) -> StoredCalibratio
 
 
 def _from_csv(path: Path, size: int) -> dict[str, FloatArray]:
+    """Read columns that commas part, or semicolons or tabs, between which a comma is a point."""
     if size > _LARGEST_CSV:
         raise DataError(f"{path}: is {size} bytes long, which no event table is; check the path")
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.reader(line for line in file if not line.startswith("#"))
-            header = [name.strip() for name in next(rows, [])]
+            lines = (line for line in file if not line.startswith("#"))
+            first = next(lines, "")
+            between = separator(first)
+            rows = csv.reader(lines, delimiter=between)
+            header = [name.strip() for name in next(csv.reader([first], delimiter=between), [])]
             places = _places(header, path)
             columns = {column: array("d") for column in places}
             for number, row in enumerate(rows):
@@ -324,7 +329,9 @@ def _from_csv(path: Path, size: int) -> dict[str, FloatArray]:
                         "export it again"
                     )
                 for column, place in places.items():
-                    columns[column].append(float(row[place]) if row[place].strip() else math.nan)
+                    value = row[place].strip()
+                    value = value.replace(decimal_mark(between), ".")
+                    columns[column].append(float(value) if value else math.nan)
     except UnicodeDecodeError:
         raise DataError(f"{path}: is neither an HDF5 file nor a text file in UTF-8") from None
     except (ValueError, MemoryError, csv.Error) as error:

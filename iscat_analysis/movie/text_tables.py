@@ -41,3 +41,20 @@ def separator(text: str) -> str:
     """
     heading = next(iter(without_remarks(text)), "")
     return max(_SEPARATORS, key=heading.count)
+
+
+def decimal_mark(between: str) -> str:
+    """Give what stands before the decimals of a table's numbers.
+
+    Parameters
+    ----------
+    between : str
+        From `separator`.
+
+    Returns
+    -------
+    str
+        A comma, as spreadsheets of many languages write it, where commas do not part the cells of a
+        table that they wrote; else a point.
+    """
+    return "." if between == "," else ","

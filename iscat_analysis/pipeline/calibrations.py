@@ -18,6 +18,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.movie.event_tables import read_events
+from iscat_analysis.movie.text_tables import decimal_mark, separator
 from iscat_analysis.optics.measured import sha256_of
 from iscat_analysis.pipeline.learning import calibrate_movie
 from iscat_analysis.pipeline.picture import MeasuredPicture, measure_template
@@ -348,7 +349,9 @@ def read_contrasts(path: Path) -> pd.DataFrame:
             first = file.readline(4096)
     except OSError:
         return read_events(path)  # says what is wrong with it
-    names = first.decode("utf-8", errors="replace").lstrip("\ufeff").strip().split(",")
+    heading = first.decode("utf-8", errors="replace").lstrip("\ufeff").strip()
+    between = separator(heading)
+    names = heading.split(between)
     if not {"event", "contrast", "mass_kda", "status"} <= set(names):
         table = read_events(path)
         if table["contrast"].isna().all():
@@ -358,7 +361,7 @@ def read_contrasts(path: Path) -> pd.DataFrame:
             )
         return table
     try:
-        table = pd.read_csv(path)
+        table = pd.read_csv(path, sep=between, decimal=decimal_mark(between))
         good = table[table["status"] == Status.OK.value]
         columns = good[["contrast", "mass_kda", "sigma_mass_kda"]].astype(float)
     except (ValueError, KeyError, UnicodeDecodeError) as error:

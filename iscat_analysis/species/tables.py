@@ -30,6 +30,7 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
+from iscat_analysis.movie.text_tables import decimal_mark, separator
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.species.events import Efficiency, Events
 from iscat_analysis.units import count
@@ -275,9 +276,14 @@ def _read(path: Path) -> tuple[pd.DataFrame, Path]:
         if head.startswith(b"PAR1"):
             return pd.read_parquet(path), path
         first = head.splitlines()[0].decode("utf-8", errors="replace") if head else ""
-        names = [name.strip() for name in first.lstrip("\ufeff").split(",")]
+        between = separator(first)
+        names = [name.strip() for name in first.lstrip("\ufeff").split(between)]
         if "mass_kda" in names:
-            return pd.read_csv(path, keep_default_na=False, na_values=["", "nan", "NaN"]), path
+            table = pd.read_csv(
+                path, sep=between, decimal=decimal_mark(between),
+                keep_default_na=False, na_values=["", "nan", "NaN"],
+            )  # fmt: skip
+            return table, path
     except (ValueError, OSError, MemoryError) as error:
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise DataError(f"{path}: cannot be read as a table ({said}); export it again") from None

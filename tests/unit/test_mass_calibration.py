@@ -24,8 +24,10 @@ from iscat_analysis.calibration.mass import (
 from iscat_analysis.config import configure, parse_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.event_tables import read_events, stored_calibration
+from iscat_analysis.pipeline.calibrations import read_contrasts
 from iscat_analysis.pipeline.systematic import systematic
 from iscat_analysis.species import describe
+from iscat_analysis.species.tables import event_table
 
 STANDARDS = (66.0, 146.0, 480.0)
 GRADIENT, OFFSET = -3.1e-5, 2e-4
@@ -333,6 +335,40 @@ def test_a_match_is_refused_by_its_chi_square() -> None:
     with pytest.raises(DataError, match=r"χ² = .* for 1 degree of freedom"):
         calibrate_mass(contrast, (66, 146, 420), standards_se_kda=(0.66, 1.46, 4.2))
     assert calibrate_mass(contrast, (66, 146, 420), standards_se_kda=(3.3, 7.3, 21.0)).dof == 1
+
+
+@pytest.mark.parametrize(
+    ("contrasts", "masses", "said"),
+    [
+        (1.0, 1e3, r"66000,146000,480000 seem to be in Da; give them in kDa"),
+        (1.0, 1e-3, r"0\.066,0\.146,0\.48 seem to be in MDa; give them in kDa"),
+        (100.0, 1.0, r"contrasts, of up to 1\.\d+, seem to be in per cent; divide them by 100"),
+    ],
+    ids=["Da", "MDa", "per cent"],
+)
+def test_numbers_in_other_units_are_named(contrasts: float, masses: float, said: str) -> None:
+    found = events(np.random.default_rng(11))
+    calibrate_mass(found, STANDARDS)
+    calibrate_mass(10 * found, STANDARDS)  # as behind a mask that dims the reference
+    with pytest.raises(DataError, match=said):
+        calibrate_mass(contrasts * found, [masses * mass for mass in STANDARDS])
+
+
+@pytest.mark.parametrize("mark", [";", "\t"])
+def test_tables_of_other_spreadsheets_are_read(mark: str, tmp_path: Path) -> None:
+    contrast = events(np.random.default_rng(11))
+    mass = contrast / GRADIENT
+    theirs = pd.DataFrame({"masses_kDa": mass, "contrasts": contrast})
+    ours = pd.DataFrame({"event": 0, "mass_kda": mass, "contrast": contrast, "status": "ok"})
+    ours["sigma_mass_kda"] = 8.5
+    for table in (theirs, ours):
+        table.to_csv(tmp_path / "plain.csv", index=False)
+        table.to_csv(tmp_path / "other.csv", index=False, sep=mark, decimal=",")
+        plain, other = (read_contrasts(tmp_path / f"{name}.csv") for name in ("plain", "other"))
+        pd.testing.assert_frame_equal(plain, other)
+    plain, other = (event_table(tmp_path / f"{name}.csv") for name in ("plain", "other"))
+    assert np.array_equal(plain.mass_kda, other.mass_kda)
+    assert len(other.mass_kda)
 
 
 def test_the_error_of_the_line_is_keys_that_are_read_back() -> None:

@@ -24,6 +24,10 @@ LEAST_EVENTS = 30
 """Fewer events make no histogram."""
 
 _LANDING_SHARE = 0.4
+_PER_KDA = (3e-7, 1.5e-3)
+# Contrast per kDa of any microscope: 3e-5 at visible light, and up to 30 times as much where a mask
+# dims the reference; less of dense metals, and of a reference that is not dimmed, far into the red.
+_LIGHT_KDA = 10.0  # lighter than any standard that is seen
 _DETAILS = (1.0, 2.0, 4.0, 0.5)
 
 
@@ -63,7 +67,8 @@ def calibrate_mass(
     ConfigError
         The standards are not two or more different positive masses.
     DataError
-        There are too few events, most have the sign of leaving, or no peaks match the standards.
+        There are too few events, most have the sign of leaving, no peaks match the standards, or
+        their line is one of other units.
     """
     masses, masses_se = _standards(standards_kda, standards_se_kda)
     signed = np.asarray(contrasts, dtype=np.float64)
@@ -106,6 +111,7 @@ def calibrate_mass(
             refusals.append((len(peaks), refusal))
     else:  # the clearest view is the one that shows most peaks
         raise max(refusals, key=lambda each: each[0])[1]
+    _refuse_unlikely(line.slope, float(size.max()), masses, name)
     widen = max(1.0, line.chi2 / line.dof) if line.dof else 1.0
     notes = []
     if widen > 1:
@@ -149,6 +155,29 @@ def _standards(
         )
     order = np.argsort(values)
     return values[order], se[order]
+
+
+def _refuse_unlikely(slope: float, largest: float, masses: FloatArray, name: str) -> None:
+    """Refuse a line that no microscope has: numbers of another unit."""
+    low, high = _PER_KDA
+    if low <= abs(slope) <= high:
+        return
+    shown = ",".join(f"{m:g}" for m in masses)
+    said = (
+        f"{name}: the line through the standards has a contrast of {abs(slope):.2g} per kDa, where "
+        f"microscopes have {low:g} to {high:g}: "
+    )
+    if abs(slope) < low:
+        raise DataError(
+            f"{said}`standards_kda` = {shown} seem to be in Da; give them in kDa, as 66,146,480"
+        )
+    if masses.max() < _LIGHT_KDA:
+        raise DataError(
+            f"{said}`standards_kda` = {shown} seem to be in MDa; give them in kDa, as 66,146,480"
+        )
+    raise DataError(
+        f"{said}contrasts, of up to {largest:.3g}, seem to be in per cent; divide them by 100"
+    )
 
 
 def _table(
