@@ -46,6 +46,7 @@ COARSE = 2
 """Of the fitted square's side, by which it is cut while particles are still being looked for."""
 
 _BLOCK = 32  # frames that one thread takes at a time
+_SWEPT = 4  # the same, where every row is fitted several times
 _TOLERANCE = 2e-4  # as in `Likelihood.maximize`
 _PASSING = 0.02  # the same, of a fit that the next turn goes on with
 _PASSES = 40
@@ -443,11 +444,17 @@ class MovingField:
         canvas = blank(np.empty_like(light.counts), rows)
         outcome = np.zeros(n, dtype=np.int64)
         fisher, gain = np.empty((n, 4, 4)), np.empty(n)
-        fit_frames(
-            light, self._coarse, near, far, self._search, starts, 0, times.size, sweeps, theta,
-            rows.group, canvas, self._slopes_of(n, 0), outcome, fisher, gain,
-            np.zeros(times.size), np.zeros(self.used.shape),
-        )  # fmt: skip
+        slopes, expected = self._slopes_of(n, 0), np.zeros(times.size)
+
+        def block(part: int) -> None:
+            first = part * _SWEPT
+            fit_frames(
+                light, self._coarse, near, far, self._search, starts, first,
+                min(first + _SWEPT, times.size), sweeps, theta, rows.group, canvas, slopes,
+                outcome, fisher, gain, expected, np.zeros(self.used.shape),
+            )  # fmt: skip
+
+        self.share(block, -(-times.size // _SWEPT))
         return rows.fitted(theta, fisher, gain), outcome == CONVERGED
 
     def add_modes(
