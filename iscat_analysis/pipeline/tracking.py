@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -17,6 +18,7 @@ import numpy as np
 from iscat_analysis.config import Config
 from iscat_analysis.movie.background import Check, add_frames, start_power
 from iscat_analysis.movie.camera import Camera
+from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pieces.regions import lines_from, numbered
 from iscat_analysis.pipeline.blank import FrameNoise
 from iscat_analysis.pipeline.block_store import Block, BlockStore, analyse_block
@@ -106,6 +108,8 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         run.tell(text)
     for text in pixel_warnings(*windows.left_out):
         run.tell(text)
+    if not len(joined.fits) and not interrupted:
+        run.tell(f"{movie.name}: {_nothing_found(scene, blocks[0])}")
     run.clock.lap("track")
     found = Found(
         scene=replace(scene, mode="track", config=config),
@@ -120,6 +124,20 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         interrupted=interrupted,
     )
     return kept.put_back(found)
+
+
+def _nothing_found(scene: Scene, block: Block) -> str:
+    """Say why a movie may show no particle: how far one stands out of a frame's noise."""
+    model, grid = scene.model, PixelGrid.centred(scene.roi_px | 1, scene.pixel_nm)
+    light, mass = float(block.level[block.used].mean()), model.material.mass_kda
+    signal = model.image(grid, 0.0, 0.0, model.height_nm, mass)
+    height = math.sqrt(light * float(np.sum(signal**2)))
+    return (
+        f"no particle was found: over {light:.3g} e per pixel and frame one of particle.mass_kda = "
+        f"{mass:.4g} stands out of the noise of a frame by {height:.2g} standard deviations, and "
+        f"{scene.templates.threshold:.2g} are needed; if there are particles, record with more "
+        "light, or longer exposures"
+    )
 
 
 def track_movie(

@@ -1,7 +1,8 @@
-"""Counts that began at zero again beyond the largest of their type are named, in every mode."""
+"""Counts beyond the largest of their type, and too few of them, are named."""
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -52,3 +53,16 @@ def test_what_else_is_bright_and_dark_is_not_taken_for_it(counts: NDArray[np.uin
         refuse_overflow(right, "movie")
     with pytest.raises(DataError, match="8 bits"):
         refuse_overflow((counts // 64).astype(np.uint8), "movie")
+
+
+def test_a_movie_too_dark_to_show_its_particles_says_so() -> None:
+    dim = wander((40, 48, 48), seed=5, species=((400.0, 0.05, 1),), level_e=100.0, gain_e_per_adu=1)
+    found = ia.fit_movie(dim.counts, settings={**SETTINGS, "camera.gain_e_per_adu": 1.0})
+    assert not len(found.table)
+    (said,) = (text for text in found.warnings if "no particle was found" in text)
+    numbers = r"over (\d+) e per .* by ([\d.]+) standard deviations, and ([\d.]+) are"
+    light, height, needed = map(float, re.findall(numbers, said)[0])
+    assert light == pytest.approx(100, rel=0.05)
+    assert height < needed
+    # a peak of 0.0124 over a dozen pixels, and rings: 0.0124·√(100·12)
+    assert height == pytest.approx(0.0124 * (100 * 12) ** 0.5, rel=0.5)
