@@ -147,3 +147,9 @@ def test_where_nothing_tells_them_apart_both_are_named() -> None:
 
 def test_few_frames_say_nothing() -> None:
     assert find_zero(_movie(1)[:8], Camera(gain_e_per_adu=GAIN)) is None
+
+
+def test_frames_without_noise_say_nothing() -> None:
+    one = _movie(1)[0].astype(np.int64)
+    copied = np.stack([one + t % 2 for t in range(40)]).astype(np.uint16)
+    assert find_zero(copied, Camera(gain_e_per_adu=GAIN)) is None

@@ -33,6 +33,7 @@ _SIGMAS = 4.0  # and the excess over the tolerance that chance must not explain
 _LEAST_FRAMES, _MOST_FRAMES = 16, 256
 _MOST_COUNTS = 2**22  # of a movie's counts that are looked at: a tenth of a second
 _LEAST_PIXELS = 256
+_LEAST_NOISE = 1e-6  # of the shot noise; what has less, as a picture that was copied, has none
 _LEAST_SLOPE = 5.0  # standard errors of the slope, of which the line's zero is a quotient
 _TILE_PX = 16  # within which pixels may differ from the line together, as a speckle that shakes
 
@@ -134,7 +135,7 @@ def find_zero(
         found = moments_of(_Electrons(electrons), used, lambda _: None)
     except DataError:
         return None
-    used &= ~unsteady([found], used)
+    used &= ~unsteady([found], used) & (found.variance > _LEAST_NOISE * light)
     if np.count_nonzero(used) < _LEAST_PIXELS:
         return None
     mean, variance = found.mean[used], found.variance[used]
