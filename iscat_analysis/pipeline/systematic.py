@@ -26,7 +26,7 @@ from iscat_analysis.optics.measured import Template
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Status
 
 _AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
-_BENT = 0.01  # of a mass; beneath, any line of standards is as wrong
+_BENT = 0.02  # of a mass; beneath, lines of standards that scatter by a per cent are as wrong
 _HEIGHTS_PER_FRINGE = 10  # between them it is interpolated
 
 Source = Callable[[Config, pd.DataFrame], Mapping[str, FloatArray]]
