@@ -1,7 +1,8 @@
-"""A process that draws figures, begun with a command so that it is ready when they are wanted.
+"""A process that draws figures, started before they are wanted so that it is ready then.
 
 Loading Matplotlib and drawing take as long as the rest of a small run.  The process loads it while
-a movie is analysed, and then draws while tables are written.  It is started from a file of this
+a movie is analysed, and then draws while tables are written.  What it has loaded is 100 MB, so that
+it is started for a large movie when most of the work is done.  It is started from a file of this
 package, never from the user's script, and ends when the process that started it does.
 """
 
@@ -25,17 +26,16 @@ if TYPE_CHECKING:
 
 
 class Draughtsman:
-    """The process; `draughtsman` starts one.
+    """The process; `draughtsman` ends it."""
 
-    Parameters
-    ----------
-    process : subprocess.Popen
-        ``python -m iscat_analysis.report.drawing``, given nothing yet.
-    """
-
-    def __init__(self, process: subprocess.Popen[bytes]) -> None:
-        self._process = process
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
         self._answer: Future[tuple[bytes, bytes | None]] | None = None
+
+    def start(self) -> None:
+        """Start it, once; not where this process has Matplotlib loaded, or none can be started."""
+        if self._process is None and "matplotlib" not in sys.modules:
+            self._process = _started()
 
     def begin(self, analysis: Analysis, folder: Path, most: int) -> bool:
         """Let it draw what `iscat_analysis.report.drawing.draw` would, once.
@@ -54,7 +54,7 @@ class Draughtsman:
         bool
             Whether it does.
         """
-        if self._answer is not None or self._process.poll() is not None:
+        if self._answer is not None or self._process is None or self._process.poll() is not None:
             return False
         order = pickle.dumps((analysis, folder, most), pickle.HIGHEST_PROTOCOL)
         self._answer = beside(self._process.communicate, order)
@@ -68,13 +68,15 @@ class Draughtsman:
         str or None
             The page; None where the process failed, and another has to draw.
         """
-        if self._answer is None:
+        if self._answer is None or self._process is None:
             return None
         page, _ = self._answer.result()
         return None if self._process.returncode else page.decode("utf-8")
 
     def close(self) -> None:
         """End the process, and its copy, whatever they are at."""
+        if self._process is None:
+            return
         if self._process.poll() is None:
             if sys.platform == "win32":
                 self._process.kill()
@@ -87,23 +89,19 @@ class Draughtsman:
 
 
 @contextmanager
-def draughtsman() -> Iterator[Draughtsman | None]:
-    """Start a process that will draw.
+def draughtsman() -> Iterator[Draughtsman]:
+    """Give a process that will draw, which is still to be started, and end it.
 
     Yields
     ------
-    Draughtsman or None
-        None where this process has Matplotlib loaded, or none can be started.
+    Draughtsman
+        Without a process.
     """
-    process = None if "matplotlib" in sys.modules else _started()
-    if process is None:
-        yield None
-        return
-    begun = Draughtsman(process)
+    pen = Draughtsman()
     try:
-        yield begun
+        yield pen
     finally:
-        begun.close()
+        pen.close()
 
 
 def _started() -> subprocess.Popen[bytes] | None:

@@ -10,14 +10,18 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from iscat_analysis import draughtsman as module
+from iscat_analysis.config import load_config
 from iscat_analysis.draughtsman import Draughtsman, draughtsman
+from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.records import Analysis
 from iscat_analysis.report import write_report
 from iscat_analysis.report.drawing import draw
+from iscat_analysis.study.simulate import write_stack
 from iscat_analysis.threads import processors
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -40,8 +44,8 @@ def expected(analysis: Analysis, tmp_path_factory: pytest.TempPathFactory) -> di
 def pen(monkeypatch: pytest.MonkeyPatch) -> Iterator[Draughtsman]:
     monkeypatch.delitem(sys.modules, "matplotlib")
     with draughtsman() as begun:
+        begun.start()
         monkeypatch.undo()
-        assert begun is not None
         yield begun
 
 
@@ -119,7 +123,8 @@ def test_it_ends_with_its_copy_whatever_they_are_at(
 def test_it_ends_when_the_command_is_killed(tmp_path: Path) -> None:
     text = (
         "import sys, time; from iscat_analysis.draughtsman import draughtsman\n"
-        "with draughtsman() as pen: print(pen._process.pid, flush=True); time.sleep(60)"
+        "with draughtsman() as pen:\n"
+        "    pen.start(); print(pen._process.pid, flush=True); time.sleep(60)"
     )
     command = [sys.executable, "-c", text]
     with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=tmp_path) as process:
@@ -132,7 +137,8 @@ def test_it_ends_when_the_command_is_killed(tmp_path: Path) -> None:
 def test_a_process_that_has_matplotlib_draws_itself() -> None:
     assert "matplotlib" in sys.modules
     with draughtsman() as pen:
-        assert pen is None
+        pen.start()
+        assert pen._process is None
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be bound")
@@ -142,17 +148,38 @@ def test_a_job_on_one_processor_starts_none() -> None:
         "every = os.sched_getaffinity(0)\n"
         "for allowed in ({min(every)}, every):\n"
         "    os.sched_setaffinity(0, allowed)\n"
-        "    with draughtsman() as pen: print(pen is None)"
+        "    with draughtsman() as pen: pen.start(); print(pen._process is None)"
     )
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["True", "False"]
 
 
-def test_one_that_cannot_be_started_is_done_without(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_that_cannot_be_started_is_done_without(
+    analysis: Analysis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delitem(sys.modules, "matplotlib")
     monkeypatch.setattr(module.sys, "executable", "/nowhere/python")
     with draughtsman() as pen:
-        assert pen is None
+        pen.start()
+        assert not pen.begin(analysis, tmp_path, 12)
+        assert pen.page() is None
+
+
+def test_it_is_started_at_the_latest_when_the_chunks_of_a_movie_are_done(tmp_path: Path) -> None:
+    fewer = ["simulation.frames=200", "simulation.count=2", "simulation.leavings=0"]
+    config = load_config(Path("sample_configs/landing.toml"), fewer)
+    write_stack(config, tmp_path / "movie.tif")
+    told: list[Any] = []
+
+    class Pen(Draughtsman):
+        def start(self) -> None:
+            told.append("start")
+
+    fit_stack(
+        tmp_path / "movie.tif", config, draughtsman=Pen(),
+        progress=lambda stage, done, total: told.append((stage, done >= total)),
+    )  # fmt: skip
+    assert told.index("start") + 1 == told.index(("landing", True))
 
 
 def test_what_the_copy_cannot_draw_is_an_error(
