@@ -10,7 +10,7 @@ import atexit
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from typing import Any
 
 from numba import config, njit
@@ -73,15 +73,19 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba is not typed
         return super().load_overload(sig, target_context)
 
 
-def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def kernel(
+    *, fastmath: bool | Set[str] = False, forceinline: bool = False, _nrt: bool = True
+) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function by Numba when it is first called, and keep what was compiled.
 
     It runs without the interpreter's lock, and divides by zero as NumPy does.
 
     Parameters
     ----------
-    **options
-        Further ones of `numba.njit`.
+    fastmath, forceinline
+        As of `numba.njit`.
+    _nrt : bool
+        Whether it may ask for memory; without, a call costs less.
 
     Returns
     -------
@@ -90,7 +94,9 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(nogil=True, error_model="numpy", **options)(function)
+        dispatcher = njit(
+            nogil=True, error_model="numpy", fastmath=fastmath, forceinline=forceinline, _nrt=_nrt
+        )(function)
         dispatcher._cache = _KernelCache(function)
         return dispatcher
 

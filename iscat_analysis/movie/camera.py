@@ -343,7 +343,8 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
     """Refuse a movie whose counts went beyond the largest number of their type and began at zero.
 
     A pixel there leaps over nearly the whole range of the type from one frame to the next, as no
-    light does in some pixels of a frame and not in the others.
+    light does in some pixels of a frame and not in the others.  One that is saturated is at the
+    very end of the range, where one that overflowed hardly ever is.
 
     Parameters
     ----------
@@ -363,7 +364,8 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
     if not counts.size or int(counts.max()) - int(counts.min()) < _LEAP * largest:
         return
     for before, after in pairwise(counts):
-        leap = np.maximum(before, after) - np.minimum(before, after) > _LEAP * largest
+        high = np.maximum(before, after)
+        leap = (high - np.minimum(before, after) > _LEAP * largest) & (high < largest)
         if _OVERFLOWN < leap.mean() < 1 / 2:
             y, x = np.unravel_index(int(np.argmax(leap)), leap.shape)
             raise DataError(
