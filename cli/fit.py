@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -129,9 +130,9 @@ def fit(
         changes = _changes(settings, mode, frames, background, posterior, workers)
         resolved = load_config(config, changes)
 
-        from iscat_analysis.draughtsman import draughtsman
+        from iscat_analysis.draughtsman import Draughtsman
 
-        with draughtsman() as pen:
+        with closing(Draughtsman()) as pen:
             if resolved.background.method != "sliding" or not _is_large(stack):
                 pen.start()  # first, because it has as much to load
             from iscat_analysis.movie.addresses import MARK, beside

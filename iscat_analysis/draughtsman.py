@@ -13,9 +13,7 @@ import pickle
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Draughtsman:
-    """The process; `draughtsman` ends it."""
+    """The process, which is still to be started, and is ended by `close`."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -86,22 +84,6 @@ class Draughtsman:
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None and self._answer is None:
                 pipe.close()
-
-
-@contextmanager
-def draughtsman() -> Iterator[Draughtsman]:
-    """Give a process that will draw, which is still to be started, and end it.
-
-    Yields
-    ------
-    Draughtsman
-        Without a process.
-    """
-    pen = Draughtsman()
-    try:
-        yield pen
-    finally:
-        pen.close()
 
 
 def _started() -> subprocess.Popen[bytes] | None:

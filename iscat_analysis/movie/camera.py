@@ -263,7 +263,7 @@ def check_counts(
     lowest, highest = counts.min(axis=(1, 2)), counts.max(axis=(1, 2))
     floor = _negative_floor_adu(camera, counts.dtype)
     ceiling = _ceiling_adu(camera)
-    lowest_floor, lowest_ceiling = float(np.max(floor)), float(np.min(ceiling))
+    highest_floor, lowest_ceiling = float(np.max(floor)), float(np.min(ceiling))
     for number in range(len(counts)):
         frame = counts[number]
         where = f"{name}: frame {first_frame + number}"
@@ -279,7 +279,7 @@ def check_counts(
             raise DataError(
                 f"{where} is zero throughout; it was dropped by the camera: leave it out"
             )
-        if low < lowest_floor:
+        if low < highest_floor:
             _refuse_negative(frame, floor, where)
         full = low == high >= converter_ceiling(frame)
         if full or (low >= lowest_ceiling and bool(np.all(frame >= ceiling))):

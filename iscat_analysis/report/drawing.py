@@ -102,7 +102,8 @@ def _gathered(
 
 def main() -> None:
     """Draw what stdin holds, where it holds anything."""
-    templates()  # compiled while the other process is still at work
+    for name in templates().list_templates():  # compiled while the other process is at work
+        templates().get_template(name)
     try:  # not until stdin ends: a copy of the other process may hold it open
         order = pickle.Unpickler(sys.stdin.buffer).load()
     except EOFError:

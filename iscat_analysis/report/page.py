@@ -59,12 +59,12 @@ def render_page(template: str, context: Mapping[str, Any]) -> str:
 
 @cache
 def templates() -> jinja2.Environment:
-    """Compile the templates, once in a process.
+    """Give the templates, each of which is compiled once in a process.
 
     Returns
     -------
     jinja2.Environment
-        That holds all of them.
+        That loads them.
     """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("iscat_analysis.report"),
@@ -74,8 +74,6 @@ def templates() -> jinja2.Environment:
         undefined=_AskableUndefined,
     )
     environment.filters["cell"] = _cell
-    for name in environment.list_templates():
-        environment.get_template(name)
     return environment
 
 

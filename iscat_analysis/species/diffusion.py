@@ -136,7 +136,7 @@ def fit_diffusion(
     )  # fmt: skip
     if not 0 < number_in("level", level) < 1:
         raise ConfigError(f"level = {level!r}: give a coverage between 0 and 1")
-    best, sigma, crb = _estimated(track)
+    best, sigma, crb, log_likelihood = _estimated(track)
     other, other_sigma = _covariance_based(track, best)
     spare = other_sigma**2 - crb**2
     return Diffusion(
@@ -145,7 +145,7 @@ def fit_diffusion(
         crb_d_um2_s=crb / _UM2,
         interval_um2_s=tuple(end / _UM2 for end in _interval(track, best, level)),  # type: ignore[arg-type]
         level=float(level),
-        log_likelihood=track.likelihood(best).value,
+        log_likelihood=log_likelihood,
         n_positions=track.counted.size + 1,
         covariance_d_um2_s=other / _UM2,
         covariance_sigma_d_um2_s=other_sigma / _UM2,
@@ -187,17 +187,17 @@ def estimate_diffusion(
     track = gather(
         frames, positions_nm, sigma_nm, frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms
     )
-    best, sigma, _ = _estimated(track)
+    best, sigma, *_ = _estimated(track)
     return best / _UM2, sigma / _UM2
 
 
-def _estimated(track: Displacements) -> tuple[float, float, float]:
-    """D of highest likelihood, its standard error, and the bound there [nm²/s]."""
+def _estimated(track: Displacements) -> tuple[float, float, float, float]:
+    """D of highest likelihood, its standard error, the bound there [nm²/s], and the likelihood."""
     best = most_likely(track)
     there = track.likelihood(best)
     crb = 1 / math.sqrt(there.information)
     sigma = 1 / math.sqrt(-there.curvature) if best > 0 and there.curvature < 0 else crb
-    return best, sigma, crb
+    return best, sigma, crb, there.value
 
 
 def hydrodynamic_diameter(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import pytest
 
 from iscat_analysis import draughtsman as module
 from iscat_analysis.config import load_config
-from iscat_analysis.draughtsman import Draughtsman, draughtsman
+from iscat_analysis.draughtsman import Draughtsman
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.records import Analysis
 from iscat_analysis.report import write_report
@@ -43,7 +43,7 @@ def expected(analysis: Analysis, tmp_path_factory: pytest.TempPathFactory) -> di
 @pytest.fixture
 def pen(monkeypatch: pytest.MonkeyPatch) -> Iterator[Draughtsman]:
     monkeypatch.delitem(sys.modules, "matplotlib")
-    with draughtsman() as begun:
+    with closing(Draughtsman()) as begun:
         begun.start()
         monkeypatch.undo()
         yield begun
@@ -56,7 +56,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def wait_until_gone(kill: Callable[[int, int], None], number: int) -> None:
     """Wait for the end of a process or group that is no child: the system collects it."""
-    with contextlib.suppress(ProcessLookupError):
+    with suppress(ProcessLookupError):
         while True:
             kill(number, 0)
             time.sleep(0.01)
@@ -122,8 +122,9 @@ def test_it_ends_with_its_copy_whatever_they_are_at(
 
 def test_it_ends_when_the_command_is_killed(tmp_path: Path) -> None:
     text = (
-        "import sys, time; from iscat_analysis.draughtsman import draughtsman\n"
-        "with draughtsman() as pen:\n"
+        "import sys, time; from contextlib import closing\n"
+        "from iscat_analysis.draughtsman import Draughtsman\n"
+        "with closing(Draughtsman()) as pen:\n"
         "    pen.start(); print(pen._process.pid, flush=True); time.sleep(60)"
     )
     command = [sys.executable, "-c", text]
@@ -136,7 +137,7 @@ def test_it_ends_when_the_command_is_killed(tmp_path: Path) -> None:
 
 def test_a_process_that_has_matplotlib_draws_itself() -> None:
     assert "matplotlib" in sys.modules
-    with draughtsman() as pen:
+    with closing(Draughtsman()) as pen:
         pen.start()
         assert pen._process is None
 
@@ -144,11 +145,12 @@ def test_a_process_that_has_matplotlib_draws_itself() -> None:
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be bound")
 def test_a_job_on_one_processor_starts_none() -> None:
     text = (
-        "import os, sys; from iscat_analysis.draughtsman import draughtsman\n"
+        "import os, sys; from contextlib import closing\n"
+        "from iscat_analysis.draughtsman import Draughtsman\n"
         "every = os.sched_getaffinity(0)\n"
         "for allowed in ({min(every)}, every):\n"
         "    os.sched_setaffinity(0, allowed)\n"
-        "    with draughtsman() as pen: pen.start(); print(pen._process is None)"
+        "    with closing(Draughtsman()) as pen: pen.start(); print(pen._process is None)"
     )
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["True", "False"]
@@ -159,7 +161,7 @@ def test_one_that_cannot_be_started_is_done_without(
 ) -> None:
     monkeypatch.delitem(sys.modules, "matplotlib")
     monkeypatch.setattr(module.sys, "executable", "/nowhere/python")
-    with draughtsman() as pen:
+    with closing(Draughtsman()) as pen:
         pen.start()
         assert not pen.begin(analysis, tmp_path, 12)
         assert pen.page() is None

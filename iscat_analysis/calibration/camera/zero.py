@@ -23,8 +23,9 @@ from iscat_analysis.calibration.camera.regression import (
     zero_of_flicker,
 )
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.records import BoolArray
 
 TOLERANCE = 0.01
 """Share of the light, and of masses, that an offset may be wrong by before it is said."""
@@ -81,20 +82,6 @@ class LightZero:
         return abs(self.share - share) < TOLERANCE + _SIGMAS * self.se
 
 
-@dataclass(frozen=True, eq=False)
-class _Electrons:
-    frames: FloatArray
-    name: str = "movie"
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        t, y, x = self.frames.shape
-        return t, y, x
-
-    def read(self, start: int, stop: int) -> NDArray[Any]:
-        return self.frames[start:stop]
-
-
 def find_zero(
     counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
 ) -> LightZero | None:
@@ -132,7 +119,7 @@ def find_zero(
     if np.count_nonzero(used) < _LEAST_PIXELS:
         return None
     try:
-        found = moments_of(_Electrons(electrons), used, lambda _: None)
+        found = moments_of(open_stack(electrons), used, lambda _: None)
     except DataError:
         return None
     used &= ~unsteady([found], used) & (found.variance > _LEAST_NOISE * light)
