@@ -29,6 +29,8 @@ from pathlib import Path
 FENCE = re.compile(r"^(?P<indent> *)(?P<ticks>```+)(?P<language>[^`]*?)\s*$")
 COMMENT = re.compile(r"^ *<!-- (?P<kind>not run|needs|first|keep): (?P<text>.*?) -->$")
 RUNNABLE = ("console", "python")
+SURROUNDINGS = {"MPLBACKEND": "Agg", "COLUMNS": "100", "PYTHONWARNINGS": "error"}
+"""Variables of the environment in which blocks run."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,9 @@ def blocks_of(page: Path) -> Iterator[Block]:
             first, not_run, keep = [], None, None
 
 
-def run_page(page: Path, folder: Path, bin_folder: Path) -> list[Outcome]:
+def run_page(
+    page: Path, folder: Path, bin_folder: Path, prepared: Path | None = None
+) -> list[Outcome]:
     """Run a page's blocks in a folder and stop at the first that fails.
 
     Parameters
@@ -107,20 +111,19 @@ def run_page(page: Path, folder: Path, bin_folder: Path) -> list[Outcome]:
         Where; it should hold what the page takes for granted.
     bin_folder : Path
         Where `iscat` and `python` are.
+    prepared : Path, optional
+        Where the programs of `prepared.prepared` are, which start sooner.
 
     Returns
     -------
     list of Outcome
         One for each block that was run.
     """
-    environment = os.environ | {
-        "PATH": f"{bin_folder}{os.pathsep}{os.environ['PATH']}",
-        "MPLBACKEND": "Agg",
-        "COLUMNS": "100",
-        "PYTHONWARNINGS": "error",
-    }
+    path = [*([prepared] if prepared else []), bin_folder, os.environ["PATH"]]
+    environment = os.environ | SURROUNDINGS | {"PATH": os.pathsep.join(map(str, path))}
+    python = [str(prepared / "interpreter")] if prepared else [str(bin_folder / "python"), "-c"]
     outcomes = []
-    with _Interpreter(bin_folder / "python", folder, environment) as interpreter:
+    with _Interpreter(python, folder, environment) as interpreter:
         for block in blocks_of(page):
             if block.not_run is not None:
                 continue
@@ -160,8 +163,8 @@ for line in sys.stdin:
     print(json.dumps([said.getvalue(), failed]), flush=True)
 """
 
-    def __init__(self, python: Path, folder: Path, environment: dict[str, str]) -> None:
-        self._arguments = ([str(python), "-c", self.LOOP], folder, environment)
+    def __init__(self, python: list[str], folder: Path, environment: dict[str, str]) -> None:
+        self._arguments = ([*python, self.LOOP], folder, environment)
         self._process: subprocess.Popen[str] | None = None
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed with the interpreter
 
