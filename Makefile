@@ -18,7 +18,7 @@ PYTEST := pytest -n auto --dist loadfile --no-loadscope-reorder
 DEMO_CONFIG := sample_configs/landing.toml
 DEMO        := demo
 
-.PHONY: help install demo test test-all test-lowest lint kernels lint-and-kernels bench docs clean
+.PHONY: help install demo test tests test-all test-lowest lint kernels lint-and-kernels bench docs docs-and-test clean
 
 help:
 	@echo "make demo         simulate a landing movie, analyse it, say where the report is"
@@ -29,6 +29,7 @@ help:
 	@echo "make kernels      compile the kernels that tests and manual share, in .kernels"
 	@echo "make bench        speed and efficiency, against peers"
 	@echo "make docs         the manual, in docs/_build/html; runs all of its code blocks"
+	@echo "make docs-and-test  both at the same time, as .ci/run does"
 	@echo "make clean        remove what these made, the environment included"
 
 install: $(STAMP)
@@ -64,6 +65,9 @@ lint-and-kernels: $(STAMP)
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint kernels
 
 test: lint-and-kernels
+	@$(MAKE) --no-print-directory tests
+
+tests: $(STAMP)
 	$(BIN)/$(PYTEST)
 
 test-all: lint-and-kernels
@@ -85,8 +89,11 @@ bench: $(STAMP)
 	$(BIN)/python benchmarks/run.py
 
 docs: $(KERNELS)
-	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
+	$(BIN)/sphinx-build --quiet -W --keep-going -b html docs docs/_build/html
 	@echo "The manual: docs/_build/html/index.html"
+
+docs-and-test: lint-and-kernels
+	@$(MAKE) --no-print-directory --jobs=2 docs tests
 
 clean:
 	rm -rf $(VENV) .kernels $(DEMO) build dist docs/_build docs/reference/api *.egg-info .coverage* \
