@@ -1,4 +1,4 @@
-"""Rows and columns that flicker: measured in every frame, and divided out.
+"""Rows and columns that flicker, and light that changes smoothly: measured and divided out.
 
 Where a shutter rolls, every row sees the laser at its own moment, and where columns have their own
 amplifiers each may drift: all pixels of a line share a factor f that no other frame has.  It is
@@ -10,11 +10,14 @@ that a median is moved by it as a mean is, and is noisier; but what it does to a
 lowers its line by the line's mean contrast, of a diffraction-limited spot 2λ/(π NA C a) of its
 height, with pixels of side a, as much as 2 % where C = 128.  `Lines.left` says what the correction
 leaves of a signal, and searches and fits expect that.
+
+Light that changes smoothly over the field is measured by a polynomial, of which the same holds; see
+`iscat_analysis.movie.lighting`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +25,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.lighting import Surface
 from iscat_analysis.movie.spectrum import measure_spectrum
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.records import CountSource, FloatArray, StackMetadata
@@ -31,7 +35,7 @@ _LEAST_LIT = 0.25  # of a line's pixels that must be usable
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Which lines flicker together; `find_lines` makes it.
+    """Which lines flicker together, and how smoothly the light changes; `find_lines` makes it.
 
     Attributes
     ----------
@@ -40,14 +44,26 @@ class Lines:
     shares : (float, float)
         Part of the variance of a pixel's noise that its whole row has in common, and its column;
         0 where there is none, and nothing is corrected.
+    surface : Surface or None
+        None where the light of a frame is distributed as that of any other.
     """
 
     light_e: FloatArray
     shares: tuple[float, float]
+    surface: Surface | None = None
 
     @property
-    def message(self) -> str:
-        """One line for the user."""
+    def messages(self) -> list[str]:
+        """What the user should know, one line each."""
+        said = []
+        if self.surface is not None:
+            said.append(self.surface.message)
+        if any(self.shares):
+            said.append(self._flicker)
+        return said
+
+    @property
+    def _flicker(self) -> str:
         names = [n for n, share in zip(("rows", "columns"), self.shares, strict=True) if share]
         parts = " and ".join(f"{100 * share:.2g} %" for share in self.shares if share)
         return (
@@ -58,10 +74,15 @@ class Lines:
     @property
     def summary(self) -> dict[str, float]:
         """What ``summary.json`` says of it."""
-        return {"row_share": float(self.shares[0]), "column_share": float(self.shares[1])}
+        return {
+            "row_share": float(self.shares[0]),
+            "column_share": float(self.shares[1]),
+            "smooth_degree": 0 if self.surface is None else self.surface.degree,
+            "smooth_rms": 0.0 if self.surface is None else self.surface.rms,
+        }
 
     def factors(self, electrons: FloatArray) -> FloatArray:
-        """Measure the light of the lines over that of the frame.
+        """Measure the smooth change of the light, and that of the lines over that of the frame.
 
         Parameters
         ----------
@@ -78,6 +99,9 @@ class Lines:
         with np.errstate(divide="ignore", invalid="ignore"):
             frame = seen.sum(axis=(-2, -1), keepdims=True) / self.light_e.sum()
             out = np.ones((*electrons.shape[:-2], 1, 1))
+            if self.surface is not None:
+                out = self.surface.factors(electrons)
+                seen = seen / out
             for axis, share in zip((-1, -2), self.shares, strict=True):
                 if not share:
                     continue
@@ -85,6 +109,32 @@ class Lines:
                 factor = seen.sum(axis=axis, keepdims=True) / line / frame
                 lit = (used.mean(axis=axis, keepdims=True) > _LEAST_LIT) & (frame > 0)
                 out = out * np.where(lit & (factor > 0), factor, 1.0)
+        return out
+
+    def divided(self, counts: NDArray[Any], camera: Camera) -> NDArray[Any]:
+        """Divide frames by what is measured of their light.
+
+        Parameters
+        ----------
+        counts : ndarray, shape (t, y, x)
+            As recorded.
+        camera : Camera
+            Counts → photoelectrons.
+
+        Returns
+        -------
+        ndarray of float32 or float64, shape (t, y, x)
+            Corrected counts; saturated pixels keep theirs, at the camera's full scale.
+        """
+        offset = np.asarray(camera.offset_adu)
+        steady = counts - offset
+        steady /= self.factors(steady * camera.gain_e_per_adu)
+        steady += offset
+        full = camera.saturated(counts)
+        if full.any():
+            limit = camera.full_scale_adu
+            steady[full] = counts[full] if limit is None else limit
+        out: NDArray[Any] = steady.astype(_divided_type(counts.dtype))
         return out
 
     def taken(self, signal: FloatArray) -> FloatArray:
@@ -116,6 +166,10 @@ class Lines:
             Contrast in corrected frames.
         """
         return (1 + signal) / self.taken(signal) - 1
+
+
+def _divided_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    return np.dtype(np.float32 if dtype.itemsize <= 2 else np.float64)
 
 
 class SteadyFrames:
@@ -151,7 +205,7 @@ class SteadyFrames:
         self._movie, self._lines, self._camera = movie, lines, camera
         self.shape = movie.shape
         self.name = movie.name
-        self.dtype = np.dtype(np.float32 if movie.dtype.itemsize <= 2 else np.float64)
+        self.dtype = _divided_type(movie.dtype)
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
@@ -166,24 +220,15 @@ class SteadyFrames:
         ndarray, shape (stop − start, y, x)
             Corrected counts; saturated pixels keep theirs, at the camera's full scale.
         """
-        counts = self._movie.read(start, stop)
-        camera = self._camera
-        offset = np.asarray(camera.offset_adu)
-        steady = counts - offset
-        steady /= self._lines.factors(steady * camera.gain_e_per_adu)
-        steady += offset
-        full = camera.saturated(counts)
-        if full.any():
-            limit = camera.full_scale_adu
-            steady[full] = counts[full] if limit is None else limit
-        out: NDArray[Any] = steady.astype(self.dtype)
-        return out
+        return self._lines.divided(self._movie.read(start, stop), self._camera)
 
     def close(self) -> None:
         """Leave the movie open; it belongs to the caller."""
 
 
-def find_lines(counts: NDArray[Any], camera: Camera) -> Lines | None:
+def find_lines(
+    counts: NDArray[Any], camera: Camera, surface: Surface | None = None
+) -> Lines | None:
     """Look for rows and columns that flicker.
 
     Parameters
@@ -192,21 +237,29 @@ def find_lines(counts: NDArray[Any], camera: Camera) -> Lines | None:
         Consecutive good frames.
     camera : Camera
         Counts → photoelectrons.
+    surface : Surface, optional
+        Smooth changes of the light, from `iscat_analysis.movie.lighting.find_surface`.
 
     Returns
     -------
     Lines or None
-        None where no line has noise of its own beyond 4.5 standard errors of it.
+        None where no line has noise of its own beyond 4.5 standard errors of it, and the light
+        does not change smoothly.
     """
-    spectrum = measure_spectrum(counts, camera)
-    if spectrum is None or not any(spectrum.shared):
-        return None
     mean = camera.to_electrons(counts.mean(axis=0))
     shape = (counts.shape[1], counts.shape[2])
-    read = camera.read_variance_e2(shape)
-    off = find_defects(len(counts) * mean, len(counts) * read)
+    off = find_defects(len(counts) * mean, len(counts) * camera.read_variance_e2(shape))
     off |= camera.saturated(counts.max(axis=0))
-    return Lines(np.where(off, 0.0, np.maximum(mean, 0.0)), spectrum.shared)
+    seen = np.maximum(mean, 0.0) if surface is None else surface.light_e
+    lines = Lines(np.where(off, 0.0, seen), (0.0, 0.0))
+    even = counts
+    if surface is not None:  # both parts of what is divided out are relative to the same light
+        lines = replace(lines, surface=replace(surface, light_e=lines.light_e))
+        even = lines.divided(counts, camera)
+    spectrum = measure_spectrum(even, camera)
+    if spectrum is not None and any(spectrum.shared):
+        return replace(lines, shares=spectrum.shared)
+    return None if surface is None else lines
 
 
 def steady(movie: Stack, lines: Lines | None, camera: Camera) -> Stack:

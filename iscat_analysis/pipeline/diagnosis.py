@@ -17,15 +17,13 @@ from iscat_analysis.inference.fit import OUTWARD
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import follow_pattern
-from iscat_analysis.movie.lines import Lines, find_lines
 from iscat_analysis.movie.metadata import diagnose_gain
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, first_counts, is_lit
 from iscat_analysis.pipeline.systematic import is_bent
-from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import Status, Windows
-from iscat_analysis.search.sliding import measure_frames, measure_noise
+from iscat_analysis.search.sliding import measure_noise
 from iscat_analysis.units import count, listed
 
 DRIFT_PX = 0.02
@@ -88,43 +86,6 @@ def axes_warning(name: str, counts: NDArray[Any]) -> str:
                 f"its {lines_of}: the axes must be (t, y, x); export it again in this order"
             )
     return ""
-
-
-def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
-    """Look for rows and columns that flicker, where their light may be divided out.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    config : Config
-        Its background frames, or the first that are analysed, are looked at; nothing is where
-        ``background.power_normalization`` is false, the background is dark or known, or the fixed
-        pattern is followed as it moves: it changes the light of the lines far more than flicker, as
-        nanoparticles that move in a volume do, which are there in every frame.
-    camera : Camera
-        Counts → photoelectrons.
-
-    Returns
-    -------
-    Lines or None
-        None where there is nothing to correct.
-    """
-    background = config.background
-    if (
-        not background.power_normalization
-        or background.method == "known"
-        or (background.method == "sliding" and background.drift_correction)
-        or config.optics.scheme == "darkfield"
-        or (way_of(config) == "tracks" and config.track.free == "joint")
-    ):
-        return None
-    first, last = background.recorded or config.fit.frames or (0, movie.shape[0])
-    counts = movie.read(first, max(first, min(last, movie.shape[0], first + SPECTRUM_FRAMES)))
-    if not len(counts):
-        return None
-    light, repeats = measure_frames(counts, camera)
-    return find_lines(counts[np.isfinite(light) & ~repeats], camera)
 
 
 def pixel_warnings(defects: int, saturated: int) -> Iterator[str]:

@@ -17,8 +17,9 @@ from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_overf
 from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pieces.setups import darkfield_photons
-from iscat_analysis.pipeline.diagnosis import axes_warning, judge_lines
+from iscat_analysis.pipeline.diagnosis import axes_warning
 from iscat_analysis.pipeline.learning import learn_optics
+from iscat_analysis.pipeline.light import judge_lines
 from iscat_analysis.pipeline.ranges import fitted_frames, tracked_frames
 from iscat_analysis.pipeline.recognise import (
     as_landing,
@@ -134,7 +135,8 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     lines = judge_lines(movie, config, camera)
     steady = movie
     if lines is not None:
-        run.tell(f"{movie.name}: {lines.message}")
+        for text in lines.messages:
+            run.tell(f"{movie.name}: {text}")
         summary["lines"] = lines.summary
         steady = movie.seen_as(SteadyFrames(movie, lines, camera))
     looking: Future[Changes] | None = None

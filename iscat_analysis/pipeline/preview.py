@@ -16,7 +16,7 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_ratio
 from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.metadata import resolve_metadata
-from iscat_analysis.pipeline.diagnosis import judge_lines
+from iscat_analysis.pipeline.light import judge_lines
 from iscat_analysis.pipeline.looks import (
     BoundSearch,
     LandingSearch,

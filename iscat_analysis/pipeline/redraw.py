@@ -28,9 +28,9 @@ from iscat_analysis.movie.camera import Camera, camera_from_config
 from iscat_analysis.movie.lines import Lines, SteadyFrames, steady
 from iscat_analysis.pipeline.block_store import row_view
 from iscat_analysis.pipeline.chunks import HALO, Reader, counts_budget
-from iscat_analysis.pipeline.diagnosis import judge_lines
 from iscat_analysis.pipeline.events import Fitted, PlaceAndMass
 from iscat_analysis.pipeline.field import add_signal
+from iscat_analysis.pipeline.light import judge_lines
 from iscat_analysis.pipeline.moving import blurred_rows
 from iscat_analysis.pipeline.moving_field import exposure_of, load_field, track_scene
 from iscat_analysis.pipeline.neighbours import Neighbours, Step

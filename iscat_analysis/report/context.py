@@ -288,6 +288,13 @@ def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
                 f"Whole {lines} flickered ({percent(share)} of the noise variance); each {name} of "
                 "each frame was divided by its own light."
             )
+    smooth = summary.get("lines", {}).get("smooth_rms")
+    if smooth:
+        yield (
+            f"The light changed slowly over the field ({percent(smooth)} rms from one window to "
+            "the next); each frame was divided by a polynomial of degree "
+            f"{summary['lines']['smooth_degree']}."
+        )
     background = summary.get("background")
     if background and background["drift_px"] is not None:
         (y, x), (y_se, x_se) = background["drift_px"], background["drift_error_px"]

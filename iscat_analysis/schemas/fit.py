@@ -160,10 +160,12 @@ class Spectrum(Closed):
 
 
 class Lines(Closed):
-    """Rows or columns that flickered, and were divided by their own light."""
+    """What of the light flickered or changed over the field, and was divided out of each frame."""
 
     row_share: NotNegative = key("Part of the noise variance that each row had in common")
     column_share: NotNegative = key("Part of the noise variance that each column had in common")
+    smooth_degree: Count = key("Degree of the polynomial in x and y, of smooth changes; 0: none")
+    smooth_rms: NotNegative = key("Relative rms of smooth changes from one window to the next")
 
 
 class Noise(Document):
@@ -358,7 +360,9 @@ class Summary(Document):
         "Width of each species beyond σ; where the model is rejected, poor fits are counted too"
     )
     repeats: Repeats = maybe("Whether the measured spread agrees with σ")
-    lines: Lines = maybe("Where rows or columns flickered, and were corrected")
+    lines: Lines = maybe(
+        "Where rows, columns or a smooth part of the light changed, and were corrected"
+    )
     optics: Learned = maybe("Where the optics were tested: the test, and what was learned")
     distribution: Distribution | None = maybe(
         "Species; null where masses are not fitted once per event"

@@ -15,7 +15,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.lines import Lines
-from iscat_analysis.pipeline.diagnosis import judge_lines
+from iscat_analysis.pipeline.light import judge_lines
 from iscat_analysis.study.simulate import Movie
 
 pytestmark = pytest.mark.large

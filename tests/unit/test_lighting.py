@@ -1,0 +1,142 @@
+"""Light that changes smoothly over the field: found, divided out, and seen through by fits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scenes import PIXEL_NM, make_config
+from scipy.ndimage import fourier_shift, gaussian_filter
+
+import iscat_analysis as ia
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.lighting import Surface, find_surface
+from iscat_analysis.movie.lines import Lines
+from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.study.simulate import Movie
+
+Array = NDArray[np.float64]
+
+SHAPE = (96, 128)
+LEVEL_E, WINDOW, FRAMES, PAIRS = 1e5, 50, 1, 12
+Y, X = (k / (n / 2) - 1 for k, n in zip(np.indices(SHAPE), SHAPE, strict=True))
+
+
+def _light(grain_px: float = 2.0) -> Array:
+    rough = gaussian_filter(np.random.default_rng(1).standard_normal(SHAPE), grain_px, mode="wrap")
+    return np.asarray(LEVEL_E * (1 + 0.1 * rough / rough.std()))
+
+
+def _pairs(light: list[tuple[Array, Array]], seed: int) -> list[tuple[Array, Array]]:
+    """Draw sums of frames of the light before and after, as one frame with a gain of its own."""
+    rng = np.random.default_rng(seed)
+    return [
+        tuple(  # type: ignore[misc]
+            np.stack([k * (1 + 0.02 * rng.standard_normal())] * FRAMES)
+            + np.sqrt(k) * rng.standard_normal((FRAMES, *SHAPE))
+            for k in two
+        )
+        for two in light
+    ]
+
+
+def _changed(factor: Array, grain_px: float = 2.0) -> list[tuple[Array, Array]]:
+    light = _light(grain_px)
+    return [(light, light * factor), (light * factor, light)] * (PAIRS // 2)
+
+
+def test_a_polynomial_is_measured_exactly() -> None:
+    light = _light()
+    light[10, 20] = 0.0  # not used
+    factor = 1 + 0.02 * X - 0.01 * Y**2 * X + 0.03 * X * Y
+    factor /= np.average(factor, weights=light)
+    np.testing.assert_allclose(Surface(light, 3).factors(light * factor), factor, atol=1e-12)
+    assert np.abs(Surface(light, 2).factors(light * factor) - factor).max() > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("factor", "degrees"),
+    [
+        (1 + 5e-4 * X, (1, 1)),
+        (1 + 2e-3 * X * Y, (2, 3)),
+        (1 + 1e-2 * np.sin(2 * np.pi * (X + 0.3 * Y)), (7, 12)),
+    ],
+)
+def test_smooth_changes_are_found_with_their_size(factor: Array, degrees: tuple[int, int]) -> None:
+    found = find_surface(_pairs(_changed(factor), 2), Camera(), WINDOW)
+    assert found is not None
+    assert degrees[0] <= found.degree <= degrees[1]
+    weight = _light()
+    spread = np.sqrt(np.average((factor - np.average(factor, weights=weight)) ** 2, weights=weight))
+    assert found.rms == pytest.approx(spread, rel=0.05)
+
+
+def test_nothing_is_found_in_steady_light() -> None:
+    still = [(_light(), _light())] * PAIRS
+    assert all(find_surface(_pairs(still, seed), Camera(), WINDOW) is None for seed in range(12))
+
+
+def test_particles_and_pixels_that_blink_are_no_light() -> None:
+    """Six bright ones land between the frames of every pair, 3 % dark; ten pixels blink."""
+    rng = np.random.default_rng(3)
+    light = []
+    for _ in range(PAIRS):
+        factor = np.ones(SHAPE)
+        for y, x in zip(rng.uniform(0, 96, 6), rng.uniform(0, 128, 6), strict=True):
+            factor -= 0.03 * np.exp(-(((Y + 1) * 48 - y) ** 2 + ((X + 1) * 64 - x) ** 2) / 2)
+        factor[rng.integers(0, 96, 10), rng.integers(0, 128, 10)] *= 1.5
+        light.append((_light(), _light() * factor))
+    assert find_surface(_pairs(light, 4), Camera(), WINDOW) is None
+
+
+@pytest.mark.parametrize("grain_px", [1.5, 4.0])
+def test_a_pattern_that_moves_is_not_taken_for_light(grain_px: float) -> None:
+    still = _light(grain_px)
+    moved = np.fft.ifft2(fourier_shift(np.fft.fft2(still), (0.1, 0.25))).real
+    assert find_surface(_pairs([(still, moved)] * PAIRS, 5), Camera(), WINDOW) is None
+
+
+def test_what_is_left_of_a_particle_is_foreseen() -> None:
+    """The polynomial takes a part of its light; frames say the same as the model."""
+    scene = make_scene(make_config(), SHAPE)
+    grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
+    signal = scene.wide.image(grid, 9 * PIXEL_NM, 7 * PIXEL_NM, 5.0, 1000.0)
+    lines = Lines(_light(), (0.0, 0.0), Surface(_light(), 10))
+    changed = 1 + 0.01 * X * Y
+    frames = _light() * changed * np.stack([np.ones(SHAPE), 1 + signal])
+    before, after = (f / f.sum() for f in frames / lines.factors(frames))
+    gained = np.average(1 + signal, weights=_light())
+    left = after / before * gained - 1
+    peak = np.unravel_index(int(np.abs(signal).argmax()), SHAPE)
+    np.testing.assert_allclose(left, lines.left(signal), atol=2e-3 * abs(signal[peak]))
+    assert abs(left[peak] / signal[peak] - 1) > 0.01  # control: near a corner it is not nothing
+
+
+def test_particles_that_land_in_wandering_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All are found and ok, and nothing else; without the correction they are poor fits."""
+    places = [(20.0, 20.0), (44.0, 20.0), (20.0, 44.0), (44.0, 44.0)]
+    events = [
+        {"frame": 55 + 12 * i, "x_px": x, "y_px": y, "mass_kda": 500.0}
+        for i, (x, y) in enumerate(places)
+    ]
+    config = make_config(
+        background={"method": "sliding", "frames": None, "window_frames": 40},
+        fit={"frames": None}, camera={"gain_e_per_adu": 4.0}, optics={"calibrate": "never"},
+        detection={"false_alarms_per_movie": 1e-3},
+        simulation={"shape": [64, 64], "frames": 150, "photons_per_pixel": 1e5, "events": events},
+    )  # fmt: skip
+    rng = np.random.default_rng(6)
+    x = np.linspace(-1, 1, 64)
+    tilt = [1 + 0.02 * np.sin(t / 40) * x + 0.01 * np.cos(t / 30) * x[:, None] for t in range(150)]
+    light = np.array(list(Movie(config, 6).expected_frames())) * tilt
+    counts = np.round(rng.poisson(light) / 4).astype(np.uint16)
+    result = ia.fit_movie(counts, config=config)
+    table = result.table
+    assert list(table["status"]) == ["ok"] * 4
+    assert (abs(table["mass_kda"] - 500.0) < 4 * table["sigma_mass_kda"]).all()
+    assert result.summary["lines"]["smooth_degree"] >= 1
+    assert any("changes slowly over the field" in text for text in result.warnings)
+    monkeypatch.setattr("iscat_analysis.pipeline.light.find_surface", lambda *_: None)
+    without = ia.fit_movie(counts, config=config)
+    assert (without.table["status"] == "ok").sum() < 2
