@@ -20,6 +20,10 @@ _OBJECTS = 200_000
 """New containers after which cycles among them are looked for: loading the libraries makes some
 ten times as many, which stay, and looking through them every 700 took a quarter of a short run."""
 
+_ALGEBRA = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""What says how many threads linear algebra takes.  Work is divided among threads above it; small
+products that are divided once more take several times the processors, and longer."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `iscat`.
@@ -55,6 +59,8 @@ def main_fit(arguments: Sequence[str] | None = None) -> int:
 
 def _start(program: str, arguments: Sequence[str] | None) -> int:
     if arguments is None:  # the process is ours
+        for name in _ALGEBRA:
+            os.environ.setdefault(name, "1")
         gc.set_threshold(_OBJECTS, *gc.get_threshold()[1:])
     try:
         import signal

@@ -29,7 +29,12 @@ from pathlib import Path
 FENCE = re.compile(r"^(?P<indent> *)(?P<ticks>```+)(?P<language>[^`]*?)\s*$")
 COMMENT = re.compile(r"^ *<!-- (?P<kind>not run|needs|first|keep): (?P<text>.*?) -->$")
 RUNNABLE = ("console", "python")
-SURROUNDINGS = {"MPLBACKEND": "Agg", "COLUMNS": "100", "PYTHONWARNINGS": "error"}
+SURROUNDINGS = {
+    "MPLBACKEND": "Agg",
+    "COLUMNS": "100",
+    "PYTHONWARNINGS": "error",
+    "OPENBLAS_NUM_THREADS": "1",
+}
 """Variables of the environment in which blocks run."""
 
 

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.pixels import pixel_terms
-from iscat_analysis.optics.forward import PEAK_REACH, ForwardModel, MassScale
+from iscat_analysis.optics.forward import PEAK_REACH, ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import PARAMETERS, FloatArray
 
@@ -192,21 +191,19 @@ def peak_gradient(
     shared : ndarray, shape (len(names),)
         Per unit of each parameter.
     """
-    plain = model
-    if model.scale.calibration is not None:  # below an offset two amplitudes have one mass
-        plain = replace(model, scale=MassScale())
     spot = model.optics.wavelength_nm / model.optics.na
     x, y, half = 0.0, 0.0, min(PEAK_REACH * spot, model.reach_nm - spot) / math.sqrt(2)
     while half > _PEAK_NM:
         axis = np.linspace(-half, half, _PEAK_POINTS)
         grid = PixelGrid(x + axis, y + axis, _PEAK_NM)
-        signal = np.abs(plain.amplitude_image(grid, 0.0, 0.0, z_nm, amplitude))
+        signal = np.abs(model.amplitude_image(grid, 0.0, 0.0, z_nm, amplitude))
         row, column = np.unravel_index(int(np.argmax(signal)), signal.shape)
         x, y = float(grid.x_nm[column]), float(grid.y_nm[row])
         half *= 3 / _PEAK_POINTS
     # where the signal is largest its place does not matter to first order
     there = PixelGrid(np.array([x]), np.array([y]), _PEAK_NM)
-    contrast, own, shared = plain.joint_gradient(there, 0.0, 0.0, z_nm, amplitude, names)
+    at = (0.0, 0.0, z_nm, amplitude)
+    contrast, own, shared = model.amplitude_joint_gradient(there, *at, names)
     return float(contrast[0, 0]), own[:, 0, 0], shared[:, 0, 0]
 
 

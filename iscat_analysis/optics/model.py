@@ -386,16 +386,53 @@ class ForwardModel:
         ConfigError
             A name is unknown, or the convention is D21's.
         """
+        amplitude = self.scale.amplitude(mass_kda)
+        signal, own, shared = self.amplitude_joint_gradient(
+            grid, x_nm, y_nm, z_nm, amplitude, names
+        )
+        own[3] /= self.scale.slope(amplitude)
+        return signal, own, shared
+
+    def amplitude_joint_gradient(
+        self,
+        grid: PixelGrid,
+        x_nm: float,
+        y_nm: float,
+        z_nm: float,
+        amplitude: float,
+        names: Sequence[str],
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Signal and its derivatives for an amplitude instead of a mass, see `amplitude_image`.
+
+        Parameters
+        ----------
+        grid : PixelGrid
+            Where to evaluate it.
+        x_nm, y_nm, z_nm : float
+            Particle [nm].
+        amplitude : float
+            Amplitude, see `MassScale`.
+        names : sequence of str
+            As in `joint_gradient`.
+
+        Returns
+        -------
+        signal, own, shared : ndarray
+            As `joint_gradient` gives them, with ∂/∂amplitude in place of ∂/∂mass.
+
+        Raises
+        ------
+        ConfigError
+            A name is unknown, or the convention is D21's.
+        """
         check_names(self.optics, names)
         if self.is_measured:
             raise ConfigError('optics.psf = "measured" knows no parameters of the optics')
         lens, stack = self._sensitivities(z_nm, tuple(names))
-        amplitude = self.scale.amplitude(mass_kda)
         _, pixels, *_ = self._geometry(grid, x_nm, y_nm, amplitude)
         rows = np.empty((grid.shape[0], 5, grid.shape[1]))
         lifted = stack[:2].reshape(-1, *stack.shape[3:])
         signal_gradient(lifted, lens, pixels, x_nm, y_nm, amplitude, rows)
-        rows[:, 4] /= self.scale.slope(amplitude)
         out = np.moveaxis(rows, 1, 0)
         shared = signal_derivatives(stack, lens, pixels, x_nm, y_nm, amplitude)
         return out[0], out[1:], shared

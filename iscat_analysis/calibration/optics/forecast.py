@@ -31,6 +31,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
+from iscat_analysis.threads import one_thread_algebra
 
 EVENTS = 60
 """Particles where nobody says how many."""
@@ -187,6 +188,7 @@ class OpticsForecast:
         }
 
 
+@one_thread_algebra()
 def forecast_optics(
     config: Config, *, events: int = EVENTS, free: str | Sequence[str] | None = None
 ) -> OpticsForecast:

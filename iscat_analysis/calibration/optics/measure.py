@@ -29,6 +29,7 @@ from iscat_analysis.calibration.optics.sights import Build, Settings, Sight
 from iscat_analysis.calibration.optics.starts import average_sights, with_masses
 from iscat_analysis.calibration.optics.states import StateSearch, same_state
 from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.threads import one_thread_algebra
 
 LEAST_SIGHTS = 12
 """Pictures without which nothing is calibrated: eight to fit and four to judge."""
@@ -172,6 +173,7 @@ def judge(
     return Judgement(p_values, found[:, 0], float(kstest(p_values, "uniform").pvalue))
 
 
+@one_thread_algebra()
 def measure_microscope(
     sights: Sequence[Sight],
     configured: Settings,
