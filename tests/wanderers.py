@@ -78,6 +78,7 @@ def wander(
     drift_nm_per_frame: tuple[float, float] = (0.0, 0.0),
     stage_nm: FloatArray | None = None,
     led: Callable[[FloatArray], FloatArray] | None = None,
+    shade: Callable[[int], FloatArray] | None = None,
 ) -> Wanderers:
     """Record particles that diffuse during the whole of every frame.
 
@@ -105,6 +106,9 @@ def wander(
     led : callable, optional
         Takes the places x, y of every particle in every part of a frame, shape (particles, frames,
         parts, 2) [nm], and gives others.
+    shade : callable, optional
+        Takes the number of a frame and gives what the illumination multiplies the light by, shape
+        (rows, columns) or one that is broadcast to it.
 
     Returns
     -------
@@ -148,6 +152,8 @@ def wander(
         spectrum += spectra[1] * ((across * squares) @ along)
         contrast = irfft2(spectrum, s=(side, side))[:rows, :columns]
         expected = (1 + power_noise * rng.standard_normal()) * light * (1 + contrast)
+        if shade is not None:
+            expected = expected * shade(t)
         noisy = expected + np.sqrt(expected) * rng.standard_normal((rows, columns))
         counts[t] = np.floor(noisy / gain_e_per_adu + rng.random((rows, columns)))
 

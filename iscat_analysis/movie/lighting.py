@@ -53,7 +53,7 @@ class Surface:
     degree : int
         Of the polynomial in x and y.
     rms : float
-        Of the change from one window to the next, over the field and the movie.
+        Of the change between frames that are compared, over the field and the movie.
     """
 
     light_e: FloatArray
@@ -64,9 +64,9 @@ class Surface:
     def message(self) -> str:
         """One line for the user."""
         return (
-            f"the light changes slowly over the field, by {100 * self.rms:.2g} % rms from one "
-            "window to the next, as where the beam wanders or fringes pass: each frame was divided "
-            f"by its own smooth light, a polynomial of degree {self.degree}"
+            f"the light changes slowly over the field, by {100 * self.rms:.2g} % rms between "
+            "frames that are compared, as where the beam wanders or fringes pass: each frame was "
+            f"divided by its own smooth light, a polynomial of degree {self.degree}"
         )
 
     @cached_property

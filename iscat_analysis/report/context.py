@@ -291,8 +291,8 @@ def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     smooth = summary.get("lines", {}).get("smooth_rms")
     if smooth:
         yield (
-            f"The light changed slowly over the field ({percent(smooth)} rms from one window to "
-            "the next); each frame was divided by a polynomial of degree "
+            f"The light changed slowly over the field ({percent(smooth)} rms between frames that "
+            "are compared); each frame was divided by a polynomial of degree "
             f"{summary['lines']['smooth_degree']}."
         )
     background = summary.get("background")

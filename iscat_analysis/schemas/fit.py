@@ -165,7 +165,7 @@ class Lines(Closed):
     row_share: NotNegative = key("Part of the noise variance that each row had in common")
     column_share: NotNegative = key("Part of the noise variance that each column had in common")
     smooth_degree: Count = key("Degree of the polynomial in x and y, of smooth changes; 0: none")
-    smooth_rms: NotNegative = key("Relative rms of smooth changes from one window to the next")
+    smooth_rms: NotNegative = key("Relative rms of smooth changes between frames that are compared")
 
 
 class Noise(Document):

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scenes import PIXEL_NM, make_config
 from scipy.ndimage import fourier_shift, gaussian_filter
+from wanderers import SETTINGS, wander
 
 import iscat_analysis as ia
 from iscat_analysis.movie.camera import Camera
@@ -140,3 +141,26 @@ def test_particles_that_land_in_wandering_light(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("iscat_analysis.pipeline.light.find_surface", lambda *_: None)
     without = ia.fit_movie(counts, config=config)
     assert (without.table["status"] == "ok").sum() < 2
+
+
+def test_a_particle_that_moves_in_wandering_light() -> None:
+    """The spot is a Gaussian as wide as the field, whose centre goes where it likes."""
+    frames, side = 100, 64
+    steps = np.random.default_rng(7).standard_normal((frames, 2))
+    way = 4.0 * np.cumsum(steps, axis=0) / np.sqrt(frames)
+    y, x = np.indices((side, side)) - (side - 1) / 2
+
+    def spot(t: int) -> Array:
+        return np.asarray(np.exp((x * way[t, 0] + y * way[t, 1]) / (0.6 * side) ** 2))
+
+    shape = (frames, side, side)
+    movie = wander(shape, seed=5, species=((300.0, 0.3, 1),), shade=spot)
+    result = ia.fit_movie(movie.counts, settings=SETTINGS)
+    assert any("changes slowly over the field" in text for text in result.warnings)
+    assert list(result.tracks["status"]) == ["ok"]
+    track = result.tracks.iloc[0]
+    assert abs(track["mass_kda"] - 300) < 4 * track["sigma_mass_kda"]
+    both = result.table.merge(movie.truth, on="frame", suffixes=("", "_true"))
+    for axis in ("x_nm", "y_nm"):
+        pull = (both[axis] - both[f"{axis}_true"]) / both[f"sigma_{axis}"]
+        assert abs(pull.std() - 1) < 4 / np.sqrt(2 * len(pull))
