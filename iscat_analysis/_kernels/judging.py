@@ -13,16 +13,19 @@ from iscat_analysis._kernels.canvas import (
     Pictures,
     cut,
     draw_gradient,
+    lens_of,
     ready_frame,
     square_of,
     stage,
     table_of,
 )
 from iscat_analysis._kernels.dense import factorise
+from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.lens import STAMP
+from iscat_analysis._kernels.lens import STAMP, Lens
 from iscat_analysis._kernels.place_score import place_score
 from iscat_analysis._kernels.scoring import FLOOR, blank_profile
+from iscat_analysis._kernels.stamp_bends import BENDS, stamp_bends
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -142,16 +145,12 @@ def judge_frames(
     near_profile = blank_profile(table_of(near, 0), near.lens, 1)
     far_profile = blank_profile(table_of(far, 0), far.lens, 1)
     profile = blank_profile(table_of(near, 0), near.lens, 2)
-    low = near.first_nm
-    high = low + near.step_nm * (near.heights.shape[1] - 1)
     index = np.flatnonzero(free[:4])
-    n = index.size
     image = np.empty(max(field.drawn, field.side) ** 2)
     square = np.empty(4 * field.side**2)
-    g, up = np.empty(5 * field.side**2), np.empty(5 * field.side**2)
-    down = np.empty(5 * field.side**2)
+    g, work = np.empty(5 * field.side**2), np.empty(BENDS * field.side**2)
     pull, known = np.empty(5), np.empty((5, 5))
-    ways_here, trial, ahead, behind = np.empty((4, n)), np.empty(5), np.empty(4), np.empty(4)
+    ways_here = np.empty((4, index.size))
     for t in range(first, last):
         ready_frame(
             field, near, far, starts, t, theta, group, canvas, near_profile, far_profile, image
@@ -181,23 +180,107 @@ def judge_frames(
                 continue
             if PART * np.abs(ways_here[:2]).max() > field.pixel_nm:  # as good as singular
                 continue
-            for k in range(n):
-                for sign in range(2):
-                    step = PART if sign == 0 else -PART
-                    trial[:] = p
-                    for a in range(4):
-                        trial[a] += step * ways_here[a, k]
-                    if free[2]:
-                        trial[2] = min(max(trial[2], low), high)
-                    there = (up if sign == 0 else down)[: 5 * ny * nx].reshape(ny, 5, nx)
-                    draw_gradient(near, group[r], trial, pixels, profile, there)
-                    _score_of(data, there, ahead if sign == 0 else behind)
-                plus = up[: 5 * ny * nx].reshape(ny, 5, nx)
-                minus = down[: 5 * ny * nx].reshape(ny, 5, nx)
-                _add_curvature(data, here, plus, minus, bias[r])
+            for k in range(index.size):
                 for a in range(4):
-                    turned[r, a, k] = -(ahead[a] - behind[a]) / (2 * PART)
                     ways[r, a, k] = ways_here[a, k]
+            lens = lens_of(near, group[r])
+            _curve(
+                near, lens, group[r], free, pixels, data, here, p, ways_here, profile, work,
+                turned[r], bias[r],
+            )  # fmt: skip
+
+
+@kernel()
+def _curve(
+    near: Pictures, lens: Lens, group: int, free: BoolArray, pixels: Pixels, data: FloatArray,
+    here: FloatArray, p: FloatArray, ways: FloatArray, profile: FloatArray, work: FloatArray,
+    turned: FloatArray, bias: FloatArray,
+) -> None:  # fmt: skip
+    """Fill O V of a row and add to its bias; what a lens leaves out depends on its type.
+
+    A picture at one height has second derivatives; of others they are differences.
+    """
+    ny, nx = pixels.y.size, pixels.x.size
+    if len(lens) == STAMP:
+        bends = work[: BENDS * ny * nx].reshape(ny, BENDS, nx)
+        stamp_bends(near.nodes, lens, pixels, p[0], p[1], p[3], bends)
+        _curve_at_one_height(data, bends, ways, turned, bias)
+        return
+    low = near.first_nm
+    high = low + near.step_nm * (near.heights.shape[1] - 1)
+    trial, ahead, behind = np.empty(5), np.empty(4), np.empty(4)
+    both = work[: 10 * ny * nx].reshape(2, ny, 5, nx)
+    for k in range(ways.shape[1]):
+        for sign in range(2):
+            step = PART if sign == 0 else -PART
+            trial[:] = p
+            for a in range(4):
+                trial[a] += step * ways[a, k]
+            if free[2]:
+                trial[2] = min(max(trial[2], low), high)
+            draw_gradient(near, group, trial, pixels, profile, both[sign])
+            _score_of(data, both[sign], ahead if sign == 0 else behind)
+        _add_curvature(data, here, both[0], both[1], bias)
+        for a in range(4):
+            turned[a, k] = -(ahead[a] - behind[a]) / (2 * PART)
+
+
+@kernel()
+def _curve_at_one_height(
+    data: FloatArray, bends: FloatArray, ways: FloatArray, turned: FloatArray, bias: FloatArray
+) -> None:
+    """Do it with the second derivatives of a picture at one height (ny, BENDS, nx)."""
+    sums, spread = np.zeros(9), np.zeros((4, 4))
+    for a in range(4):
+        for b in range(4):
+            for k in range(ways.shape[1]):
+                spread[a, b] += ways[a, k] * ways[b, k]
+    _observe(data, bends, spread, sums)
+    order = (0, 1, 3)
+    observed = np.zeros((4, 4))
+    for m in range(3):
+        for q in range(3):
+            observed[order[m], order[q]] = sums[m + q + (m > 0 and q > 0)]
+        bias[order[m]] -= 0.5 * sums[6 + m]
+    for a in range(4):
+        for k in range(ways.shape[1]):
+            turned[a, k] = 0.0
+            for b in range(4):
+                turned[a, k] += observed[a, b] * ways[b, k]
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def _observe(data: FloatArray, bends: FloatArray, spread: FloatArray, sums: FloatArray) -> None:
+    """Sum the observed information in xx, xy, xa, yy, ya, aa, and Σ β²/λ tr(F⁻¹ ∂²s) ∂s."""
+    o0 = o1 = o2 = o3 = o4 = o5 = b0 = b1 = b2 = 0.0
+    vxx, vyy, vaa = spread[0, 0], spread[1, 1], spread[3, 3]
+    vxy, vxa, vya = 2.0 * spread[0, 1], 2.0 * spread[0, 3], 2.0 * spread[1, 3]
+    for i in range(data.shape[1]):
+        d0, d1, d2, d3 = data[0, i], data[1, i], data[2, i], data[3, i]
+        s, gx, gy, ga = bends[i, 0], bends[i, 1], bends[i, 2], bends[i, 3]
+        gxx, gxy, gyy = bends[i, 4], bends[i, 5], bends[i, 6]
+        gxa, gya, gaa = bends[i, 7], bends[i, 8], bends[i, 9]
+        for j in range(s.size):
+            per = 1.0 / max(d1[j] + d2[j] * s[j] + d3[j], FLOOR)
+            over = d0[j] * per
+            pull = d2[j] * (over - 1.0)
+            weight = d2[j] * d2[j] * per
+            bend = weight * over
+            o0 += bend * gx[j] * gx[j] - pull * gxx[j]
+            o1 += bend * gx[j] * gy[j] - pull * gxy[j]
+            o2 += bend * gx[j] * ga[j] - pull * gxa[j]
+            o3 += bend * gy[j] * gy[j] - pull * gyy[j]
+            o4 += bend * gy[j] * ga[j] - pull * gya[j]
+            o5 += bend * ga[j] * ga[j] - pull * gaa[j]
+            curved = weight * (
+                vxx * gxx[j] + vyy * gyy[j] + vaa * gaa[j]
+                + vxy * gxy[j] + vxa * gxa[j] + vya * gya[j]
+            )  # fmt: skip
+            b0 += curved * gx[j]
+            b1 += curved * gy[j]
+            b2 += curved * ga[j]
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = o0, o1, o2, o3, o4, o5
+    sums[6], sums[7], sums[8] = b0, b1, b2
 
 
 @kernel()

@@ -45,7 +45,7 @@ _WEIGHTS = 4 * TAPS + 3  # of x and y, their slopes, the first nodes, and the am
 
 
 @kernel()
-def _sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
+def sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
     """Length of a line, of a block of nodes, of what is made of them, and of a strip's pixels."""
     more = (TAPS + lens.fine - 2) // lens.fine
     line = columns + more
@@ -62,7 +62,7 @@ def _begin(
     amplitude: float,
 ) -> AnyFloatArray:
     """Work space of an image, the weights of all of its pixels at the beginning."""
-    _, block, made, strip = _sizes(lens, pixels.x.size)
+    _, block, made, strip = sizes(lens, pixels.x.size)
     w = np.empty(_WEIGHTS + lens.fine * (2 * block + 3 * made) + 4 * strip, profile.dtype)
     x = (pixels.x[0] - x_p) * lens.inv_step + lens.half
     y = (pixels.y[0] - y_p) * lens.inv_step + lens.half
@@ -77,7 +77,7 @@ def _begin(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _copy(
+def copy_nodes(
     profile: AnyFloatArray, row: int, step: int, first: int, last: int, line: int,
     a: np.floating[Any], signal: AnyFloatArray, slope: AnyFloatArray,
 ) -> None:  # fmt: skip
@@ -99,7 +99,7 @@ def _copy(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _mix(nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArray) -> None:
+def mix_nodes(nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArray) -> None:
     """Fill `out` with the combination w of what begins at TAPS places of `nodes`."""
     n = out.size
     for k in range(0, TAPS, 4):
@@ -109,11 +109,11 @@ def _mix(nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArra
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _mix_both(
+def mix_nodes_both(
     nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, v: AnyFloatArray,
     out: AnyFloatArray, other: AnyFloatArray,
 ) -> None:  # fmt: skip
-    """Fill `out` and `other` with two combinations of the same nodes; see `_mix`."""
+    """Fill `out` and `other` with two combinations of the same nodes; see `mix_nodes`."""
     n = out.size
     for k in range(0, TAPS, 4):
         a, b = nodes[at[k] : at[k] + n], nodes[at[k + 1] : at[k + 1] + n]
@@ -132,7 +132,7 @@ def _make_strip(
     `STRIP` lines long.
     """
     fine = lens.fine
-    line, block, made, strip = _sizes(lens, columns)
+    line, block, made, strip = sizes(lens, columns)
     wx, vx, wy, vy = w[:TAPS], w[TAPS : 2 * TAPS], w[2 * TAPS : 3 * TAPS], w[3 * TAPS : 4 * TAPS]
     left, top, a = int(w[4 * TAPS]), int(w[4 * TAPS + 1]) + fine * row, w[4 * TAPS + 2]
     per_phase = profile.shape[2] // fine
@@ -149,28 +149,28 @@ def _make_strip(
             start = k * block
             stop = start + (rows + (TAPS - 1 - k) // fine) * line
             end = kept + stop if gradient else kept + start
-            _copy(
+            copy_nodes(
                 profile, top + k, fine, phase * per_phase + first, phase * per_phase + last, line,
                 a, nodes[start:stop], nodes[kept + start : end],
             )  # fmt: skip
         start = phase * made
         here = sums[start : start + used]
         if not gradient:
-            _mix(nodes[:kept], at, wy, here)
+            mix_nodes(nodes[:kept], at, wy, here)
             continue
-        _mix_both(nodes[:kept], at, wy, vy, here, sums[start + size : start + size + used])
-        _mix(nodes[kept:], at, wy, sums[start + 2 * size : start + 2 * size + used])
+        mix_nodes_both(nodes[:kept], at, wy, vy, here, sums[start + size : start + size + used])
+        mix_nodes(nodes[kept:], at, wy, sums[start + 2 * size : start + 2 * size + used])
     phase = left % fine
     for k in range(TAPS):
         at[k] = (phase + k) % fine * made + (phase + k) // fine
     out: int = _WEIGHTS + 2 * fine * block + 3 * fine * made
     used -= more
     if not gradient:
-        _mix(sums, at, wx, w[out : out + used])
+        mix_nodes(sums, at, wx, w[out : out + used])
         return out
-    _mix_both(sums, at, wx, vx, w[out : out + used], w[out + strip : out + strip + used])
-    _mix(sums[size:], at, wx, w[out + 2 * strip : out + 2 * strip + used])
-    _mix(sums[2 * size :], at, wx, w[out + 3 * strip : out + 3 * strip + used])
+    mix_nodes_both(sums, at, wx, vx, w[out : out + used], w[out + strip : out + strip + used])
+    mix_nodes(sums[size:], at, wx, w[out + 2 * strip : out + 2 * strip + used])
+    mix_nodes(sums[2 * size :], at, wx, w[out + 3 * strip : out + 3 * strip + used])
     return out
 
 
@@ -190,7 +190,7 @@ def _fill_gradient(
     out: FloatArray,
 ) -> None:  # fmt: skip
     rows, n = out.shape[0], out.shape[2]
-    line, _, _, strip = _sizes(lens, n)
+    line, _, _, strip = sizes(lens, n)
     for row in range(rows):
         if row % STRIP == 0:
             begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, True, at, f)
@@ -234,7 +234,7 @@ def _put_signal(
 ) -> None:  # fmt: skip
     """Write the signal into `out`, or add it to what is there."""
     rows, n = out.shape
-    line = _sizes(lens, n)[0]
+    line = sizes(lens, n)[0]
     for row in range(rows):
         if row % STRIP == 0:
             begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, False, at, f)
