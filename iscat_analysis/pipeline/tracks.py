@@ -32,7 +32,7 @@ from iscat_analysis.records import (
     Windows,
     track_numbers,
 )
-from iscat_analysis.species.tracks import Correlation, TrackSetup, describe_tracks
+from iscat_analysis.species.tracks import Correlation, TrackSetup, changes_together, describe_tracks
 from iscat_analysis.threads import one_thread_algebra
 from iscat_analysis.units import listed
 
@@ -133,6 +133,7 @@ def tracks_of(
         ``tracks`` and ``motion`` of ``summary.json``.
     """
     setup = track_setup(scene, windows)
+    setup = replace(setup, change=changes_together(fits, setup.frames))
     with one_thread_algebra():
         tracks = describe_tracks(
             fits,
@@ -142,6 +143,12 @@ def tracks_of(
             seed=scene.config.compute.seed,
             workers=scene.config.compute.workers,
             progress=progress,
+        )
+    if setup.change:
+        tell(
+            f"the masses of all tracks change together, by {100 * setup.change:.2g} % in these "
+            "frames, as where the focus drifts: tracks that this puts off by more than their "
+            "errors are flagged mass_varies; hold the focus, or analyse fewer frames (fit.frames)"
         )
     met = tracks[tracks["nearest_nm"] < setup.near_nm]
     if len(met):

@@ -97,8 +97,9 @@ _TRACK_ADVICE = {
     TrackStatus.FEW_FRAMES: "Fewer positions than track.min_frames: no diffusion coefficient.",
     TrackStatus.POOR_FITS: "Fewer than half of its frames are ok, so that its mass is that of a "
     "selection: see the status of its rows in fits.csv.",
-    TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors: motion blurs "
-    "the picture, particles met, or the particle changed.",
+    TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors, or those of "
+    "all tracks do together: motion blurs the picture, particles met, the particle changed, or the "
+    "focus drifts.",
     TrackStatus.SHORT_WAY: "It went so short a way that it can hardly be told from the background "
     "learnt with it: mass and D are wrong together, D as the mass to the power of -2; record for "
     "longer, or give background frames without it.",

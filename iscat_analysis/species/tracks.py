@@ -35,6 +35,7 @@ from iscat_analysis.records import (
     silent,
     track_numbers,
 )
+from iscat_analysis.species.common_change import common_change
 from iscat_analysis.species.common_mass import CommonMass, combine_masses, information_power
 from iscat_analysis.species.diffusion import Diffusion, fit_diffusion, hydrodynamic_diameter
 from iscat_analysis.species.displacements import LEAST_POSITIONS
@@ -98,6 +99,8 @@ class TrackSetup:
         Its density [kg/m³].
     n_medium : float
         Refractive index of the liquid.
+    change : float
+        By how much, relative, the masses of all tracks change together; from `changes_together`.
     """
 
     frame_rate_hz: float | None
@@ -112,6 +115,7 @@ class TrackSetup:
     index: float | None = 1.46
     density_kg_m3: float = 1350.0
     n_medium: float = 1.33
+    change: float = 0.0
 
 
 Correlation = Callable[[FloatArray], FloatArray]
@@ -179,6 +183,25 @@ def describe_tracks(
         crossed = ["crosses"] if record["nearest_nm"] < setup.near_nm else []
         record["flags"] = ";".join([*map(str, status), *crossed])
     return _table(records, fits)
+
+
+def changes_together(fits: pd.DataFrame, frames: tuple[int, int]) -> float:
+    """Say by how much the masses of all tracks change together.
+
+    Parameters
+    ----------
+    fits : pandas.DataFrame
+        As for `describe_tracks`.
+    frames : (int, int)
+        Half-open range that was analysed.
+
+    Returns
+    -------
+    float
+        As from `iscat_analysis.species.common_change.common_change`.
+    """
+    massive = map(_massive, _by_track(fits).values())
+    return common_change([(g.frame, g.mass_kda, g.sigma_mass_kda) for g in massive], frames)
 
 
 @dataclass(frozen=True)
@@ -437,7 +460,8 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
     seen = {
         TrackStatus.FEW_FRAMES: record["n_d_frames"] < max(LEAST_POSITIONS, setup.min_frames),
         TrackStatus.POOR_FITS: record["n_mass_frames"] < record["n_frames"] / 2,
-        TrackStatus.MASS_VARIES: record["p_mass"] < SURPRISING / 10,
+        TrackStatus.MASS_VARIES: record["p_mass"] < SURPRISING / 10
+        or setup.change * abs(record["mass_kda"]) > record["sigma_mass_kda"],
         TrackStatus.SHORT_WAY: record["short_way"],
         TrackStatus.NOT_FREE: min(record[name] for name in _FREE) <= SURPRISING,
         TrackStatus.STANDS_STILL: record["d_low_um2_s"] == 0,

@@ -1,0 +1,63 @@
+"""Masses that all tracks change together, as where the focus drifts.
+
+A track of its own cannot tell whether it changed or the microscope did, and a short one not even
+that it did; all of them can.  With the mean of each track taken off, the relative masses of all
+frames are fitted by one parabola in time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.polynomial import legendre
+from scipy.stats import chi2
+
+from iscat_analysis.records import FloatArray
+
+_DEGREE = 2
+_FEWEST_TRACKS = 3
+_SURE = 1e-4  # chance of it, whichever track is left out: one that changes is no drift
+
+
+def common_change(
+    tracks: Sequence[tuple[FloatArray, FloatArray, FloatArray]], frames: tuple[int, int]
+) -> float:
+    """Say by how much the masses of all tracks change together.
+
+    Parameters
+    ----------
+    tracks : sequence of (ndarray, ndarray, ndarray), shape (n,) each
+        Frames, masses and their standard errors of every track.
+    frames : (int, int)
+        Half-open range that was analysed.
+
+    Returns
+    -------
+    float
+        The largest mass over the smallest in these frames, minus 1; 0 where the tracks do not say
+        that there is any change.
+    """
+    first, last = frames
+    information, pull = [], []
+    for frame, mass, sigma in tracks:
+        if len(frame) <= _DEGREE + 1:
+            continue
+        mean = np.average(mass, weights=sigma**-2)
+        weight = (mean / sigma) ** 2
+        time = 2 * (frame - first) / max(last - 1 - first, 1) - 1
+        slopes = legendre.legvander(time, _DEGREE)[:, 1:]
+        slopes = slopes - np.average(slopes, axis=0, weights=weight)
+        information.append((slopes.T * weight) @ slopes)
+        pull.append(slopes.T @ (weight * (mass / mean - 1)))
+    if len(pull) < _FEWEST_TRACKS:
+        return 0.0
+    every, whole = np.sum(pull, axis=0), np.sum(information, axis=0)
+    least = chi2.isf(_SURE, _DEGREE)
+    for mine, known in zip(pull, information, strict=True):
+        rest = every - mine
+        if rest @ np.linalg.pinv(whole - known) @ rest < least:
+            return 0.0
+    found = np.linalg.pinv(whole) @ every
+    change = legendre.legval(np.linspace(-1, 1, last - first), np.append(0.0, found))
+    return float(np.ptp(change))
