@@ -21,12 +21,11 @@ of each component, followed by the same for ∂/∂z, and for ∂²/∂z² where
 from __future__ import annotations
 
 import math
-from functools import cache, lru_cache
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import toeplitz
-from scipy.special import i0
+from scipy.special import i0, j0, j1
 
 from iscat_analysis._kernels import kernel
 
@@ -78,13 +77,6 @@ def window() -> tuple[FloatArray, FloatArray]:
     waves[:, 1:] *= 2
     undo = np.linalg.lstsq(smoothing[:, None] * waves, np.ones(band.size), rcond=1e-14)[0]
     return np.ascontiguousarray(weights.T), np.concatenate([undo[:0:-1], undo])
-
-
-@lru_cache(8)
-def undoing(half: int) -> FloatArray:
-    """Write the filter of `window` as a matrix, shape (2·half + 1, 2·(half + FILTER) + 1)."""
-    undo = window()[1]
-    return np.asarray(toeplitz(np.pad(undo[:1], (0, 2 * half)), np.pad(undo, (0, 2 * half))))
 
 
 def lattice_half(reach_nm: float, step_nm: float) -> int:
@@ -157,37 +149,55 @@ def _fill_quintics(nodes: FloatArray, powers: FloatArray) -> None:
             powers[i, 5, j] = 6 * rise - 3 * d0 - 3 * d1 - 0.5 * s0 + 0.5 * s1
 
 
-@kernel()
 def bessel_ladder(x: FloatArray, out: FloatArray) -> None:
-    """Fill `out` (orders, n) with J_0, J_1, … of x ≥ 0 by Miller's downward recurrence."""
+    """Fill `out` (orders, n) with J_0, J_1, … of x ≥ 0."""
+    j0(x, out=out[0])
+    j1(x, out=out[1])
+    _climb(x, out)
+
+
+@kernel()
+def _climb(x: FloatArray, out: FloatArray) -> None:
+    """Fill rows 2, 3, … of `out` from rows 0 and 1; where that is unstable, all by `_descend`."""
     orders = out.shape[0]
     for k in range(x.size):
-        value = x[k]
-        if value < 1e-8:
-            for m in range(orders):
-                out[m, k] = 0.0
-            out[0, k] = 1.0
-            out[1, k] = value / 2
+        if x[k] < orders:
+            _descend(x[k], out[:, k])
             continue
-        top = max(orders, int(value)) + 14 + int(6 * np.sqrt(max(float(orders), value)) / 2)
-        above, here, total = 0.0, 1e-280, 0.0
-        for m in range(top, 0, -1):
-            if m < orders:
-                out[m, k] = here
-            if m % 2 == 0:
-                total += 2 * here
-            below = 2 * m / value * here - above
-            above, here = here, below
-            if abs(here) > 1e200:
-                here *= 1e-200
-                above *= 1e-200
-                total *= 1e-200
-                for j in range(m, orders):
-                    out[j, k] *= 1e-200
-        out[0, k] = here
-        total += here
-        for m in range(orders):
-            out[m, k] /= total
+        twice = 2 / x[k]
+        below, here = out[0, k], out[1, k]
+        for m in range(1, orders - 1):
+            below, here = here, m * twice * here - below
+            out[m + 1, k] = here
+
+
+@kernel()
+def _descend(x: float, out: FloatArray) -> None:
+    """Fill `out` (orders) with J_0, J_1, … of x ≥ 0 by Miller's downward recurrence."""
+    orders = out.size
+    if x < 1e-8:
+        out[:] = 0.0
+        out[0] = 1.0
+        out[1] = x / 2
+        return
+    top = orders + 14 + int(3 * np.sqrt(float(orders)))
+    above, here, total = 0.0, 1e-280, 0.0
+    for m in range(top, 0, -1):
+        if m < orders:
+            out[m] = here
+        if m % 2 == 0:
+            total += 2 * here
+        above, here = here, 2 * m / x * here - above
+        if abs(here) > 1e200:
+            here *= 1e-200
+            above *= 1e-200
+            total *= 1e-200
+            for j in range(m, orders):
+                out[j] *= 1e-200
+    out[0] = here
+    total += here
+    for m in range(orders):
+        out[m] /= total
 
 
 @kernel(fastmath=FAST)
@@ -304,8 +314,50 @@ def spread(waves: FloatArray, radial_step_nm: float, step_nm: float, half: int) 
     side = 2 * (half + FILTER) + 1
     fields = np.empty((waves.shape[4], 2, side, side))
     _sample(waves, 1 / radial_step_nm, step_nm, fields)
-    undo = undoing(half)
-    return np.asarray(undo @ (fields @ undo.T))
+    coefficients = undo_window(fields.reshape(-1, side, side))
+    return coefficients.reshape(-1, 2, 2 * half + 1, 2 * half + 1)
+
+
+def undo_window(samples: FloatArray) -> FloatArray:
+    """Turn samples of fields into coefficients.
+
+    Parameters
+    ----------
+    samples : ndarray, shape (k, n, n)
+        At the nodes.
+
+    Returns
+    -------
+    ndarray, shape (k, n − 2·FILTER, n − 2·FILTER)
+        Of the nodes that have all those under the filter.
+    """
+    side = samples.shape[1] - 2 * FILTER
+    out = np.empty((len(samples), side, side))
+    _filter(samples, window()[1][FILTER:], out)
+    return out
+
+
+@kernel(fastmath=FAST)
+def _filter(samples: FloatArray, undo: FloatArray, out: FloatArray) -> None:
+    """Fill `out` with `samples`, filtered along both axes by a middle and one half of a filter."""
+    half, side = undo.size - 1, out.shape[1]
+    line = np.empty(side + 2 * half)
+    for k in range(len(out)):
+        for i in range(side):
+            middle = samples[k, half + i]
+            for j in range(line.size):
+                line[j] = undo[0] * middle[j]
+            for t in range(1, half + 1):
+                low, high, weight = samples[k, half + i - t], samples[k, half + i + t], undo[t]
+                for j in range(line.size):
+                    line[j] += weight * (low[j] + high[j])
+            row = out[k, i]
+            for j in range(side):
+                row[j] = undo[0] * line[half + j]
+            for t in range(1, half + 1):
+                low, high, weight = line[half - t :], line[half + t :], undo[t]
+                for j in range(side):
+                    row[j] += weight * (low[j] + high[j])
 
 
 def reach_of_samples(reach_nm: float, step_nm: float) -> float:

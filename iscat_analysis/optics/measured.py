@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.lattice import FILTER, LATTICE_STEP, lattice_half, undoing, window
+from iscat_analysis._kernels.lattice import FILTER, LATTICE_STEP, lattice_half, undo_window, window
 from iscat_analysis._kernels.lens import LatticeLens
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.kept import kept
@@ -222,8 +222,8 @@ class MeasuredField:
         half = min(have, self.half + FILTER)
         inner, there = (slice(c - half, c + half + 1) for c in (self.half + FILTER, have))
         samples[inner, inner] = known[there, there]
-        undo = undoing(self.half)
-        return np.asarray(undo @ samples @ undo.T)
+        coefficients: FloatArray = undo_window(samples[None])[0]
+        return coefficients
 
     def components(
         self, dx_nm: FloatArray, dy_nm: FloatArray, _z_nm: float

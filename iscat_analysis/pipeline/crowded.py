@@ -10,10 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
-
 from iscat_analysis.calibration.optics import LEAST_SIGHTS, OpticsCalibration, Sight
-from iscat_analysis.calibration.optics.settings import with_settings
+from iscat_analysis.calibration.optics.settings import heights_free, settings_of, with_settings
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.pipeline.field import fit_field
@@ -50,12 +48,11 @@ def seen_in_field(
     others : list of Sight
         Every particle, on small regions.
     """
-    fit = config.fit.model_copy(update={"mode": "mass"})
+    fit = config.fit.model_copy(update={"mode": "joint" if heights_free(config) else "mass"})
     rows, columns = windows.after_e.shape
     scene = make_scene(config.model_copy(update={"fit": fit}), (rows, columns))
     events, _ = fit_field(scene, windows, pool=pool)
-    known = np.array([(event.fit.x_nm, event.fit.y_nm) for event in events]).reshape(-1, 2)
-    return known_places(windows, config, known, LEAST_SIGHTS)
+    return known_places(windows, config, [event.fit.theta for event in events], LEAST_SIGHTS)
 
 
 def learn_in_field(
@@ -90,16 +87,22 @@ def learn_in_field(
     DataError
         The field has too few particles.
     """
-    places, others = bright_places(windows, config, alone_nm=0.0)
-    found = calibrate_sights(
-        places, others, config, groups, source, least=LEAST_ROUGH, mapper=pool.map
-    )
-    for _ in range(ROUNDS):
+    guess: Config | None = config
+    if not heights_free(config):
+        places, others = bright_places(windows, config, alone_nm=0.0)
+        found = calibrate_sights(
+            places, others, config, groups, source, least=LEAST_ROUGH, mapper=pool.map
+        )
         guess, why = with_sign(with_settings(config, found.measured.settings))
+    for _ in range(ROUNDS):
         if guess is None:
             raise DataError(why)
         sights, others = seen_in_field(windows, guess, pool)
-        found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
+        known = settings_of(guess) if heights_free(config) else None
+        found = calibrate_sights(
+            sights, others, config, groups, source, known=known, mapper=pool.map
+        )
         if found.accepted:
             break
+        guess, why = with_sign(with_settings(config, found.measured.settings))
     return found

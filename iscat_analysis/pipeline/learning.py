@@ -23,6 +23,7 @@ from iscat_analysis.calibration.optics import (
     Settings,
     Sight,
     free_groups,
+    heights_free,
     maximise,
     settings_of,
 )
@@ -47,7 +48,7 @@ from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, judge_counts
 from iscat_analysis.pipeline.ranges import frame_ranges, measured_windows
 from iscat_analysis.pipeline.sights import bright_sights, kind_of, reach_nm, scan_sights
 from iscat_analysis.pipeline.ways import way_of
-from iscat_analysis.records import FREE_PARAMETERS, Mapper, Progress, Windows, silent
+from iscat_analysis.records import Mapper, Progress, Windows, silent
 from iscat_analysis.search.sliding import measure_frames
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
@@ -103,7 +104,8 @@ def learn_optics(
     measured = config.background.method != "known"
     if (
         optics.calibrate == "never"
-        or (optics.calibrate == "auto" and (optics.file is not None or _at_heights(config)))
+        or (optics.calibrate == "auto" and optics.file is not None)
+        or (heights_free(config) and way_of(config) != "fixed")
         or not suited
         or not measured
         or config.fit.mode == "track"
@@ -111,7 +113,9 @@ def learn_optics(
         return config, {}
     tested: dict[str, Any] = {}
     with threads(config.compute.workers) as pool:
-        sights, others = bright_sights(movie, config, camera, pool)
+        sights, others = (
+            ([], []) if heights_free(config) else bright_sights(movie, config, camera, pool)
+        )
         alone, source = len(sights), {"movie": movie.name}
         try:
             if alone < LEAST_TESTED and way_of(config) == "fixed":
@@ -181,11 +185,6 @@ def taken(
     for note in found.notes:
         tell(note)
     return learned, summary | {"calibrated": True}
-
-
-def _at_heights(config: Config) -> bool:
-    """Whether heights are fitted, so that particles need not be at ``particle.height_nm``."""
-    return "z_nm" in FREE_PARAMETERS[config.fit.mode]
 
 
 def calibrate_movie(
@@ -303,20 +302,23 @@ def _median_p(
     settings = settings_of(config)
     build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
     model = build(settings)
-    averages, placed = average_sights(sights[:_TESTED])
-    x, y = _centre(averages[0], model, build, settings)
+    shown: Sequence[Sight] = sights[:_TESTED]
+    x, y = 0.0, 0.0
+    if not heights_free(config):
+        averages, shown = average_sights(shown)
+        x, y = _centre(averages[0], model, build, settings)
 
     def median(pictures: Sequence[Sight]) -> tuple[float, Sequence[Sight]]:
         fitted = maximise(pictures, build, settings, (), mapper=mapper).sights
         return float(np.median([goodness(sight, model)[1] for sight in fitted])), fitted
 
-    moved = [sight.placed(sight.x_nm + x, sight.y_nm + y) for sight in placed]
+    moved = [sight.placed(sight.x_nm + x, sight.y_nm + y) for sight in shown]
     found, fitted = median(with_masses(moved, build, settings))
     if found >= REJECTED_P or not any(sight.neighbours for sight in fitted):
         return found
     elsewhere = [other.placed(other.x_nm + x, other.y_nm + y) for other in others]
     near = Neighbours.fitted(elsewhere, build, rings_of(config, sights[0]), settings, mapper)
-    return max(found, median([near.around(sight) for sight in fitted])[0])
+    return max(found, median(near.around(fitted, mapper))[0])
 
 
 def _noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:

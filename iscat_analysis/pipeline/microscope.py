@@ -7,8 +7,6 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from iscat_analysis.calibration.optics import (
     FOCUS_STEP,
     LEAST_SIGHTS,
@@ -201,9 +199,8 @@ def goodness(sight: Sight, model: ForwardModel) -> tuple[float, float]:
     chi2_reduced, p_value : float
         From `goodness_of_fit`.
     """
-    theta = np.array([sight.x_nm, sight.y_nm, sight.z_nm, sight.mass_kda, sight.level])
     likelihood = Likelihood(model, sight.grid, sight.kind, sight.data)
-    return goodness_of_fit(likelihood, theta, np.array([True, True, False, True, True]))
+    return goodness_of_fit(likelihood, sight.private, sight.free)
 
 
 def with_sign(config: Config) -> tuple[Config | None, str]:

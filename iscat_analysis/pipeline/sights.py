@@ -15,8 +15,10 @@ import numpy as np
 from iscat_analysis.calibration.optics import (
     FAINTEST,
     MOST_SIGHTS,
+    PRIVATE,
     Sight,
     build_microscope,
+    heights_free,
     settings_of,
 )
 from iscat_analysis.config import Config
@@ -236,7 +238,7 @@ def bright_places(
 
 
 def known_places(
-    windows: Windows, config: Config, known_nm: FloatArray, least: int
+    windows: Windows, config: Config, known: Sequence[FloatArray], least: int
 ) -> tuple[list[Sight], list[Sight]]:
     """Cut out particles that are known, those that are farthest from others.
 
@@ -246,8 +248,8 @@ def known_places(
         The sums before and after.
     config : Config
         Resolved.
-    known_nm : ndarray, shape (n, 2)
-        Where all particles are, x and y [nm].
+    known : sequence of ndarray, shape (5,)
+        All particles, as they were fitted, in the order of `Likelihood`.
     least : int
         Pictures wanted: the distance from others is the largest that leaves so many.
 
@@ -259,19 +261,25 @@ def known_places(
         Every particle, on small regions.
     """
     pixel, cut_out = _pixel_nm(config), _cutter(windows, config)
+    heights = config.fit.z_range_nm if heights_free(config) else None
 
     def cut(chosen: FloatArray, side: int) -> list[Sight]:
-        places = chosen.tolist()
-        return [cut_out(round(y / pixel), round(x / pixel), side).placed(x, y) for x, y in places]
+        places = np.rint(chosen[:, 1::-1] / pixel).astype(int).tolist()
+        return [
+            replace(cut_out(row, column, side).moved(theta), heights_nm=heights)
+            for (row, column), theta in zip(places, chosen, strict=True)
+        ]
 
-    others = cut(known_nm, round(OTHERS_NM / pixel))
+    thetas = np.array(known).reshape(-1, PRIVATE)
+    places_nm = thetas[:, :2]
+    others = cut(thetas, round(OTHERS_NM / pixel))
     room = (_roi_px(config) // 2 + 1) * pixel
     far = np.array(windows.after_e.shape[::-1]) * pixel - room
-    inside = ((known_nm >= room) & (known_nm < far)).all(axis=1)
-    apart = np.hypot(*(known_nm[:, None] - known_nm).transpose(2, 0, 1))
+    inside = ((places_nm >= room) & (places_nm < far)).all(axis=1)
+    apart = np.hypot(*(places_nm[:, None] - places_nm).transpose(2, 0, 1))
     np.fill_diagonal(apart, np.inf)
     nearest = apart.min(axis=1, initial=np.inf)[inside]
-    seen = [_among(sight, others, 0.0) for sight in cut(known_nm[inside], _roi_px(config))]
+    seen = [_among(sight, others, 0.0) for sight in cut(thetas[inside], _roi_px(config))]
     for alone_nm in _KNOWN_APART_NM:
         sights = _bright(s for s, d in zip(seen, nearest, strict=True) if d >= alone_nm)
         if len(sights) >= least:

@@ -10,6 +10,7 @@ from calibrations import GRID, configuration, make_sights, microscope
 
 from iscat_analysis._kernels.scoring import CONDITIONAL, POISSON
 from iscat_analysis.calibration.optics import (
+    PRIVATE,
     Sight,
     free_groups,
     maximise,
@@ -65,18 +66,20 @@ def test_value_is_that_of_the_likelihood_of_fits() -> None:
         assert mine == pytest.approx(likelihood.values(theta[None])[0], rel=1e-9)
 
 
-def test_private_unknowns_are_eliminated_exactly() -> None:
+@pytest.mark.parametrize("heights_nm", [None, (0.0, 200.0)])
+def test_private_unknowns_are_eliminated_exactly(heights_nm: tuple[float, float] | None) -> None:
     """The reduced information is the inverse of the shared block of the whole inverse."""
     sights, _, build = make_sights({"z11": 8.0}, 3, seed=5)
+    sights = [replace(sight, heights_nm=heights_nm) for sight in sights]
     settings = settings_of(configuration())
     private = np.array([sight.private for sight in sights])
-    private[:, 2] = 6000.0
+    private[:, 3] = 6000.0
     at = _Point.evaluate(sights, build, settings, NAMES, private, _walls(sights), map)
     k, n = len(NAMES), len(sights)
-    whole = np.zeros((k + 4 * n, k + 4 * n))
+    whole = np.zeros((k + PRIVATE * n, k + PRIVATE * n))
     whole[:k, :k] = at.fisher[:, :k, :k].sum(axis=0)
     for e in range(n):
-        own = slice(k + 4 * e, k + 4 * (e + 1))
+        own = slice(k + PRIVATE * e, k + PRIVATE * (e + 1))
         whole[:k, own] = at.fisher[e, :k, k:]
         whole[own, :k] = at.fisher[e, k:, :k]
         whole[own, own] = at.fisher[e, k:, k:]
@@ -90,7 +93,7 @@ def test_score_is_the_slope_of_the_joint_likelihood() -> None:
     sights, _, build = make_sights({"z11": 8.0}, 2, seed=6)
     settings = {**settings_of(configuration()), "z7": 3.0}
     private = np.array([sight.private for sight in sights])
-    private[:, 2] = 6000.0
+    private[:, 3] = 6000.0
 
     def at(name: str, change: float) -> _Point:
         moved = {**settings, name: settings[name] + change}

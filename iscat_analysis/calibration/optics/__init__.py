@@ -28,11 +28,12 @@ from iscat_analysis.calibration.optics.settings import (
     FREE,
     build_microscope,
     free_groups,
+    heights_free,
     is_term,
     settings_of,
     with_settings,
 )
-from iscat_analysis.calibration.optics.sights import FOCUS_STEP, Settings, Sight
+from iscat_analysis.calibration.optics.sights import FOCUS_STEP, PRIVATE, Settings, Sight
 
 __all__ = [
     "FAINTEST",
@@ -41,6 +42,7 @@ __all__ = [
     "HELD_OUT_P",
     "LEAST_SIGHTS",
     "MOST_SIGHTS",
+    "PRIVATE",
     "Estimate",
     "Judgement",
     "Measured",
@@ -54,6 +56,7 @@ __all__ = [
     "build_microscope",
     "forecast_optics",
     "free_groups",
+    "heights_free",
     "is_term",
     "judge",
     "make_pictures",

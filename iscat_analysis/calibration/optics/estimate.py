@@ -25,6 +25,7 @@ from iscat_analysis.calibration.optics.sights import (
     Settings,
     Sight,
 )
+from iscat_analysis.inference.likelihood import LEVEL
 from iscat_analysis.inference.pixels import pixel_terms
 from iscat_analysis.records import FloatArray, Mapper
 
@@ -54,6 +55,9 @@ _LARGEST_STEP = {
 }
 _TERM_STEP_NM = 25.0
 _PLACE_STEP_NM = 60.0
+_HEIGHT_STEP_NM = 20.0  # a fringe is some 200 nm high
+_LEVEL_STEP = 0.5
+_Z = 2  # of what is a sight's own
 _DAMPING = (1e-3, 1e8)  # first, and where the search gives up
 _LOWEST_NA = 0.3
 _NA_ROOM = 2e-3  # below the index of the oil
@@ -199,11 +203,12 @@ def maximise(
 
 
 def _walls(sights: Sequence[Sight]) -> FloatArray:
-    """Bounds of what is a sight's own, shape (2, n, 4): a particle stays in its picture."""
+    """Bounds of what is a sight's own, shape (2, n, 5): a particle stays in its picture."""
     centres = np.array([(s.grid.x_nm.mean(), s.grid.y_nm.mean()) for s in sights])
     walls = np.full((2, len(sights), PRIVATE), np.inf)
     walls[0] = -np.inf
     walls[0, :, :2], walls[1, :, :2] = centres - ROAM_NM, centres + ROAM_NM
+    walls[:, :, _Z] = np.transpose([s.heights_nm or (s.z_nm, s.z_nm) for s in sights])
     return walls
 
 
@@ -249,8 +254,8 @@ class _Point:
     """Likelihood, score and information of all sights at one set of parameters."""
 
     value: float
-    score: FloatArray  # (n, k + 4)
-    fisher: FloatArray  # (n, k + 4, k + 4)
+    score: FloatArray  # (n, k + 5)
+    fisher: FloatArray  # (n, k + 5, k + 5)
     squares: FloatArray  # the same, with squared residuals in place of their expectation
 
     @classmethod
@@ -284,6 +289,7 @@ class _Point:
         score, fisher, squares = (np.array([each[part] for each in found]) for part in (1, 2, 3))
         own = score[:, len(names) :]
         stopped = (private <= walls[0]) & (own < 0) | (private >= walls[1]) & (own > 0)
+        stopped |= walls[0] == walls[1]
         free = np.pad(~stopped, ((0, 0), (len(names), 0)), constant_values=True)
         both = free[:, :, None] & free[:, None, :]
         alone = np.eye(free.shape[1]) * ~free[:, None, :]
@@ -341,7 +347,8 @@ class _Point:
         rest = self.score[:, k:] - np.einsum("eij,i->ej", self.fisher[:, :k, k:], shared)
         own = np.einsum("eij,ej->ei", inverse, rest)
         own[:, :2] = np.clip(own[:, :2], -_PLACE_STEP_NM, _PLACE_STEP_NM)
-        own[:, 3] = np.clip(own[:, 3], -0.5, 0.5)
+        own[:, _Z] = np.clip(own[:, _Z], -_HEIGHT_STEP_NM, _HEIGHT_STEP_NM)
+        own[:, LEVEL] = np.clip(own[:, LEVEL], -_LEVEL_STEP, _LEVEL_STEP)
         return shared, own
 
 
@@ -382,8 +389,8 @@ def _scores(
     sight: Sight, model: Microscope, names: tuple[str, ...], private: FloatArray
 ) -> tuple[float, FloatArray, FloatArray, FloatArray]:
     """Log-likelihood, score, expected information and its observed squares, shared ones first."""
-    x, y, mass, level = (float(v) for v in private)
-    place = (sight.grid, x, y, sight.z_nm, mass)
+    x, y, z, mass, level = (float(v) for v in private)
+    place = (sight.grid, x, y, z, mass)
     k = len(names)
     if names:
         wanted = tuple(dict.fromkeys("focus_nm" if n == FOCUS_STEP else n for n in names))
@@ -396,8 +403,7 @@ def _scores(
             row[:] = sight.focus_steps * slopes[wanted.index("focus_nm")].ravel()
         else:
             row[:] = slopes[wanted.index(name)].ravel()
-    rows[k : k + 2] = own[:2].reshape(2, -1)
-    rows[k + 2] = own[3].ravel()
+    rows[k : k + LEVEL] = own.reshape(LEVEL, -1)
     value, residual, weight, of_signal, of_level = pixel_terms(
         sight.kind, sight.data, signal, level
     )

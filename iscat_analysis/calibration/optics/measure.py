@@ -302,8 +302,8 @@ class _Search:
             return best, tuple(held_out)
         near = Neighbours.fitted(self.others, self.build, self.build_wide, best.values, self.mapper)
         self.others = near.particles  # where they are is known the next time
-        fitted = tuple(self.mapper(near.around, best.sights))
-        judged = tuple(self.mapper(near.around, held_out))
+        among = near.around((*best.sights, *held_out), self.mapper)
+        fitted, judged = among[: len(best.sights)], among[len(best.sights) :]
         judged = self._own(judged, best.values) if judged else ()
         return self._fit(fitted, best.values, best.names), judged
 

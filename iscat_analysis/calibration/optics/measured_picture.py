@@ -23,7 +23,7 @@ from scipy import ndimage
 
 from iscat_analysis.calibration.optics.sights import Sight
 from iscat_analysis.calibration.optics.starts import average_sights
-from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, peak_per_amplitude, with_template
 from iscat_analysis.optics.measured import Template
 from iscat_analysis.records import FloatArray, Mapper
@@ -194,7 +194,7 @@ def fit_own(sight: Sight, model: ForwardModel, *, level: bool) -> Sight:
     low[:2], high[:2] = centre - _ROAM_NM, centre + _ROAM_NM
     free = np.array([True, True, False, True, level])
     found = likelihood.maximize(start, free, low, high).theta
-    return sight.moved(found[[0, 1, 3, LEVEL]])
+    return sight.moved(found)
 
 
 def place_sights(sights: Sequence[Sight], nominal: ForwardModel) -> list[Sight]:

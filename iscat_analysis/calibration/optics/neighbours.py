@@ -10,7 +10,7 @@ import numpy as np
 from iscat_analysis.calibration.optics.estimate import maximise
 from iscat_analysis.calibration.optics.sights import Build, Microscope, Settings, Sight
 from iscat_analysis.calibration.optics.starts import with_masses
-from iscat_analysis.records import Mapper
+from iscat_analysis.records import FloatArray, Mapper
 
 _PASSES = 6
 
@@ -62,25 +62,40 @@ class Neighbours:
             return maximise(sights, build, settings, (), passes=_PASSES, mapper=mapper).sights
 
         first = cls(own(with_masses(others, build, settings)), build_wide(settings))
-        among = tuple(mapper(first.around, first.particles))
-        return cls(own(among), first.wide)
+        return cls(own(first.around(first.particles, mapper)), first.wide)
 
-    def around(self, sight: Sight) -> Sight:
-        """Put their rings into what is expected of a picture.
+    def around(self, sights: Sequence[Sight], mapper: Mapper = map) -> tuple[Sight, ...]:
+        """Put their rings into what is expected of pictures.
+
+        Every particle is drawn into all pictures at once: its field at its height takes longest.
 
         Parameters
         ----------
-        sight : Sight
-            A picture, which says whose rings reach into it.
+        sights : sequence of Sight
+            Pictures, which say whose rings reach into them.
+        mapper : callable
+            `map`, or the one of a pool.
 
         Returns
         -------
-        Sight
-            The picture among them.
+        tuple of Sight
+            The pictures among them.
         """
-        contrast = np.zeros(sight.grid.shape)
-        for number, share in sight.neighbours:
+        reached: list[list[tuple[int, float]]] = [[] for _ in self.particles]
+        for index, sight in enumerate(sights):
+            for number, share in sight.neighbours:
+                reached[number].append((index, share))
+
+        def drawn(number: int) -> list[tuple[int, FloatArray]]:
             other = self.particles[number]
             place = (other.x_nm, other.y_nm, other.z_nm, other.mass_kda)
-            contrast += share * self.wide.image(sight.grid, *place)
-        return sight.among(contrast)
+            return [
+                (index, share * self.wide.image(sights[index].grid, *place))
+                for index, share in reached[number]
+            ]
+
+        rings = [np.zeros(sight.grid.shape) for sight in sights]
+        for images in mapper(drawn, range(len(self.particles))):
+            for index, image in images:
+                rings[index] += image
+        return tuple(sight.among(ring) for sight, ring in zip(sights, rings, strict=True))

@@ -112,6 +112,22 @@ def free_names(groups: Sequence[str], settings: Settings, terms: Sequence[str]) 
     )
 
 
+def heights_free(config: Config) -> bool:
+    """Tell whether every particle has a height of its own, which is fitted.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration; particles that move are learned from at the height of their track.
+
+    Returns
+    -------
+    bool
+        Whether it asks for that.
+    """
+    return config.fit.mode in ("localize", "joint")
+
+
 def settings_of(config: Config) -> dict[str, Any]:
     """Parameters that a calibration may change, as configured.
 
@@ -192,4 +208,5 @@ def build_microscope(
         Ready to evaluate.
     """
     changed = with_settings(config, settings).model_copy(update={"calibration": None})
-    return forward_model(changed, reach_nm, z_max_nm=config.particle.height_nm, like=like)
+    highest = None if heights_free(config) else config.particle.height_nm
+    return forward_model(changed, reach_nm, z_max_nm=highest, like=like)

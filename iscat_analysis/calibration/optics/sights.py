@@ -10,14 +10,15 @@ import numpy as np
 
 from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import BoolArray, FloatArray
 
 FOCUS_STEP = "focus_step_nm"
 """Rise of the focus from picture to picture of a scan [nm]; the one parameter that is not a key of
 ``[optics]``."""
 
-PRIVATE = 4
-"""Unknowns of one sight: x, y [nm], mass [kDa] and the logarithm of the background level."""
+PRIVATE = 5
+"""Unknowns of one sight, as `Likelihood` has them: x, y, z [nm], mass [kDa], logarithm of the
+background level."""
 
 ROAM_NM = 300.0
 """Farthest from the centre of a picture that its particle may be, along x and y."""
@@ -70,7 +71,7 @@ class Sight:
     x_nm, y_nm : float
         Place from which the search starts [nm].
     z_nm : float
-        Height of the particle [nm].
+        Height of the particle, or where the search for it begins [nm].
     mass_kda : float
         Signed mass from which the search starts, 0 where unknown [kDa].
     level : float
@@ -91,6 +92,8 @@ class Sight:
         What they add to the log-likelihood where there is no particle.
     owner : int
         Pictures of one owner share errors, as those of one track share its background; -1: none.
+    heights_nm : (float, float), optional
+        Between which the particle's height is looked for [nm]; without them it is known.
     """
 
     grid: PixelGrid
@@ -108,11 +111,17 @@ class Sight:
     rings: FloatArray | float = 1.0
     baseline: float = 0.0
     owner: int = -1
+    heights_nm: tuple[float, float] | None = None
 
     @property
     def private(self) -> FloatArray:
-        """Start of the sight's own unknowns, shape (4,)."""
-        return np.array([self.x_nm, self.y_nm, self.mass_kda, self.level])
+        """Start of the sight's own unknowns, shape (5,)."""
+        return np.array([self.x_nm, self.y_nm, self.z_nm, self.mass_kda, self.level])
+
+    @property
+    def free(self) -> BoolArray:
+        """Which of its own unknowns are, shape (5,)."""
+        return np.array([True, True, self.heights_nm is not None, True, True])
 
     def among(self, contrast: FloatArray) -> Sight:
         """Return the sight with the contrast of its neighbours in its expectation."""
@@ -141,8 +150,8 @@ class Sight:
 
     def moved(self, private: FloatArray) -> Sight:
         """Return the same pictures with another start."""
-        x, y, mass, level = (float(v) for v in private)
-        return replace(self, x_nm=x, y_nm=y, mass_kda=mass, level=level)
+        x, y, z, mass, level = (float(v) for v in private)
+        return replace(self, x_nm=x, y_nm=y, z_nm=z, mass_kda=mass, level=level)
 
     def placed(self, x_nm: float, y_nm: float) -> Sight:
         """Return the same picture with another place, or the nearest where it may be."""
