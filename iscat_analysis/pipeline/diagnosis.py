@@ -94,7 +94,7 @@ def pixel_warnings(defects: int, saturated: int) -> Iterator[str]:
     Parameters
     ----------
     defects : int
-        Dead and hot pixels.
+        Dead and hot pixels, and where particles move noisy ones.
     saturated : int
         Those that are saturated in some frame.
 
@@ -104,7 +104,7 @@ def pixel_warnings(defects: int, saturated: int) -> Iterator[str]:
         One line each.
     """
     if defects:
-        yield f"{count(defects, 'dead or hot pixel')} {_be(defects)} left out"
+        yield f"{count(defects, 'dead, hot or noisy pixel')} {_be(defects)} left out"
     if saturated:
         yield (
             f"{count(saturated, 'pixel')} {_be(saturated)} saturated in some frame and left out; "

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+from scipy.stats import chi2
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
@@ -16,7 +18,7 @@ from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.scene import Scene, make_scene
-from iscat_analysis.records import FrameSource, Progress
+from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress
 from iscat_analysis.search.moving import FrameFilter, Sightings
 from iscat_analysis.units import count
 
@@ -27,6 +29,10 @@ RING_SLOPE = 1.7
 """Distance of the outer rings of a particle over its height, tan 60°: within it, what is much
 fainter than the particle may be what the model leaves over of them."""
 
+_PAIRS = 100  # of successive frames, which tell how noisy a pixel is
+_NOISY = 3.0  # times the variance of its light, and of the pixels around it
+_BY_CHANCE = 1e-9  # of a pixel that is not
+_AROUND = 7  # pixels, along each axis
 _SAMPLED = 4  # blocks, of which one tells whether the others are searched
 _BLOCK = 16  # frames that are read or searched at a time; what more of them need is slow to clear
 
@@ -128,7 +134,9 @@ def load_field(
         counts[start - first : stop - first] = camera.to_electrons(raw)
         progress("background", stop - first, frames)
     read = np.broadcast_to(camera.read_variance_e2(shape), shape)
-    masked = saturated | find_defects(counts.sum(axis=0, dtype=np.float64), frames * read)
+    total = counts.sum(axis=0, dtype=np.float64)
+    masked = saturated | find_defects(total, frames * read)
+    masked |= _noisy(counts, total / frames + read)
     nominal = abs(scene.model.scale.amplitude(scene.model.material.mass_kda))
     free_z = scene.mode == "joint"
     return MovingField(
@@ -137,6 +145,24 @@ def load_field(
         z_range_nm=scene.config.fit.z_range_nm if free_z else None,
         largest=100 * nominal, pool=pool, saturated=saturated,
     )  # fmt: skip
+
+
+def _noisy(counts_e: NDArray[np.float32], variance_e2: FloatArray) -> BoolArray:
+    """Tell which pixels have far more noise than their light, and than the pixels around them.
+
+    Particles that move change the light from frame to frame as well, of many pixels together.
+    """
+    firsts = np.arange(0, len(counts_e) - 1, max(2, len(counts_e) // _PAIRS))
+    light = counts_e.mean(axis=(1, 2), dtype=np.float64)
+    light /= light.mean() or 1.0
+    squares = np.zeros(variance_e2.shape)
+    for t in firsts:
+        if light[t] > 0 and light[t + 1] > 0:
+            squares += (counts_e[t] / light[t] - counts_e[t + 1] / light[t + 1]) ** 2
+    noise = squares / (2 * len(firsts) * np.maximum(variance_e2, 1.0))
+    most = max(_NOISY, float(chi2.isf(_BY_CHANCE, len(firsts))) / len(firsts))
+    around = median_filter(noise, size=_AROUND, mode="nearest")
+    return np.asarray(noise > most * np.maximum(around, 1.0))
 
 
 def search_frames(

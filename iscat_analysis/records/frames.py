@@ -99,7 +99,7 @@ class Windows:
 
     @property
     def left_out(self) -> tuple[int, int]:
-        """Numbers of dead or hot pixels, and of saturated ones."""
+        """Numbers of dead, hot or noisy pixels, and of saturated ones."""
         defects = self.masked & ~self.saturated
         return int(defects.sum()), int(self.saturated.sum())
 

@@ -552,9 +552,11 @@ def test_too_few_frames_are_refused(tmp_path: Path) -> None:
 def test_an_empty_movie_has_no_tracks(tmp_path: Path) -> None:
     """The frame rate is not needed for that, nor for the blur of a whole frame."""
     movie = tmp_path / "movie.tif"
-    counts = np.random.default_rng(1).poisson(1e4, (25, *SHAPE)).astype(np.uint16)
+    rng = np.random.default_rng(1)
+    counts = rng.poisson(1e4, (25, *SHAPE)).astype(np.uint16)
     counts[:, 11, 17] = 0  # a dead pixel is no particle, and is said
+    counts[:, :, 30] = np.rint(rng.normal(1e4, 900.0, (25, SHAPE[0])))  # nor is a noisy column
     tifffile.imwrite(movie, counts, photometric="minisblack")
     found = fit_stack(movie, _config(camera={"frame_rate_hz": None}))
     assert len(found.table) == 0
-    assert "1 dead or hot pixel is left out" in found.warnings
+    assert f"{1 + SHAPE[0]} dead, hot or noisy pixels are left out" in found.warnings
