@@ -18,7 +18,7 @@ PYTEST := pytest -n auto --dist loadfile --no-loadscope-reorder
 DEMO_CONFIG := sample_configs/landing.toml
 DEMO        := demo
 
-.PHONY: help install demo test tests test-all test-lowest lint kernels lint-and-kernels bench docs docs-and-test clean
+.PHONY: help install runtime demo test tests test-all test-lowest lint kernels lint-and-kernels bench docs docs-and-test clean
 
 help:
 	@echo "make demo         simulate a landing movie, analyse it, say where the report is"
@@ -29,10 +29,13 @@ help:
 	@echo "make kernels      compile the kernels that tests and manual share, in .kernels"
 	@echo "make bench        speed and efficiency, against peers"
 	@echo "make docs         the manual, in docs/_build/html; runs all of its code blocks"
-	@echo "make docs-and-test  both at the same time, as .ci/run does"
+	@echo "make docs-and-test  the manual beside the tests, without lint, as .ci/run does"
 	@echo "make clean        remove what these made, the environment included"
 
 install: $(STAMP)
+
+runtime: | $(BIN)/python
+	$(BIN)/python -m pip install --quiet $(PIP_OPTIONS) --editable .
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -92,7 +95,7 @@ docs: $(KERNELS)
 	$(BIN)/sphinx-build --quiet -W --keep-going -b html docs docs/_build/html
 	@echo "The manual: docs/_build/html/index.html"
 
-docs-and-test: lint-and-kernels
+docs-and-test: $(KERNELS)
 	@$(MAKE) --no-print-directory --jobs=2 docs tests
 
 clean:

@@ -43,12 +43,16 @@ def compile_kernels() -> None:
     few = ("simulation.count=6", "simulation.leavings=1", "simulation.frames=400")
     one = ("simulation.events=[{frame=200, x_px=31.2, y_px=30.8, mass_kda=900.0}]",)
     cobri = (*one, "optics.scheme=cobri")
+    coma = (*one, "optics.aberrations_nm.z8=10")
     moving = (
         "simulation.count=0", "simulation.leavings=0", "simulation.frames=60",
         "simulation.movers=[{count=1, mass_kda=900.0, d_um2_s=0.15}]",
         "camera.frame_rate_hz=331.0", "fit.mode=track", "track.free=mass",
     )  # fmt: skip
-    jobs = [("landing", few), ("landing", moving), ("mass", one), ("joint", one), ("joint", cobri)]
+    jobs = [
+        ("landing", few), ("landing", moving), ("mass", one), ("mass", coma), ("joint", one),
+        ("joint", cobri),
+    ]  # fmt: skip
     with tempfile.TemporaryDirectory() as name:
         for number, (sample, changes) in enumerate(jobs):
             movie = f"{name}/{number}.tif"

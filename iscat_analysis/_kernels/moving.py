@@ -210,9 +210,9 @@ def _climb(
         if search.free[i]:
             p[i] = min(max(p[i], lower[i]), upper[i])
     value, _, outcome = maximize(
-        table_of(near, group), lens_of(near, group), pixels, POISSON, data, search.free, lower,
-        upper, search.max_step, search.tolerance, search.passes, p, score, fisher,
-    )  # fmt: skip
+        table_of(near, group), lens_of(near, group), pixels, np.int64(POISSON), data, search.free,
+        lower, upper, search.max_step, search.tolerance, search.passes, p, score, fisher, -np.inf,
+    )  # fmt: skip  # np.int64: a constant would be compiled for by itself
     draw_gradient(near, group, p, pixels, profile, both[0])
     place_score(data, both[0], with_z, score, fisher)
     step[:] = 0.0

@@ -49,15 +49,15 @@ def place_score(
         Over that without the particle.
     """
     if with_z:
-        image_score(POISSON, data, 1.0, here, score, fisher)
+        image_score(np.int64(POISSON), data, 1.0, here, score, fisher)
         score[4] = 0.0
         for i in range(5):
             fisher[i, 4] = fisher[4, i] = 0.0
-        value: float = image_value(POISSON, data, 1.0, here)
+        value: float = image_value(np.int64(POISSON), data, 1.0, here)
         return value
     value, beyond = _flat_score(data, here, score, fisher)
     if beyond:
-        value = image_value(POISSON, data, 1.0, here)
+        value = image_value(np.int64(POISSON), data, 1.0, here)
     return value
 
 

@@ -347,4 +347,4 @@ def profile_at(axial: AxialTable, z_nm: float, start: int, stop: int, profile: F
 @kernel()
 def profile_between(axial: AxialTable, z_nm: float, profile: FloatArray) -> None:
     """Fill a whole profile of one order or more by interpolation along z."""
-    profile_at(axial, z_nm, 0, axial.heights.shape[3], profile)
+    profile_at(axial, z_nm, np.int64(0), axial.heights.shape[3], profile)

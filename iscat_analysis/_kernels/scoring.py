@@ -281,12 +281,13 @@ def value_pass(
 @kernel()
 def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int, int]:
     """Range of the flattened profile, `width` long, that an image needs."""
+    zero = int(np.int64(0))  # a plain 0 is a type of its own, for which its callers are compiled
     if len(lens) == STAMP:
-        return 0, width
+        return zero, width
     if len(lens) == LATTICE:
         first, last = lattice_span(lens, pixels.x, abs(pixels.offsets[-1]), theta[0])
         return first, last
-    return 0, POWERS * intervals_needed(lens, pixels, theta[0], theta[1], width // POWERS)
+    return zero, POWERS * intervals_needed(lens, pixels, theta[0], theta[1], width // POWERS)
 
 
 @kernel()
@@ -395,7 +396,7 @@ def maximize(
     theta: FloatArray,
     score: FloatArray,
     fisher: FloatArray,
-    least: float = -np.inf,
+    least: float,
 ) -> tuple[float, int, int]:
     """Damped Fisher scoring inside a box, from θ, which is overwritten with the estimate.
 

@@ -7,6 +7,7 @@ import io
 import math
 import os
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -191,15 +192,15 @@ def test_watching_ends_nowhere(nowhere: Path) -> None:
     assert not list(nowhere.iterdir())
 
 
-def test_any_command_line_ends_well(nowhere: Path) -> None:
+def test_any_command_line_ends_well(nowhere: Path, repetitions: Callable[[int, int], int]) -> None:
     before = set(nowhere.iterdir())
 
-    @settings(max_examples=300)
+    @settings(max_examples=repetitions(120, 300))
     @given(arguments=ARGUMENTS)
     def umbrella(arguments: list[str]) -> None:
         run(main, arguments)
 
-    @settings(max_examples=200)
+    @settings(max_examples=repetitions(80, 200))
     @given(arguments=ARGUMENTS)
     def fit(arguments: list[str]) -> None:
         run(main_fit, arguments)
