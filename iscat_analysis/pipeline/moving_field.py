@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
@@ -160,7 +160,7 @@ def _noisy(counts_e: NDArray[np.float32], variance_e2: FloatArray) -> BoolArray:
         if light[t] > 0 and light[t + 1] > 0:
             squares += (counts_e[t] / light[t] - counts_e[t + 1] / light[t + 1]) ** 2
     noise = squares / (2 * len(firsts) * np.maximum(variance_e2, 1.0))
-    most = max(_NOISY, float(chi2.isf(_BY_CHANCE, len(firsts))) / len(firsts))
+    most = max(_NOISY, float(chdtri(len(firsts), _BY_CHANCE)) / len(firsts))
     around = median_filter(noise, size=_AROUND, mode="nearest")
     return np.asarray(noise > most * np.maximum(around, 1.0))
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.polynomial import legendre
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from iscat_analysis.records import FloatArray
 
@@ -53,7 +53,7 @@ def common_change(
     if len(pull) < _FEWEST_TRACKS:
         return 0.0
     every, whole = np.sum(pull, axis=0), np.sum(information, axis=0)
-    least = chi2.isf(_SURE, _DEGREE)
+    least = chdtri(_DEGREE, _SURE)
     for mine, known in zip(pull, information, strict=True):
         rest = every - mine
         if rest @ np.linalg.pinv(whole - known) @ rest < least:
