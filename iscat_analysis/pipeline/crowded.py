@@ -3,28 +3,45 @@
 From bright places alone the optics are learned roughly, with what is faint or near another not
 accounted for.  With these optics the field is fitted, and from its particles, now all known, the
 optics are learned again, until they describe pictures that were not fitted.
+
+Particles that each have a height of their own are learned from in the same way, beginning with the
+field as the configured optics fit it: their pictures differ, so that nothing can be averaged.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from iscat_analysis.calibration.optics import LEAST_SIGHTS, OpticsCalibration, Sight
-from iscat_analysis.calibration.optics.settings import heights_free, settings_of, with_settings
+from iscat_analysis.calibration.optics import (
+    LEAST_SIGHTS,
+    OpticsCalibration,
+    Settings,
+    Sight,
+    heights_free,
+    maximise,
+    settings_of,
+    with_settings,
+)
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.microscope import calibrate_sights, with_sign
+from iscat_analysis.pipeline.microscope import calibrate_sights, microscopes, with_sign
 from iscat_analysis.pipeline.scene import make_scene
-from iscat_analysis.pipeline.sights import bright_places, known_places
-from iscat_analysis.records import Windows
+from iscat_analysis.pipeline.sights import bright_places, known_places, reach_nm
+from iscat_analysis.records import Mapper, Windows
 
 LEAST_ROUGH = 6
 """Bright places, whatever is near them, without which the optics are not even learned roughly."""
 
 ROUNDS = 3
 """Of a fit of the field and optics learned from it."""
+
+HOPELESS_CHI2 = 2.0
+"""Reduced χ² of pictures that were not fitted, above which it must have fallen for another round.
+Not more than that: with the first optics heights may be those of two fringes, and the field that is
+fitted with the next ones has a single one."""
 
 
 def seen_in_field(
@@ -94,15 +111,39 @@ def learn_in_field(
             places, others, config, groups, source, least=LEAST_ROUGH, mapper=pool.map
         )
         guess, why = with_sign(with_settings(config, found.measured.settings))
-    for _ in range(ROUNDS):
+    before, free = math.inf, heights_free(config)
+    for number in range(ROUNDS):
         if guess is None:
             raise DataError(why)
         sights, others = seen_in_field(windows, guess, pool)
-        known = settings_of(guess) if heights_free(config) else None
+        known: Settings | None = settings_of(guess) if free else None
+        if free and not number:
+            known = _likelier_light(sights, guess, groups, pool.map)
         found = calibrate_sights(
             sights, others, config, groups, source, known=known, mapper=pool.map
         )
-        if found.accepted:
+        misfit = float(found.measured.judgement.chi2_reduced.mean())
+        before = min(before, float(found.measured.configured.chi2_reduced.mean()))
+        if found.accepted or misfit > max(HOPELESS_CHI2, before):
             break
+        before = misfit
         guess, why = with_sign(with_settings(config, found.measured.settings))
     return found
+
+
+def _likelier_light(
+    sights: Sequence[Sight], config: Config, groups: Sequence[str], mapper: Mapper
+) -> Settings:
+    """Give a microscope to begin with, of either polarisation the one that suits the pictures.
+
+    Where particles are at one height it is tried on the average of their pictures.
+    """
+    settings = settings_of(config)
+    if "polarization" not in groups or not sights:
+        return settings
+    build = microscopes(config, max(map(reach_nm, sights)))
+
+    def likelihood(kind: Settings) -> float:
+        return maximise(sights, build, kind, (), mapper=mapper).log_likelihood
+
+    return max(({**settings, "polarization": p} for p in ("linear", "circular")), key=likelihood)

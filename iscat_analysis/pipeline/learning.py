@@ -46,6 +46,7 @@ from iscat_analysis.pipeline.microscope import (
 )
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, judge_counts
 from iscat_analysis.pipeline.ranges import frame_ranges, measured_windows
+from iscat_analysis.pipeline.run import unheard
 from iscat_analysis.pipeline.sights import bright_sights, kind_of, reach_nm, scan_sights
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import Mapper, Progress, Windows, silent
@@ -70,7 +71,12 @@ _FITTED = 3  # of these starts
 
 
 def learn_optics(
-    movie: Stack, config: Config, camera: Camera, *, tell: Callable[[str], None]
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    *,
+    tell: Callable[[str], None],
+    notify: Callable[[str], None] = unheard,
 ) -> tuple[Config, dict[str, Any]]:
     """Test the configured optics on the brightest particles, and learn them where they fail.
 
@@ -84,6 +90,8 @@ def learn_optics(
         Counts → photoelectrons.
     tell : callable
         Told in one line what was found, unless the configured optics are fine.
+    notify : callable
+        Told that they are being learned, which may take minutes.
 
     Returns
     -------
@@ -133,6 +141,7 @@ def learn_optics(
             if optics.calibrate == "auto" and _noise_differs(movie, config, camera):
                 tell(f"the optics cannot be tested on this movie: {_NOISE}")
                 return config, tested | {"calibrated": False, "reason": _NOISE}
+            notify("learning the optics from the particles of the movie, which may take minutes…")
             found = _learned(
                 sights[:alone], others, movie, config, camera, tuple(FREE), source, pool
             )

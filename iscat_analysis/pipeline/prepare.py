@@ -143,7 +143,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if way == "sliding" or tracked:
         looking = beside(look_at_changes, steady, config, camera, span)
     configured = config
-    config, learned = learn_optics(steady, config, camera, tell=run.tell)
+    config, learned = learn_optics(steady, config, camera, tell=run.tell, notify=run.notify)
     if learned:
         summary["optics"] = learned
     run.clock.lap("optics")
