@@ -42,8 +42,9 @@ HOPE = 16.0
 SERIES = 0.2
 """Largest |x| at which ln(1+x) is taken from its series."""
 
-FLOOR = 1e-300
-"""Least expected count or intensity: keeps quotients finite where a dark fringe is exactly zero."""
+FLOOR = 1e-150
+"""Least expected count or intensity: keeps quotients, and their squares, finite where a dark fringe
+or a masked pixel is exactly zero."""
 
 _TOGETHER = 256
 """Pixels for which one series is tried: bright ones take the slow logarithm for these alone."""

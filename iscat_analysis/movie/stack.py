@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK, fingerprint, split_address
-from iscat_analysis.records import StackMetadata
+from iscat_analysis.records import BoolArray, StackMetadata
+
+LeftOut = tuple[BoolArray, NDArray[Any]]
+"""Pixels that are left out (y, x), and the counts of each in the dark."""
 
 _MB = 1_000_000
 _BLOCK_BYTES = 2**20
@@ -154,7 +157,7 @@ def not_shared(path: Path) -> DataError:
     )
 
 
-def _reopened(address: Path, identity: str) -> Stack:
+def _reopened(address: Path, identity: str, left_out: LeftOut | None) -> Stack:
     """Open a movie that another process has open."""
     from iscat_analysis.movie import open_stack
 
@@ -164,7 +167,7 @@ def _reopened(address: Path, identity: str) -> Stack:
     if stack.identity != identity:
         stack.close()
         raise not_shared(address)
-    return stack
+    return stack if left_out is None else stack.without(*left_out)
 
 
 class Stack:
@@ -191,18 +194,22 @@ class Stack:
         self._files = (path,) if files is None else tuple(files)
         self._closed = False
         self._own = True
+        self._left_out: LeftOut | None = None
 
     def __repr__(self) -> str:
         t, y, x = self.shape
         state = ", closed" if self._closed else ""
         return f"<Stack {self.name}: {t} frames of {y} x {x} pixels, {self.dtype}{state}>"
 
-    def __reduce__(self) -> tuple[Callable[[Path, str], Stack], tuple[Path, str]]:
+    def __reduce__(
+        self,
+    ) -> tuple[Callable[[Path, str, LeftOut | None], Stack], tuple[Path, str, LeftOut | None]]:
         """Let another process open the same file."""
         if not self._files or not self._own:
             raise TypeError(f"{self.name} is no file that another process could open")
         path = self._path.absolute()
-        return _reopened, (Path(f"{path}{MARK}{self._part}") if self._part else path, self.identity)
+        address = Path(f"{path}{MARK}{self._part}") if self._part else path
+        return _reopened, (address, self.identity, self._left_out)
 
     def __enter__(self) -> Self:
         return self
@@ -267,6 +274,26 @@ class Stack:
         seen._own = False
         return seen
 
+    def without(self, pixels: BoolArray, dark: NDArray[Any]) -> Stack:
+        """Give the same movie with some pixels as dark as dead ones, which all stages leave out.
+
+        Parameters
+        ----------
+        pixels : ndarray of bool, shape (y, x)
+            Which.
+        dark : ndarray, shape (n,)
+            Counts of each of them without light.
+
+        Returns
+        -------
+        Stack
+            Under the same name; it reads from the same file.
+        """
+        seen = Stack(self._path, self._frames, part=self._part, files=self._files)
+        seen._own = self._own
+        seen._left_out = pixels, dark
+        return seen
+
     def close(self) -> None:
         """Release the file; closing twice is harmless."""
         if not self._closed:
@@ -296,7 +323,11 @@ class Stack:
         if self._closed:
             raise ValueError(f"{self.name} was closed; open it again to read from it")
         self._check_range(start, stop)
-        return self._frames.read(start, stop)
+        counts = self._frames.read(start, stop)
+        if self._left_out is not None:
+            pixels, dark = self._left_out
+            counts[:, pixels] = dark
+        return counts
 
     def chunks(
         self, start: int = 0, stop: int | None = None, memory_mb: float = 64.0

@@ -68,6 +68,9 @@ _NOISE = "its noise is not what the camera's numbers predict; the analysis goes 
 _STUCK = 0.02  # share of frames that repeat another, which sums of frames count
 _STARTS_NM = tuple(range(-400, 401, 100))  # along each axis; rings are some 200 nm apart
 _FITTED = 3  # of these starts
+_CLEAR = 10.0  # standard errors of χ² by which a wrong microscope would be seen in a picture
+_DESCRIBED = 0.1  # of that, which a picture that is described has at most
+_DESCRIBED_SHARE = 0.25  # of the pictures, that must be described where others are not
 
 
 def learn_optics(
@@ -129,12 +132,14 @@ def learn_optics(
             if alone < LEAST_TESTED and way_of(config) == "fixed":
                 sights, others = seen_in_field(_summed(movie, config, camera), config, pool)
             if len(sights) < LEAST_TESTED:
-                raise DataError(
-                    f"{movie.name}: shows {count(len(sights), 'bright particle')} standing "
-                    f"alone, and "
-                    f"{LEAST_TESTED} are needed to test the optics, {LEAST_SIGHTS} to learn them"
-                )
+                raise DataError(_too_few(movie.name, len(sights)))
             median = _median_p(sights, config, others, pool.map)
+            if optics.calibrate == "auto" and median < REJECTED_P and not heights_free(config):
+                pairs, median = _not_alone(sights, config, others, pool.map)
+                sights = [sight for k, sight in enumerate(sights) if k not in pairs]
+                alone -= sum(k < alone for k in pairs)
+                if len(sights) < LEAST_TESTED:
+                    raise DataError(_too_few(movie.name, len(sights)))
             tested = {"tested": len(sights), "median_p": median}
             if optics.calibrate == "auto" and median >= REJECTED_P:
                 return config, tested | {"calibrated": False}
@@ -149,6 +154,14 @@ def learn_optics(
             tell(f"{_verdict(tested)}: {error}; the analysis goes on as configured")
             return config, tested | {"calibrated": False, "reason": str(error)}
     return taken(found, config, tested, _verdict(tested), tell=tell)
+
+
+def _too_few(name: str, number: int) -> str:
+    """Say that too few particles stand alone."""
+    return (
+        f"{name}: shows {count(number, 'bright particle')} standing alone, and {LEAST_TESTED} are "
+        f"needed to test the optics, {LEAST_SIGHTS} to learn them"
+    )
 
 
 def taken(
@@ -330,6 +343,44 @@ def _median_p(
     return max(found, median(near.around(fitted, mapper))[0])
 
 
+def _not_alone(
+    sights: Sequence[Sight], config: Config, others: Sequence[Sight] = (), mapper: Mapper = map
+) -> tuple[list[int], float]:
+    """Find bright places that the configured microscope describes badly, and others well.
+
+    Returns their numbers, and the median p-value of the others.
+
+    A microscope that is wrong is so for all particles, and is seen the better the brighter they
+    are.  Where some as bright are described, the places that are not show two that landed at once.
+    From a place that others drew aside a fit ends in another optimum: each begins anew here.
+    """
+    settings = settings_of(config)
+    build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
+    model = build(settings)
+
+    def fitted(sight: Sight) -> Sight:
+        x, y = _centre(sight, model, build, settings)
+        (placed,) = with_masses([sight.placed(x, y)], build, settings)
+        return maximise([placed], build, settings, ()).sights[0]
+
+    some = list(mapper(fitted, sights[:_TESTED]))
+    if any(sight.neighbours for sight in some):
+        near = Neighbours.fitted(others, build, rings_of(config, some[0]), settings, mapper)
+        pictures = near.around(some, mapper)
+        some = list(maximise(pictures, build, settings, (), mapper=mapper).sights)
+    chi2, p = np.transpose([goodness(sight, model) for sight in some])
+    mass = np.array([sight.mass_kda for sight in some])
+    poor = p < REJECTED_P
+    if not poor.any() or poor.all():
+        return [], float(np.median(p))
+    expected = float(np.median((chi2 - 1)[poor] / mass[poor] ** 2)) * mass**2
+    clear = expected > _CLEAR * np.sqrt(2 / math.prod(some[0].grid.shape))
+    described = ~poor & clear & (chi2 - 1 < _DESCRIBED * expected)
+    if described.sum() < max(2, _DESCRIBED_SHARE * len(some)):
+        return [], float(np.median(p))
+    return np.flatnonzero(poor).tolist(), float(np.median(p[~poor]))
+
+
 def _noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
     """Whether the first frames have another noise than p-values rest on, or repeat each other."""
     first, last = config.background.recorded or config.fit.frames or (0, movie.shape[0])
@@ -340,19 +391,23 @@ def _noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
 
 
 def _centre(
-    average: Sight,
+    sight: Sight,
     model: ForwardModel,
     build: Callable[[Settings], ForwardModel],
     settings: Settings,
 ) -> tuple[float, float]:
-    """Find the particle in the average picture [nm], whose brightest spot may be of a ring.
+    """Find the particle in a picture [nm], whose brightest spot may be of a ring.
 
     From a place half a ring away a fit ends in another optimum, with the mass of the other sign.
     """
-    starts = [replace(average, x_nm=x, y_nm=y) for x in _STARTS_NM for y in _STARTS_NM]
+    starts = [
+        replace(sight, x_nm=sight.x_nm + x, y_nm=sight.y_nm + y)
+        for x in _STARTS_NM
+        for y in _STARTS_NM
+    ]
 
-    def misfit(sight: Sight) -> float:
-        return goodness(sight, model)[0]
+    def misfit(one: Sight) -> float:
+        return goodness(one, model)[0]
 
     likely = sorted(with_masses(starts, build, settings), key=misfit)[:_FITTED]
     fits = [maximise([sight], build, settings, ()).sights[0] for sight in likely]

@@ -1,9 +1,11 @@
-"""The light before anything is searched: what of it flickers or changes over the field."""
+"""The light before anything is searched: pixels, lines and a smooth part that are unsteady."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,21 +15,100 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.lighting import find_surface
 from iscat_analysis.movie.lines import Lines, find_lines
+from iscat_analysis.movie.unsteady import find_unsteady, unsteady_said
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import BoolArray
+from iscat_analysis.search.changes import least_beside, spot_of
 from iscat_analysis.search.sliding import longest_window, measure_frames
 from iscat_analysis.threads import one_thread_algebra
 
 PAIRS = 12
 """Places in a movie at which the light of some frames is compared with that of later ones."""
 
+_LEAST_PAIRS = 3  # of a range of frames
 _TOGETHER = 8  # frames that are summed there
 _SINGLE_PAIRS = 24  # places where particles are followed
-_SAMPLE_BYTES = 32_000_000  # of counts that are read for it
+_SAMPLE_BYTES = 96_000_000  # of counts that are read for it
 
 
-def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
+class Pair(NamedTuple):
+    """Frames next to each other, and others a window later.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first of them.
+    before : ndarray, shape (t, y, x)
+        The good ones among them [counts].
+    later : int
+        Number of the first of the others.
+    after : ndarray, shape (t, y, x)
+        The good ones among these [counts].
+    """
+
+    first: int
+    before: NDArray[Any]
+    later: int
+    after: NDArray[Any]
+
+
+@dataclass(frozen=True)
+class JudgedLight:
+    """A movie whose light and pixels were looked at.
+
+    Attributes
+    ----------
+    movie : Stack
+        Without the pixels that are unsteady.
+    lines : Lines or None
+        What of the light may be divided out.
+    messages : tuple of str
+        What the user should know, one line each.
+    """
+
+    movie: Stack
+    lines: Lines | None
+    messages: tuple[str, ...]
+
+
+def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
+    """Look for pixels and for parts of the light that are unsteady.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        Says which frames are compared with which.
+    camera : Camera
+        Counts → photoelectrons.
+
+    Returns
+    -------
+    JudgedLight
+        Of dark field the movie itself: its particles are few pixels in the dark.
+    """
+    if config.optics.scheme == "darkfield":
+        return JudgedLight(movie, None, ())
+    pairs, window = _pairs(movie, config, camera)
+    said = []
+    optics, pixel_nm = config.optics, config.camera.pixel_size_nm
+    spot = spot_of(optics.wavelength_nm, optics.na, pixel_nm or optics.wavelength_nm / optics.na)
+    odd = find_unsteady(_apart(pairs), camera, least_beside(spot))
+    if odd is not None:
+        dark = np.broadcast_to(np.floor(camera.offset_adu), odd.shape)[odd].astype(movie.dtype)
+        for part in (part for pair in pairs for part in (pair.before, pair.after)):
+            part[:, odd] = dark
+        movie = movie.without(odd, dark)
+        said.append(unsteady_said(odd))
+    lines = judge_lines(movie, config, camera, pairs, window)
+    return JudgedLight(movie, lines, (*said, *(lines.messages if lines is not None else ())))
+
+
+def judge_lines(
+    movie: Stack, config: Config, camera: Camera, pairs: Sequence[Pair], window: int
+) -> Lines | None:
     """Look for rows, columns and a smooth part of the light that may be divided out.
 
     Parameters
@@ -42,6 +123,10 @@ def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
         are there in every frame.
     camera : Camera
         Counts → photoelectrons.
+    pairs : sequence of Pair
+        Frames, and others a window later.
+    window : int
+        Frames that are compared with as many others.
 
     Returns
     -------
@@ -54,7 +139,6 @@ def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
         not background.power_normalization
         or background.method == "known"
         or (background.method == "sliding" and background.drift_correction)
-        or config.optics.scheme == "darkfield"
         or (way == "tracks" and config.track.free == "joint")
     ):
         return None
@@ -62,10 +146,24 @@ def judge_lines(movie: Stack, config: Config, camera: Camera) -> Lines | None:
     counts = movie.read(first, max(first, min(last, movie.shape[0], first + SPECTRUM_FRAMES)))
     if not len(counts):
         return None
-    pairs, window = _pairs(movie, config, camera)
     with one_thread_algebra():
-        surface = find_surface(pairs, camera, window)
+        surface = find_surface([(p.before, p.after) for p in pairs], camera, window)
     return find_lines(counts[_good(counts, camera)], camera, surface)
+
+
+def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:
+    """Give the frames of pairs that have none in common."""
+    parts = sorted(
+        (part for p in pairs for part in ((p.first, p.before), (p.later, p.after))),
+        key=lambda part: part[0],
+    )
+    kept: list[NDArray[Any]] = []
+    end = 0
+    for first, counts in parts:
+        if first >= end:
+            kept.append(counts)
+            end = first + len(counts)
+    return kept
 
 
 def _good(counts: NDArray[Any], camera: Camera) -> BoolArray:
@@ -74,9 +172,7 @@ def _good(counts: NDArray[Any], camera: Camera) -> BoolArray:
     return np.isfinite(light) & ~repeats
 
 
-def _pairs(
-    movie: Stack, config: Config, camera: Camera
-) -> tuple[list[tuple[NDArray[Any], NDArray[Any]]], int]:
+def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], int]:
     """Read frames that are as far apart as windows that are compared, and how many those have.
 
     Where the background has frames of its own, particles are in the others alone: both are looked
@@ -98,17 +194,18 @@ def _pairs(
         spans = [(before[0], min(before[1], total)), (first, min(last, total))]
         window = max(stop - start for start, stop in spans)
     frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
-    together = min(together, _SAMPLE_BYTES // (2 * places * frame_bytes) or 1)
+    most = min(together, _SAMPLE_BYTES // (2 * places * frame_bytes) or 1)
     pairs = []
     for start, stop in spans:
         gap = min(window, (stop - start) // 2)
-        number = min(together, gap)
-        if number < 1:
+        together = min(most, gap, (stop - start - gap) // _LEAST_PAIRS)
+        if together < 1:
             continue
-        starts = np.linspace(start, stop - gap - number, places // len(spans)).astype(int)
-        for place in np.unique(starts).tolist():
-            two = [movie.read(k, k + number) for k in (place, place + gap)]
+        room = stop - gap - together - start
+        number = min(places // len(spans), room // together + 1)  # none has another's frames
+        for place in np.linspace(start, start + room, number).astype(int).tolist():
+            two = [movie.read(k, k + together) for k in (place, place + gap)]
             good = [part[_good(part, camera)] for part in two]
             if all(map(len, good)):
-                pairs.append((good[0], good[1]))
+                pairs.append(Pair(place, good[0], place + gap, good[1]))
     return pairs, window

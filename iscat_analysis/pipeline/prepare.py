@@ -19,7 +19,7 @@ from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pieces.setups import darkfield_photons
 from iscat_analysis.pipeline.diagnosis import axes_warning
 from iscat_analysis.pipeline.learning import learn_optics
-from iscat_analysis.pipeline.light import judge_lines
+from iscat_analysis.pipeline.light import judge_light
 from iscat_analysis.pipeline.ranges import fitted_frames, tracked_frames
 from iscat_analysis.pipeline.recognise import (
     as_landing,
@@ -43,7 +43,7 @@ class Prepared:
     Attributes
     ----------
     movie : Stack
-        As it was opened.
+        As it was opened, without pixels that are unsteady.
     steady : Stack
         The same without the flicker of lines.
     config : Config
@@ -132,11 +132,12 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if swapped:
         run.tell(swapped)
     summary: dict[str, Any] = {}
-    lines = judge_lines(movie, config, camera)
+    judged = judge_light(movie, config, camera)
+    for text in judged.messages:
+        run.tell(f"{movie.name}: {text}")
+    movie, lines = judged.movie, judged.lines
     steady = movie
     if lines is not None:
-        for text in lines.messages:
-            run.tell(f"{movie.name}: {text}")
         summary["lines"] = lines.summary
         steady = movie.seen_as(SteadyFrames(movie, lines, camera))
     looking: Future[Changes] | None = None

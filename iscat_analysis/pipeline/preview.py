@@ -16,7 +16,7 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_ratio
 from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.metadata import resolve_metadata
-from iscat_analysis.pipeline.light import judge_lines
+from iscat_analysis.pipeline.light import judge_light
 from iscat_analysis.pipeline.looks import (
     BoundSearch,
     LandingSearch,
@@ -82,8 +82,8 @@ class Preview:
         shape = (movie.shape[1], movie.shape[2])
         camera = camera_from_config(config.camera, shape, movie.dtype)
         refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
-        lines = judge_lines(movie, config, camera)
-        self._search = _SEARCHES[way_of(config)](movie, config, camera, lines)
+        judged = judge_light(movie, config, camera)
+        self._search = _SEARCHES[way_of(config)](judged.movie, config, camera, judged.lines)
         self._lock = threading.Lock()  # a viewer may ask from several threads
 
     @property

@@ -50,14 +50,17 @@ def look_at_changes(
     """
     last = min(span[1], span[0] + MOST_FRAMES, movie.shape[0])
     images: list[NDArray[np.float32]] = []  # noise is a thousand times what they round away
+    saturated = np.zeros(movie.shape[1:], dtype=np.bool_)
     for first in range(span[0], last - BLOCK + 1, BLOCK):
-        light = camera.to_electrons(movie.read(first, first + BLOCK).mean(axis=0))
+        counts = movie.read(first, first + BLOCK)
+        saturated |= camera.saturated(counts.max(axis=0))
+        light = camera.to_electrons(counts.mean(axis=0))
         if light.mean() > 0:
             images.append((light / light.mean()).astype(np.float32))
     if not images:
         return Changes(0, float("nan"), float("nan"))
     level = np.mean(images, axis=0, dtype=np.float64)
-    usable = level > 0.1 * np.median(level)
+    usable = (level > 0.1 * np.median(level)) & ~saturated
     for image in images:
         image /= np.where(usable, level, 1.0)
         image[~usable] = 1.0

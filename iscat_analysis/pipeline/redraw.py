@@ -30,7 +30,7 @@ from iscat_analysis.pipeline.block_store import row_view
 from iscat_analysis.pipeline.chunks import HALO, Reader, counts_budget
 from iscat_analysis.pipeline.events import Fitted, PlaceAndMass
 from iscat_analysis.pipeline.field import add_signal
-from iscat_analysis.pipeline.light import judge_lines
+from iscat_analysis.pipeline.light import judge_light
 from iscat_analysis.pipeline.moving import blurred_rows
 from iscat_analysis.pipeline.moving_field import exposure_of, load_field, track_scene
 from iscat_analysis.pipeline.neighbours import Neighbours, Step
@@ -89,7 +89,8 @@ def redraw(
         Position of a row → `EventView`.
     """
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
-    lines = judge_lines(movie, config, camera)
+    judged = judge_light(movie, config, camera)
+    movie, lines = judged.movie, judged.lines
     way = way_of(config)
     if way == "sliding":
         window = int(summary["landing"]["window_frames"])

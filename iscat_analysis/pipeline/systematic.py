@@ -27,6 +27,8 @@ from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Stat
 
 _AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
 _BENT = 0.02  # of a mass; beneath, lines of standards that scatter by a per cent are as wrong
+_BENT_SIGMAS = 3.0  # beyond which the square is clear in a single row, however small its share
+_TOLD = 0.5  # of σ, beyond which it is told of every row
 _HEIGHTS_PER_FRINGE = 10  # between them it is interpolated
 
 Source = Callable[[Config, pd.DataFrame], Mapping[str, FloatArray]]
@@ -84,14 +86,14 @@ def _of_heavy_particles(
     scale: MassScale, config: Config, table: pd.DataFrame
 ) -> Mapping[str, FloatArray]:
     """Give what a line of faint standards makes of particles that are not, where it matters."""
-    if "mass_kda" not in FREE_PARAMETERS[config.fit.mode] or not is_bent(scale, table).any():
+    if "mass_kda" not in FREE_PARAMETERS[config.fit.mode]:
         return {}
-    mass = table["mass_kda"].to_numpy(float)
-    return {"mass_kda": np.abs(mass * scale.bend(mass))}
+    off, sigma = _off_the_line(scale, table)
+    return {"mass_kda": off} if (off > _TOLD * sigma).any() else {}
 
 
 def is_bent(scale: MassScale, table: pd.DataFrame) -> NDArray[np.bool_]:
-    """Tell which masses a line of faint standards is wrong about, by more than chance hides.
+    """Tell which masses a line of faint standards is clearly wrong about.
 
     Parameters
     ----------
@@ -103,12 +105,20 @@ def is_bent(scale: MassScale, table: pd.DataFrame) -> NDArray[np.bool_]:
     Returns
     -------
     ndarray of bool, shape (rows,)
-        Of the rows that are ok.
+        Of the rows that are ok: by three of their errors, or by more than lines are wrong anyway.
     """
+    off, sigma = _off_the_line(scale, table)
+    share = off / np.maximum(np.abs(table["mass_kda"].to_numpy(float)), 1e-300)
+    return np.asarray(
+        (off > _BENT_SIGMAS * sigma) | ((share > _BENT) & (off > _TOLD * sigma)), dtype=np.bool_
+    )
+
+
+def _off_the_line(scale: MassScale, table: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
+    """Give what the square of the scattered light adds to masses, and σ where rows are ok."""
     mass, sigma = (table[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
-    share = np.abs(scale.bend(mass))
     good = (table["status"] == Status.OK.value).to_numpy()
-    return np.asarray(good & (share > _BENT) & (share * np.abs(mass) > sigma / 2))
+    return np.abs(mass * scale.bend(mass)), np.where(good, sigma, np.nan)
 
 
 def _of_the_line(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:

@@ -96,7 +96,7 @@ def _of_spots(
     blocks: Sequence[NDArray[np.floating]], peaks: NDArray[np.int64], spot_px: float
 ) -> NDArray[np.bool_]:
     """Tell changes whose neighbouring pixels change as well from pixels that blink."""
-    least = _SHARED * math.exp(-0.5 / spot_px**2)
+    least = least_beside(spot_px)
     real = np.ones(len(peaks), dtype=np.bool_)
     rows, columns = blocks[0].shape
     for number, (t, y, x) in enumerate(peaks.tolist()):
@@ -120,6 +120,22 @@ def _middle(values: NDArray[np.floating]) -> float:
     values.partition(half)
     upper = values[half]
     return float(upper if values.size % 2 else (values[:half].max() + upper) / 2)
+
+
+def least_beside(spot_px: float) -> float:
+    """Give the part of a particle's change that the pixels beside its centre have at least.
+
+    Parameters
+    ----------
+    spot_px : float
+        Standard deviation of a particle's picture [px], from `spot_of`.
+
+    Returns
+    -------
+    float
+        Below it, a pixel changes by itself.
+    """
+    return _SHARED * math.exp(-0.5 / spot_px**2)
 
 
 def spot_of(wavelength_nm: float, na: float, pixel_nm: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,7 +14,6 @@ import iscat_analysis as ia
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
-from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.lines import Lines
 from iscat_analysis.pipeline.light import judge_lines
 from iscat_analysis.study.simulate import Movie
@@ -128,7 +128,7 @@ def test_pulls_are_standard_and_masses_unbiased(kind: str, lines: str) -> None:
 @pytest.mark.parametrize("kind", ["landing", "fixed"])
 def test_without_the_correction_they_are_not(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Control: the movies above; across the rows and in the mass, and not along them."""
-    monkeypatch.setattr("iscat_analysis.pipeline.prepare.judge_lines", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.pipeline.light.judge_lines", lambda *_: None)
     table = _fitted(kind, "rows", 8)
     _assert_standard(table["x"])
     for name in ("y", "mass"):
@@ -166,11 +166,11 @@ def test_lines_that_are_divided_out_of_a_moving_pattern_make_particles(
 ) -> None:
     """Control: of the test above, and of its own movie without flicker."""
 
-    def divided(movie: Stack, config: Config, camera: Camera) -> Lines | None:
+    def divided(movie: Stack, config: Config, *others: Any) -> Lines | None:
         background = config.background.model_copy(update={"drift_correction": False})
-        return judge_lines(movie, config.model_copy(update={"background": background}), camera)
+        return judge_lines(movie, config.model_copy(update={"background": background}), *others)
 
-    monkeypatch.setattr("iscat_analysis.pipeline.prepare.judge_lines", divided)
+    monkeypatch.setattr("iscat_analysis.pipeline.light.judge_lines", divided)
     config = _config("drifting", "simulation.count=0", "detection.false_alarms_per_movie=1e-3")
     with pytest.raises(DataError, match="places in frames 0:140 pass the detection threshold"):
         ia.fit_movie(_recorded(config, 0, "both", FLICKER), config=config)
@@ -194,6 +194,6 @@ def test_clean_movies_are_not_touched(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = [_recorded(config, seed, "rows", 0.0) for seed in range(6)]
     found = [ia.fit_movie(c, config=config) for c in counts]
     assert not any("lines" in result.summary for result in found)
-    monkeypatch.setattr("iscat_analysis.pipeline.prepare.judge_lines", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.pipeline.light.judge_lines", lambda *_: None)
     for c, result in zip(counts, found, strict=True):
         pd.testing.assert_frame_equal(ia.fit_movie(c, config=config).table, result.table)

@@ -8,10 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibrations import configuration, make_sights
+from calibrations import GRID, PHOTONS, configuration, make_sights, microscope
 from scenes import PIXEL_NM, Stack, make_config
 
+from iscat_analysis._kernels.scoring import CONDITIONAL
+from iscat_analysis.calibration.optics import Sight
 from iscat_analysis.config import Config
+from iscat_analysis.inference.noise import conditional
 from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import learning
@@ -59,6 +62,42 @@ def test_places_on_a_ring_do_not_condemn_the_optics(y_nm: float) -> None:
         sights, _, _ = make_sights(changes, 8, seed=5, config=config)
         moved = [replace(sight, y_nm=sight.y_nm + y_nm) for sight in sights]
         assert (_median_p(moved, config) > learning.REJECTED_P) == fits
+
+
+def _pairs(changes: dict[str, Any], count: int, seed: int) -> list[Sight]:
+    """Draw pictures of two particles that landed at once, 0.3 to 1 µm apart."""
+    config = configuration()
+    model = microscope(config, changes)
+    rng = np.random.default_rng(seed)
+    sights = []
+    for _ in range(count):
+        apart, angle = rng.uniform(300, 1000), rng.uniform(0, 2 * np.pi)
+        first = model.image(GRID, 0.0, 0.0, 5.0, 2000.0)
+        x, y = apart * np.cos(angle), apart * np.sin(angle)
+        both = (1 + first) * (1 + model.image(GRID, x, y, 5.0, 2000.0))
+        before, after = rng.poisson(PHOTONS, GRID.shape), rng.poisson(PHOTONS * both)
+        data = conditional(model, GRID, before.astype(float), after.astype(float), 1.0).data
+        sights.append(Sight(GRID, CONDITIONAL, data, x / 2, y / 2, 5.0, mass_kda=0.0, snr=1e3))
+    return sights
+
+
+@pytest.mark.parametrize(("changes", "fits"), [({}, True), ({"z11": 25.0}, False)])
+def test_pairs_that_land_at_once_do_not_condemn_the_optics(
+    changes: dict[str, Any], fits: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Six of eleven bright places are two particles; control: optics that are wrong."""
+    config = _config("auto")
+    singles, _, _ = make_sights(changes, 5, seed=3)
+    sights = [*_pairs(changes, 6, 4), *singles]
+    monkeypatch.setattr(learning, "_noise_differs", lambda *_: False)
+    monkeypatch.setattr(learning, "bright_sights", lambda *_: (sights, []))
+    said: list[str] = []
+    camera = camera_from_config(config.camera, (64, 64), "uint16")
+    learned, summary = learn_optics(MOVIE, config, camera, tell=said.append)
+    assert learned == config
+    assert (summary["median_p"] > learning.REJECTED_P) == fits
+    assert summary["tested"] == (11 if not fits else 5)
+    assert bool(said) != fits
 
 
 def test_too_few_particles_to_test_are_said(monkeypatch: pytest.MonkeyPatch) -> None:

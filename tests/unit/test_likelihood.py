@@ -370,6 +370,7 @@ def test_a_masked_pixel_says_nothing(kind: str, weak: Case) -> None:
     assert np.isnan(with_mask.residuals(weak.theta)[masked]).all()
     assert np.isnan(with_mask.measured_signal()[masked]).all()
     assert (with_mask.signal_information()[masked] == 0).all()
+    assert np.isfinite(with_mask.observed_information(weak.theta)).all()
 
 
 # ---- what the images are made of ----------------------------------------------------------------

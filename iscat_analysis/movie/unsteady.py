@@ -1,0 +1,165 @@
+"""Pixels whose noise is not that of light: found by their neighbours, and left out.
+
+A pixel that switches between two levels, a column with a noisy amplifier and a time that is burnt
+into a corner look like particles that come and go.  In frames next to each other a pixel's counts
+scatter as its light has it, and so do averages of frames far apart; a pixel is unsteady where they
+scatter more than those of the pixels around it, and those beside it do not follow: a particle's
+picture covers several.  One that never changes is no light either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+from scipy.special import chdtri
+
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.units import count, listed
+
+_CHANCE = 1e-9  # that noise alone makes a pixel unsteady
+_AROUND = 5  # pixels along each side, whose median tells how counts scatter there
+_LINE = 0.15  # of the usual scatter, by which that of a noisy line is larger at least
+_LINE_SIGMAS = 8.0  # robust standard deviations of all lines
+_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
+_FEWEST = 20  # frames that tell
+_LEAST_E = 20.0  # of light, below which noise is far from normal
+_WHOLE = 0.5  # of the pixels of a line that is named as such
+_MOST = 0.1  # of the pixels: where more are, it is not the pixels that are odd
+
+
+def unsteady_said(pixels: BoolArray) -> str:
+    """Say which pixels are unsteady.
+
+    Parameters
+    ----------
+    pixels : ndarray of bool, shape (y, x)
+        From `find_unsteady`.
+
+    Returns
+    -------
+    str
+        One line.
+    """
+    number = int(pixels.sum())
+    where = [
+        f"{name} {listed(np.flatnonzero(pixels.mean(axis=axis) > _WHOLE), 4)}"
+        for axis, name in ((1, "row"), (0, "column"))
+        if (pixels.mean(axis=axis) > _WHOLE).any()
+    ]
+    if not where:
+        y, x = np.nonzero(pixels)
+        where = [listed([f"({a}, {b})" for a, b in zip(x, y, strict=True)], 3)]
+    verb = "has" if number == 1 else "have"
+    return (
+        f"{count(number, 'pixel')} ({' and '.join(where)}) {verb} noise that is not the light's, "
+        "as where a pixel switches, an amplifier is noisy or a text is burnt in: taken for dead"
+    )
+
+
+def find_unsteady(
+    blocks: Sequence[NDArray[Any]], camera: Camera, least_beside: float
+) -> BoolArray | None:
+    """Find pixels that flicker, switch or repeat themselves.
+
+    Parameters
+    ----------
+    blocks : sequence of ndarray, shape (t, y, x)
+        Frames next to each other, from several times of a movie [counts].
+    camera : Camera
+        Counts → photoelectrons.
+    least_beside : float
+        Part of what a pixel changes by, that those beside it change by in a particle's picture.
+
+    Returns
+    -------
+    ndarray of bool, shape (y, x), or None
+        None where there are none, too few frames or photoelectrons to tell, or so many that the
+        pixels are not to blame.
+    """
+    frames = np.array([len(block) for block in blocks])
+    freedom = int((frames - 1).sum()), len(blocks) - 1
+    if freedom[0] < _FEWEST or freedom[1] < 4:
+        return None
+    light = camera.to_electrons(np.sum([b.sum(axis=0, dtype=np.float64) for b in blocks], axis=0)
+                                / frames.sum())  # fmt: skip
+    lit = light > max(_LEAST_E, 0.1 * float(np.median(light)))
+    lit &= ~camera.saturated(np.max([block.max(axis=0) for block in blocks], axis=0))
+    level = float(light[lit].mean()) if lit.any() else 0.0
+    if lit.mean() < 0.5:
+        return None
+    variance = np.where(lit, light + camera.read_variance_e2(light.shape), np.inf)
+    fast, slow = _Scatter(light.shape), _Scatter(light.shape)
+    found = lit & np.all([np.ptp(block, axis=0) == 0 for block in blocks if len(block) > 1], axis=0)
+    for block in blocks:
+        electrons = camera.to_electrons(block)
+        power = electrons[:, lit].mean(axis=1) / level
+        if power.min() <= 0:
+            return None
+        electrons /= power[:, None, None]
+        mean = electrons.mean(axis=0)
+        for frame in electrons:
+            fast.add(frame - mean)
+        slow.add((mean - light) * np.sqrt(len(block)))
+    for scatter, number in ((fast, freedom[0]), (slow, freedom[1])):
+        ratio = np.where(lit, scatter.squares / variance / number, 0.0)
+        usual = float(np.median(ratio[lit]))
+        around = np.maximum(median_filter(ratio, _AROUND, mode="nearest"), usual)
+        more = ratio > around * chdtri(number, _CHANCE) / number
+        more &= scatter.beside < least_beside * scatter.squares
+        found |= more & (_beside(ratio) - usual < least_beside * (ratio - usual))
+        if scatter is fast:
+            found |= _noisy_lines(ratio, lit, usual, least_beside)
+    found &= lit
+    return found if 0 < found.mean() < _MOST else None
+
+
+def _beside(values: FloatArray) -> FloatArray:
+    """Give the larger of the two values beside each, along the axis where that is less."""
+    padded = np.pad(values, 1, mode="reflect")
+    along_y = np.maximum(padded[:-2, 1:-1], padded[2:, 1:-1])
+    along_x = np.maximum(padded[1:-1, :-2], padded[1:-1, 2:])
+    return np.minimum(along_y, along_x)
+
+
+class _Scatter:
+    """Squares of what pixels have beyond their mean, and how far those beside them follow."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.squares = np.zeros(shape)
+        self._products = np.zeros((2, *shape))
+
+    def add(self, image: FloatArray) -> None:
+        """Add one image."""
+        padded = np.pad(image, 1, mode="reflect")
+        self.squares += image**2
+        self._products[0] += image * (padded[:-2, 1:-1] + padded[2:, 1:-1]) / 2
+        self._products[1] += image * (padded[1:-1, :-2] + padded[1:-1, 2:]) / 2
+
+    @property
+    def beside(self) -> FloatArray:
+        """Products with the pixels beside along y or x, whichever follow more."""
+        largest: FloatArray = self._products.max(axis=0)
+        return largest
+
+
+def _noisy_lines(ratio: FloatArray, lit: BoolArray, usual: float, least_beside: float) -> BoolArray:
+    """Find rows and columns most of whose pixels scatter more than those of the lines beside."""
+    noisy = np.zeros(ratio.shape, dtype=np.bool_)
+    for axis in (0, 1):
+        lines = np.flatnonzero(lit.mean(axis=axis) > _WHOLE)
+        if lines.size < _AROUND:
+            continue
+        seen = np.where(lit, ratio, np.nan).take(lines, axis=1 - axis)
+        excess = np.nanmedian(seen, axis=axis) - usual
+        spread = _NORMAL * float(np.median(np.abs(excess - np.median(excess))))
+        padded = np.pad(excess, 1, mode="reflect")
+        beside = np.maximum(padded[:-2], padded[2:])
+        off = excess > max(_LINE * usual, _LINE_SIGMAS * spread)
+        odd = lines[off & (beside < least_beside * excess)]
+        noisy[(slice(None), odd) if axis == 0 else odd] = True
+    return noisy
