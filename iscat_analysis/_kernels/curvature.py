@@ -38,7 +38,10 @@ def derivatives_between(
 def _slopes(
     kind: int, data: FloatArray, row: int, level: float, s: FloatArray, t: FloatArray
 ) -> float:
-    """Fill t (3, nx) with ∂ℓ/∂s, ∂²ℓ/∂s² and ∂²ℓ/∂s∂g, and return the sum of ∂²ℓ/∂g²."""
+    """Fill t (3, nx) with ∂ℓ/∂s, ∂²ℓ/∂s² and ∂²ℓ/∂s∂g, and return the sum of ∂²ℓ/∂g².
+
+    A masked pixel adds 0, as its quotients and their squares are finite, see `FLOOR`.
+    """
     c0, c1, c2, c3 = data[0, row], data[1, row], data[2, row], data[3, row]
     total = 0.0
     if kind == CONDITIONAL:
