@@ -19,6 +19,7 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain
 from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
+from iscat_analysis.movie.successive import shared_light
 from iscat_analysis.pipeline.chunks import NOISE_FRAMES, Reader
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Mapper, Windows
@@ -123,6 +124,9 @@ def judge_counts(
     except DataError:  # too dark to tell
         return Noise(spectrum=spectrum)
     gain = allow_for_correlation(gain, spectrum)
+    shared = shared_light(counts, camera, masked=masked)
+    if shared is not None:
+        return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
     excess = (
         ExcessNoise(gain.noise_ratio, gain.message)
         if gain.message and gain.noise_ratio > 1
@@ -142,6 +146,15 @@ def judge_counts(
         rest = allow_for_correlation(rest, measure_spectrum(counts, moved, masked=masked))
         messages += [f"with that offset, {rest.message}"] if rest.message else []
     return Noise(tuple(messages), True, excess, spectrum)
+
+
+def _filtered(shared: float) -> str:
+    """Say that frames are no independent measurements."""
+    return (
+        f"frames next to each other differ by {shared:.2g} times the variance of those farther "
+        "apart: they were averaged, interpolated or filtered in time, so that their noise does not "
+        "tell the gain, landings are blurred and σ may be too small: record or export raw frames"
+    )
 
 
 def _tells(zero: LightZero, gain: GainDiagnosis) -> bool:

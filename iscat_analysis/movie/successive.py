@@ -1,0 +1,62 @@
+"""Frames that hold light of those before them: averaged, interpolated or filtered in time.
+
+Of independent frames any two differ alike, but for what changes slowly.  Where each was averaged
+with the one before, neighbours differ less than frames farther apart, and these all alike; where
+light or the stage drift, or the laser flickers, differences go on growing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.movie.camera import Camera
+from iscat_analysis.records import BoolArray
+
+_APART, _FAR = 8, 16  # frames: filters are forgotten by then
+_FEWEST = 40  # frames that tell
+_LEAST = 0.1  # by which the variance between neighbours falls short
+_GROWS = 0.15  # of that, by which it may still grow farther on
+
+
+def shared_light(
+    counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
+) -> float | None:
+    """Tell whether successive frames have light in common.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Successive frames.
+    camera : Camera
+        Counts → photoelectrons.
+    masked : ndarray of bool, shape (y, x), optional
+        Pixels to leave out.
+
+    Returns
+    -------
+    float or None
+        Variance between neighbouring frames over that of frames farther apart; None where they are
+        independent, as far as one can tell.
+    """
+    if len(counts) < _FEWEST:
+        return None
+    electrons = camera.to_electrons(counts)
+    used = electrons.mean(axis=0) > 0
+    if masked is not None:
+        used &= ~masked
+    pixels = electrons[:, used]
+    power = pixels.mean(axis=1)
+    if not used.any() or power.min() <= 0:
+        return None
+    pixels *= (power.mean() / power)[:, None]
+    near, apart, far = (
+        float(np.median(np.square(pixels[lag:] - pixels[:-lag]).mean(axis=0) / pixels.mean(axis=0)))
+        for lag in (1, _APART, _FAR)
+    )
+    if apart <= 0 or far <= 0:
+        return None
+    short = 1 - near / apart
+    return near / apart if short > _LEAST and abs(far / apart - 1) < _GROWS * short else None
