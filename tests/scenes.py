@@ -58,6 +58,7 @@ class Stack:
     def __init__(self, counts: NDArray[Any]) -> None:
         self.counts = counts
         self.shape = counts.shape
+        self.dtype = counts.dtype
         self.name = "movie"
 
     def read(self, start: int, stop: int) -> NDArray[Any]:

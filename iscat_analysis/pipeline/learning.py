@@ -36,6 +36,7 @@ from iscat_analysis.movie.camera import Camera, camera_from_config
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.pipeline.crowded import learn_in_field, seen_in_field
+from iscat_analysis.pipeline.diagnosis import drift_warning, examine_background
 from iscat_analysis.pipeline.microscope import (
     calibrate_sights,
     goodness,
@@ -130,7 +131,10 @@ def learn_optics(
         alone, source = len(sights), {"movie": movie.name}
         try:
             if alone < LEAST_TESTED and way_of(config) == "fixed":
-                sights, others = seen_in_field(_summed(movie, config, camera), config, pool)
+                windows = _summed(movie, config, camera)
+                if drift_warning(movie.name, examine_background(movie, camera, windows)):
+                    raise DataError("the edges of a fixed pattern that moved look like particles")
+                sights, others = seen_in_field(windows, config, pool)
             if len(sights) < LEAST_TESTED:
                 raise DataError(_too_few(movie.name, len(sights)))
             median = _median_p(sights, config, others, pool.map)

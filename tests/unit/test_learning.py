@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from calibrations import GRID, PHOTONS, configuration, make_sights, microscope
 from scenes import PIXEL_NM, Stack, make_config
+from scipy.ndimage import gaussian_filter, shift
 
 from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.calibration.optics import Sight
@@ -189,3 +190,26 @@ def test_particles_at_heights_of_their_own_do_not_condemn_the_optics(
     assert not said
     learn_optics(MOVIE, config, camera, tell=said.append)  # the control: one height for all
     assert len(said) == 1
+
+
+@pytest.mark.parametrize(("moved_px", "why"), [(0.5, "edges of a fixed pattern"), (0.0, "shows 0")])
+def test_edges_of_a_pattern_that_moved_are_not_learned_from(moved_px: float, why: str) -> None:
+    """Where every particle has a height of its own, they would be fitted as if they were some."""
+    config = make_config(
+        background={"frames": [0, 10]}, fit={"frames": [10, 20], "mode": "joint"}
+    )  # fmt: skip
+    rng = np.random.default_rng(4)
+    speckle = gaussian_filter(rng.standard_normal((64, 64)), 2.0, mode="wrap")
+    light = 1e5 * (1 + 0.1 * speckle / speckle.std())
+    later = shift(light, (moved_px, 0.0), mode="wrap")
+    counts = rng.poisson(np.repeat([light, later], 10, axis=0)).astype(np.uint32)
+    camera = config.camera.model_copy(update={"well_depth_e": 1e9})
+    unsaturated = config.model_copy(update={"camera": camera})
+    said: list[str] = []
+    movie: Any = Stack(counts)
+    _, summary = learn_optics(
+        movie, unsaturated, camera_from_config(camera, (64, 64), counts.dtype), tell=said.append
+    )
+    assert not summary["calibrated"]
+    assert len(said) == 1
+    assert why in said[0]
