@@ -23,6 +23,7 @@ from iscat_analysis.units import count, listed
 
 _CHANCE = 1e-9  # that noise alone makes a pixel unsteady
 _AROUND = 5  # pixels along each side, whose median tells how counts scatter there
+_CHANGING = 3.0  # times shot noise, by which most pixels change slowly where it is not the pixels
 _LINE = 0.15  # of the usual scatter, by which that of a noisy line is larger at least
 _LINE_SIGMAS = 8.0  # robust standard deviations of all lines
 _NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
@@ -108,6 +109,8 @@ def find_unsteady(
     for scatter, number in ((fast, freedom[0]), (slow, freedom[1])):
         ratio = np.where(lit, scatter.squares / variance / number, 0.0)
         usual = float(np.median(ratio[lit]))
+        if scatter is slow and usual > _CHANGING:  # by the light or the stage, and in what pattern
+            continue
         around = np.maximum(median_filter(ratio, _AROUND, mode="nearest"), usual)
         more = ratio > around * chdtri(number, _CHANCE) / number
         more &= scatter.beside < least_beside * scatter.squares

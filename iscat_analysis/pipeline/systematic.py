@@ -27,7 +27,7 @@ from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Stat
 
 _AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
 _BENT = 0.02  # of a mass; beneath, lines of standards that scatter by a per cent are as wrong
-_BENT_SIGMAS = 3.0  # beyond which the square is clear in a single row, however small its share
+_BENT_SIGMAS = 5.0  # beyond which the square is clear in a single row, however small its share
 _TOLD = 0.5  # of σ, beyond which it is told of every row
 _HEIGHTS_PER_FRINGE = 10  # between them it is interpolated
 
@@ -105,7 +105,7 @@ def is_bent(scale: MassScale, table: pd.DataFrame) -> NDArray[np.bool_]:
     Returns
     -------
     ndarray of bool, shape (rows,)
-        Of the rows that are ok: by three of their errors, or by more than lines are wrong anyway.
+        Of the rows that are ok: by five of their errors, or by more than lines are wrong anyway.
     """
     off, sigma = _off_the_line(scale, table)
     share = off / np.maximum(np.abs(table["mass_kda"].to_numpy(float)), 1e-300)

@@ -82,7 +82,7 @@ def test_fits_meet_the_truth(mode: str, fitted, movies) -> None:
     fits = pd.read_csv(fitted[mode] / "fits.csv")
     truth = pd.read_csv(movies[mode].with_suffix(".truth.csv"))
     # of particles this heavy it is told what a line of light standards makes of them
-    common = ["systematic_mass_kda"] if mode == "joint" else []
+    common = ["systematic_mass_kda"] if mode in ("mass", "joint") else []
     assert list(fits.columns) == [*EVENT_COLUMNS, *common, *REPEAT_COLUMNS]
     assert len(fits) == len(truth) == 8
     assert set(fits["status"]) == {"ok"}

@@ -90,6 +90,14 @@ def test_light_that_changes_particles_and_a_pattern_that_moves_are_no_pixels() -
     assert find_unsteady(moving.reshape(8, 8, SIDE, SIDE), Camera(GAIN), LEAST) is None
 
 
+def test_a_fine_pattern_that_drifts_far_is_no_pixels() -> None:
+    """Over 24 blocks of a movie it goes 1.4 pixels; no pixel changes then as one that switches."""
+    moving = speckled_counts(
+        [np.ones((SIDE, SIDE))] * 192, 192, "drift", np.random.default_rng(28), drift_px=0.0075
+    )
+    assert find_unsteady(moving.reshape(24, 8, SIDE, SIDE), Camera(GAIN), LEAST) is None
+
+
 def test_particles_that_move_are_no_pixels() -> None:
     """Six of 5 % go 0.7 pixels from one frame to the next, everywhere in the field."""
     rng = np.random.default_rng(24)
