@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,14 +20,6 @@ Array = NDArray[np.float64]
 GAIN, OFFSET, LEVEL_E = 4.0, 100.0, 4e4
 CAMERA = Camera(gain_e_per_adu=GAIN, offset_adu=OFFSET, full_scale_adu=65535.0)
 SHAPE = (48, 64)
-
-
-class Counts(Stack):
-    """Counts in memory that know their type."""
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        return np.dtype(self.counts.dtype)
 
 
 def _light() -> Array:
@@ -55,7 +46,7 @@ def test_a_line_keeps_its_share_of_the_light(kind: str) -> None:
     share = 4e-6 * LEVEL_E / (1 + 4e-6 * LEVEL_E)
     assert lines.shares[kind == "columns"] == pytest.approx(share, rel=0.1)
     assert lines.shares[kind == "rows"] == 0
-    steady = CAMERA.to_electrons(SteadyFrames(Counts(counts), lines, CAMERA).read(0, 64))
+    steady = CAMERA.to_electrons(SteadyFrames(Stack(counts), lines, CAMERA).read(0, 64))
     before = CAMERA.to_electrons(counts)
     along = 2 if kind == "rows" else 1
     power = before.mean(axis=(1, 2))
@@ -78,7 +69,7 @@ def test_saturated_and_empty_pixels_stay_what_they_are() -> None:
     lines = find_lines(counts[11:], CAMERA)
     assert lines is not None
     assert lines.light_e[5, 6] == 0
-    steady = SteadyFrames(Counts(counts), lines, CAMERA).read(0, 64)
+    steady = SteadyFrames(Stack(counts), lines, CAMERA).read(0, 64)
     assert (steady[np.arange(64) != 10, 5, 6] == 65535).all()
     assert not steady[10].any()
 
