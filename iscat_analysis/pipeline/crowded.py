@@ -105,13 +105,13 @@ def learn_in_field(
         The field has too few particles.
     """
     guess: Config | None = config
-    if not heights_free(config):
+    before, free = math.inf, heights_free(config)
+    if not free:
         places, others = bright_places(windows, config, alone_nm=0.0)
         found = calibrate_sights(
             places, others, config, groups, source, least=LEAST_ROUGH, mapper=pool.map
         )
         guess, why = with_sign(with_settings(config, found.measured.settings))
-    before, free = math.inf, heights_free(config)
     for number in range(ROUNDS):
         if guess is None:
             raise DataError(why)

@@ -306,7 +306,7 @@ def _learned(
 ) -> OpticsCalibration:
     """Learn the optics from particles that stand alone, or where these do not suffice from all."""
     crowded = way_of(config) == "fixed"
-    if len(sights) >= LEAST_SIGHTS or not crowded:
+    if not crowded or (len(sights) >= LEAST_SIGHTS and not heights_free(config)):
         found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
         if found.accepted or not crowded:
             return found
