@@ -17,6 +17,7 @@ from iscat_analysis.records import BoolArray
 
 _APART, _FAR = 8, 16  # frames: filters are forgotten by then
 _FEWEST = 40  # frames that tell
+_PIXELS = 4096  # that tell, all over the field
 _LEAST = 0.1  # by which the variance between neighbours falls short
 _GROWS = 0.15  # of that, by which it may still grow farther on
 
@@ -43,13 +44,16 @@ def shared_light(
     """
     if len(counts) < _FEWEST:
         return None
-    electrons = camera.to_electrons(counts)
-    used = electrons.mean(axis=0) > 0
+    used = camera.to_electrons(counts.mean(axis=0)) > 0
     if masked is not None:
         used &= ~masked
-    pixels = electrons[:, used]
+    places = np.flatnonzero(used)
+    if not places.size:
+        return None
+    places = places[:: -(-places.size // _PIXELS)]
+    pixels = np.array([camera.to_electrons(frame).flat[places] for frame in counts])
     power = pixels.mean(axis=1)
-    if not used.any() or power.min() <= 0:
+    if power.min() <= 0:
         return None
     pixels *= (power.mean() / power)[:, None]
     near, apart, far = (
