@@ -6,11 +6,13 @@ so that ``--help`` and shell completion stay quick; and `app` itself only once C
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import gc
 import os
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 __all__ = ["main", "main_fit"]
 
@@ -76,18 +78,24 @@ def _start(program: str, arguments: Sequence[str] | None) -> int:
             if ours:
                 signal.signal(signal.SIGINT, signal.default_int_handler)
         status = app.run(program, sys.argv[1:] if arguments is None else arguments)
-        if arguments is None:  # the process ends; looking through what is left takes half a second
-            gc.freeze()
+        if arguments is None:  # the process ends
+            if status != INTERRUPTED:
+                atexit._run_exitfuncs()
+            _end(status)
     except KeyboardInterrupt:  # before a command began or after it ended
         status = INTERRUPTED
-    if status == INTERRUPTED and arguments is None:
-        _end()
+        if arguments is None:
+            _end(status)
     return status
 
 
-def _end() -> None:
-    """End the process without waiting for threads that are still at work."""
+def _end(status: int) -> NoReturn:
+    """End the process at once.
+
+    It waits for no thread that is still at work, and tidies nothing of the libraries away, which
+    takes a tenth of a second.
+    """
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError, AttributeError):
             stream.flush()
-    os._exit(INTERRUPTED)
+    os._exit(status)
