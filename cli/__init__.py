@@ -18,9 +18,9 @@ __all__ = ["main", "main_fit"]
 
 INTERRUPTED = 130
 
-_OBJECTS = 200_000
-"""New containers after which cycles among them are looked for: loading the libraries makes some
-ten times as many, which stay, and looking through them every 700 took a quarter of a short run."""
+_OBJECTS = 500_000
+"""New containers after which cycles among them are looked for: loading the libraries makes fewer,
+which stay, and looking through them every 700 took a quarter of a short run."""
 
 _ALGEBRA = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """What says how many threads linear algebra takes.  Work is divided among threads above it; small
