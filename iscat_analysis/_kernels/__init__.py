@@ -10,7 +10,8 @@ import atexit
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Set
+from collections.abc import Callable, Iterable, Iterator, Set
+from contextlib import contextmanager
 from typing import Any
 
 from numba import config, njit
@@ -57,6 +58,29 @@ def environment() -> dict[str, str]:
     return os.environ | ({"NUMBA_CACHE_DIR": config.CACHE_DIR} if TEMPORARY else {})
 
 
+_elsewhere: dict[str, Callable[[], None]] = {}
+
+
+@contextmanager
+def awaited(modules: Iterable[str], wait: Callable[[], None]) -> Iterator[None]:
+    """Wait for kernels that another process compiles, instead of compiling them here as well.
+
+    Parameters
+    ----------
+    modules : iterable of str
+        Names of the modules in this package that hold these kernels.
+    wait : callable
+        Returns when the other process has ended, at once where there is none.
+    """
+    names = [f"{__name__}.{module}" for module in modules]
+    _elsewhere.update(dict.fromkeys(names, wait))
+    try:
+        yield
+    finally:
+        for name in names:
+            _elsewhere.pop(name, None)
+
+
 class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba is not typed
     """Numba's compiled functions on disk, of which one is loaded without what only compiling needs.
 
@@ -68,6 +92,9 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba is not typed
         with self._guard_against_spurious_io_errors():
             rtsys.initialize(target_context)
             loaded = self._load_overload(sig, target_context)
+            if loaded is None and (wait := _elsewhere.get(self._py_func.__module__)) is not None:
+                wait()
+                loaded = self._load_overload(sig, target_context)
             if loaded is not None:
                 return loaded
         return super().load_overload(sig, target_context)

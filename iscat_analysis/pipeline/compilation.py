@@ -20,6 +20,7 @@ _PATIENCE_S = 1.0  # of compilation, before it is announced
 _BETWEEN_S = 4.0  # from one line to the next
 _ROOM = f"{_kernels.__name__}."
 _SHARED = ("radial", "image", "scoring")  # whose kernels the other process compiles half of
+_THEIRS = ("curvature", "hessian", "residuals", "score_test")  # all of whose kernels it compiles
 _ABOUT = {
     "curvature": "the precision of fits",
     "diffusion": "diffusion",
@@ -192,7 +193,10 @@ def compiling(
         )
     listener = Compilation(notify, together=workers > 1, parts=parts)
     try:
-        with event.install_listener("numba:compile", listener):
+        with (
+            event.install_listener("numba:compile", listener),
+            _kernels.awaited(_THEIRS, listener.wait),
+        ):
             yield listener
     finally:
         listener.close()

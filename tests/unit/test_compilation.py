@@ -146,6 +146,29 @@ def test_the_second_process_compiles_what_the_first_needs():
     assert len(set(maximize.signatures) - others) <= 2  # of the field, and of a picture
 
 
+def test_a_kernel_of_the_second_process_is_awaited_and_not_compiled_twice(monkeypatch, tmp_path):
+    monkeypatch.setattr(_kernels.config, "CACHE_DIR", str(tmp_path))
+
+    def third(x):
+        return x / 3
+
+    third.__module__ = f"{ROOM}.residuals"
+    here, there = _kernels.kernel()(third), _kernels.kernel()(third)
+    with _kernels.awaited(["residuals"], lambda: None):
+        assert here(3.0) == 1.0
+    assert sum(here.stats.cache_misses.values()) == 1  # the other one has ended without it
+
+    def wait():
+        with monkeypatch.context() as own:
+            own.setattr(_kernels, "_elsewhere", {})
+            there(1)
+
+    with _kernels.awaited(["residuals"], wait):
+        assert here(6) == 2.0
+    assert list(here.stats.cache_hits.values()) == [1]
+    assert sum(here.stats.cache_misses.values()) == 1
+
+
 def test_a_picture_is_compiled_without_those_of_other_kinds(tmp_path):
     code = """
 from iscat_analysis._kernels.lattice_rows import lattice_signal
