@@ -45,6 +45,7 @@ MOST_PIXELS = 1800
 
 _SINGULAR = 1e-9
 _TOGETHER = 128  # rows whose products are added in single precision
+_SOLVED = 256  # rows whose triangular systems are solved at a time, in the caches
 _DOUBTFUL = 2.5  # logarithm of the largest pivot over the least, where 1e-7 may count
 _STEPS = 4  # of Newton's method
 _SETTLED = 0.3  # standard deviations; what a step leaves is a fiftieth of it
@@ -169,24 +170,31 @@ def _all_pixels(
 ) -> tuple[FloatArray, FloatArray]:
     """Covariance of every row besides its own, and that of the amplitudes of all rows."""
     inverse = _inverse(fisher, index)
-    changes, weight = patterns(field, ground, rows)
-    pixels = np.flatnonzero(weight > 0)
-    slopes = changes.reshape(*changes.shape[:2], -1)
-    if pixels.size < weight.size:
-        slopes = slopes[:, :, pixels]
-    if slopes.shape[0] * slopes.shape[1] < _SHORT * pixels.size:
-        return _of_a_short_one(slopes, weight.flat[pixels], inverse)
-    follows, left = _undetermined(slopes, weight.flat[pixels], inverse)
+    slopes, weight = _slopes(field, ground, rows)
+    if slopes.shape[0] * slopes.shape[1] < _SHORT * weight.size:
+        return _of_a_short_one(slopes, weight, inverse)
+    left = _undetermined(slopes, weight, inverse)
     if left is None or np.ptp(np.log(left.diagonal())) > _DOUBTFUL:
-        follows, left = _undetermined(slopes.astype(np.float64), weight.flat[pixels], inverse)
+        slopes = _slopes(field, ground, rows)[0].astype(np.float64)
+        left = _undetermined(slopes, weight, inverse)
     if left is None:
         return _unknown(inverse)
     own = np.diag(inverse[:, -1, -1])
-    every = follows.reshape(-1, follows.shape[2])
-    _forward(left.astype(every.dtype), every.T)
-    root = follows
+    root, left = slopes, left.astype(slopes.dtype)
+    for first in range(0, len(root), _SOLVED):
+        _forward(left, root[first : first + _SOLVED].reshape(-1, weight.size).T)
     extra = (root @ np.swapaxes(root, 1, 2)).astype(np.float64)
     return extra, own + (root[:, -1] @ root[:, -1].T).astype(np.float64)
+
+
+def _slopes(field: MovingField, ground: Ground, rows: Rows) -> tuple[NDArray[Any], FloatArray]:
+    """Give G, shape (n, free, m), and 1/N of the m pixels that say something."""
+    changes, weight = patterns(field, ground, rows)
+    slopes = changes.reshape(*changes.shape[:2], -1)
+    pixels = np.flatnonzero(weight > 0)
+    if pixels.size < weight.size:
+        slopes = slopes[:, :, pixels]
+    return slopes, weight.flat[pixels]
 
 
 def _of_a_short_one(
@@ -216,19 +224,20 @@ def _unknown(inverse: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _undetermined(
     slopes: NDArray[Any], weight: FloatArray, inverse: FloatArray
-) -> tuple[NDArray[Any], NDArray[Any] | None]:
-    """Give F⁻¹ G, shape (n, free, pixels), and the lower factor of M.
-
-    The products are of the precision of the slopes.
-    """
+) -> NDArray[Any] | None:
+    """Give the lower factor of M, and put F⁻¹ G in the place of the slopes G."""
     root = np.linalg.cholesky(inverse).astype(slopes.dtype)
-    felt = np.swapaxes(root, 1, 2) @ slopes
     left = np.zeros((weight.size, weight.size))
-    for first in range(0, len(felt), _TOGETHER):
-        some = felt[first : first + _TOGETHER].reshape(-1, weight.size)
-        left -= some.T @ some
+    products = np.empty(left.shape, dtype=slopes.dtype)
+    for first in range(0, len(slopes), _TOGETHER):
+        some = slice(first, first + _TOGETHER)
+        felt = np.swapaxes(root[some], 1, 2) @ slopes[some]
+        np.matmul(root[some], felt, out=slopes[some])
+        flat = felt.reshape(-1, weight.size)
+        np.matmul(flat.T, flat, out=products)
+        left -= products
     left.flat[:: weight.size + 1] += 1 / weight
-    return root @ felt, _factor(left)
+    return _factor(left)
 
 
 def _factor(matrix: FloatArray) -> NDArray[Any] | None:

@@ -53,6 +53,7 @@ _PASSES = 40
 _SLACK = np.array([0.1, 0.1, 0.01, 0.05])
 """How far particles may go from their rings: pixels, wavelengths, relative."""
 _ANY = 1e300
+_MORE_ROWS = 1.25  # for which there is room, than those of the first fit
 _BEYOND = 1.0  # resolutions λ/NA outside the field, from where a particle is still seen
 
 
@@ -149,13 +150,20 @@ class MovingField:
     @cached_property
     def total_e(self) -> FloatArray:
         """Photoelectrons of all frames, shape (y, x) [e]."""
-        return np.asarray(self.counts_e.sum(axis=0, dtype=np.float64))
+        return self._sum_of(
+            lambda first: np.sum(self.counts_e[first : first + _BLOCK], axis=0, dtype=np.float64)
+        )
 
     @cached_property
     def frame_totals(self) -> FloatArray:
         """Photoelectrons in the used pixels of each frame, shape (t,) [e]."""
         unused = self.counts_e[:, ~self.used].sum(axis=1, dtype=np.float64)
-        return np.asarray(self.counts_e.sum(axis=(1, 2), dtype=np.float64) - unused)
+        blocks = range(0, self.frames, _BLOCK)
+        parts = self._pool.map(
+            lambda first: self.counts_e[first : first + _BLOCK].sum(axis=(1, 2), dtype=np.float64),
+            blocks,
+        )
+        return np.asarray(np.concatenate(list(parts)) - unused)
 
     @property
     def frames(self) -> int:
@@ -525,7 +533,9 @@ class MovingField:
         """Room for slopes, in the place of those before."""
         free = int(self.free[:4].sum())
         size = rows * free * side**2
-        if self._room_of_slopes.size < size:  # new memory is cleared first, as long as a fit takes
-            self._room_of_slopes = np.empty(size, dtype=np.float32)
+        if self._room_of_slopes.size < size:
+            # It is cleared where it is first used, as long as a fit takes: once, for all to come.
+            most = round(_MORE_ROWS * rows) * free * self._whole.side**2
+            self._room_of_slopes = np.empty(most, dtype=np.float32)
         values = self._room_of_slopes[:size].reshape(rows, free, side**2)
         return Slopes(np.zeros((rows, 4), dtype=np.int64), values)

@@ -10,7 +10,6 @@ have none.
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import io
 import os
@@ -28,13 +27,13 @@ from contextlib import suppress
 from typing import IO, Any, NoReturn, TypeVar
 
 from iscat_analysis.config import Config
+from iscat_analysis.memory import give_back_freed_memory
 from iscat_analysis.pipeline.chunk_work import ChunkSetting
 from iscat_analysis.places import Here, Place
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.threads import allotted, is_allotted, processors
 
 _LENGTH = struct.Struct("<Q")
-_MMAP_THRESHOLD, _LARGE_BYTES = -3, 4 * 2**20  # GNU's name for it, and from where on
 _LOOK_S = 0.2  # between two looks at whether an interrupt has come
 _PATIENCE, _PATIENCE_S = 10.0, 30.0  # for its last item: times the longest of ours, and more
 
@@ -180,19 +179,8 @@ def paired(place: Place, config: Config, setting: ChunkSetting, chunks: int) -> 
         pickle.dumps(setting)
     except TypeError:  # an array in memory, which cannot be opened again
         return place
-    _give_back_large_arrays()
+    give_back_freed_memory()
     return Pair(config.compute.workers)
-
-
-def _give_back_large_arrays() -> None:
-    """Have memory of large arrays go back to the system as they are freed: two processes hold it.
-
-    The C library otherwise keeps up to 32 MB at a time, between others that are still in use.
-    """
-    with suppress(OSError, AttributeError):  # of GNU
-        library = ctypes.CDLL(None)
-        library.mallopt(_MMAP_THRESHOLD, _LARGE_BYTES)
-        library.malloc_trim(0)
 
 
 class _Copy:

@@ -125,16 +125,22 @@ def load_field(
             "without particles"
         )
     counts = np.empty((frames, *shape), dtype=np.float32)
-    saturated = np.zeros(shape, dtype=bool)
-    for start in range(first, last, _BLOCK):
-        stop = min(start + _BLOCK, last)
-        raw = movie.read(start, stop)
+    saturated, total = np.zeros(shape, dtype=bool), np.zeros(shape)
+
+    def read_some(start: int) -> tuple[BoolArray, FloatArray]:
+        raw = movie.read(start, min(start + _BLOCK, last))
         check(raw, start)
-        saturated |= camera.saturated(raw).any(axis=0)
-        counts[start - first : stop - first] = camera.to_electrons(raw)
-        progress("background", stop - first, frames)
+        part = counts[start - first : start - first + len(raw)]
+        part[:] = camera.to_electrons(raw)
+        full = np.asarray(camera.saturated(raw).any(axis=0))
+        return full, np.sum(part, axis=0, dtype=np.float64)
+
+    starts = range(first, last, _BLOCK)
+    for start, (full, light) in zip(starts, pool.map(read_some, starts), strict=True):
+        saturated |= full
+        total += light
+        progress("background", min(start + _BLOCK, last) - first, frames)
     read = np.broadcast_to(camera.read_variance_e2(shape), shape)
-    total = counts.sum(axis=0, dtype=np.float64)
     masked = saturated | find_defects(total, frames * read)
     masked |= _noisy(counts, total / frames + read)
     nominal = abs(scene.model.scale.amplitude(scene.model.material.mass_kda))
