@@ -3,34 +3,44 @@
 from __future__ import annotations
 
 import ctypes
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # GNU's names for them
 _EVERYTHING = 2**31 - 1  # the largest size that it can be told
 _LARGE_BYTES = 4 * 2**20  # from where on an array goes back by itself
 
 
-def keep_freed_memory() -> None:
-    """Have memory that is freed kept for the next arrays, up to the most that was in use at a time.
+@contextmanager
+def freed_memory_kept() -> Iterator[None]:
+    """Have memory that is freed kept for the next arrays, and given back at the end.
 
     The system clears memory before it gives it, which takes longer than many a step of ours with
     the array that lies in it.
+
+    Yields
+    ------
+    None
     """
-    _tell({_TRIM_THRESHOLD: _EVERYTHING, _MMAP_THRESHOLD: _EVERYTHING})
+    _keep_up_to(_EVERYTHING)
+    try:
+        yield
+    finally:
+        give_back_freed_memory()
 
 
 def give_back_freed_memory() -> None:
-    """Have memory of large arrays go back to the system as they are freed: two processes hold it.
+    """Have memory of large arrays go back to the system, now and from now on as they are freed.
 
     The C library otherwise keeps up to 32 MB at a time, between others that are still in use.
     """
-    _tell({_TRIM_THRESHOLD: _LARGE_BYTES, _MMAP_THRESHOLD: _LARGE_BYTES}, now=True)
+    _keep_up_to(_LARGE_BYTES)
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
-def _tell(options: dict[int, int], *, now: bool = False) -> None:
+def _keep_up_to(size: int) -> None:
     with suppress(OSError, AttributeError):  # of GNU
         library = ctypes.CDLL(None)
-        for option, size in options.items():
-            library.mallopt(option, size)
-        if now:
-            library.malloc_trim(0)
+        for threshold in (_TRIM_THRESHOLD, _MMAP_THRESHOLD):
+            library.mallopt(threshold, size)

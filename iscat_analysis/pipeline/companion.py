@@ -179,7 +179,7 @@ def paired(place: Place, config: Config, setting: ChunkSetting, chunks: int) -> 
         pickle.dumps(setting)
     except TypeError:  # an array in memory, which cannot be opened again
         return place
-    give_back_freed_memory()
+    give_back_freed_memory()  # two processes hold it
     return Pair(config.compute.workers)
 
 

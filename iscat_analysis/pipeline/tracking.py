@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.config import Config
-from iscat_analysis.memory import keep_freed_memory
+from iscat_analysis.memory import freed_memory_kept
 from iscat_analysis.movie.background import Check, add_frames, start_power
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.forward import PixelGrid
@@ -44,6 +44,7 @@ from iscat_analysis.threads import threads
 _STEPS = 100  # of the progress of a block
 
 
+@freed_memory_kept()
 def find_moving(ready: Prepared, run: Run) -> Found:
     """Track particles over backgrounds that are learnt with them.
 
@@ -67,7 +68,6 @@ def find_moving(ready: Prepared, run: Run) -> Found:
     KeyboardInterrupt
         The user stopped it before the first block was finished.
     """
-    keep_freed_memory()
     config, camera = ready.config, ready.camera
     kept = keep_frames(ready.steady, camera, fitted_frames(ready.steady, config))
     movie, (first, last) = kept.movie, kept.span
