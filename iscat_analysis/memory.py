@@ -8,7 +8,10 @@ from contextlib import contextmanager, suppress
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # GNU's names for them
 _EVERYTHING = 2**31 - 1  # the largest size that it can be told
+_USUAL_BYTES = 32 * 2**20  # what the library comes to by itself
 _LARGE_BYTES = 4 * 2**20  # from where on an array goes back by itself
+
+_OTHERS = OSError, AttributeError, TypeError  # what libraries that are not GNU's end in
 
 
 @contextmanager
@@ -26,7 +29,7 @@ def freed_memory_kept() -> Iterator[None]:
     try:
         yield
     finally:
-        give_back_freed_memory()
+        _give_back(_USUAL_BYTES)
 
 
 def give_back_freed_memory() -> None:
@@ -34,13 +37,17 @@ def give_back_freed_memory() -> None:
 
     The C library otherwise keeps up to 32 MB at a time, between others that are still in use.
     """
-    _keep_up_to(_LARGE_BYTES)
-    with suppress(OSError, AttributeError):
+    _give_back(_LARGE_BYTES)
+
+
+def _give_back(size: int) -> None:
+    _keep_up_to(size)
+    with suppress(*_OTHERS):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def _keep_up_to(size: int) -> None:
-    with suppress(OSError, AttributeError):  # of GNU
+    with suppress(*_OTHERS):
         library = ctypes.CDLL(None)
         for threshold in (_TRIM_THRESHOLD, _MMAP_THRESHOLD):
             library.mallopt(threshold, size)

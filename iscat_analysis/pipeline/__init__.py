@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import path_in
+from iscat_analysis.memory import freed_memory_kept
 from iscat_analysis.movie import Stack, beside, open_stack
 from iscat_analysis.pipeline.bound import find_bound
 from iscat_analysis.pipeline.compilation import compiling, needed_parts
@@ -181,8 +183,10 @@ def analyse(
         )
     started = datetime.now(UTC).isoformat(timespec="seconds")
     # particles that move are fitted by kernels of their own, which call those of others
-    workers = 1 if way_of(config) == "tracks" else config.compute.workers
-    with compiling(notify, workers, needed_parts(config)) as compilation:
+    tracked = way_of(config) == "tracks"
+    workers = 1 if tracked else config.compute.workers
+    kept = freed_memory_kept() if tracked else nullcontext()
+    with kept, compiling(notify, workers, needed_parts(config)) as compilation:
         run = Run(notify, progress, compilation, partial, place or Here(), inject)
         ready = prepare(movie, config, run)  # load, calibrate
         found = FIND[ready.way](ready, run)  # background, detect, fit, posterior, bounds

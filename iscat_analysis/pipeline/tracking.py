@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.config import Config
-from iscat_analysis.memory import freed_memory_kept
 from iscat_analysis.movie.background import Check, add_frames, start_power
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.forward import PixelGrid
@@ -44,7 +43,6 @@ from iscat_analysis.threads import threads
 _STEPS = 100  # of the progress of a block
 
 
-@freed_memory_kept()
 def find_moving(ready: Prepared, run: Run) -> Found:
     """Track particles over backgrounds that are learnt with them.
 
