@@ -2,6 +2,7 @@
 
 import ctypes
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,8 +24,7 @@ def _pages_cleared() -> int:
 
 
 def _resident() -> int:
-    with open("/proc/self/statm", encoding="ascii") as told:
-        return int(told.read().split()[1]) * PAGE
+    return int(Path("/proc/self/statm").read_text("ascii").split()[1]) * PAGE
 
 
 @pytest.mark.skipif(
