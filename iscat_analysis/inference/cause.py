@@ -10,6 +10,7 @@ another microscope, one parameter at a time.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,6 +85,8 @@ class Cause:
         Of `step`.
     events : int
         Fits that were looked at.
+    learned : bool
+        Whether the optics can be learned from such a movie.
     """
 
     name: str
@@ -91,6 +94,7 @@ class Cause:
     step: float | None
     unit: str
     events: int
+    learned: bool
 
     @property
     def likeness(self) -> str:
@@ -105,9 +109,11 @@ class Cause:
     @property
     def message(self) -> str:
         """One line for the user."""
+        elsewhere = "" if self.learned else " with an interferometric movie of the same microscope"
         return (
             f"the model does not describe the brightest particles ({self.events} looked at): what "
-            f"it leaves over looks most like {self.likeness}; correct it, or calibrate the optics"
+            f"it leaves over looks most like {self.likeness}; correct it, or calibrate the "
+            f"optics{elsewhere}"
         )
 
 
@@ -126,16 +132,15 @@ def likely_cause(
     Returns
     -------
     Cause or None
-        None without fits, in dark field, or where nothing explains `WORTH_NAMING`.
+        None without fits, or where nothing explains `WORTH_NAMING`.
     """
-    if not fits or config.optics.scheme == "darkfield" or config.optics.convention != "exact":
+    if not fits or config.optics.convention != "exact":
         return None
     left = [_Left.of(*fit) for fit in fits]
     excess = sum(each.excess for each in left)
     if excess <= 0:
         return None
     reach = fits[0][0].model.reach_nm
-    least_index = min(config.optics.n_immersion, config.optics.n_glass)
     best: Cause | None = None
     for name in (*_STEPS, PIXEL, _TURNED, *_OTHERS):
         changes = _neighbours(config, name, reach)
@@ -143,20 +148,19 @@ def likely_cause(
             continue
         share, step = _explained(left, changes, excess, whole=name in _WHOLE)
         if len(changes) == 1 and name not in (_TURNED, *_OTHERS) and share > WORTH_NAMING:
-            try:  # far from a first order: the same, as far away as it seems
+            # far from a first order: the same, as far away as it seems, if a microscope is there
+            with suppress(ConfigError):
                 there = _neighbours(config, name, reach, float(step[0]))
-                share, step = _explained(left, there, excess)
-            except ConfigError:  # no microscope is there
-                pass
+                share, step = _explained(left, there, excess) if there else (0.0, step)
         for far in _FAR.get(name, ()):
-            if name != PIXEL and not 0 < config.optics.na + far < least_index:
-                continue
-            larger, asked = _explained(left, _neighbours(config, name, reach, far), excess)
+            there = _neighbours(config, name, reach, far)
+            larger, asked = _explained(left, there, excess) if there else (0.0, step)
             if larger > share and _WHOLE_STEP < asked[0] / far < 1 / _WHOLE_STEP:
                 share, step = larger, np.array([far])
         if share > WORTH_NAMING and (best is None or share > best.share):
             size = float(step[0]) if name in _UNITS else None
-            best = Cause(name, min(share, 1.0), size, _UNITS.get(name, ""), len(fits))
+            unit, learned = _UNITS.get(name, ""), config.optics.scheme != "darkfield"
+            best = Cause(name, min(share, 1.0), size, unit, len(fits), learned)
     return best
 
 
@@ -227,7 +231,7 @@ def _explained(
 def _neighbours(
     config: Config, name: str, reach_nm: float, far: float | None = None
 ) -> list[tuple[float, _Picture]]:
-    """Give the microscopes that differ in one respect, and by how much; none where it is so.
+    """Give the microscopes that differ in one respect, and by how much; none where there are none.
 
     They are `far` away where that is given, else as in `_STEPS`.
     """
@@ -245,6 +249,11 @@ def _neighbours(
     updates: list[tuple[float, dict[str, Any]]]
     if name in _STEPS:
         steps = {key: step if far is None else far for key, step in _STEPS[name].items()}
+        least_index = min(optics.n_immersion, optics.n_glass)
+        if not 0 < optics.na + steps.get("na", 0.0) < least_index:
+            return []
+        if optics.wavelength_nm + steps.get("wavelength_nm", 0.0) <= 0:
+            return []
         updates = [
             (step, {key: getattr(optics, key) + step})
             if hasattr(optics, key)

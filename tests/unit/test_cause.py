@@ -59,6 +59,40 @@ def test_the_wrong_number_is_named_with_its_error(name: str, key: str, off: floa
     assert f"off by about {math.copysign(1, off):+g}"[:-1] in cause.message
 
 
+@pytest.mark.parametrize(
+    ("name", "key", "off", "found"),
+    [
+        ("spherical aberration", "z11", 20.0, 20.0),
+        ("focus", "focus_nm", 100.0, 100.0),
+        ("numerical aperture", "na", -0.06, -0.06),
+        ("focus", "focus_nm", -100.0, -100.0),  # a first order asks for an NA of 1.52, in oil of 1.515
+    ],
+)
+def test_the_wrong_number_is_named_in_dark_field(
+    name: str, key: str, off: float, found: float
+) -> None:
+    dark = {"scheme": "darkfield"}
+    usual = {"focus_nm": -300.0, "na": 1.42}
+    seen = {"aberrations_nm": {key: off}} if key == "z11" else {key: usual[key] + off}
+    config, rng = make_config(calibrated=False, optics=dark), np.random.default_rng(5)
+    grid = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM)
+    model = forward_model(config, grid.diagonal_nm)
+    other = forward_model(make_config(calibrated=False, optics=dark | seen), grid.diagonal_nm)
+    level, scale = np.full(grid.shape, 2e4), 1e14
+    fits = []
+    for x, y in rng.uniform(15.0, 17.0, (4, 2)):
+        light = level + scale * other.image(grid, x * PIXEL_NM, y * PIXEL_NM, 5.0, 1000.0)
+        likelihood = noise.poisson(model, grid, rng.poisson(light).astype(float), level, scale)
+        start = Candidate(x, y, 5.0, 1000.0, 10.0)
+        fit = fit_particle(likelihood, start, "mass", (0, 1000), level=False)
+        fits.append((likelihood, fit.theta, fit.box.free))
+    cause = likely_cause(config, fits)
+    assert cause is not None
+    assert cause.name == name
+    assert cause.step == pytest.approx(found, rel=0.5)
+    assert "with an interferometric movie" in cause.message
+
+
 @pytest.mark.parametrize("stretch", [0.8, 0.95, 1.03, 1.1, 1.2])
 def test_a_wrong_pixel_size_is_named(stretch: float) -> None:
     cause = _cause({}, stretch=stretch)
