@@ -65,7 +65,7 @@ def test_the_wrong_number_is_named_with_its_error(name: str, key: str, off: floa
         ("spherical aberration", "z11", 20.0, 20.0),
         ("focus", "focus_nm", 100.0, 100.0),
         ("numerical aperture", "na", -0.06, -0.06),
-        ("focus", "focus_nm", -100.0, -100.0),  # a first order asks for an NA of 1.52, in oil of 1.515
+        ("focus", "focus_nm", -100.0, -100.0),  # by first order, NA 1.52 in oil of 1.515
     ],
 )
 def test_the_wrong_number_is_named_in_dark_field(
