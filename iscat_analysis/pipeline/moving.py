@@ -49,8 +49,9 @@ from iscat_analysis.pipeline.linking import (
 from iscat_analysis.pipeline.moving_field import exposure_of, load_field, search_frames
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress
-from iscat_analysis.search.moving import Sightings
+from iscat_analysis.search.moving import Sightings, load_linker
 from iscat_analysis.species.diffusion import estimate_diffusion
+from iscat_analysis.threads import beside
 
 ROUNDS = 8
 """Searches of the whole movie; each sees what the fits so far leave over."""
@@ -176,6 +177,8 @@ def follow(
         if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(scene, rows, found)
+        if len(np.unique(rows.frame)) < len(rows.frame):  # there may be a choice
+            beside(load_linker)
         rows, ground, done = settle(
             field,
             ground,

@@ -9,18 +9,17 @@ is not theirs alone yet: the sign of the contrast is the model's.
 from __future__ import annotations
 
 import gc
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
-from scipy.optimize import linear_sum_assignment
-from scipy.sparse.csgraph import connected_components
 
 from iscat_analysis._kernels.links import link_surely
 from iscat_analysis.errors import DataError
@@ -34,7 +33,6 @@ LEFT_OVER = 0.2
 """Of a particle's signal-to-noise ratio that a candidate beside it must reach when what was fitted
 has been taken off: less may be what the model leaves over."""
 
-_MOST_TOGETHER = 30  # particles of a net, beyond which which is which is not to be told
 _FIELDS = 32  # of frames and templates that are filtered at a time
 
 
@@ -257,8 +255,9 @@ def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int
 
     Notes
     -----
-    After J. C. Crocker and D. G. Grier, J. Colloid Interface Sci. 179, 298 (1996), as trackpy does
-    (D. B. Allan et al., doi:10.5281/zenodo.4682814).  What has no choice is linked at once.
+    What has no choice is linked at once, and the rest of each frame by
+    trackpy (D. B. Allan et al., doi:10.5281/zenodo.4682814), after J. C. Crocker and D. G. Grier,
+    J. Colloid Interface Sci. 179, 298 (1996).
     """
     n = len(frame)
     track = np.zeros(n, dtype=np.int64)
@@ -289,31 +288,39 @@ def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int
 
 
 def _chosen(old: FloatArray, new: FloatArray, reach_nm: float) -> IntArray:
-    """Say which of the old places each new one follows, -1 where it follows none.
-
-    The sum of the squared steps is the least, where one that is lost counts as a step of the reach.
-    """
-    square = ((old[:, None] - new[None]) ** 2).sum(axis=2)
-    within = square <= reach_nm**2
-    if _largest_net(within) > _MOST_TOGETHER:
+    """Say which of the old places each new one follows, -1 where it follows none."""
+    trackpy = load_linker()
+    try:
+        (_, one), (_, two) = trackpy.link_iter(iter([(0, old), (1, new)]), search_range=reach_nm)
+    except trackpy.SubnetOversizeException as trouble:
         raise DataError(
             f"too many particles are within track.max_step_nm = {reach_nm:g} of each other to tell "
             "which is which from frame to frame: lower it to the farthest that one goes, or record "
             "fewer particles or more frames a second"
-        )
-    one, two = linear_sum_assignment(np.where(within, square - reach_nm**2, 0.0))
-    kept = within[one, two]
-    before = np.full(len(new), -1, dtype=np.int64)
-    before[two[kept]] = one[kept]
-    return before
+        ) from trouble
+    where = {number: i for i, number in enumerate(one)}
+    return np.array([where.get(number, -1) for number in two], dtype=np.int64)
 
 
-def _largest_net(within: BoolArray) -> int:
-    """Count the old places of the largest net of places that are in reach of one another."""
-    if len(within) <= _MOST_TOGETHER:
-        return len(within)
-    _, net = connected_components(scipy.sparse.bmat([[None, within], [within.T, None]]))
-    return int(np.bincount(net[: len(within)]).max())
+@cache
+def load_linker() -> Any:
+    """Import trackpy, silenced, which reports every frame, and let it keep what it compiles.
+
+    That takes a third of a second, which is better taken beside something else.
+
+    Returns
+    -------
+    module
+        trackpy.
+    """
+    import trackpy
+    from trackpy.linking import subnetlinker
+
+    logging.getLogger("trackpy").setLevel(logging.WARNING)
+    compiled = getattr(subnetlinker, "_numba_subnet_norecur", None)
+    if compiled is not None:
+        compiled.enable_caching()
+    return trackpy
 
 
 @contextmanager
