@@ -125,9 +125,7 @@ def learn_optics(
         return config, {}
     tested: dict[str, Any] = {}
     with threads(config.compute.workers) as pool:
-        sights, others = (
-            ([], []) if heights_free(config) else bright_sights(movie, config, camera, pool)
-        )
+        sights, others = bright_sights(movie, config, camera, pool)
         alone, source = len(sights), {"movie": movie.name}
         try:
             if alone < LEAST_TESTED and way_of(config) == "fixed":
@@ -306,7 +304,7 @@ def _learned(
 ) -> OpticsCalibration:
     """Learn the optics from particles that stand alone, or where these do not suffice from all."""
     crowded = way_of(config) == "fixed"
-    if not crowded or (len(sights) >= LEAST_SIGHTS and not heights_free(config)):
+    if not crowded or len(sights) >= LEAST_SIGHTS:
         found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
         if found.accepted or not crowded:
             return found

@@ -64,6 +64,9 @@ def bright_sights(
 ) -> tuple[list[Sight], list[Sight]]:
     """Find the bright particles of a movie, in the way in which it is analysed.
 
+    Particles with heights of their own are known only from fits of the whole field: there are none
+    then, where frames before and after are compared.
+
     Parameters
     ----------
     movie : Stack
@@ -84,6 +87,8 @@ def bright_sights(
     """
     if way_of(config) == "sliding":
         return landing_sights(movie, config, camera, pool)
+    if heights_free(config) and way_of(config) == "fixed":
+        return [], []
     windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
     return bright_places(windows, config)
 
