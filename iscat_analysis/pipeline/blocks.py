@@ -34,7 +34,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory, follow_pattern, trusted
 from iscat_analysis.pipeline.moving_field import LEAST_FRAMES
 from iscat_analysis.pipeline.ranges import fitted_frames
-from iscat_analysis.records import FloatArray, FrameSource, Mapper
+from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Mapper
 
 BYTES = 16
 """Of memory for each pixel and frame of a block: counts, picture, slopes of the particles."""
@@ -256,12 +256,18 @@ def follow_light(
     count = max(2, min(_SUMS, most, (last - first) // _LEAST_SUM))
     spans = _spans(first, last, count)
     sums, saturated = np.zeros((count, *shape)), np.zeros(shape, dtype=bool)
-    for total, (low, high) in zip(sums, spans, strict=True):
-        for start in range(low, high, _READ):
-            raw = movie.read(start, min(start + _READ, high))
+
+    def add_up(part: int) -> BoolArray:
+        full = np.zeros(shape, dtype=np.bool_)
+        for start in range(*spans[part], _READ):
+            raw = movie.read(start, min(start + _READ, spans[part][1]))
             check(raw, start)
-            saturated |= camera.saturated(raw).any(axis=0)
-            total += len(raw) * camera.to_electrons(raw.mean(axis=0))
+            full |= camera.saturated(raw).any(axis=0)
+            sums[part] += len(raw) * camera.to_electrons(raw.mean(axis=0))
+        return full
+
+    for full in mapper(add_up, range(count)):
+        saturated |= full
     read = np.broadcast_to(camera.read_variance_e2(shape), shape)
     usable = ~(saturated | find_defects(sums.sum(axis=0), (last - first) * read))
     light = sums[:, usable].mean(axis=1) if usable.any() else np.zeros(count)

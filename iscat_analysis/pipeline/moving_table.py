@@ -86,7 +86,7 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
         "contrast": _contrasts(model, estimate[:, 2], estimate[:, 3]),
         "n_scattered": collected, "snr": np.sqrt(2 * np.maximum(judged.gain, 0.0)),
         "chi2_reduced": judged.chi2 / freedom, "p_value": p_value,
-        "flags": [";".join(flags) for flags in _flags(scene, moving, sigma, p_value, losses)],
+        "flags": _flags(scene, moving, sigma, p_value, losses),
     }  # fmt: skip
     quantum = _quantum(model, estimate[:, 2], mass, collected, free)
     for k, name in enumerate(PARAMETERS):
@@ -255,8 +255,8 @@ def _off_line(scene: Scene, moving: Moving, sigma_kda: FloatArray) -> BoolArray:
 
 def _flags(
     scene: Scene, moving: Moving, sigma: FloatArray, p_value: FloatArray, losses: FloatArray
-) -> list[list[Status]]:
-    """Gather what is to be remarked on each row."""
+) -> NDArray[np.object_]:
+    """Join what is to be remarked on each row with semicolons."""
     rows, free = moving.rows, np.flatnonzero(moving.field.free[:4])
     lost = ~moving.converged | ~np.isfinite(sigma[:, free]).all(axis=1)
     poor = (p_value < POOR_FIT_P) | (losses > LARGEST_LOSS)
@@ -273,7 +273,11 @@ def _flags(
         (lost, Status.NOT_CONVERGED), (outside, Status.AT_BOUND),
         (too_bright, Status.SATURATED), (poor, Status.POOR_FIT), (moving.close, Status.TOO_CLOSE),
     )  # fmt: skip
-    return [[mark for told, mark in marks if told[i]] for i in range(len(rows.frame))]
+    texts = [""]  # of every set of remarks; in the number of one, each remark has its bit
+    for _, mark in marks:
+        texts += [f"{text};{mark}".lstrip(";") for text in texts]
+    numbers = sum(told.astype(np.int64) << bit for bit, (told, _) in enumerate(marks))
+    return np.asarray(np.array(texts, dtype=object)[numbers])
 
 
 def _contrasts(model: ForwardModel, z_nm: FloatArray, amplitude: FloatArray) -> FloatArray:

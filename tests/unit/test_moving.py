@@ -511,6 +511,20 @@ def test_links_are_those_of_trackpy(memory: int, side: float) -> None:
         assert np.all(np.diff(first) > 0)
 
 
+@pytest.mark.parametrize(("count", "apart"), [(31, 0.6), (9, 0.01)])
+def test_links_of_a_crowd_are_refused(count: int, apart: float) -> None:
+    """Of a row that hangs together, and of places that are all in reach of one another."""
+
+    def linked(n: int) -> np.ndarray:
+        x = np.tile(apart * np.arange(n), 2)
+        at = np.column_stack([x, np.zeros(2 * n)])
+        return link(np.repeat([0, 1], n), at, reach_nm=1.0, memory=0)
+
+    assert linked(count - 1).tolist() == 2 * list(range(count - 1))
+    with pytest.raises(DataError, match="which is which"):
+        linked(count)
+
+
 # ---- the whole job ---------------------------------------------------------------------------
 
 
