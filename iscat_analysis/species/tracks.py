@@ -16,21 +16,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields
-from itertools import pairwise
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from iscat_analysis.records import (
     TRACK_COLUMNS,
-    BoolArray,
     FloatArray,
     Progress,
-    Status,
     TrackStatus,
     silent,
     track_numbers,
@@ -41,6 +37,13 @@ from iscat_analysis.species.diffusion import Diffusion, fit_diffusion, hydrodyna
 from iscat_analysis.species.displacements import LEAST_POSITIONS
 from iscat_analysis.species.motion import anomalous_test, confinement_test, steadiness_test
 from iscat_analysis.species.refraction import refractive_index
+from iscat_analysis.species.track_rows import (
+    TrackRows,
+    mean_known,
+    median_known,
+    nearest_nm,
+    rows_by_track,
+)
 from iscat_analysis.threads import threads
 
 TESTED_POSITIONS = 300
@@ -55,9 +58,6 @@ COVERAGE = 0.95
 SLOWED = 0.05
 """Share by which a wall slows a particle before its size is remarked on."""
 
-NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
-"""Of rows that do not say how a particle moves."""
-
 _FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
 _DOUBT = 0.1
 _ENOUGH = 3  # of the first that are as surprising leave none
@@ -66,7 +66,6 @@ _VAGUE = 0.03  # of a mass, which the background makes too uncertain for the err
 _FREE = ("p_confinement", "p_anomalous", "p_steady")
 _STEPS = 3.0  # standard deviations of a displacement within which it may end beyond the border
 _LOOKS = 3  # at D, on which it depends which displacements tell it
-_USELESS = 300.0  # times the median error: such a place says nothing
 _UM2 = 1e6  # nm²
 
 
@@ -158,16 +157,16 @@ def describe_tracks(
         Columns `TRACK_COLUMNS`, one row per track in the order of their numbers, and
         ``systematic_mass_kda`` where `fits` has it.
     """
-    groups = _by_track(fits)
-    massive = {track: _massive(rows) for track, rows in groups.items()}
+    groups = rows_by_track(fits)
+    massive = {track: rows.massive() for track, rows in groups.items()}
     power = information_power(
         [(good.mass_kda, good.sigma_mass_kda) for good in massive.values() if len(good.frame) > 1]
     )
-    nearest = _nearest(groups)
+    nearest = nearest_nm(groups)
     exact = {} if masses is None else masses.to_dict("index")
     records, places = [], {}
     for track, rows in groups.items():
-        good, placed = massive[track], _placed(rows)
+        good, placed = massive[track], rows.placed()
         record = _record(
             track, rows, good, placed, setup, power, correlation, exact.get(track, {})
         )  # fmt: skip
@@ -200,79 +199,15 @@ def changes_together(fits: pd.DataFrame, frames: tuple[int, int]) -> float:
     float
         As from `iscat_analysis.species.common_change.common_change`.
     """
-    massive = map(_massive, _by_track(fits).values())
+    massive = [rows.massive() for rows in rows_by_track(fits).values()]
     return common_change([(g.frame, g.mass_kda, g.sigma_mass_kda) for g in massive], frames)
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Rows of one track, or some of them, in the order of their frames; columns of ``fits.csv``."""
-
-    frame: FloatArray
-    x_nm: FloatArray
-    y_nm: FloatArray
-    z_nm: FloatArray
-    mass_kda: FloatArray
-    contrast: FloatArray
-    sigma_x_nm: FloatArray
-    sigma_y_nm: FloatArray
-    sigma_mass_kda: FloatArray
-    crb_mass_kda: FloatArray
-    status: NDArray[np.object_]
-
-    def only(self, kept: BoolArray | NDArray[np.int64]) -> _Rows:
-        return _Rows(*(getattr(self, column.name)[kept] for column in fields(self)))
-
-
-def _by_track(fits: pd.DataFrame) -> dict[int, _Rows]:
-    """Rows of each track, by their numbers."""
-    numbers = track_numbers(fits)
-    known, track = fits[numbers.notna()], numbers.dropna().to_numpy(int)
-    rows = _Rows(
-        *(known[part.name].to_numpy(object if part.name == "status" else float)
-          for part in fields(_Rows))
-    )  # fmt: skip
-    order = np.lexsort((rows.frame, track))
-    edges = np.flatnonzero(np.diff(track[order], prepend=-1, append=-1))
-    return {int(track[order[a]]): rows.only(order[a:b]) for a, b in pairwise(edges)}
-
-
-def _massive(rows: _Rows) -> _Rows:
-    """Rows whose mass counts."""
-    known = np.isfinite(rows.sigma_mass_kda) & np.isfinite(rows.crb_mass_kda)
-    return rows.only(known & (rows.mass_kda != 0) & (rows.status == Status.OK))
-
-
-def _placed(rows: _Rows) -> _Rows:
-    """Rows whose place counts.
-
-    A status that motion itself makes more likely must not choose, or fast steps would be missing.
-    """
-    errors = np.fmax(rows.sigma_x_nm, rows.sigma_y_nm)
-    useful = errors <= _USELESS * _median(errors)
-    useful &= np.diff(rows.frame, prepend=-1) > 0
-    for status in NO_PLACE:
-        useful &= rows.status != status
-    return rows.only(useful)
-
-
-def _median(values: FloatArray) -> float:
-    """Give the median of what is known, NaN where nothing is."""
-    known = values[~np.isnan(values)]
-    return float(np.median(known)) if known.size else np.nan
-
-
-def _mean(values: FloatArray) -> float:
-    """Give the mean of what is known, NaN where nothing is."""
-    known = values[~np.isnan(values)]
-    return float(np.mean(known)) if known.size else np.nan
 
 
 def _record(
     track: int,
-    rows: _Rows,
-    good: _Rows,
-    placed: _Rows,
+    rows: TrackRows,
+    good: TrackRows,
+    placed: TrackRows,
     setup: TrackSetup,
     power: float,
     correlation: Correlation | None,
@@ -287,9 +222,9 @@ def _record(
         "n_frames": len(rows.frame),
         "n_mass_frames": len(good.frame),
         "n_d_frames": len(placed.frame),
-        "x_nm": _mean(rows.x_nm),
-        "y_nm": _mean(rows.y_nm),
-        "z_nm": _mean(rows.z_nm),
+        "x_nm": mean_known(rows.x_nm),
+        "y_nm": mean_known(rows.y_nm),
+        "z_nm": mean_known(rows.z_nm),
     }
     if len(good.frame):
         mass = _mass(good, power, correlation)
@@ -305,7 +240,7 @@ def _record(
         record |= {name: value for name, value in exact.items() if name != "told"}
     scale = _scale_error(record, told)
     record["short_way"] = told < _LITTLE_TOLD and scale > 2 * _VAGUE
-    record["contrast"] = record["mass_kda"] * _median(rows.contrast / rows.mass_kda)
+    record["contrast"] = record["mass_kda"] * median_known(rows.contrast / rows.mass_kda)
     found = _diffusion(placed, setup)
     if setup.frame_rate_hz is not None:
         record["n_d_frames"] = 0 if found is None else found.n_positions
@@ -343,7 +278,7 @@ def _wider(found: Diffusion, end: int, scale: float) -> float:
     return best * math.exp(reach if end else -reach)
 
 
-def _mass(good: _Rows, power: float, correlation: Correlation | None) -> CommonMass:
+def _mass(good: TrackRows, power: float, correlation: Correlation | None) -> CommonMass:
     among = None
     if correlation is not None:
         among = correlation(np.stack([good.x_nm, good.y_nm], axis=1))
@@ -351,14 +286,14 @@ def _mass(good: _Rows, power: float, correlation: Correlation | None) -> CommonM
     return combine_masses(*masses, power=power, correlation=among)
 
 
-def _diffusion(placed: _Rows, setup: TrackSetup) -> Diffusion | None:
+def _diffusion(placed: TrackRows, setup: TrackSetup) -> Diffusion | None:
     """Fit D to the displacements that begin so far inside that they cannot have left the field."""
     least = max(LEAST_POSITIONS, setup.min_frames)
     if setup.frame_rate_hz is None or len(placed.frame) < least:
         return None
     room = _room(placed, setup)[:-1]
     gaps_s = np.diff(placed.frame) / setup.frame_rate_hz
-    counted, found, positions = np.ones(room.size, dtype=bool), None, _positions(placed)
+    counted, found, positions = np.ones(room.size, dtype=bool), None, placed.positions()
     for _ in range(_LOOKS):
         found = fit_diffusion(
             *positions,
@@ -376,15 +311,10 @@ def _diffusion(placed: _Rows, setup: TrackSetup) -> Diffusion | None:
     return found
 
 
-def _room(rows: _Rows, setup: TrackSetup) -> FloatArray:
+def _room(rows: TrackRows, setup: TrackSetup) -> FloatArray:
     """Distance of every position from the border of the field [nm]."""
     (height, width), x, y = setup.field_nm, rows.x_nm, rows.y_nm
     return np.asarray(np.minimum.reduce([x, y, width - x, height - y]))
-
-
-def _positions(placed: _Rows) -> tuple[FloatArray, FloatArray, FloatArray]:
-    places, errors = (placed.x_nm, placed.y_nm), (placed.sigma_x_nm, placed.sigma_y_nm)
-    return placed.frame, np.stack(places, axis=1), np.stack(errors, axis=1)
 
 
 def _size(record: Mapping[str, Any], setup: TrackSetup) -> dict[str, float]:
@@ -417,7 +347,7 @@ def _size(record: Mapping[str, Any], setup: TrackSetup) -> dict[str, float]:
 
 
 def _tested(
-    places: Mapping[int, _Rows],
+    places: Mapping[int, TrackRows],
     setup: TrackSetup,
     seed: int,
     workers: int,
@@ -436,9 +366,9 @@ def _tested(
     return tested
 
 
-def _tests(placed: _Rows, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:
+def _tests(placed: TrackRows, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:
     """Ask whether the motion is free, two tests of the first positions of a long track."""
-    whole = _positions(placed)
+    whole = placed.positions()
     track = tuple(part[:TESTED_POSITIONS] for part in whole)
     times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
     walls = confinement_test(*track, **times, resamples=_FIRST_LOOK, enough=_ENOUGH, rng=rng)
@@ -470,7 +400,7 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
     return [status for status in TrackStatus if seen.get(status, False)]
 
 
-def _ends(rows: _Rows, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:
+def _ends(rows: TrackRows, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:
     """Say whether the track begins and ends with the movie, at the border, or inside the field."""
     step_nm = 0.0
     if setup.frame_rate_hz is not None and np.isfinite(d_um2_s):
@@ -481,24 +411,6 @@ def _ends(rows: _Rows, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:
         where = "border" if room[at] < border else "inside"
         said[which] = "movie" if rows.frame[at] == frame else where
     return said
-
-
-def _nearest(groups: Mapping[int, _Rows]) -> dict[int, float]:
-    """Smallest distance of each track from any other in the same frame [nm]."""
-    closest = np.full(len(groups), np.inf)
-    own = np.repeat(np.arange(len(groups)), [len(rows.frame) for rows in groups.values()])
-    frame, x, y = (
-        np.concatenate([getattr(rows, name) for rows in groups.values()] or [[]])
-        for name in ("frame", "x_nm", "y_nm")
-    )
-    order = np.argsort(frame, kind="stable")
-    edges = np.flatnonzero(np.diff(frame[order], prepend=-1, append=np.inf))
-    for a, b in pairwise(edges):
-        here = order[a:b]
-        apart = np.hypot(x[here, None] - x[here], y[here, None] - y[here])
-        apart[own[here, None] == own[here]] = np.inf
-        np.fmin.at(closest, own[here], apart.min(axis=1))
-    return dict(zip(groups, closest.tolist(), strict=True))
 
 
 def _table(records: Iterable[Mapping[str, Any]], fits: pd.DataFrame) -> pd.DataFrame:

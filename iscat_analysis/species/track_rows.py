@@ -1,0 +1,160 @@
+"""Rows of one track, and which of them say what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis.records import BoolArray, FloatArray, Status, track_numbers
+
+NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
+"""Of rows that do not say how a particle moves."""
+
+_USELESS = 300.0  # times the median error: such a place says nothing
+
+
+@dataclass(frozen=True)
+class TrackRows:
+    """Rows of one track, or some of them, in the order of their frames; columns of ``fits.csv``."""
+
+    frame: FloatArray
+    x_nm: FloatArray
+    y_nm: FloatArray
+    z_nm: FloatArray
+    mass_kda: FloatArray
+    contrast: FloatArray
+    sigma_x_nm: FloatArray
+    sigma_y_nm: FloatArray
+    sigma_mass_kda: FloatArray
+    crb_mass_kda: FloatArray
+    status: NDArray[np.object_]
+
+    def only(self, kept: BoolArray | NDArray[np.int64]) -> TrackRows:
+        """Give some of the rows.
+
+        Parameters
+        ----------
+        kept : ndarray
+            Which, as an index.
+
+        Returns
+        -------
+        TrackRows
+            These.
+        """
+        return TrackRows(*(getattr(self, column.name)[kept] for column in fields(self)))
+
+    def massive(self) -> TrackRows:
+        """Give the rows whose mass counts."""
+        known = np.isfinite(self.sigma_mass_kda) & np.isfinite(self.crb_mass_kda)
+        return self.only(known & (self.mass_kda != 0) & (self.status == Status.OK))
+
+    def placed(self) -> TrackRows:
+        """Give the rows whose place counts.
+
+        A status that motion itself makes more likely must not choose, or fast steps would be
+        missing.
+        """
+        errors = np.fmax(self.sigma_x_nm, self.sigma_y_nm)
+        useful = errors <= _USELESS * median_known(errors)
+        useful &= np.diff(self.frame, prepend=-1) > 0
+        for status in NO_PLACE:
+            useful &= self.status != status
+        return self.only(useful)
+
+    def positions(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Give frames, places and their errors, shapes (n,), (n, 2) and (n, 2) [nm]."""
+        places, errors = (self.x_nm, self.y_nm), (self.sigma_x_nm, self.sigma_y_nm)
+        return self.frame, np.stack(places, axis=1), np.stack(errors, axis=1)
+
+
+def rows_by_track(fits: pd.DataFrame) -> dict[int, TrackRows]:
+    """Part a table by its tracks.
+
+    Parameters
+    ----------
+    fits : pandas.DataFrame
+        One row per particle and frame, with its track.
+
+    Returns
+    -------
+    dict of int to TrackRows
+        Rows of each track, by its number.
+    """
+    numbers = track_numbers(fits)
+    known, track = fits[numbers.notna()], numbers.dropna().to_numpy(int)
+    rows = TrackRows(
+        *(known[part.name].to_numpy(object if part.name == "status" else float)
+          for part in fields(TrackRows))
+    )  # fmt: skip
+    order = np.lexsort((rows.frame, track))
+    edges = np.flatnonzero(np.diff(track[order], prepend=-1, append=-1))
+    return {int(track[order[a]]): rows.only(order[a:b]) for a, b in pairwise(edges)}
+
+
+def nearest_nm(groups: Mapping[int, TrackRows]) -> dict[int, float]:
+    """Measure how near each track comes to any other in the same frame.
+
+    Parameters
+    ----------
+    groups : mapping of int to TrackRows
+        Rows of each track, by its number.
+
+    Returns
+    -------
+    dict of int to float
+        Smallest distance of each [nm]; infinite where it never has company.
+    """
+    closest = np.full(len(groups), np.inf)
+    own = np.repeat(np.arange(len(groups)), [len(rows.frame) for rows in groups.values()])
+    frame, x, y = (
+        np.concatenate([getattr(rows, name) for rows in groups.values()] or [[]])
+        for name in ("frame", "x_nm", "y_nm")
+    )
+    order = np.argsort(frame, kind="stable")
+    edges = np.flatnonzero(np.diff(frame[order], prepend=-1, append=np.inf))
+    for a, b in pairwise(edges):
+        here = order[a:b]
+        apart = np.hypot(x[here, None] - x[here], y[here, None] - y[here])
+        apart[own[here, None] == own[here]] = np.inf
+        np.fmin.at(closest, own[here], apart.min(axis=1))
+    return dict(zip(groups, closest.tolist(), strict=True))
+
+
+def median_known(values: FloatArray) -> float:
+    """Take the median of what is known.
+
+    Parameters
+    ----------
+    values : ndarray
+        NaN where nothing is known.
+
+    Returns
+    -------
+    float
+        NaN where nothing is known at all.
+    """
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if known.size else np.nan
+
+
+def mean_known(values: FloatArray) -> float:
+    """Take the mean of what is known.
+
+    Parameters
+    ----------
+    values : ndarray
+        NaN where nothing is known.
+
+    Returns
+    -------
+    float
+        NaN where nothing is known at all.
+    """
+    known = values[~np.isnan(values)]
+    return float(np.mean(known)) if known.size else np.nan
