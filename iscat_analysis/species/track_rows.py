@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -61,7 +62,7 @@ class TrackRows:
         missing.
         """
         errors = np.fmax(self.sigma_x_nm, self.sigma_y_nm)
-        useful = errors <= _USELESS * median_known(errors)
+        useful = errors <= _USELESS * of_known(np.median, errors)
         useful &= np.diff(self.frame, prepend=-1) > 0
         for status in NO_PLACE:
             useful &= self.status != status
@@ -126,11 +127,13 @@ def nearest_nm(groups: Mapping[int, TrackRows]) -> dict[int, float]:
     return dict(zip(groups, closest.tolist(), strict=True))
 
 
-def median_known(values: FloatArray) -> float:
-    """Take the median of what is known.
+def of_known(statistic: Callable[[FloatArray], Any], values: FloatArray) -> float:
+    """Take a statistic of what is known.
 
     Parameters
     ----------
+    statistic : callable
+        Such as `numpy.median`.
     values : ndarray
         NaN where nothing is known.
 
@@ -140,21 +143,4 @@ def median_known(values: FloatArray) -> float:
         NaN where nothing is known at all.
     """
     known = values[~np.isnan(values)]
-    return float(np.median(known)) if known.size else np.nan
-
-
-def mean_known(values: FloatArray) -> float:
-    """Take the mean of what is known.
-
-    Parameters
-    ----------
-    values : ndarray
-        NaN where nothing is known.
-
-    Returns
-    -------
-    float
-        NaN where nothing is known at all.
-    """
-    known = values[~np.isnan(values)]
-    return float(np.mean(known)) if known.size else np.nan
+    return float(statistic(known)) if known.size else np.nan

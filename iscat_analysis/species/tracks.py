@@ -39,9 +39,8 @@ from iscat_analysis.species.motion import anomalous_test, confinement_test, stea
 from iscat_analysis.species.refraction import refractive_index
 from iscat_analysis.species.track_rows import (
     TrackRows,
-    mean_known,
-    median_known,
     nearest_nm,
+    of_known,
     rows_by_track,
 )
 from iscat_analysis.threads import threads
@@ -222,9 +221,9 @@ def _record(
         "n_frames": len(rows.frame),
         "n_mass_frames": len(good.frame),
         "n_d_frames": len(placed.frame),
-        "x_nm": mean_known(rows.x_nm),
-        "y_nm": mean_known(rows.y_nm),
-        "z_nm": mean_known(rows.z_nm),
+        "x_nm": of_known(np.mean, rows.x_nm),
+        "y_nm": of_known(np.mean, rows.y_nm),
+        "z_nm": of_known(np.mean, rows.z_nm),
     }
     if len(good.frame):
         mass = _mass(good, power, correlation)
@@ -240,7 +239,7 @@ def _record(
         record |= {name: value for name, value in exact.items() if name != "told"}
     scale = _scale_error(record, told)
     record["short_way"] = told < _LITTLE_TOLD and scale > 2 * _VAGUE
-    record["contrast"] = record["mass_kda"] * median_known(rows.contrast / rows.mass_kda)
+    record["contrast"] = record["mass_kda"] * of_known(np.median, rows.contrast / rows.mass_kda)
     found = _diffusion(placed, setup)
     if setup.frame_rate_hz is not None:
         record["n_d_frames"] = 0 if found is None else found.n_positions
