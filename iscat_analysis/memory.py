@@ -10,6 +10,7 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # GNU's names for them
 _EVERYTHING = 2**31 - 1  # the largest size that it can be told
 _USUAL_BYTES = 32 * 2**20  # what the library comes to by itself
 _LARGE_BYTES = 4 * 2**20  # from where on an array goes back by itself
+_KEPT_BYTES = 16 * 2**20  # at the end of the others, at most
 
 _OTHERS = OSError, AttributeError, TypeError  # what libraries that are not GNU's end in
 
@@ -25,29 +26,30 @@ def freed_memory_kept() -> Iterator[None]:
     ------
     None
     """
-    _keep_up_to(_EVERYTHING)
+    _keep_up_to(_EVERYTHING, _EVERYTHING)
     try:
         yield
     finally:
-        _give_back(_USUAL_BYTES)
+        _give_back(_USUAL_BYTES, _USUAL_BYTES)
 
 
 def give_back_freed_memory() -> None:
     """Have memory of large arrays go back to the system, now and from now on as they are freed.
 
     The C library otherwise keeps up to 32 MB at a time, between others that are still in use.
+    Smaller arrays, which every event makes anew, lie in memory that is kept.
     """
-    _give_back(_LARGE_BYTES)
+    _give_back(_LARGE_BYTES, _KEPT_BYTES)
 
 
-def _give_back(size: int) -> None:
-    _keep_up_to(size)
+def _give_back(large: int, kept: int) -> None:
+    _keep_up_to(large, kept)
     with suppress(*_OTHERS):
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _keep_up_to(size: int) -> None:
+def _keep_up_to(large: int, kept: int) -> None:
     with suppress(*_OTHERS):
         library = ctypes.CDLL(None)
-        for threshold in (_TRIM_THRESHOLD, _MMAP_THRESHOLD):
-            library.mallopt(threshold, size)
+        library.mallopt(_TRIM_THRESHOLD, kept)
+        library.mallopt(_MMAP_THRESHOLD, large)

@@ -51,7 +51,11 @@ def shared_light(
     if not places.size:
         return None
     places = places[:: -(-places.size // _PIXELS)]
-    pixels = np.array([camera.to_electrons(frame).flat[places] for frame in counts])
+    offset, gain = (
+        np.broadcast_to(value, used.shape).flat[places]
+        for value in (camera.offset_adu, camera.gain_e_per_adu)
+    )
+    pixels = (counts.reshape(len(counts), -1)[:, places] - offset) * gain
     power = pixels.mean(axis=1)
     if power.min() <= 0:
         return None

@@ -89,6 +89,7 @@ def chunk_job(
     core: tuple[int, int],
     span: tuple[int, int],
     posteriors: int,
+    earlier: int,
     *,
     progress: Progress = silent,
 ) -> Done:
@@ -102,6 +103,8 @@ def chunk_job(
         Half-open ranges of frames, from `iscat_analysis.pipeline.chunks.plan_chunks`.
     posteriors : int
         Events whose posterior is sampled, at most.
+    earlier : int
+        Events that come before all of this chunk, as far as is known.
     progress : Progress
         Told when the frames are read.
 
@@ -114,8 +117,9 @@ def chunk_job(
         chunk = setting.reader.chunk(span, stride_of(setting.window), pool)
         progress("landing", 0, 1)
         return analyse_chunk(
-            setting.scene, chunk, core, setting.window, pool, posteriors, setting.excess_noise
-        )
+            setting.scene, chunk, core, setting.window, pool, posteriors, setting.excess_noise,
+            earlier,
+        )  # fmt: skip
 
 
 def analyse_chunk(
@@ -126,6 +130,7 @@ def analyse_chunk(
     pool: ThreadPoolExecutor,
     posteriors: int,
     excess_noise: ExcessNoise | None,
+    earlier: int,
 ) -> Done:
     """Find and fit every step of a chunk.
 
@@ -145,6 +150,9 @@ def analyse_chunk(
         Events whose posterior is sampled, at most.
     excess_noise : ExcessNoise or None
         Where the noise is not as expected.
+    earlier : int
+        Events that come before all of this chunk, as far as is known: what the report shows of
+        single events it shows of the first, and that of others is not made.
 
     Returns
     -------
@@ -169,7 +177,7 @@ def analyse_chunk(
         except KeyboardInterrupt:  # the fits are done, and kept
             stopped = True
             break
-    shown = fitter.shown(steps[:VIEWS], CLIPS)
+    shown = fitter.shown(steps[: max(VIEWS - earlier, 0)], CLIPS - earlier)
     inside = slice(core[0] - chunk.first, core[1] - chunk.first)
     light = np.where(chunk.good, chunk.power, np.nan) * float(chunk.mean_e.mean())
     return Done(

@@ -56,6 +56,7 @@ class Reader:
         self._held = (first, first)
         self._light: FloatArray = np.empty(0)
         self._repeats: BoolArray = np.empty(0, dtype=np.bool_)
+        self._summed: tuple[tuple[int, int], int, Chunk] | None = None  # span, stride, and that
 
     @property
     def name(self) -> str:
@@ -66,6 +67,7 @@ class Reader:
         """Give the memory of the frames back."""
         self._buffer = self._buffer[:0].copy()
         self._held = (self.first, self.first)
+        self._summed = None
 
     def _reserve(self, frames: int) -> None:
         if frames > len(self._buffer):
@@ -79,6 +81,11 @@ class Reader:
     ) -> tuple[NDArray[Any], BoolArray, FloatArray]:
         """Frames [start, stop), which of them are good, and their light [e per pixel]."""
         low, high = self._held
+        if low == start and stop <= high:  # a part of them stays with the others
+            light = self._light[: stop - start]
+            good = np.isfinite(light) & ~self._repeats[: stop - start]
+            return self._buffer[: stop - start], good, light
+        self._summed = None
         kept = 0
         if low <= start < high:
             kept = min(high, stop) - start
@@ -126,17 +133,21 @@ class Reader:
         self._held = (start, end)
 
     def chunk(self, span: tuple[int, int], stride: int, pool: ThreadPoolExecutor) -> Chunk:
-        """Frames of a span, summed in blocks."""
+        """Frames of a span, summed in blocks, once for all who ask for it one after the other."""
+        if self._summed is not None and self._summed[:2] == (span, stride):
+            return self._summed[2]
         counts, good, light = self.counts(*span, pool.map)
         if not good.any():
             raise DataError(
                 f"{self.name}: frames {span[0]}:{span[1]} hold no light that changes; every frame "
                 "is zero or repeats the one before it; analyse the others with fit.frames = [A, B]"
             )
-        return make_chunk(
+        chunk = make_chunk(
             span[0], counts, good, light, self.camera,
             stride=stride, defects=find_defects, mapper=pool.map,
         )  # fmt: skip
+        self._summed = span, stride, chunk
+        return chunk
 
     def opening(self, mapper: Mapper = map) -> NDArray[Any]:
         """Good frames among the first, on which the noise is judged."""

@@ -26,7 +26,7 @@ from iscat_analysis.pipeline.chunk_work import ChunkSetting, analyse_chunk, chun
 from iscat_analysis.pipeline.chunks import Reader, counts_budget, plan_chunks
 from iscat_analysis.pipeline.companion import paired
 from iscat_analysis.pipeline.merging import Done, Merged
-from iscat_analysis.pipeline.noise import judge_opening
+from iscat_analysis.pipeline.noise import Opening, judge_opening
 from iscat_analysis.pipeline.odd_frames import frame_warnings
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.ranges import fitted_frames
@@ -80,6 +80,7 @@ def find_landings(ready: Prepared, run: Run) -> Found:
             identity=ready.movie.identity if run.partial else "",
             lines=ready.lines,
             place=run.place,
+            opening=ready.opening,
         )
     except FloodError as error:  # what seems to be noise is then particles
         raise FloodError(ready.other_kind) if ready.other_kind else error from None
@@ -103,6 +104,7 @@ def analyse_landings(
     identity: str = "",
     lines: Lines | None = None,
     place: Place | None = None,
+    opening: Opening | None = None,
 ) -> Found:
     """Find and fit every particle that lands or leaves.
 
@@ -128,6 +130,8 @@ def analyse_landings(
         Rows and columns that flicker; they are divided by their light as frames are read.
     place : Place, optional
         Where the chunks are analysed; default in this process.
+    opening : Opening, optional
+        Of the movie without the flicker of `lines`, where it was judged.
 
     Returns
     -------
@@ -144,9 +148,11 @@ def analyse_landings(
     place = place or Here()
     first, last = fitted_frames(movie, config)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
-    reader = Reader(frames, camera, first, last, counts_budget(config))
-    with threads(config.compute.workers) as pool:
-        noise, curve, window = judge_opening(reader, config, pool.map)
+    if opening is None:
+        reader = Reader(frames, camera, first, last, counts_budget(config))
+        with threads(config.compute.workers) as pool:
+            opening = judge_opening(reader, config, pool.map)
+    reader, noise, window = opening.reader, opening.noise, opening.window
     for text in noise.said(movie.name):
         tell(text)
     stride = stride_of(window)
@@ -175,13 +181,17 @@ def analyse_landings(
             if done is None:
                 core, span = plan[number]
                 budget = POSTERIORS - merged.sampled if posterior else 0
+                earlier = merged.earlier(number, core[0] - window)  # before all of this chunk
                 if place.distant:
                     reader.forget()  # whoever does it has a reader of its own
-                    done = place.call(chunk_job, movie_job, core, span, budget)
+                    done = place.call(chunk_job, movie_job, core, span, budget, earlier)
                 else:
                     chunk = reader.chunk(span, stride, pool)
-                    done = analyse_chunk(scene, chunk, core, window, pool, budget, noise.excess)
+                    done = analyse_chunk(
+                        scene, chunk, core, window, pool, budget, noise.excess, earlier
+                    )
                 store.save(number, done)
+            merged.note(number, done)
             return done
 
         try:
@@ -194,6 +204,7 @@ def analyse_landings(
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
             interrupted = True
+    reader.forget()
     fits, views, repeats = merged.result()
     light = merged.light()
     wanted = config.background.drift_correction
@@ -211,9 +222,9 @@ def analyse_landings(
         "stride_frames": stride,
         "boundaries_searched": count,
         **_counted(fits),
-        "shot_noise_limited_frames": curve.shot_limited,
-        "noise_frames": list(curve.frames),
-        "noise_variance_over_shot": list(curve.variance_over_shot),
+        "shot_noise_limited_frames": opening.curve.shot_limited,
+        "noise_frames": list(opening.curve.frames),
+        "noise_variance_over_shot": list(opening.curve.variance_over_shot),
         "noise_spectrum": noise.summary,
         "frames_left_out": merged.left_out(),
         "drift_px": merged.drift(),
@@ -262,6 +273,7 @@ def _finished(
     ready = frames = 0
     for number, done in results():
         waiting[number] = done
+        merged.note(number, done)
         frames += done.core[1] - done.core[0]
         while ready in waiting:
             merged.add(waiting.pop(ready))

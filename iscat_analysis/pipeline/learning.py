@@ -45,7 +45,7 @@ from iscat_analysis.pipeline.microscope import (
     rings_of,
     with_sign,
 )
-from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, judge_counts
+from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, Opening, judge_counts
 from iscat_analysis.pipeline.ranges import frame_ranges, measured_windows
 from iscat_analysis.pipeline.run import unheard
 from iscat_analysis.pipeline.sights import bright_sights, kind_of, reach_nm, scan_sights
@@ -81,6 +81,7 @@ def learn_optics(
     *,
     tell: Callable[[str], None],
     notify: Callable[[str], None] = unheard,
+    opening: Opening | None = None,
 ) -> tuple[Config, dict[str, Any]]:
     """Test the configured optics on the brightest particles, and learn them where they fail.
 
@@ -96,6 +97,8 @@ def learn_optics(
         Told in one line what was found, unless the configured optics are fine.
     notify : callable
         Told that they are being learned, which may take minutes.
+    opening : Opening, optional
+        As in `bright_sights`.
 
     Returns
     -------
@@ -125,7 +128,7 @@ def learn_optics(
         return config, {}
     tested: dict[str, Any] = {}
     with threads(config.compute.workers) as pool:
-        sights, others = bright_sights(movie, config, camera, pool)
+        sights, others = bright_sights(movie, config, camera, pool, opening)
         alone, source = len(sights), {"movie": movie.name}
         try:
             if alone < LEAST_TESTED and way_of(config) == "fixed":

@@ -150,7 +150,8 @@ class LandingSearch:
         self._config = config
         self._reader = Reader(frames, camera, first, last, counts_budget(config))
         with threads(config.compute.workers) as pool:
-            noise, _, self.window = judge_opening(self._reader, config, pool.map)
+            opening = judge_opening(self._reader, config, pool.map)
+        noise, self.window = opening.noise, opening.window
 
         @lru_cache(_WINDOWS_KEPT)
         def scene(window: int) -> Scene:

@@ -18,7 +18,7 @@ VIEWS = 1000
 """Events whose images are kept for the report."""
 
 CLIPS = 250
-"""Events of which a clip is kept; the page holds fewer."""
+"""Events of which a clip is kept, the first; the page holds fewer."""
 
 _SEAM_PX = 2.0  # two chunks' estimates of one step are nearer than this
 
@@ -55,10 +55,21 @@ class Merged:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self._done: list[Done] = []
+        self._dated: dict[int, NDArray[np.int64]] = {}
         self._strongest = np.zeros((2, *shape))
         self.sampled = 0
         self.cause = ""
         self.empty: EmptySpread | None = None
+
+    def note(self, number: int, done: Done) -> None:
+        """Note when the events of a finished chunk happen, whose turn may not have come yet."""
+        frame = done.lines["frame"].to_numpy() if len(done.lines) else np.empty(0, dtype=np.int64)
+        self._dated[number] = frame[(frame >= done.core[0]) & (frame < done.core[1])]
+
+    def earlier(self, number: int, frame: int) -> int:
+        """Count the events before a frame, of the finished chunks before one."""
+        known = list(self._dated.items())  # other threads note theirs
+        return sum(int((dated < frame).sum()) for n, dated in known if n < number)
 
     def add(self, done: Done) -> None:
         """Take one more."""
@@ -106,7 +117,8 @@ class Merged:
             done, row = homes[i]
             repeats.append(done.repeats[row])
             if number < VIEWS and row < len(done.views):
-                views.append(replace(done.views[row], event=number))
+                view = replace(done.views[row], event=number)
+                views.append(view if number < CLIPS else replace(view, clip=None))
         rows = numbered(table.iloc[order], range(len(order)))
         return rows, tuple(views), tuple(repeats)
 

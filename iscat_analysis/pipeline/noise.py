@@ -316,9 +316,29 @@ def judge_beside(
     return Noise()
 
 
-def judge_opening(
-    reader: Reader, config: Config, mapper: Mapper = map
-) -> tuple[Noise, NoiseCurve, int]:
+@dataclass(frozen=True)
+class Opening:
+    """What the first frames of a landing movie say, and the frames themselves.
+
+    Attributes
+    ----------
+    reader : Reader
+        The frames.
+    noise : Noise
+        Of the first good ones, in which little has landed.
+    curve : NoiseCurve
+        Noise against averaging, of these.
+    window : int
+        Frames before, and as many after, each step.
+    """
+
+    reader: Reader
+    noise: Noise
+    curve: NoiseCurve
+    window: int
+
+
+def judge_opening(reader: Reader, config: Config, mapper: Mapper = map) -> Opening:
     """Judge the noise of a landing movie, and choose how many frames around a step are summed.
 
     Parameters
@@ -332,12 +352,8 @@ def judge_opening(
 
     Returns
     -------
-    noise : Noise
-        Of the first good frames, in which little has landed.
-    curve : NoiseCurve
-        Noise against averaging, of these.
-    window : int
-        Frames before, and as many after, each step.
+    Opening
+        The noise, and the window.
 
     Raises
     ------
@@ -355,7 +371,7 @@ def judge_opening(
             "many bright particles; lower background.window_frames, which helps against all"
         )
         noise = replace(noise, excess=ExcessNoise(ratio, message))
-    return noise, curve, window
+    return Opening(reader, noise, curve, window)
 
 
 def judge_window(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,9 +19,11 @@ from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_overf
 from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pieces.setups import darkfield_photons
+from iscat_analysis.pipeline.chunks import Reader, counts_budget
 from iscat_analysis.pipeline.diagnosis import axes_warning
 from iscat_analysis.pipeline.learning import learn_optics
 from iscat_analysis.pipeline.light import judge_light
+from iscat_analysis.pipeline.noise import Opening, judge_opening
 from iscat_analysis.pipeline.ranges import fitted_frames, tracked_frames
 from iscat_analysis.pipeline.recognise import (
     as_landing,
@@ -31,7 +35,7 @@ from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.tracks import judge_times
 from iscat_analysis.pipeline.ways import Way, way_of, way_said
 from iscat_analysis.search.changes import Changes
-from iscat_analysis.threads import beside
+from iscat_analysis.threads import beside, threads
 
 _OPENING = 64  # frames that are looked at before anything else
 
@@ -54,6 +58,8 @@ class Prepared:
         Which frames stand against which.
     lines : Lines or None
         Rows and columns that flicker.
+    opening : Opening or None
+        Of a landing movie; its reader holds frames that were looked at.
     other_kind : str
         Says that the movie seems to be of another kind than configured; else empty.
     digest : Future of str
@@ -68,6 +74,7 @@ class Prepared:
     camera: Camera
     way: Way
     lines: Lines | None
+    opening: Opening | None
     other_kind: str
     digest: Future[str]
     summary: Mapping[str, Any]
@@ -144,7 +151,16 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if way == "sliding" or tracked:
         looking = beside(look_at_changes, steady, config, camera, span)
     configured = config
-    config, learned = learn_optics(steady, config, camera, tell=run.tell, notify=run.notify)
+    opened: Opening | None = None
+    loading: Future[ModuleType] | None = None
+    if way == "sliding":
+        loading = beside(import_module, "scipy.optimize")  # for the species, when all has ended
+        reader = Reader(steady, camera, *span, counts_budget(config))
+        with threads(config.compute.workers) as pool:
+            opened = judge_opening(reader, config, pool.map)
+    config, learned = learn_optics(
+        steady, config, camera, tell=run.tell, notify=run.notify, opening=opened
+    )
     if learned:
         summary["optics"] = learned
     run.clock.lap("optics")
@@ -157,9 +173,13 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         other_kind = (as_landing if tracked else as_moving)(changes, movie.name)
         if other_kind:
             run.tell(other_kind)
+    if loading is not None:
+        loading.result()  # a copy of this process may be made from here on
     if way != "sliding":
         _refuse_what_only_slides(run, movie.name)
-    return Prepared(movie, steady, config, camera, way, lines, other_kind, digest, summary)
+    return Prepared(
+        movie, steady, config, camera, way, lines, opened, other_kind, digest, summary
+    )  # fmt: skip
 
 
 def _refuse_still(counts: NDArray[Any], name: str) -> None:

@@ -29,7 +29,7 @@ from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.pipeline.chunks import Reader, counts_budget, plan_chunks
-from iscat_analysis.pipeline.noise import judge_window
+from iscat_analysis.pipeline.noise import Opening, judge_window
 from iscat_analysis.pipeline.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import FloatArray, Windows
@@ -60,7 +60,11 @@ _SHIFT_NM = 450.0  # how far a particle may lie from the centre of its picture
 
 
 def bright_sights(
-    movie: Stack, config: Config, camera: Camera, pool: ThreadPoolExecutor
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    pool: ThreadPoolExecutor,
+    opening: Opening | None = None,
 ) -> tuple[list[Sight], list[Sight]]:
     """Find the bright particles of a movie, in the way in which it is analysed.
 
@@ -77,6 +81,8 @@ def bright_sights(
         Counts → photoelectrons.
     pool : ThreadPoolExecutor
         Runs the search.
+    opening : Opening, optional
+        Of a landing movie, where it was judged; its reader keeps what is read here.
 
     Returns
     -------
@@ -86,7 +92,11 @@ def bright_sights(
         Every bright particle, on small regions.
     """
     if way_of(config) == "sliding":
-        return landing_sights(movie, config, camera, pool)
+        if opening is not None:
+            return landing_sights(opening.reader, opening.window, config, pool)
+        reader = Reader(movie, camera, *fitted_frames(movie, config), counts_budget(config))
+        window = judge_window(reader, config, pool.map)[2]
+        return landing_sights(reader, window, config, pool)
     if heights_free(config) and way_of(config) == "fixed":
         return [], []
     windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
@@ -110,18 +120,18 @@ def kind_of(config: Config) -> str:
 
 
 def landing_sights(
-    movie: Stack, config: Config, camera: Camera, pool: ThreadPoolExecutor
+    reader: Reader, window: int, config: Config, pool: ThreadPoolExecutor
 ) -> tuple[list[Sight], list[Sight]]:
     """Find bright steps of a landing movie, chunk by chunk until there are enough.
 
     Parameters
     ----------
-    movie : Stack
-        The movie.
+    reader : Reader
+        The frames.
+    window : int
+        Frames before, and as many after, each step.
     config : Config
         Resolved.
-    camera : Camera
-        Counts → photoelectrons.
     pool : ThreadPoolExecutor
         Runs the search.
 
@@ -132,9 +142,6 @@ def landing_sights(
     others : list of Sight
         Every bright step, on small regions.
     """
-    first, last = fitted_frames(movie, config)
-    reader = Reader(movie, camera, first, last, counts_budget(config))
-    _, _, window = judge_window(reader, config, pool.map)
     stride = max(1, window // STRIDES)
     found: list[BrightStep] = []
     rest: list[BrightStep] = []

@@ -19,7 +19,7 @@ from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.pipeline import analyse, fit_stack
+from iscat_analysis.pipeline import analyse, chunk_work, fit_stack, merging
 from iscat_analysis.pipeline import chunks as chunks_module
 from iscat_analysis.pipeline import events as events_module
 from iscat_analysis.pipeline import landing as landing_module
@@ -28,6 +28,7 @@ from iscat_analysis.pipeline.landing import analyse_landings
 from iscat_analysis.pipeline.merging import Done, Merged
 from iscat_analysis.pipeline.odd_frames import frame_warnings
 from iscat_analysis.pipeline.resume import partial_folder
+from iscat_analysis.pipeline.steps import ChunkFitter
 from iscat_analysis.pipeline.summary import summary_of
 from iscat_analysis.pipeline.tasks import TaskBuilder
 from iscat_analysis.pipeline.ways import way_of
@@ -361,6 +362,30 @@ def test_pulls_of_injected_particles_are_in_units_of_the_errors_that_are_reporte
         )  # fmt: skip
         pulls.append(found["pull_std"])
     assert pulls[0] > 1.1 * pulls[1]
+
+
+def test_what_is_shown_of_events_is_made_of_the_first_alone(
+    counts: np.ndarray, plain: tuple[Any, list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.005)
+    for module in (merging, chunk_work):
+        monkeypatch.setattr(module, "VIEWS", 2)
+        monkeypatch.setattr(module, "CLIPS", 1)
+    real, made = ChunkFitter.shown, []
+
+    def shown(self: ChunkFitter, fitted: Any, clips: int) -> Any:
+        made.append((len(fitted), clips))
+        return real(self, fitted, clips)
+
+    monkeypatch.setattr(ChunkFitter, "shown", shown)
+    found = _run(counts, _config("compute.workers=1"))[0]
+    # cores begin at 0, 110, 220 and 330; what is a window earlier is known to come before
+    assert made == [(1, 1), (2, 1), (0, -1), (0, -2)]
+    assert [view.event for view in found.views] == [0, 1]
+    assert [view.clip is not None for view in found.views] == [True, False]
+    for mine, whole in zip(found.views, plain[0].views[:2], strict=True):
+        assert mine.model == pytest.approx(whole.model, abs=1e-6)
+    assert len(found.fits) == len(STEPS)
 
 
 def test_lines_of_chunks_have_no_numbers(
