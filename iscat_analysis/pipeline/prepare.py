@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
-from importlib import import_module
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -152,9 +150,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         looking = beside(look_at_changes, steady, config, camera, span)
     configured = config
     opened: Opening | None = None
-    loading: Future[ModuleType] | None = None
     if way == "sliding":
-        loading = beside(import_module, "scipy.optimize")  # for the species, when all has ended
         reader = Reader(steady, camera, *span, counts_budget(config))
         with threads(config.compute.workers) as pool:
             opened = judge_opening(reader, config, pool.map)
@@ -173,8 +169,6 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         other_kind = (as_landing if tracked else as_moving)(changes, movie.name)
         if other_kind:
             run.tell(other_kind)
-    if loading is not None:
-        loading.result()  # a copy of this process may be made from here on
     if way != "sliding":
         _refuse_what_only_slides(run, movie.name)
     return Prepared(

@@ -1,34 +1,33 @@
 """Memory that is freed is kept for the next arrays, and only while it shall be."""
 
 import ctypes
+import json
+import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 
-import numpy as np
 import pytest
+
+MB = 48
+
+COUNTS = f"""
+import ctypes, json, resource
 
 from iscat_analysis.memory import freed_memory_kept
 
-resource = pytest.importorskip("resource")
 
-PAGE = resource.getpagesize()
-PAGES = 48 * 2**20 // PAGE
-
-
-def _cleared() -> int:
-    """Count the pages that the system clears for an array."""
+def cleared():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    room = ctypes.create_string_buffer(PAGES * PAGE)
-    np.frombuffer(room, dtype=np.uint8)[::PAGE] = 1
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+    room = ctypes.create_string_buffer({MB} * 2**20)
+    ctypes.memset(room, 1, len(room))
+    return (resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) * resource.getpagesize()
 
 
-def _cleared_before_within_and_after() -> tuple[list[int], list[int], int]:
-    before = [_cleared(), _cleared()]
-    with freed_memory_kept():
-        within = [_cleared(), _cleared()]
-    return before, within, _cleared()
+before = [cleared(), cleared()]
+with freed_memory_kept():
+    within = [cleared(), cleared()]
+print(json.dumps([before, within, cleared()]))
+"""
+"""Bytes that the system clears for one array after the other, in a process that freed no others."""
 
 
 @pytest.mark.skipif(
@@ -36,8 +35,7 @@ def _cleared_before_within_and_after() -> tuple[list[int], list[int], int]:
     reason="not GNU's C library",
 )
 def test_freed_memory_is_kept_and_given_back_at_the_end() -> None:
-    """In a process that has freed nothing else."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        before, within, after = pool.submit(_cleared_before_within_and_after).result()
-    assert min(*before, within[0], after) > PAGES / 2
-    assert within[1] < PAGES / 10
+    done = subprocess.run([sys.executable, "-c", COUNTS], check=True, capture_output=True)
+    before, within, after = json.loads(done.stdout)
+    assert min(*before, within[0], after) > MB / 2 * 2**20
+    assert within[1] < MB / 10 * 2**20
