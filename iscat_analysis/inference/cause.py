@@ -151,10 +151,9 @@ def likely_cause(
             # far from a first order: the same, as far away as it seems, if a microscope is there
             with suppress(ConfigError):
                 there = _neighbours(config, name, reach, float(step[0]))
-                share, step = _explained(left, there, excess) if there else (0.0, step)
+                share, step = _explained(left, there, excess)
         for far in _FAR.get(name, ()):
-            there = _neighbours(config, name, reach, far)
-            larger, asked = _explained(left, there, excess) if there else (0.0, step)
+            larger, asked = _explained(left, _neighbours(config, name, reach, far), excess)
             if larger > share and _WHOLE_STEP < asked[0] / far < 1 / _WHOLE_STEP:
                 share, step = larger, np.array([far])
         if share > WORTH_NAMING and (best is None or share > best.share):
@@ -217,6 +216,8 @@ def _explained(
 
     `whole` changes are there or not: just one of them is taken.
     """
+    if not changes:
+        return 0.0, np.zeros(0)
     slope, curvature = np.zeros(len(changes)), np.zeros((len(changes), len(changes)))
     for each in left:
         change = np.stack([each.change(*one) for one in changes], axis=1)

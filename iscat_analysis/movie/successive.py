@@ -55,7 +55,8 @@ def shared_light(
         np.broadcast_to(value, used.shape).flat[places]
         for value in (camera.offset_adu, camera.gain_e_per_adu)
     )
-    pixels = (counts.reshape(len(counts), -1)[:, places] - offset) * gain
+    theirs = Camera(offset_adu=offset, gain_e_per_adu=gain)
+    pixels = theirs.to_electrons(counts.reshape(len(counts), -1)[:, places])
     power = pixels.mean(axis=1)
     if power.min() <= 0:
         return None

@@ -150,8 +150,7 @@ def analyse_landings(
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     if opening is None:
         reader = Reader(frames, camera, first, last, counts_budget(config))
-        with threads(config.compute.workers) as pool:
-            opening = judge_opening(reader, config, pool.map)
+        opening = judge_opening(reader, config)
     reader, noise, window = opening.reader, opening.noise, opening.window
     for text in noise.said(movie.name):
         tell(text)

@@ -149,8 +149,7 @@ class LandingSearch:
         frames = movie if lines is None else SteadyFrames(movie, lines, camera)
         self._config = config
         self._reader = Reader(frames, camera, first, last, counts_budget(config))
-        with threads(config.compute.workers) as pool:
-            opening = judge_opening(self._reader, config, pool.map)
+        opening = judge_opening(self._reader, config)
         noise, self.window = opening.noise, opening.window
 
         @lru_cache(_WINDOWS_KEPT)

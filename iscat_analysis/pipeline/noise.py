@@ -32,6 +32,7 @@ from iscat_analysis.search.sliding import (
     measure_noise,
 )
 from iscat_analysis.search.templates import ExcessNoise
+from iscat_analysis.threads import threads
 
 SPECTRUM_FRAMES = 128
 """Background frames on which the spectrum of the noise is measured."""
@@ -338,7 +339,7 @@ class Opening:
     window: int
 
 
-def judge_opening(reader: Reader, config: Config, mapper: Mapper = map) -> Opening:
+def judge_opening(reader: Reader, config: Config) -> Opening:
     """Judge the noise of a landing movie, and choose how many frames around a step are summed.
 
     Parameters
@@ -347,8 +348,6 @@ def judge_opening(reader: Reader, config: Config, mapper: Mapper = map) -> Openi
         The frames.
     config : Config
         ``background.window_frames`` wins where it is given.
-    mapper : callable
-        `map`, or the one of a pool.
 
     Returns
     -------
@@ -360,9 +359,10 @@ def judge_opening(reader: Reader, config: Config, mapper: Mapper = map) -> Openi
     DataError
         The movie is shorter than two windows, or holds no two frames that differ.
     """
-    opening, curve, window = judge_window(reader, config, mapper)
     additive = config.optics.scheme == "darkfield"
-    noise = judge_counts(opening, reader.camera, additive=additive, mapper=mapper)
+    with threads(config.compute.workers) as pool:
+        opening, curve, window = judge_window(reader, config, pool.map)
+        noise = judge_counts(opening, reader.camera, additive=additive, mapper=pool.map)
     if noise.excess is None:
         ratio = curve.at(window)
         message = (

@@ -33,7 +33,7 @@ from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.tracks import judge_times
 from iscat_analysis.pipeline.ways import Way, way_of, way_said
 from iscat_analysis.search.changes import Changes
-from iscat_analysis.threads import beside, threads
+from iscat_analysis.threads import beside
 
 _OPENING = 64  # frames that are looked at before anything else
 
@@ -151,9 +151,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     configured = config
     opened: Opening | None = None
     if way == "sliding":
-        reader = Reader(steady, camera, *span, counts_budget(config))
-        with threads(config.compute.workers) as pool:
-            opened = judge_opening(reader, config, pool.map)
+        opened = judge_opening(Reader(steady, camera, *span, counts_budget(config)), config)
     config, learned = learn_optics(
         steady, config, camera, tell=run.tell, notify=run.notify, opening=opened
     )
