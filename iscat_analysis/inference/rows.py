@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from iscat_analysis.records import BoolArray, FloatArray
@@ -97,6 +98,24 @@ class Rows:
     def only(self, kept: BoolArray | IntArray) -> Rows:
         """Take some of the rows."""
         return Rows(*(getattr(self, part.name)[kept] for part in fields(self)))
+
+    def pairs_within(self, limit_nm: float) -> IntArray:
+        """Give the pairs of rows of a frame that are no farther apart than a limit.
+
+        Parameters
+        ----------
+        limit_nm : float
+            Distance [nm].
+
+        Returns
+        -------
+        ndarray of int, shape (pairs, 2)
+            Rows, each pair once.
+        """
+        apart = (2 * limit_nm + 1) * self.frame  # no two frames lie within the limit of each other
+        places = np.column_stack([self.theta[:, :2], apart])
+        tree = scipy.spatial.cKDTree(places, balanced_tree=False, compact_nodes=False)
+        return np.asarray(tree.query_pairs(limit_nm, output_type="ndarray"), dtype=np.int64)
 
 
 @dataclass(frozen=True)

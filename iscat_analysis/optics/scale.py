@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.config import Calibration
 
@@ -40,12 +39,17 @@ class MassScale:
 
     def amplitude(self, mass_kda: float) -> float:
         """Amplitude a of a particle of a given mass [kDa]."""
+        return mass_kda if self.calibration is None else float(self.amplitudes(mass_kda))
+
+    def amplitudes(self, mass_kda: ArrayLike) -> FloatArray:
+        """`amplitude` of masses of any shape."""
+        mass_kda = np.asarray(mass_kda, dtype=float)
         if self.calibration is None:
             return mass_kda
         line = self.calibration
-        contrast = line.gradient_per_kda * mass_kda + math.copysign(1.0, mass_kda) * line.offset
-        root = math.sqrt(max(self.linear**2 + 4 * self.quadratic * contrast, 0.0))
-        return 2 * contrast / (self.linear + math.copysign(root, self.linear))
+        contrast = line.gradient_per_kda * mass_kda + np.copysign(1.0, mass_kda) * line.offset
+        root = np.sqrt(np.maximum(self.linear**2 + 4 * self.quadratic * contrast, 0.0))
+        return np.asarray(2 * contrast / (self.linear + np.copysign(root, self.linear)))
 
     def mass(self, amplitude: FloatArray) -> FloatArray:
         """Mass [kDa] of amplitudes of any shape; the inverse of `amplitude`."""
@@ -83,9 +87,8 @@ class MassScale:
         sizes = np.abs(np.asarray(mass_kda, dtype=float))
         if self.calibration is None:
             return np.zeros(sizes.shape)
-        amplitude = np.array([self.amplitude(mass) for mass in sizes.ravel().tolist()])
-        whole = self.linear + self.quadratic * amplitude
-        return np.asarray(self.linear / whole - 1).reshape(sizes.shape)
+        whole = self.linear + self.quadratic * self.amplitudes(sizes)
+        return np.asarray(self.linear / whole - 1)
 
     def slopes(self, amplitude: FloatArray) -> FloatArray:
         """`slope` of amplitudes of any shape."""

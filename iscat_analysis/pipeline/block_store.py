@@ -173,6 +173,7 @@ def analyse_block(
     if not goes_on[0]:
         seen = rows.frame + first, rows.theta[:, :2]
         noise = judge_beside(scene, movie, camera, span, seen, field.used, without)
+    aligned = None if goes_on[0] else align(scene, moving)  # draws all frames, for the views too
     return Block(
         span=span,
         rows=replace(rows, frame=rows.frame + first),
@@ -190,7 +191,7 @@ def analyse_block(
         saturated=field.saturated,
         noise=noise.messages,
         noise_differs=noise.differs,
-        aligned=None if goes_on[0] else align(scene, moving),
+        aligned=aligned,
     )
 
 
@@ -219,7 +220,7 @@ def row_view(field: MovingField, ground: Ground, rows: Rows, mine: int) -> Event
         for centre, size in zip((theta[1], theta[0]), field.used.shape, strict=True)
     ]
     cut = slice(*spans[0]), slice(*spans[1])
-    others = rows.only(np.arange(len(rows.frame)) != mine)
+    others = rows.only((rows.frame == frame) & (np.arange(len(rows.frame)) != mine))
     left, alone = (field.residual(ground, r, frame, frame + 1)[0][cut] for r in (rows, others))
     light = ground.power[frame] * ground.level[cut]
     used = field.used[cut]

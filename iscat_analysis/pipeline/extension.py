@@ -8,7 +8,7 @@ masses that their tracks have.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -64,17 +64,15 @@ def extended(
     tracks = int(rows.track.max(initial=-1)) + 1
     if not tracks:
         return rows, 0
-    typical = np.array([np.median(rows.theta[rows.track == k, 3]) for k in range(tracks)])
     blur = np.zeros(tracks, dtype=np.int64)
     blur[rows.track] = rows.group
-    frames: list[dict[int, FloatArray]] = [{} for _ in range(field.frames)]
-    for t, k, theta in zip(rows.frame, rows.track, rows.theta, strict=True):
-        frames[t][int(k)] = theta
-    ends = []
+    frames, typical, ends = _Frames(rows, field.frames), np.zeros(tracks), []
     for k in range(tracks):
-        mine = rows.frame[rows.track == k]
-        ends += [_End(k, int(mine.max()), 1), _End(k, int(mine.min()), -1)]
-    added, refitted = 0, {}
+        mine = np.flatnonzero(rows.track == k)
+        typical[k] = np.median(rows.theta[mine, 3])
+        ends += [_End(k, int(rows.frame[mine[-1]]), 1), _End(k, int(rows.frame[mine[0]]), -1)]
+    refitted: dict[int, Rows] = {}
+    added = 0
     meeting, same = _MEETING * resolution_nm, _SAME * resolution_nm
     while ends:
         proposed: dict[int, dict[int, _End]] = {}
@@ -117,17 +115,35 @@ def extended(
             added += len(kept)
             refitted[t] = fitted.only(of_frame)
             ends += [_End(end.track, t, end.way) for end in kept]
-    frame = np.array([t for t, found in enumerate(frames) for _ in found], dtype=np.int64)
-    track = np.array([k for found in frames for k in found], dtype=np.int64)
-    theta = np.array([theta for found in frames for theta in found.values()])
+    rows = replace(rows, group=blur[rows.track])
+    if not refitted:
+        return rows, 0
+    changed = sorted(refitted)
+    frame = np.array([t for t in changed for _ in frames[t]], dtype=np.int64)
+    track = np.array([k for t in changed for k in frames[t]], dtype=np.int64)
+    theta = np.array([theta for t in changed for theta in frames[t].values()])
     longer = Rows.of(frame, track, theta, blur[track]).recalling(rows)
-    if refitted:
-        longer = longer.recalling(Rows.together([refitted[t] for t in sorted(refitted)]))
-    return longer, added
+    longer = longer.recalling(Rows.together([refitted[t] for t in changed]))
+    others = rows.only(~np.isin(rows.frame, changed))
+    return Rows.together([others, longer]).in_order(), added
+
+
+class _Frames(dict[int, dict[int, FloatArray]]):
+    """θ of every particle by frame and track, made where it is asked for."""
+
+    def __init__(self, rows: Rows, frames: int) -> None:
+        super().__init__()
+        self._rows, self._starts = rows, rows.starts(frames)
+
+    def __missing__(self, t: int) -> dict[int, FloatArray]:
+        here = slice(self._starts[t], self._starts[t + 1])
+        tracks, thetas = self._rows.track[here].tolist(), self._rows.theta[here]
+        self[t] = dict(zip(tracks, thetas, strict=True))
+        return self[t]
 
 
 def _starts(
-    frames: list[dict[int, FloatArray]],
+    frames: _Frames,
     proposed: dict[int, dict[int, _End]],
     typical: FloatArray,
     blur: np.ndarray,

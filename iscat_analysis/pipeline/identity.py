@@ -14,14 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.inference.rows import Rows
-from iscat_analysis.records import BoolArray
 
 LEAST_GAIN = 8.0
 """In log-likelihood, from which on two tracks exchange what comes after a meeting: of pairs that
@@ -58,7 +56,7 @@ class _Part:
     mass: float
 
     @classmethod
-    def of(cls, rows: Rows, mine: BoolArray) -> _Part:
+    def of(cls, rows: Rows, mine: IntArray) -> _Part:
         """Gather it from some of the rows."""
         theta = rows.theta[mine]
         moved = np.diff(theta[:, :2], axis=0)[np.diff(rows.frame[mine]) == 1]
@@ -103,10 +101,11 @@ def identified(rows: Rows, *, near_nm: float, error: float) -> Rows:
         parts = []
         for k in met.tracks:
             until = next((m.first for m in meetings[number + 1 :] if k in m.tracks), np.inf)
-            later = (rows.frame > met.last) & (rows.frame < until)
+            mine = np.flatnonzero(track == k)
+            when = rows.frame[mine]
             parts += [
-                _Part.of(rows, (track == k) & (rows.frame < met.first)),
-                _Part.of(rows, (track == k) & later),
+                _Part.of(rows, mine[when < met.first]),
+                _Part.of(rows, mine[(when > met.last) & (when < until)]),
             ]
         if min(part.steps for part in parts) < _LEAST_STEPS:
             continue
@@ -132,10 +131,11 @@ def _continued(rows: Rows, near_nm: float, error: float) -> IntArray:
             continue
         end = of_one[-1]
         two, new = found
-        begun = rows.frame[track == new][0]
-        mine, fresh = (_Part.of(rows, track == k) for k in (one, new))
-        before = _Part.of(rows, (track == two) & (rows.frame < rows.frame[end]))
-        after = _Part.of(rows, (track == two) & (rows.frame > begun))
+        of_two, of_new = (np.flatnonzero(track == k) for k in (two, new))
+        when, begun = rows.frame[of_two], rows.frame[of_new[0]]
+        mine, fresh = (_Part.of(rows, own) for own in (of_one, of_new))
+        before = _Part.of(rows, of_two[when < rows.frame[end]])
+        after = _Part.of(rows, of_two[when > begun])
         if min(part.steps for part in (mine, fresh, before, after)) < _LEAST_STEPS:
             continue
         straight = mine.with_(fresh, error) + before.with_(after, error)
@@ -155,22 +155,24 @@ def _continued(rows: Rows, near_nm: float, error: float) -> IntArray:
 def _parted(rows: Rows, track: IntArray, end: int, near_nm: float) -> tuple[int, int] | None:
     """Find a track beside which another ended, and the first that began beside that one then."""
     last = int(rows.frame[end])
-    beside = _beside(rows, rows.frame == last, end, near_nm)
-    for t in range(last + 1, last + MERGED_FRAMES + 1):
-        here = np.flatnonzero(rows.frame == t)
-        for born in here[[not (track[: here[0]] == track[i]).any() for i in here]]:
-            for i in _beside(rows, rows.frame == t, born, near_nm):
-                if track[i] in track[beside] and track[i] != track[end]:
-                    return int(track[i]), int(track[born])
+    beside = _beside(rows, end, near_nm)
+    if not beside.size:
+        return None
+    first, stop = np.searchsorted(rows.frame, [last + 1, last + MERGED_FRAMES + 1])
+    numbers, births = np.unique(track[first:stop], return_index=True)
+    for born in np.sort(first + births[~np.isin(numbers, track[:first])]):
+        for i in _beside(rows, born, near_nm):
+            if track[i] in track[beside] and track[i] != track[end]:
+                return int(track[i]), int(track[born])
     return None
 
 
-def _beside(rows: Rows, among: BoolArray, row: int, near_nm: float) -> IntArray:
-    """Give the rows near another one."""
-    apart = np.hypot(*(rows.theta[:, :2] - rows.theta[row, :2]).T)
-    near = among & (apart < near_nm)
-    near[row] = False
-    return np.flatnonzero(near)
+def _beside(rows: Rows, row: int, near_nm: float) -> IntArray:
+    """Give the rows near another one of their frame."""
+    first, stop = np.searchsorted(rows.frame, rows.frame[row] + np.arange(2))
+    apart = np.hypot(*(rows.theta[first:stop, :2] - rows.theta[row, :2]).T)
+    near = first + np.flatnonzero(apart < near_nm)
+    return np.asarray(near[near != row])
 
 
 class _Meeting(NamedTuple):
@@ -184,18 +186,20 @@ class _Meeting(NamedTuple):
 
 def _meetings(rows: Rows, near_nm: float) -> Iterator[_Meeting]:
     """Give the meetings of every pair of tracks."""
-    each = [(k, rows.only(rows.track == k)) for k in np.unique(rows.track).tolist()]
-    for (one, mine), (two, other) in combinations(each, 2):
-        if mine.frame[0] > other.frame[-1] or other.frame[0] > mine.frame[-1]:
-            continue
-        frames, i, j = np.intersect1d(mine.frame, other.frame, return_indices=True)
-        apart = np.hypot(*(mine.theta[i, :2] - other.theta[j, :2]).T)
-        near = np.flatnonzero(apart < near_nm)
-        for together in np.split(near, np.flatnonzero(np.diff(frames[near]) > _APART_FRAMES) + 1):
-            if together.size:
-                closest = together[np.argmin(apart[together])]
-                first, last = int(frames[together[0]]), int(frames[together[-1]])
-                yield _Meeting(first, last, (one, two), int(frames[closest]))
+    one, two = rows.pairs_within(near_nm).T
+    swapped = rows.track[one] > rows.track[two]
+    one, two = np.where(swapped, two, one), np.where(swapped, one, two)
+    order = np.lexsort((rows.frame[one], rows.track[two], rows.track[one]))
+    one, two = one[order], two[order]
+    frame, tracks = rows.frame[one], np.stack([rows.track[one], rows.track[two]], axis=1)
+    apart = np.hypot(*(rows.theta[one, :2] - rows.theta[two, :2]).T)
+    others = (np.diff(tracks, axis=0) != 0).any(axis=1) | (np.diff(frame) > _APART_FRAMES)
+    for together in np.split(np.arange(len(one)), np.flatnonzero(others) + 1):
+        if together.size:
+            first, last = together[[0, -1]]
+            closest = together[np.argmin(apart[together])]
+            of = int(tracks[first, 0]), int(tracks[first, 1])
+            yield _Meeting(int(frame[first]), int(frame[last]), of, int(frame[closest]))
 
 
 def _groups(rows: Rows, track: IntArray) -> IntArray:

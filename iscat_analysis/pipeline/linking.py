@@ -377,9 +377,7 @@ def crowded(rows: Rows, limit_nm: float) -> BoolArray:
         True for both of a pair.
     """
     out = np.zeros(len(rows.frame), dtype=bool)
-    apart = (2 * limit_nm + 1) * rows.frame  # no two frames lie within the limit of each other
-    places = np.column_stack([rows.theta[:, :2], apart])
-    out[scipy.spatial.cKDTree(places).query_pairs(limit_nm, output_type="ndarray")] = True
+    out[rows.pairs_within(limit_nm)] = True
     return out
 
 

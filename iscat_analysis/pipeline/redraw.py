@@ -240,7 +240,7 @@ def _moving(
         theta = np.zeros((len(part), 5))
         theta[:, :3] = part[["x_nm", "y_nm", "z_nm"]].to_numpy(float)
         masses = part["mass_kda"].to_numpy(float)
-        theta[:, 3] = [scene.model.scale.amplitude(float(m)) for m in masses]
+        theta[:, 3] = scene.model.scale.amplitudes(masses)
         numbers, track = np.unique(part["track"].to_numpy(int), return_inverse=True)
         frame = part["frame"].to_numpy(np.int64) - start
         order = np.lexsort((track, frame))

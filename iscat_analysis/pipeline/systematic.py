@@ -172,7 +172,7 @@ def _shifts(
     errors = config.optics.covariance
     names = errors.names if errors is not None else ()
     free = [name in FREE_PARAMETERS[config.fit.mode] for name in PARAMETERS]
-    amplitude = np.array([model.scale.amplitude(m) for m in table["mass_kda"].astype(float)])
+    amplitude = model.scale.amplitudes(table["mass_kda"].to_numpy(float))
     nodes = _amplitude_nodes(amplitude, (table["status"] == Status.OK.value).to_numpy())
     respond = _Response(
         replace(model, scale=MassScale()), grid, names, tuple(free),

@@ -349,10 +349,12 @@ def make_films(
     chosen = [film for film in chosen if len(film[2])]
     frames = np.unique([t for *_, rows in chosen for t in rows["frame"]])
     known = fits["frame"].isin(frames) & numbers.isin(models.keys()) & fits["mass_kda"].notna()
-    columns = [fits.loc[known, name].tolist() for name in _PLACE]
+    frame, x, y, z, mass = (fits.loc[known, name].to_numpy() for name in _PLACE)
+    z = np.clip(z, *scene.wide.z_range_nm)
+    theta = np.column_stack([x, y, z, scene.wide.scale.amplitudes(mass)])
     seen: dict[int, list[_Seen]] = defaultdict(list)
-    for track, frame, *theta in zip(numbers[known], *columns, strict=True):
-        seen[frame].append(_Seen(models[track], *theta))
+    for t, track, place in zip(frame.tolist(), numbers[known], theta.tolist(), strict=True):
+        seen[t].append(_Seen(models[track], *place))
     return tuple(_film(scene, movie, camera, windows, seen, *film) for film in chosen)
 
 
@@ -446,13 +448,13 @@ def _square(scene: Scene, windows: Windows, rows: pd.DataFrame) -> Region:
 
 
 class _Seen(NamedTuple):
-    """A particle in a frame [nm, kDa]."""
+    """A particle in a frame [nm], and its amplitude."""
 
     model: ForwardModel
     x: float
     y: float
     z: float
-    mass: float
+    amplitude: float
 
     def image(self, grid: PixelGrid) -> FloatArray | float:
         """Draw it; 0 where it is too far away."""
@@ -462,8 +464,7 @@ class _Seen(NamedTuple):
         ]
         if math.hypot(*far) >= self.model.reach_nm:
             return 0.0
-        height = float(np.clip(self.z, *self.model.z_range_nm))
-        return self.model.image(grid, self.x, self.y, height, self.mass)
+        return self.model.amplitude_image(grid, self.x, self.y, self.z, self.amplitude)
 
 
 def _picture(

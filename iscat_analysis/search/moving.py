@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -353,13 +352,11 @@ def gaps(frame: IntArray, track: IntArray) -> tuple[IntArray, IntArray, IntArray
         How far on the way from the one to the other.
     """
     order = np.lexsort((frame, track))
-    missed, before, after, share = [], [], [], []
-    for a, b in pairwise(order):
-        if track[a] == track[b]:
-            for t in range(int(frame[a]) + 1, int(frame[b])):
-                missed.append(t)
-                before.append(a)
-                after.append(b)
-                share.append((t - frame[a]) / (frame[b] - frame[a]))
-    whole = [np.array(v, dtype=np.int64) for v in (missed, before, after)]
-    return whole[0], whole[1], whole[2], np.array(share, dtype=float)
+    before, after = order[:-1], order[1:]
+    wide = (track[before] == track[after]) & (frame[after] > frame[before] + 1)
+    before, after = before[wide], after[wide]
+    length = frame[after] - frame[before] - 1
+    first = np.cumsum(length) - length  # of the missed frames, that of each gap
+    steps = 1 + np.arange(length.sum()) - np.repeat(first, length)
+    before, after = np.repeat(before, length), np.repeat(after, length)
+    return frame[before] + steps, before, after, steps / (frame[after] - frame[before])

@@ -160,6 +160,7 @@ def estimate_diffusion(
     *,
     frame_rate_hz: float,
     exposure_ms: float | None = None,
+    counted: ArrayLike | None = None,
 ) -> tuple[float, float]:
     """D of one track and its standard error, as in `fit_diffusion`, and nothing else.
 
@@ -171,6 +172,8 @@ def estimate_diffusion(
         Frames per second.
     exposure_ms : float, optional
         As there [ms].
+    counted : array_like of bool, optional
+        As there.
 
     Returns
     -------
@@ -185,8 +188,9 @@ def estimate_diffusion(
         The arrays are not those of a track.
     """
     track = gather(
-        frames, positions_nm, sigma_nm, frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms
-    )
+        frames, positions_nm, sigma_nm,
+        frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms, counted=counted,
+    )  # fmt: skip
     best, sigma, *_ = _estimated(track)
     return best / _UM2, sigma / _UM2
 
@@ -279,15 +283,17 @@ def most_likely(track: Displacements) -> float:
 
 
 def _interval(track: Displacements, best: float, level: float) -> tuple[float, float]:
-    """Find where the likelihood ratio has its critical value."""
-    zero, peak = track.likelihood(0.0), track.likelihood(best).value
+    """Find where the root of the likelihood ratio, nearly a line, has its critical value."""
+    zero, there = track.likelihood(0.0), track.likelihood(best)
+    peak = there.value
 
     def beyond(d: float) -> float:
         there = track.likelihood(d)
         gained = d * zero.log_determinant_slope - (there.log_determinant - zero.log_determinant)
-        return 2 * (peak - there.value) - _critical(math.sqrt(max(gained, 0.0)), level) ** 2
+        deviation = math.sqrt(2 * max(peak - there.value, 0.0))
+        return deviation - _critical(math.sqrt(max(gained, 0.0)), level)
 
-    step = 1 / math.sqrt(track.likelihood(best).information)
+    step = 1 / math.sqrt(there.information)
     high = best + step
     while beyond(high) < 0:
         step *= 2

@@ -111,19 +111,22 @@ def nearest_nm(groups: Mapping[int, TrackRows]) -> dict[int, float]:
     dict of int to float
         Smallest distance of each [nm]; infinite where it never has company.
     """
-    closest = np.full(len(groups), np.inf)
     own = np.repeat(np.arange(len(groups)), [len(rows.frame) for rows in groups.values()])
     frame, x, y = (
         np.concatenate([getattr(rows, name) for rows in groups.values()] or [[]])
         for name in ("frame", "x_nm", "y_nm")
     )
     order = np.argsort(frame, kind="stable")
-    edges = np.flatnonzero(np.diff(frame[order], prepend=-1, append=np.inf))
-    for a, b in pairwise(edges):
-        here = order[a:b]
-        apart = np.hypot(x[here, None] - x[here], y[here, None] - y[here])
-        apart[own[here, None] == own[here]] = np.inf
-        np.fmin.at(closest, own[here], apart.min(axis=1))
+    own, frame, x, y = (values[order] for values in (own, frame, x, y))
+    nearest, ahead = np.full(len(own), np.inf), 1  # of each row; others of a frame come next
+    while (together := frame[ahead:] == frame[:-ahead]).any():
+        one = np.flatnonzero(together & (own[ahead:] != own[:-ahead]))
+        apart = np.hypot(x[one + ahead] - x[one], y[one + ahead] - y[one])
+        for row in (one, one + ahead):
+            nearest[row] = np.fmin(nearest[row], apart)
+        ahead += 1
+    closest = np.full(len(groups), np.inf)
+    np.fmin.at(closest, own, nearest)
     return dict(zip(groups, closest.tolist(), strict=True))
 
 

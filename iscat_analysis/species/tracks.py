@@ -33,7 +33,12 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.species.common_change import common_change
 from iscat_analysis.species.common_mass import CommonMass, combine_masses, information_power
-from iscat_analysis.species.diffusion import Diffusion, fit_diffusion, hydrodynamic_diameter
+from iscat_analysis.species.diffusion import (
+    Diffusion,
+    estimate_diffusion,
+    fit_diffusion,
+    hydrodynamic_diameter,
+)
 from iscat_analysis.species.displacements import LEAST_POSITIONS
 from iscat_analysis.species.motion import anomalous_test, confinement_test, steadiness_test
 from iscat_analysis.species.refraction import refractive_index
@@ -292,22 +297,17 @@ def _diffusion(placed: TrackRows, setup: TrackSetup) -> Diffusion | None:
         return None
     room = _room(placed, setup)[:-1]
     gaps_s = np.diff(placed.frame) / setup.frame_rate_hz
-    counted, found, positions = np.ones(room.size, dtype=bool), None, placed.positions()
+    times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
+    inside, positions = np.ones(room.size, dtype=bool), placed.positions()
     for _ in range(_LOOKS):
-        found = fit_diffusion(
-            *positions,
-            frame_rate_hz=setup.frame_rate_hz,
-            exposure_ms=setup.exposure_ms,
-            counted=counted,
-            level=COVERAGE,
-        )
-        inside = room > _STEPS * np.sqrt(2 * found.d_um2_s * _UM2 * gaps_s)
+        counted = inside
+        d_um2_s, _ = estimate_diffusion(*positions, **times, counted=counted)
+        inside = room > _STEPS * np.sqrt(2 * d_um2_s * _UM2 * gaps_s)
         if inside.sum() < least - 1:
             return None
         if np.array_equal(inside, counted):
             break
-        counted = inside
-    return found
+    return fit_diffusion(*positions, **times, counted=counted, level=COVERAGE)
 
 
 def _room(rows: TrackRows, setup: TrackSetup) -> FloatArray:
