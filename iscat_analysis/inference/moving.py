@@ -346,8 +346,13 @@ class MovingField:
             noise [e²] are added to it; nothing in pixels that are not used.
         """
         self.draw(ground, rows)
-        total = self._canvas_for(rows, coarse=True).total
-        add_squares(self._light(ground), total, rows.frame[which], corner, owner, out)
+        total, light = self._canvas_for(rows, coarse=True).total, self._light(ground)
+
+        def add(number: int) -> None:
+            mine = np.flatnonzero(owner == number)
+            add_squares(light, total, rows.frame[which[mine]], corner[mine], owner[mine], out)
+
+        self.share(add, len(out))
 
     def _signal(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
         """Draw the rows of some frames alone."""

@@ -125,24 +125,25 @@ def load_field(
             "without particles"
         )
     counts = np.empty((frames, *shape), dtype=np.float32)
-    saturated, total = np.zeros(shape, dtype=bool), np.zeros(shape)
+    saturated, total, light = np.zeros(shape, dtype=bool), np.zeros(shape), np.empty(frames)
 
     def read_some(start: int) -> tuple[BoolArray, FloatArray]:
         raw = movie.read(start, min(start + _BLOCK, last))
         check(raw, start)
         part = counts[start - first : start - first + len(raw)]
         part[:] = camera.to_electrons(raw)
+        light[start - first :][: len(raw)] = part.mean(axis=(1, 2), dtype=np.float64)
         full = np.asarray(camera.saturated(raw).any(axis=0))
         return full, np.sum(part, axis=0, dtype=np.float64)
 
     starts = range(first, last, _BLOCK)
-    for start, (full, light) in zip(starts, pool.map(read_some, starts), strict=True):
+    for start, (full, added) in zip(starts, pool.map(read_some, starts), strict=True):
         saturated |= full
-        total += light
+        total += added
         progress("background", min(start + _BLOCK, last) - first, frames)
     read = np.broadcast_to(camera.read_variance_e2(shape), shape)
     masked = saturated | find_defects(total, frames * read)
-    masked |= _noisy(counts, total / frames + read)
+    masked |= _noisy(counts, light, total / frames + read)
     nominal = abs(scene.model.scale.amplitude(scene.model.material.mass_kda))
     free_z = scene.mode == "joint"
     return MovingField(
@@ -153,14 +154,15 @@ def load_field(
     )  # fmt: skip
 
 
-def _noisy(counts_e: NDArray[np.float32], variance_e2: FloatArray) -> BoolArray:
+def _noisy(
+    counts_e: NDArray[np.float32], light_e: FloatArray, variance_e2: FloatArray
+) -> BoolArray:
     """Tell which pixels have far more noise than their light, and than the pixels around them.
 
     Particles that move change the light from frame to frame as well, of many pixels together.
     """
     firsts = np.arange(0, len(counts_e) - 1, max(2, len(counts_e) // _PAIRS))
-    light = counts_e.mean(axis=(1, 2), dtype=np.float64)
-    light /= light.mean() or 1.0
+    light = light_e / (light_e.mean() or 1.0)
     squares = np.zeros(variance_e2.shape)
     for t in firsts:
         if light[t] > 0 and light[t + 1] > 0:

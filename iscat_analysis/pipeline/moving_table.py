@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -133,16 +131,14 @@ def table_of_tracks(
     if parted:
         names = ("track", "mass_kda", "crb_mass_kda")
         off = unlike(*(table[name].to_numpy() for name in names))
-    pairs = zip(table["flags"], off.tolist(), strict=True)
-    judged = [_verdict(text, shared) for text, shared in pairs]
-    table = table.assign(
-        status=[str(status) for status, _ in judged],
-        flags=[";".join(str(flag) for flag in flags) for _, flags in judged],
-    )
-    return table[[*EVENT_COLUMNS, "track"]]
+    numbers, texts = pd.factorize(table["flags"])
+    judged = [_verdict(text, shared) for text in texts for shared in (False, True)]
+    status = [str(status) for status, _ in judged]
+    flags = [";".join(map(str, flags)) for _, flags in judged]
+    status, flags = (np.array(said, dtype=object)[2 * numbers + off] for said in (status, flags))
+    return table.assign(status=status, flags=flags)[[*EVENT_COLUMNS, "track"]]
 
 
-@cache
 def _verdict(flags: str, shared: bool) -> tuple[Status, tuple[Status, ...]]:
     """Judge the remarks on a row, one of which may be that its mass is shared."""
     own = [Status(flag) for flag in flags.split(";") if flag]

@@ -320,6 +320,9 @@ class _Lags(NamedTuple):
     @classmethod
     def of(cls, track: Displacements) -> _Lags:
         pairs = np.abs(np.subtract.outer(track.frames, track.frames))
+        longest = int(pairs[0, -1])
+        if longest < pairs.size:  # few gaps or none: all lags up to the longest
+            return cls(np.arange(longest + 1.0), pairs)
         distinct, which = np.unique(pairs, return_inverse=True)
         return cls(distinct.astype(float), which.reshape(pairs.shape))
 
@@ -342,24 +345,26 @@ def _covariance(track: Displacements, lags: _Lags, exponent: float) -> FloatArra
     return np.asarray(-0.5 * np.diff(np.diff(msd[lags.which], axis=0), axis=1))
 
 
-def _with_errors(track: Displacements, motion: FloatArray, axis: int) -> FloatArray:
-    sigma = motion.copy()
-    main, beside = (band[axis] for band in track.error)
-    i = np.arange(main.size)
-    sigma[i, i] += main
-    sigma[i[:-1], i[1:]] += beside
-    sigma[i[1:], i[:-1]] += beside
+def _with_errors(track: Displacements, motion: FloatArray) -> FloatArray:
+    """Covariance of displacements along each axis, (c, n, n)."""
+    main, beside = track.error
+    axes, n = main.shape
+    sigma = np.broadcast_to(motion, (axes, n, n)).copy()
+    flat = sigma.reshape(axes, n * n)
+    flat[:, :: n + 1] += main
+    flat[:, 1 :: n + 1] += beside
+    flat[:, n :: n + 1] += beside
     return sigma
 
 
 def _dense(track: Displacements, motion: FloatArray) -> float:
     """Log-likelihood with any covariance of the motion; −∞ where rounding spoils it."""
+    try:
+        factors = np.linalg.cholesky(_with_errors(track, motion))
+    except np.linalg.LinAlgError:
+        return -math.inf
     value = 0.0
-    for axis, steps in enumerate(track.steps_nm):
-        try:
-            factor = np.linalg.cholesky(_with_errors(track, motion, axis))
-        except np.linalg.LinAlgError:
-            return -math.inf
+    for factor, steps in zip(factors, track.steps_nm, strict=True):
         white = solve_triangular(factor, steps, lower=True, check_finite=False)
         value -= float(white @ white) / 2 + float(np.log(np.diag(factor)).sum())
     return value - track.steps_nm.size * math.log(2 * math.pi) / 2
@@ -371,8 +376,7 @@ def _exponent_error(track: Displacements, lags: _Lags, d: float, exponent: float
     sides = [d * _covariance(track, lags, exponent + s) for s in (-_PART, _PART)]
     slope = (sides[1] - sides[0]) / (2 * _PART)
     information = np.zeros((2, 2))
-    for axis in range(len(track.steps_nm)):
-        sigma = _with_errors(track, there, axis)
+    for sigma in _with_errors(track, there):
         parts = np.split(np.linalg.solve(sigma, np.hstack([there, slope])), 2, axis=1)
         information += [[0.5 * np.sum(a * b.T) for a in parts] for b in parts]
     return float(math.sqrt(np.linalg.inv(information)[1, 1]))
