@@ -236,19 +236,20 @@ def stage(
 
     `own` (ny, 5, nx) begins with the particle's own signal.
     """
-    background, read, counts = light.background, light.read, light.counts
-    w = light.power[t]
-    for i in range(data.shape[1]):
+    w, last = light.power[t], c0 + data.shape[2]
+    for i in range(data.shape[1]):  # among more arrays at once the compiler gives up on vectors
         r = r0 + i
-        for j in range(data.shape[2]):
-            level = w * background[r, c0 + j]
-            data[2, i, j] = level
-            data[1, i, j] = level * (1.0 + total[r, c0 + j] - own[i, 0, j])
-        for j in range(data.shape[2]):
-            data[3, i, j] = read[r, c0 + j]
-        for j in range(data.shape[2]):
-            seen = counts[t, r, c0 + j] if data[2, i, j] > 0.0 else 0.0
-            data[0, i, j] = seen + data[3, i, j]
+        seen, base, level, noise = data[0, i], data[1, i], data[2, i], data[3, i]
+        background, others, mine = light.background[r, c0:last], total[r, c0:last], own[i, 0]
+        for j in range(level.size):
+            level[j] = w * background[j]
+        for j in range(level.size):
+            base[j] = level[j] * (1.0 + others[j] - mine[j])
+        read, counts = light.read[r, c0:last], light.counts[t, r, c0:last]
+        for j in range(level.size):
+            noise[j] = read[j]
+        for j in range(level.size):
+            seen[j] = noise[j] + (counts[j] if level[j] > 0.0 else np.float32(0.0))
 
 
 @kernel()
@@ -257,29 +258,81 @@ def ready_frame(
     group: IntArray, canvas: Canvas, near_profile: FloatArray,
     far_profile: FloatArray, image: FloatArray,
 ) -> None:  # fmt: skip
-    """Bring a frame of the canvas to the rows as they are."""
+    """Bring a frame of the canvas to the rows as they are.
+
+    Rings that would have to stay where their rows no longer are, are drawn anew: of these rows
+    alone, or of all rows where that takes less.
+    """
     total = canvas.total[t]
     rows, columns = total.shape
     first, last = starts[t], starts[t + 1]
-    stale = not canvas.drawn[t]
-    for r in range(first, last):
-        for k in range(4):
-            limit = field.slack[k] * (abs(canvas.rings[r, 3]) if k == 3 else 1.0)
-            stale |= abs(theta[r, k] - canvas.rings[r, k]) > limit
-    if stale:
+    pictures = 0
+    for r in range(first, last) if canvas.drawn[t] else range(0):
+        if _is_aside(field, theta[r], canvas.rings[r]):
+            pictures += 2
+        elif _is_other_size(field, theta[r], canvas.rings[r]):
+            pictures += 1
+    anew = not canvas.drawn[t] or 2 * pictures > last - first
+    if anew:
         total[:] = 0.0
         canvas.drawn[t] = True
     for r in range(first, last):
-        if stale:
-            canvas.rings[r] = canvas.squares[r] = theta[r]
-            there = square_of(field, theta[r], field.drawn, rows, columns)
-            add_row(far, field, group[r], theta[r], 1.0, there, far_profile, image, total)
-        elif np.any(theta[r] != canvas.squares[r]):
-            there = square_of(field, canvas.rings[r], field.side, rows, columns)
-            before, now = canvas.squares[r], theta[r]
-            add_row(near, field, group[r], before, -1.0, there, near_profile, image, total)
-            add_row(near, field, group[r], now, 1.0, there, near_profile, image, total)
-            canvas.squares[r] = theta[r]
+        rings, square, now = canvas.rings[r], canvas.squares[r], theta[r]
+        inner = square_of(field, rings, field.side, rows, columns)
+        outer = square_of(field, rings, field.drawn, rows, columns)
+        aside = _is_aside(field, now, rings)
+        k = group[r]
+        if aside and not anew:
+            add_row(near, field, k, square, -1.0, inner, near_profile, image, total)
+            _add_rings(far, field, k, rings, -1.0, inner, outer, far_profile, image, total)
+        if aside or anew:
+            rings[:] = square[:] = now
+            there = square_of(field, now, field.drawn, rows, columns)
+            add_row(far, field, k, now, 1.0, there, far_profile, image, total)
+            continue
+        if _is_other_size(field, now, rings):
+            # b P + b² Q minus a P + a² Q is (b - a)/(b + a) times the signal of a + b
+            share = (now[3] - rings[3]) / (now[3] + rings[3])
+            rings[3] += now[3]
+            _add_rings(far, field, k, rings, share, inner, outer, far_profile, image, total)
+            rings[3] = now[3]
+        if np.any(now != square):
+            add_row(near, field, k, square, -1.0, inner, near_profile, image, total)
+            add_row(near, field, k, now, 1.0, inner, near_profile, image, total)
+            square[:] = now
+
+
+@kernel()
+def _is_aside(field: Field, theta: FloatArray, rings: FloatArray) -> bool:
+    """Tell whether a row is too far from its rings, or the reverse of them."""
+    aside = False
+    for k in range(3):
+        aside |= abs(theta[k] - rings[k]) > field.slack[k]
+    return aside or (theta[3] != rings[3] and theta[3] == -rings[3])
+
+
+@kernel()
+def _is_other_size(field: Field, theta: FloatArray, rings: FloatArray) -> bool:
+    """Tell whether the amplitude of a row is too far from that of its rings."""
+    return abs(theta[3] - rings[3]) > field.slack[3] * abs(rings[3])
+
+
+@kernel()
+def _add_rings(
+    pictures: Pictures, field: Field, group: int, theta: FloatArray, sign: float,
+    inner: tuple[int, int, int, int], outer: tuple[int, int, int, int], profile: FloatArray,
+    image: FloatArray, total: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Add the signal of one row, times a sign, to what lies around its fitted square."""
+    top, bottom, left, right = inner
+    r0, r1, c0, c1 = outer
+    if bottom <= top:
+        top = bottom = r1
+    for part in (
+        (r0, top, c0, c1), (bottom, r1, c0, c1), (top, bottom, c0, left), (top, bottom, right, c1)
+    ):  # fmt: skip
+        if part[3] > part[2]:
+            add_row(pictures, field, group, theta, sign, part, profile, image, total)
 
 
 @kernel()

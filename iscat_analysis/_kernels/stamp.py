@@ -86,16 +86,18 @@ def copy_nodes(
     A slope without room is left out.  Numba counts no references here and below (`_nrt`), as
     nothing is allocated or handed back: counting took as long as a line of twenty nodes.
     """
-    twice = a + a
     for m in range(signal.size // line):
         p, q = profile[0, row + step * m, first:last], profile[1, row + step * m, first:last]
         s = signal[m * line : (m + 1) * line]
-        for j in range(p.size):
-            s[j] = p[j] + a * q[j]
         if slope.size:
             d = slope[m * line : (m + 1) * line]
             for j in range(p.size):
-                d[j] = p[j] + twice * q[j]
+                once = a * q[j]
+                s[j] = p[j] + once
+                d[j] = p[j] + once + once
+        else:
+            for j in range(p.size):
+                s[j] = p[j] + a * q[j]
 
 
 @kernel(fastmath=FAST, _nrt=False)

@@ -38,6 +38,7 @@ MASSES = (200.0, 400.0)
 READ_E2 = 900.0
 SIGMAS = 4.0
 SAME = 1e-5  # as exact as the samples of a picture
+SINGLE = 3e-7  # rounding of 1 in single precision, a few times
 SECOND = 1e-4  # the same, of second derivatives
 FITTED = 0.05  # standard deviations: where a fit ends, and the differences of its likelihood
 
@@ -323,6 +324,32 @@ def test_what_extends_tracks_is_told_as_it_was_fitted(pool: ThreadPoolExecutor) 
     assert np.isfinite(longer.snr).all()
     error = 1 / np.sqrt(longer.fisher[:, 3, 3])
     assert (np.abs(longer.theta - truth.theta)[:, 3] < 6 * error).all()
+
+
+@pytest.mark.parametrize("rows_moved", [[4], [0, 3], [1, 2, 3, 5, 8]])
+def test_rows_that_move_are_redrawn_as_if_all_were(
+    pool: ThreadPoolExecutor, rows_moved: list[int]
+) -> None:
+    field = _field(np.ones((1, *SHAPE)), pool)
+    ground = Ground(np.ones(SHAPE), np.ones(1))
+    size = forward_model(_config(), 1e4).scale.amplitude(400.0)
+    z = forward_model(_config(), 1e4).height_nm
+    theta = np.array(
+        [[x, y, z, size, 0.0] for x in (700.0, 1800.0, 2900.0) for y in (600.0, 1600.0, 2600.0)]
+    )
+    rows = Rows.of(np.zeros(9, dtype=int), np.arange(9), theta)
+    for change in ([0.0, 0.0, 0.0, 0.3 * size, 0.0], [170.0, -90.0, 0.0, -0.4 * size, 0.0]):
+        before = field.fit(ground, rows, sweeps=0, coarse=True)[0]
+        there = before.theta.copy()
+        there[rows_moved] += change
+        moved = replace(before, theta=there)
+        stale = field.residual(ground, before, 0, 1)
+        moved = field.fit(ground, moved, sweeps=0, coarse=True)[0]
+        drawn = field.residual(ground, moved, 0, 1)
+        field.draw(ground, moved)
+        anew = field.residual(ground, moved, 0, 1)
+        assert np.abs(drawn - anew).max() < SINGLE
+        assert np.abs(stale - anew).max() > 1e3 * SINGLE
 
 
 def test_squares_are_put_on_top_of_each_other(pool: ThreadPoolExecutor) -> None:
