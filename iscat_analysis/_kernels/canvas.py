@@ -308,13 +308,13 @@ def _is_aside(field: Field, theta: FloatArray, rings: FloatArray) -> bool:
     aside = False
     for k in range(3):
         aside |= abs(theta[k] - rings[k]) > field.slack[k]
-    return aside or (theta[3] != rings[3] and theta[3] == -rings[3])
+    return bool(aside or (theta[3] != rings[3] and theta[3] == -rings[3]))
 
 
 @kernel()
 def _is_other_size(field: Field, theta: FloatArray, rings: FloatArray) -> bool:
     """Tell whether the amplitude of a row is too far from that of its rings."""
-    return abs(theta[3] - rings[3]) > field.slack[3] * abs(rings[3])
+    return bool(abs(theta[3] - rings[3]) > field.slack[3] * abs(rings[3]))
 
 
 @kernel()
