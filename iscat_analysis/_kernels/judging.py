@@ -20,6 +20,7 @@ from iscat_analysis._kernels.canvas import (
     table_of,
 )
 from iscat_analysis._kernels.dense import factorise
+from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import STAMP, Lens
@@ -83,8 +84,8 @@ def _add_curvature(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _left_over(data: FloatArray, here: FloatArray) -> tuple[float, float, float, float]:
-    """χ², pixels, largest residual and light of a square."""
+def _left_over(data: FloatArray, here: FloatArray, numbers: FloatArray) -> None:
+    """Fill χ², pixels, largest residual and mean light of a square."""
     chi2 = used = worst = light = 0.0
     for i in range(data.shape[1]):
         d0, d1, d2, d3, s = data[0, i], data[1, i], data[2, i], data[3, i], here[i, 0]
@@ -95,7 +96,27 @@ def _left_over(data: FloatArray, here: FloatArray) -> tuple[float, float, float,
             worst = max(worst, left)
             used += 1.0 if d2[j] > 0 else 0.0
             light += d2[j]
-    return chi2, used, np.sqrt(worst), light
+    numbers[0], numbers[1] = chi2, used
+    numbers[2], numbers[3] = np.sqrt(worst), light / max(used, 1.0)
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def _growth(data: FloatArray, here: FloatArray, amplitude: float) -> float:
+    """∂ ln F/∂ ln a of the information F on the amplitude a.
+
+    Where s = a P + a² Q, a ∂²s/∂a² is 2 (∂s/∂a − s/a).
+    """
+    known = more = 0.0
+    inverse = 1.0 / amplitude if amplitude != 0.0 else 0.0
+    for i in range(data.shape[1]):
+        d1, d2, d3, s, ga = data[1, i], data[2, i], data[3, i], here[i, 0], here[i, 4]
+        for j in range(s.size):
+            slope = d2[j] * ga[j]
+            change = slope / max(d1[j] + d2[j] * s[j] + d3[j], FLOOR)
+            bend = 4.0 * (ga[j] - inverse * s[j])
+            known += change * slope
+            more += change * (d2[j] * bend - amplitude * change * slope)
+    return more / known if known > 0.0 else 0.0
 
 
 @kernel()
@@ -111,13 +132,12 @@ def judge_frames(
     theta: FloatArray,
     group: IntArray,
     canvas: Canvas,
+    slopes: Slopes,
     fisher: FloatArray,
     turned: FloatArray,
     ways: FloatArray,
     bias: FloatArray,
-    score: FloatArray,
     numbers: FloatArray,
-    brief: bool,
 ) -> None:
     """Say of the rows of frames first…last − 1 what their likelihoods know, at θ.
 
@@ -125,21 +145,20 @@ def judge_frames(
     ----------
     light, field, near, far, free, starts, first, last, theta, group, canvas
         As in `fit_frames`.
+    slopes : Slopes
+        Filled.
     fisher : ndarray, shape (rows, 4, 4)
         Filled with the expected information in (x, y, z, a).
     turned, ways : ndarray, shape (rows, 4, 4)
         Filled with O V and V, the columns of V directions of one standard deviation in the free
         parameters, and O the observed information; NaN where the information is singular.
     bias : ndarray, shape (rows, 4)
-        Filled with what `score` is expected to be off by through curvature, −½ Σ V tr(F⁻¹∂²η) ∂η:
+        Filled with what the score is expected to be off by through curvature, −½ Σ V tr(F⁻¹∂²η) ∂η:
         F⁻¹ times it is the bias of order 1/N (see `iscat_analysis.inference.bias`).
-    score : ndarray, shape (rows, 4)
-        Filled with the gradient of the log-likelihood.
-    numbers : ndarray, shape (rows, 5)
+    numbers : ndarray, shape (rows, 6)
         Filled with the log-likelihood over that without the particle, χ², pixels, the largest
-        residual in standard deviations, and mean background of the square [e].
-    brief : bool
-        Leave out what takes second derivatives: `turned`, `ways` and `bias`.
+        residual in standard deviations, mean background of the square [e], and ∂ ln F/∂ ln a of the
+        information F on the amplitude a.
     """
     rows, columns = light.background.shape
     near_profile = blank_profile(table_of(near, 0), near.lens, 1)
@@ -158,7 +177,7 @@ def judge_frames(
         for r in range(starts[t], starts[t + 1]):
             p, f = theta[r], fisher[r]
             f[:], turned[r], ways[r] = 0.0, np.nan, np.nan
-            bias[r], score[r], numbers[r] = 0.0, 0.0, 0.0
+            bias[r], numbers[r] = 0.0, 0.0
             r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
             if r1 <= r0:
                 continue
@@ -168,15 +187,16 @@ def judge_frames(
             draw_gradient(near, group[r], p, pixels, profile, here)
             data = square[: 4 * ny * nx].reshape(4, ny, nx)
             stage(light, t, canvas.total[t], here, r0, c0, data)
+            slopes.squares[r] = r0, r1, c0, c1
+            keep_slopes(data[2], here, index, slopes.values[r])
             value = place_score(data, here, len(near.lens) != STAMP, pull, known)
             for i in range(4):
-                score[r, i] = pull[i]
                 for j in range(4):
                     f[i, j] = known[i, j]
-            chi2, used, worst, amount = _left_over(data, here)
-            numbers[r, 0], numbers[r, 1], numbers[r, 2] = value, chi2, used
-            numbers[r, 3], numbers[r, 4] = worst, amount / max(used, 1.0)
-            if brief or not _directions(f, index, ways_here):
+            numbers[r, 0] = value
+            _left_over(data, here, numbers[r, 1:5])
+            numbers[r, 5] = _growth(data, here, p[3])
+            if not _directions(f, index, ways_here):
                 continue
             if PART * np.abs(ways_here[:2]).max() > field.pixel_nm:  # as good as singular
                 continue

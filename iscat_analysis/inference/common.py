@@ -8,54 +8,48 @@ The second part, of rank one in each pixel, is what the background takes.  Share
 it takes 1/T from each, but adds up for what they have in common: a particle that hardly moves is
 told from its background by its motion alone, and how it moved must be told as well.
 
-With F_t the information of frame t on its own (x, y, z, a), G_t = w_t B ∂C_t and N the counts of
-each pixel, the background that is left undetermined when every frame follows its own noise has the
-information M = N − Σ_t G_tᵀ F_t⁻¹ G_t, and a row the covariance
+With F_t = (R_t R_tᵀ)⁻¹ the information of frame t on its own (x, y, z, a), G_t = w_t B ∂C_t, N the
+counts of each pixel and E = N⁻½ Σ_t G_tᵀ F_t⁻¹ G_t N⁻½, a row has the covariance
 
-    F_t⁻¹ + F_t⁻¹ G_t M⁻¹ G_tᵀ F_t⁻¹.
+    F_t⁻¹ + R_t P_t (1 − E)⁻¹ P_tᵀ R_tᵀ,    P_t = R_tᵀ G_t N⁻½.
 
-With F_t⁻¹ = R_t R_tᵀ and K = Rᵀ G N⁻¹ Gᵀ R of all rows together, which is smaller than M for a
-short track, what is added is R ((1 − K)⁻¹ − 1) Rᵀ (Woodbury).
+P_t P_tᵀ is some 1/T, so that the eigenvalues of E add up to no more than a row has parameters: few
+of them are large, however many pixels the track covers.  (1 − E)⁻¹ is therefore worked out in the
+space that a few images span, which are sent through E until the largest are among them (block
+Krylov method: Musco and Musco, Adv. Neural Inf. Process. Syst. 28, 2015), and is 1 beyond.
 
-A mass that is common to the frames keeps Σ_t J_t − cᵀ M⁻¹ c, with M, c and J_t those that are left
-when the places alone follow.  M couples all pixels of a track.  Where it covers so many that it
-moved far (`MOST_PIXELS`), only the errors common to all frames are kept: with F = Σ_t F_t and
-L = (Σ_t G_t)(Σ_t G_t)ᵀ/N their covariance is (F − L)⁻¹ − F⁻¹.  Tracks are taken one by one.
+A mass that is common to the frames has the information Σ_t J_t − cᵀ (1 − E')⁻¹ c, with J_t that of
+frame t when its place follows, c the image that it sends then, and E' the E of the places alone; it
+is solved by conjugate gradients.  Tracks are taken one by one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
-from iscat_analysis.inference.modes import lost, patterns, pixels_of
+from iscat_analysis.inference.coupling import Coupling
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Judged, Rows
 from iscat_analysis.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
 
-MOST_PIXELS = 1800
-"""Pixels of a track whose information is taken as a whole."""
-
 _SINGULAR = 1e-9
-_TOGETHER = 128  # rows whose products are added in single precision
-_SOLVED = 256  # rows whose triangular systems are solved at a time, in the caches
-_DOUBTFUL = 2.5  # logarithm of the largest pivot over the least, where 1e-7 may count
-_STEPS = 4  # of Newton's method
-_SETTLED = 0.3  # standard deviations; what a step leaves is a fiftieth of it
-_SHORT = 0.5  # unknowns of a track over its pixels, below which the matrix of these is larger
-_AT_ONCE = 128  # unknowns of a triangular system that are solved without products
+_IMAGES = 4  # that are sent through E at a time
+_LEFT = 3e-4  # of the variance of a row, that may be left out
+_SEED = 1  # of the images to begin with
+_ROUNDS = 3  # of a mean and of the weights there
+_UNLIKE = 2.0  # amplitude over the mean, beyond which weights stay
+_UNSOLVED = 1e-6  # of the information on a mass, that a step of the conjugate gradients adds
+_MOST_STEPS = 400
 
 
 @dataclass(frozen=True)
 class CommonAmplitudes:
-    """Amplitudes that are common to the frames of each track, by the exact likelihood.
+    """Amplitudes that are common to the frames of each track.
 
     Attributes
     ----------
@@ -76,28 +70,8 @@ class CommonAmplitudes:
     frames: FloatArray
 
 
-@dataclass(frozen=True)
-class Shared:
-    """What the background takes from tracks.
-
-    Attributes
-    ----------
-    covariance : ndarray, shape (n, 4, 4)
-        Covariance of (x, y, z, a) of each row besides that over a known background; infinite on the
-        diagonal where nothing is known, 0 where not free.
-    taken : ndarray, shape (tracks,)
-        Share of the information on a common amplitude that is lost, of tracks that moved far.
-    together : mapping of int to (ndarray of int, ndarray)
-        Of the other tracks: their rows and the covariance of the amplitudes of these.
-    """
-
-    covariance: FloatArray
-    taken: FloatArray
-    together: Mapping[int, tuple[IntArray, FloatArray]]
-
-
-def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged) -> Shared:
-    """Say what the background takes from the rows and from the tracks.
+def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged) -> FloatArray:
+    """Say what the background adds to the errors of the rows.
 
     Parameters
     ----------
@@ -108,34 +82,83 @@ def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged
     rows : Rows
         Particles, at their estimates.
     judged : Judged
-        Of these rows.
+        Of these rows; the field has fitted nothing since.
 
     Returns
     -------
-    Shared
-        By row and by track.
+    ndarray, shape (n, 4, 4)
+        Covariance of (x, y, z, a) of each row besides that over a known background; infinite on the
+        diagonal where nothing is known, 0 where not free.
     """
-    tracks = int(rows.track.max(initial=-1)) + 1
     index = np.flatnonzero(field.free[:4])
-    covariance, taken = np.zeros((len(rows.frame), 4, 4)), np.zeros(tracks)
-    together: dict[int, tuple[IntArray, FloatArray]] = {}
+    covariance = np.zeros((len(rows.frame), 4, 4))
+
+    tracks = [mine for mine in _tracks(rows, judged, index) if mine.size]
 
     def of_one(k: int) -> None:
-        mine = np.flatnonzero(rows.track == k)
-        mine = mine[np.linalg.det(_scaled(judged.fisher[mine], index)[0]) > _SINGULAR]
-        if not mine.size:
-            return
-        fisher, of_track = judged.fisher[mine], rows.only(mine)
-        if pixels_of(field, of_track) <= MOST_PIXELS:
-            extra, amplitudes = _all_pixels(field, ground, of_track, fisher, index)
-            together[k] = mine, amplitudes
-        else:
-            hidden = lost(field, ground, of_track)
-            extra, taken[k] = _common_modes(fisher, hidden, index)
-        covariance[np.ix_(mine, index, index)] = extra
+        coupling = Coupling(field, ground, judged, tracks[k])
+        added = _added(coupling, _inverse(judged.fisher[tracks[k]], index))
+        covariance[np.ix_(tracks[k], index, index)] = added
 
-    field.share(of_one, tracks)
-    return Shared(covariance, taken, together)
+    field.share(of_one, len(tracks))
+    return covariance
+
+
+def _added(coupling: Coupling, inverse: FloatArray) -> FloatArray:
+    """Covariance of every row besides its own, shape (n, free, free)."""
+    free = inverse.shape[1]
+    root = np.asarray(np.linalg.cholesky(inverse), dtype=np.float64)
+    turned = np.swapaxes(root, 1, 2)
+    inner = turned @ coupling.own() @ root
+    most = float(np.linalg.eigvalsh(inner)[:, -1].max())
+    # as no eigenvalue is larger than their sum
+    if _left(most, float(np.einsum("nii->", inner))) > _LEFT:
+        more = _beyond(coupling, root, most)
+        if more is None:
+            return np.broadcast_to(np.diag(np.full(free, np.inf)), inverse.shape)
+        inner += more
+    return np.asarray(root @ inner @ turned)
+
+
+def _left(most: float, largest: float) -> float:
+    """Tell how much of the variance of a row is left out with eigenvalues of E, at most."""
+    return most * largest / (1 - largest) if largest < 1 else np.inf
+
+
+def _beyond(coupling: Coupling, root: FloatArray, most: float) -> FloatArray | None:
+    """P (1 − E)⁻¹ Pᵀ − P Pᵀ of every row, but for what is small; None where 1 − E is singular."""
+    n, free = root.shape[:2]
+    covariance = root @ np.swapaxes(root, 1, 2)
+    rank = min(n * free, coupling.pixels)
+    some = np.random.default_rng(_SEED).standard_normal((n, min(_IMAGES, rank), free))
+    images = coupling.sent(some @ np.swapaxes(root, 1, 2))
+    basis, felt = np.empty((0, coupling.pixels)), np.empty((n, 0, free))
+    largest = 1.0
+    while len(basis) < rank and _left(most, largest) > _LEFT:
+        added = _orthonormal(images, basis)[: rank - len(basis)]
+        seen, images = coupling.followed(covariance, added)
+        seen = seen @ root
+        basis, felt = np.concatenate([basis, added]), np.concatenate([felt, seen], axis=1)
+        # those of the next images, and of what is left out, are smaller
+        largest = float(np.linalg.eigvalsh(_products(seen))[-1])
+    values, turns = np.linalg.eigh(_products(felt))
+    if values[-1] > 1 - _SINGULAR:
+        return None
+    along = np.swapaxes(felt, 1, 2) @ turns
+    return np.asarray((along * (values / (1 - values))) @ np.swapaxes(along, 1, 2))
+
+
+def _products(felt: FloatArray) -> FloatArray:
+    """E between images that rows feel, shape (n, b, free)."""
+    return np.tensordot(felt, felt, axes=((0, 2), (0, 2)))
+
+
+def _orthonormal(images: FloatArray, basis: FloatArray) -> FloatArray:
+    """Make images orthonormal, to a basis as well."""
+    for _ in range(2):  # what rounding leaves of the basis goes the second time
+        images = images - (images @ basis.T) @ basis
+        images = np.linalg.qr(images.T)[0].T
+    return images
 
 
 def variances_left(information: FloatArray, index: IntArray) -> FloatArray:
@@ -165,118 +188,6 @@ def variances_left(information: FloatArray, index: IntArray) -> FloatArray:
     return out
 
 
-def _all_pixels(
-    field: MovingField, ground: Ground, rows: Rows, fisher: FloatArray, index: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Covariance of every row besides its own, and that of the amplitudes of all rows."""
-    inverse = _inverse(fisher, index)
-    slopes, weight = _slopes(field, ground, rows)
-    if slopes.shape[0] * slopes.shape[1] < _SHORT * weight.size:
-        return _of_a_short_one(slopes, weight, inverse)
-    left = _undetermined(slopes, weight, inverse)
-    if left is None or np.ptp(np.log(left.diagonal())) > _DOUBTFUL:
-        slopes = _slopes(field, ground, rows)[0].astype(np.float64)
-        left = _undetermined(slopes, weight, inverse)
-    if left is None:
-        return _unknown(inverse)
-    own = np.diag(inverse[:, -1, -1])
-    root, left = slopes, left.astype(slopes.dtype)
-    for first in range(0, len(root), _SOLVED):
-        _forward(left, root[first : first + _SOLVED].reshape(-1, weight.size).T)
-    extra = (root @ np.swapaxes(root, 1, 2)).astype(np.float64)
-    return extra, own + (root[:, -1] @ root[:, -1].T).astype(np.float64)
-
-
-def _slopes(field: MovingField, ground: Ground, rows: Rows) -> tuple[NDArray[Any], FloatArray]:
-    """Give G, shape (n, free, m), and 1/N of the m pixels that say something."""
-    changes, weight = patterns(field, ground, rows)
-    slopes = changes.reshape(*changes.shape[:2], -1)
-    pixels = np.flatnonzero(weight > 0)
-    if pixels.size < weight.size:
-        slopes = slopes[:, :, pixels]
-    return slopes, weight.flat[pixels]
-
-
-def _of_a_short_one(
-    slopes: NDArray[np.float32], weight: FloatArray, inverse: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Give the same of a track with fewer unknowns than pixels."""
-    n, free, _ = slopes.shape
-    root = np.linalg.cholesky(inverse)
-    felt = (np.swapaxes(root, 1, 2) @ slopes * np.sqrt(weight)).reshape(n * free, -1)
-    factor = _factor(np.eye(n * free) - felt @ felt.T)
-    if factor is None:
-        return _unknown(inverse)
-    half = np.linalg.inv(factor)
-    more = (half.T @ half - np.eye(n * free)).reshape(n, free, n, free)
-    each = np.arange(n)
-    extra = root @ more[each, :, each] @ np.swapaxes(root, 1, 2)
-    amplitudes = np.einsum("ia,iajb,jb->ij", root[:, -1], more, root[:, -1], optimize=True)
-    return extra, np.diag(inverse[:, -1, -1]) + amplitudes
-
-
-def _unknown(inverse: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Covariances where the background takes all that was known."""
-    diagonal = np.diag(np.full(inverse.shape[1], np.inf))
-    every = np.diag(inverse[:, -1, -1])
-    return np.broadcast_to(diagonal, inverse.shape), np.full_like(every, np.inf)
-
-
-def _undetermined(
-    slopes: NDArray[Any], weight: FloatArray, inverse: FloatArray
-) -> NDArray[Any] | None:
-    """Give the lower factor of M, and put F⁻¹ G in the place of the slopes G."""
-    root = np.linalg.cholesky(inverse).astype(slopes.dtype)
-    left = np.zeros((weight.size, weight.size))
-    products = np.empty(left.shape, dtype=slopes.dtype)
-    for first in range(0, len(slopes), _TOGETHER):
-        some = slice(first, first + _TOGETHER)
-        felt = np.swapaxes(root[some], 1, 2) @ slopes[some]
-        np.matmul(root[some], felt, out=slopes[some])
-        flat = felt.reshape(-1, weight.size)
-        np.matmul(flat.T, flat, out=products)
-        left -= products
-    left.flat[:: weight.size + 1] += 1 / weight
-    return _factor(left)
-
-
-def _factor(matrix: FloatArray) -> NDArray[Any] | None:
-    """Lower Cholesky factor of a matrix, None where that is not positive."""
-    diagonal = matrix.flat[:: len(matrix) + 1]
-    matrix.flat[:: len(matrix) + 1] = diagonal + _SINGULAR * diagonal.max()
-    try:
-        return np.linalg.cholesky(matrix)
-    except np.linalg.LinAlgError:
-        return None
-
-
-def _forward(lower: NDArray[Any], right: NDArray[Any]) -> None:
-    """Solve a lower triangular system in the place of its right sides, shape (n, m).
-
-    By halves, whose products let other threads run, as the solver of SciPy does not.
-    """
-    if len(lower) <= _AT_ONCE:
-        right[:] = solve_triangular(lower, right, lower=True, check_finite=False)
-        return
-    half = len(lower) // 2
-    _forward(lower[:half, :half], right[:half])
-    right[half:] -= lower[half:, :half] @ right[:half]
-    _forward(lower[half:, half:], right[half:])
-
-
-def _common_modes(
-    fisher: FloatArray, lost: FloatArray, index: IntArray
-) -> tuple[FloatArray, float]:
-    """Covariance that all rows share, and the share of a common amplitude that is lost."""
-    whole = fisher.sum(axis=0)[np.ix_(index, index)]
-    scale = 1 / np.sqrt(np.diag(whole))
-    whole, part = (m * np.outer(scale, scale) for m in (whole, lost))
-    taken = float(np.clip(part[-1, -1], 0.0, 1.0 - _SINGULAR))
-    if np.linalg.eigvalsh(whole - part)[0] < _SINGULAR:
-        return np.diag(np.full(index.size, np.inf)), taken
-    return (np.linalg.inv(whole - part) - np.linalg.inv(whole)) * np.outer(scale, scale), taken
-
-
 def _scaled(fisher: FloatArray, index: IntArray) -> tuple[FloatArray, FloatArray]:
     """Informations of some parameters with ones on the diagonal, and what made them so."""
     part = fisher[:, index][:, :, index]
@@ -290,13 +201,16 @@ def _inverse(fisher: FloatArray, index: IntArray) -> FloatArray:
     return np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :]
 
 
+def _tracks(rows: Rows, judged: Judged, index: IntArray) -> list[IntArray]:
+    """Give the rows of each track whose own information is no singular matrix."""
+    known = np.linalg.det(_scaled(judged.fisher, index)[0]) > _SINGULAR
+    order = np.argsort(rows.track, kind="stable")
+    edges = np.searchsorted(rows.track[order], np.arange(1, int(rows.track.max(initial=-1)) + 1))
+    return [mine[known[mine]] for mine in np.split(order, edges)] if order.size else []
+
+
 def common_amplitudes(
-    field: MovingField,
-    ground: Ground,
-    rows: Rows,
-    judged: Judged,
-    counted: BoolArray,
-    shared: Shared,
+    field: MovingField, ground: Ground, rows: Rows, judged: Judged, counted: BoolArray
 ) -> CommonAmplitudes:
     """Fit one amplitude to all frames of each track, with the background that is most likely then.
 
@@ -309,73 +223,90 @@ def common_amplitudes(
     rows : Rows
         Particles, at their estimates.
     judged : Judged
-        Of these rows.
+        Of these rows; the field has fitted nothing since.
     counted : ndarray of bool, shape (n,)
-        Rows that count; the others stay as they are.
-    shared : Shared
-        From `shared_errors`.
+        Rows that count; the others follow with all their parameters.
 
     Returns
     -------
     CommonAmplitudes
-        By Newton's method on the likelihood with the background put in, the places following the
-        amplitude to first order.  Of tracks whose pixels are taken as a whole it is the mean of
-        generalised least squares over their rows, whose maximum is that of the same likelihood.
+        The mean of generalised least squares over the rows, whose errors hang together through
+        their background.  Their informations are those at the common amplitude: those at the
+        estimates go with the noise of these where a picture is not linear in its amplitude, and
+        the mean would be off.
     """
-    tracks, taken = int(rows.track.max(initial=-1)) + 1, shared.taken
-    where = np.flatnonzero(counted)
-    owner = rows.track[where]
-    theta = rows.theta.copy()
+    index = np.flatnonzero(field.free[:4])
+    tracks = _tracks(rows, judged, index)
+    out = np.full((4, len(tracks)), np.nan)
 
-    def summed(values: FloatArray) -> FloatArray:
-        return np.bincount(owner, weights=values, minlength=tracks).astype(np.float64)
-
-    others = np.flatnonzero(field.free[:3])
-    _, information = _marginal(judged, where, others)
-    total = summed(information)
-    safe = np.maximum(total, 1e-300)
-    amplitude = summed(information * theta[where, 3]) / safe
-    bias = summed(information * judged.bias[where, 3]) / safe
-    far = total > 0
-    far[list(shared.together)] = False
-    for _ in range(_STEPS if far.any() else 0):
-        theta[where, 3] = amplitude[owner]
-        same = replace(rows, theta=theta)
-        _, found, _ = field.fit(ground, same, sweeps=0)
-        ground = Ground(found.level, ground.power)
-        at = field.judge(ground, same, brief=True)
-        score, there = _marginal(at, where, others)
-        information = np.where(far[owner], there, information)
-        total = summed(information)
-        safe = np.maximum(total, 1e-300)
-        step = np.where(far, summed(score) / (safe * (1 - taken)), 0.0)
-        amplitude = amplitude + step
-        if np.all(np.abs(step) * np.sqrt(safe) < _SETTLED):
-            break
-    known = np.where(total > 0, 1 / safe, np.nan)
-    frames = total**2 / np.maximum(summed(information**2), 1e-300)
-    amplitude = np.where(total > 0, amplitude - bias, np.nan)
-    variance = known / (1 - taken)
-    for k, (mine, covariance) in shared.together.items():
-        used = counted[mine] & np.isfinite(np.diag(covariance))
+    def of_one(k: int) -> None:
+        mine = tracks[k]
+        used = counted[mine]
         if not used.any():
-            amplitude[k] = variance[k] = np.nan
-            continue
-        weights = np.linalg.solve(covariance[np.ix_(used, used)], np.ones(int(used.sum())))
-        variance[k] = 1 / weights.sum()
-        each = (rows.theta[:, 3] - judged.bias[:, 3])[mine][used]
-        amplitude[k] = variance[k] * weights @ each
-    return CommonAmplitudes(amplitude, variance, known, frames)
+            return
+        fisher = judged.fisher[mine]
+        along, information = _marginal(fisher, index[:-1])
+        estimate = rows.theta[mine, 3] - judged.bias[mine, 3]
+        information = used * information
+        mean, more = _at_their_mean(rows.theta[mine, 3], estimate, information, judged.growth[mine])
+        weight = information * more
+        sends = np.column_stack([-along, np.ones(mine.size)]) * (used * np.sqrt(more))[:, None]
+        covariance = _inverse(fisher, index)
+        covariance[used] = 0.0
+        covariance[used, :-1, :-1] = _inverse(fisher[used], index[:-1])
+        coupling = Coupling(field, ground, judged, mine)
+        off = estimate - mean
+        mode, pulled = coupling.sent(np.stack([sends, sends * off[:, None]], axis=1))
+        total = weight.sum()
+        answer, taken = _answer(coupling, covariance, mode, total)
+        left = total - taken
+        out[2:, k] = 1 / total, total**2 / np.sum(weight**2)
+        if left > _SINGULAR * total:
+            out[:2, k] = mean + (weight @ off - answer @ pulled) / left, 1 / left
+
+    field.share(of_one, len(tracks))
+    return CommonAmplitudes(*out)
 
 
-def _marginal(judged: Judged, where: IntArray, others: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Score and information on the amplitude of rows, their places following it."""
-    fisher, score = judged.fisher[where], judged.score[where]
-    cross = fisher[:, others, 3]
-    scaled, scale = _scaled(fisher, others)
-    scaled = scaled + 1e-12 * np.eye(others.size)
-    along = np.linalg.solve(scaled, (cross * scale)[..., None])[..., 0] * scale
-    return (
-        score[:, 3] - np.einsum("ni,ni->n", along, score[:, others]),
-        np.maximum(fisher[:, 3, 3] - np.einsum("ni,ni->n", along, cross), 0.0),
-    )
+def _at_their_mean(
+    amplitude: FloatArray, estimate: FloatArray, information: FloatArray, growth: FloatArray
+) -> tuple[float, FloatArray]:
+    """Give the mean of amplitudes, and by what the information on each is more at that."""
+    power = np.average(growth, weights=information)
+    mean, more = float(np.average(estimate, weights=information)), np.ones(len(estimate))
+    for _ in range(_ROUNDS):
+        more = np.clip(amplitude / mean, 1 / _UNLIKE, _UNLIKE) ** -power
+        mean = float(np.average(estimate, weights=information * more))
+    return mean, more
+
+
+def _answer(
+    coupling: Coupling, covariance: FloatArray, image: FloatArray, total: float
+) -> tuple[FloatArray, float]:
+    """Solve (1 − E') answer = image by conjugate gradients; give image · answer as well.
+
+    That is infinite where 1 − E' is singular.
+    """
+    answer, taken = np.zeros_like(image), 0.0
+    left, way = image.copy(), image.copy()
+    size = float(left @ left)
+    for _ in range(_MOST_STEPS):
+        turned = way - coupling.followed(covariance, way[None])[1][0]
+        bend = float(way @ turned)
+        if not bend > _SINGULAR * float(way @ way):
+            return answer, np.inf
+        step = size / bend
+        answer += step * way
+        taken += step * size
+        if step * size < _UNSOLVED * (total - taken):
+            break
+        left -= step * turned
+        before, size = size, float(left @ left)
+        way = left + size / before * way
+    return answer, taken
+
+
+def _marginal(fisher: FloatArray, others: IntArray) -> tuple[FloatArray, FloatArray]:
+    """How places follow an amplitude, shape (n, others), and the information on that then."""
+    along = np.einsum("nij,nj->ni", _inverse(fisher, others), fisher[:, others, 3])
+    return along, fisher[:, 3, 3] - np.einsum("ni,ni->n", along, fisher[:, others, 3])

@@ -370,7 +370,7 @@ class MovingField:
         )  # fmt: skip
         return canvas.total
 
-    def judge(self, ground: Ground, rows: Rows, *, brief: bool = False) -> Judged:
+    def judge(self, ground: Ground, rows: Rows) -> Judged:
         """Say what the likelihood knows of every row.
 
         Parameters
@@ -379,8 +379,6 @@ class MovingField:
             Background.
         rows : Rows
             Particles, at their estimates.
-        brief : bool
-            Leave out observed information and bias, which take most of the time.
 
         Returns
         -------
@@ -392,20 +390,20 @@ class MovingField:
         near, far = self._pictures
         starts = rows.starts(self.frames)
         fisher, turned, ways = np.empty((3, n, 4, 4))
-        bias, score = np.empty((2, n, 4))
-        numbers = np.empty((n, 5))
+        bias, numbers = np.empty((n, 4)), np.empty((n, 6))
         canvas = self._canvas_for(rows, coarse=False)
+        slopes = self._slopes_of(n, self._whole.side)
 
         def block(first: int) -> FloatArray:
             judge_frames(
                 light, self._whole, near, far, self.free, starts, first,
-                min(first + _BLOCK, self.frames), rows.theta, rows.group, canvas, fisher, turned,
-                ways, bias, score, numbers, brief,
+                min(first + _BLOCK, self.frames), rows.theta, rows.group, canvas, slopes, fisher,
+                turned, ways, bias, numbers,
             )  # fmt: skip
             return np.zeros(1)
 
         self._sum_of(block)
-        return Judged.of(fisher, turned, ways, bias, score, numbers, free=self.free[:4])
+        return Judged.of(fisher, turned, ways, bias, numbers, slopes, free=self.free[:4])
 
     def share(self, task: Callable[[int], None], count: int) -> None:
         """Run a numbered task for every number below `count`, several at a time."""

@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.following import Slopes
 from iscat_analysis.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
@@ -146,8 +147,6 @@ class Judged:
         Observed information of the free parameters, NaN elsewhere.
     bias : ndarray, shape (n, 4)
         Bias of order 1/N of θ, 0 where not free.
-    score : ndarray, shape (n, 4)
-        Gradient of the log-likelihood at θ.
     gain : ndarray, shape (n,)
         Log-likelihood over that without the particle.
     chi2 : ndarray, shape (n,)
@@ -158,17 +157,23 @@ class Judged:
         Largest residual [standard deviations].
     level : ndarray, shape (n,)
         Mean light of the square [e].
+    growth : ndarray, shape (n,)
+        ∂ ln F/∂ ln a of the information F on the amplitude a: near 0 where the picture is linear in
+        it, 2 where it is quadratic.
+    slopes : Slopes
+        What each row changes of the light of its pixels; overwritten by the next fit of the field.
     """
 
     fisher: FloatArray
     observed: FloatArray
     bias: FloatArray
-    score: FloatArray
     gain: FloatArray
     chi2: FloatArray
     pixels: FloatArray
     worst: FloatArray
     level: FloatArray
+    growth: FloatArray
+    slopes: Slopes
 
     @classmethod
     def of(
@@ -177,8 +182,8 @@ class Judged:
         turned: FloatArray,
         ways: FloatArray,
         bias: FloatArray,
-        score: FloatArray,
         numbers: FloatArray,
+        slopes: Slopes,
         *,
         free: BoolArray,
     ) -> Judged:
@@ -186,7 +191,7 @@ class Judged:
 
         Parameters
         ----------
-        fisher, turned, ways, bias, score, numbers : ndarray
+        fisher, turned, ways, bias, numbers, slopes
             As there.
         free : ndarray of bool, shape (4,)
             Free parameters.
@@ -208,4 +213,8 @@ class Judged:
             observed[np.ix_(good, index, index)] = (o + np.swapaxes(o, 1, 2)) / 2
         shift = np.zeros((n, 4))
         shift[:, index] = np.einsum("nij,nj->ni", inverse, bias[:, index])
-        return cls(fisher, observed, np.nan_to_num(shift), score, *numbers.T)
+        gain, chi2, pixels, worst, level, growth = numbers.T
+        return cls(
+            fisher, observed, np.nan_to_num(shift), gain, chi2, pixels, worst, level, growth,
+            slopes,
+        )  # fmt: skip

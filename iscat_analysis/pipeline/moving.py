@@ -254,11 +254,9 @@ def follow(
     if scene.mode == "joint":  # a path along z takes as much of the mass, and must count
         unlike = unlike & crowded(rows, scene.roi_px * scene.pixel_nm)
     counted = done & field.holds(rows.theta) & ~near & ~unlike
-    common = common_amplitudes(field, ground, rows, judged, counted, shared)
+    common = common_amplitudes(field, ground, rows, judged, counted)
     progress("track", total, total)
-    return Moving(
-        rows, ground, judged, done, close, variances, diffusion, field, shared.covariance, common
-    )
+    return Moving(rows, ground, judged, done, close, variances, diffusion, field, shared, common)
 
 
 def _refuse_flood(config: Config, field: MovingField, rows: Rows) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,9 +13,9 @@ from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.inference import common
 from iscat_analysis.inference.common import common_amplitudes, shared_errors
-from iscat_analysis.inference.modes import lost
+from iscat_analysis.inference.coupling import Coupling
 from iscat_analysis.inference.moving import MovingField
-from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.inference.rows import Ground, Judged, Rows
 from iscat_analysis.inference.settling import settle
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.pipeline.extension import extended
@@ -57,9 +58,8 @@ def _expected(model: ForwardModel, paths: np.ndarray) -> tuple[np.ndarray, Rows]
 
 
 def _field(model: ForwardModel, counts: np.ndarray, pool: ThreadPoolExecutor) -> MovingField:
-    near = forward_model(make_config(), math.sqrt(2) * (ROI / 2 + 6) * PIXEL_NM)
     return MovingField(
-        counts.astype(np.float32), np.zeros(SHAPE), np.ones(SHAPE, dtype=bool), near, model,
+        counts.astype(np.float32), np.zeros(SHAPE), np.ones(SHAPE, dtype=bool), model, model,
         pixel_nm=PIXEL_NM, roi_px=ROI, z_range_nm=None, largest=1e6, pool=pool,
     )  # fmt: skip
 
@@ -74,7 +74,10 @@ def test_information_lost_is_that_of_all_parameters(
     ground = Ground(counts.mean(axis=0), np.ones(FRAMES))
     _, ground, _ = field.fit(ground, rows, sweeps=0)
     ground = Ground(ground.level, np.ones(FRAMES))
-    taken = lost(field, ground, rows)[-1, -1]
+    judged = field.judge(ground, rows)
+    one = np.array([0.0, 0.0, 1.0])
+    coupling = Coupling(field, ground, judged, np.arange(FRAMES))
+    taken = np.sum(coupling.sent(np.broadcast_to(one, (FRAMES, 1, 3))) ** 2)
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
     own = across = within = 0.0
     for theta in rows.theta:
@@ -104,12 +107,12 @@ def test_common_mass_and_shared_errors_are_right(
         rows, ground, done = settle(field, start, truth, follow_power=False)
         judged = field.judge(ground, rows)
         shared = shared_errors(field, ground, rows, judged)
-        found = common_amplitudes(field, ground, rows, judged, done, shared)
+        found = common_amplitudes(field, ground, rows, judged, done)
         amplitude.append(found.amplitude[0])
         variance.append(found.variance[0])
         index = np.array([0, 1, 3])
         own = np.linalg.inv(judged.fisher[:, index][:, :, index])
-        spread = own + shared.covariance[:, index][:, :, index]
+        spread = own + shared[:, index][:, :, index]
         off = (rows.theta[:, :4] - judged.bias - truth.theta[:, :4])[:, index]
         errors.append(off / np.sqrt(np.einsum("nii->ni", spread)))
         assert found.variance[0] > 2 * found.known[0]
@@ -121,51 +124,109 @@ def test_common_mass_and_shared_errors_are_right(
         assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * TRIALS)
 
 
-def test_a_particle_that_hardly_moves_is_worked_out_in_double_precision(
-    model: ForwardModel, pool: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+def _whole(
+    model: ForwardModel, field: MovingField, ground: Ground, rows: Rows, judged: Judged
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give what its background adds to the rows of a track, and the covariance of all amplitudes.
+
+    By the whole matrix of the pixels, from the slopes of the model itself.
+    """
+    grid, index = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM), np.array([0, 1, 3])
+    slopes = np.zeros((len(rows.frame), 3, *SHAPE))
+    for one, theta in zip(slopes, rows.theta, strict=True):
+        r, c = (round(place / PIXEL_NM - (ROI - 1) / 2) for place in theta[1::-1])
+        square = slice(max(r, 0), r + ROI), slice(max(c, 0), c + ROI)
+        gradient = model.amplitude_gradient(grid, *theta[:4])[1]
+        one[:, *square] = (ground.level * gradient[index])[:, *square]
+    own = np.linalg.inv(judged.fisher[:, index][:, :, index])
+    follow = own @ slopes.reshape(len(own), 3, -1)
+    left = np.diag(field.total_e.ravel())
+    left -= np.einsum("nap,naq->pq", slopes.reshape(follow.shape), follow, optimize=True)
+    inverse = np.linalg.inv(left)
+    added = np.einsum("nap,pq,nbq->nab", follow, inverse, follow, optimize=True)
+    amplitudes = follow[:, 2] @ inverse @ follow[:, 2].T + np.diag(own[:, 2, 2])
+    return added, amplitudes
+
+
+# steps of a particle [nm], and frames that it stays
+TRACKS = {"fast": (60.0, FRAMES), "short": (60.0, 12), "slow": (8.0, FRAMES)}
+
+
+@pytest.mark.parametrize("kind", TRACKS)
+def test_shared_errors_are_those_of_all_pixels(
+    model: ForwardModel, pool: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    """Over its background it is known so badly that single precision makes errors of its own."""
-    path = np.random.default_rng(4).normal(0.0, 0.01 * PIXEL_NM, (1, FRAMES, 2)) + 1250.0
-    mean, truth = _expected(model, path)
-    field, ground = _field(model, 100 * mean, pool), Ground(100 * _level(), np.ones(FRAMES))
-    judged = field.judge(ground, truth)
-
-    usual = common._DOUBTFUL
-
-    def amplitude_error(doubtful: float) -> float:
-        monkeypatch.setattr(common, "_DOUBTFUL", doubtful)
-        (mine, covariance) = shared_errors(field, ground, truth, judged).together[0]
-        return float(1 / math.sqrt(np.linalg.solve(covariance, np.ones(mine.size)).sum()))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(common, "_SINGULAR", 0.0)  # which is added to either matrix
-        by_rows = amplitude_error(usual)
-        patch.setattr(common, "_SHORT", 0.0)
-        assert by_rows == pytest.approx(amplitude_error(-1.0), rel=1e-6)
-    monkeypatch.setattr(common, "_SHORT", 0.0)
-    exact = amplitude_error(-1.0)
-    assert amplitude_error(usual) == pytest.approx(exact, rel=1e-2)
-    assert amplitude_error(math.inf) != pytest.approx(exact, rel=0.1)
-
-
-def test_short_tracks_are_worked_out_by_their_rows(
-    model: ForwardModel, pool: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Which is the same as by their pixels, but for the rounding of single precision."""
-    path = np.cumsum(np.random.default_rng(4).normal(0.0, 60.0, (1, FRAMES, 2)), axis=1) + 1250.0
-    mean, truth = _expected(model, path)
+    """Within a thousandth of the variance, of rows and of a common mass."""
+    step, frames = TRACKS[kind]
+    path = np.cumsum(np.random.default_rng(4).normal(0.0, step, (1, FRAMES, 2)), axis=1) + 1250.0
+    path[:, frames:] = np.nan
+    mean, rows = _expected(model, path)
     field, ground = _field(model, mean, pool), Ground(_level(), np.ones(FRAMES))
-    judged = field.judge(ground, truth)
-    found = []
-    for short in (0.0, math.inf):
-        monkeypatch.setattr(common, "_SHORT", short)
-        shared = shared_errors(field, ground, truth, judged)
-        found.append((shared.covariance, shared.together[0][1]))
-    for one, two in zip(*found, strict=True):
-        scale = np.sqrt(np.abs(np.diagonal(one, axis1=-2, axis2=-1)))
-        scale = scale[..., :, None] * scale[..., None, :] + 1e-300
-        assert np.abs((two - one) / scale).max() < 1e-3
-        assert np.abs(one).max() > 0
+    judged = field.judge(ground, rows)
+    added, amplitudes = _whole(model, field, ground, rows, judged)
+    index = np.array([0, 1, 3])
+    scale = np.linalg.cholesky(np.linalg.inv(judged.fisher[:, index][:, :, index]) + added)
+
+    def error() -> float:
+        found = shared_errors(field, ground, rows, judged)[:, index][:, :, index]
+        off = np.linalg.solve(scale, np.linalg.solve(scale, found - added).swapaxes(1, 2))
+        return float(np.abs(np.linalg.eigvalsh(off)).max())
+
+    assert error() < 1e-3
+    monkeypatch.setattr(common, "_LEFT", math.inf)
+    assert error() > 3e-3 or kind == "short"  # whose rows hardly feel one another
+    found = common_amplitudes(field, ground, rows, judged, np.ones(frames, dtype=bool))
+    weights = np.linalg.solve(amplitudes, np.ones(frames))
+    assert found.variance[0] == pytest.approx(1 / weights.sum(), rel=1e-3)
+    assert found.variance[0] > (1.001 if kind == "short" else 1.05) * found.known[0]
+
+
+def test_a_particle_that_hardly_moves_is_worked_out_to_the_last_digit(
+    model: ForwardModel, pool: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its background leaves less than 1e-5 of the information on its mass, a small difference."""
+    path = np.random.default_rng(4).normal(0.0, 0.05 * PIXEL_NM, (1, FRAMES, 2)) + 1250.0
+    mean, rows = _expected(model, path)
+    field, ground = _field(model, mean, pool), Ground(_level(), np.ones(FRAMES))
+    judged = field.judge(ground, rows)
+    every = np.ones(FRAMES, dtype=bool)
+    index = np.array([0, 1, 3])
+    inverse = np.linalg.inv(judged.fisher[:, index][:, :, index])
+    coupling = Coupling(field, ground, judged, np.arange(FRAMES))
+    alone = np.eye(3 * FRAMES).reshape(3 * FRAMES, FRAMES, 3).swapaxes(0, 1)
+    slopes = coupling.sent(alone).reshape(FRAMES, 3, -1)
+    follow = inverse @ slopes
+    left = np.eye(coupling.pixels) - np.einsum("nap,naq->pq", slopes, follow, optimize=True)
+    amplitudes = follow[:, 2] @ np.linalg.solve(left, follow[:, 2].T) + np.diag(inverse[:, 2, 2])
+    exact = 1 / np.linalg.solve(amplitudes, np.ones(FRAMES)).sum()
+    found = common_amplitudes(field, ground, rows, judged, every)
+    assert found.variance[0] == pytest.approx(exact, rel=1e-3)
+    assert exact > 1e5 * found.known[0]
+    monkeypatch.setattr(common, "_MOST_STEPS", 2)
+    rough = common_amplitudes(field, ground, rows, judged, every)
+    assert rough.variance[0] != pytest.approx(exact, rel=0.1)
+
+
+def test_weights_of_a_common_mass_do_not_go_with_the_noise(pool: ThreadPoolExecutor) -> None:
+    """In dark field the most weight would be on the highest estimates."""
+    model = forward_model(make_config(calibrated=False, optics={"scheme": "darkfield"}), 1e4)
+    path = np.cumsum(np.random.default_rng(4).normal(0.0, 60.0, (1, FRAMES, 2)), axis=1) + 1250.0
+    mean, same = _expected(model, path)
+    field, ground = _field(model, mean, pool), Ground(_level(), np.ones(FRAMES))
+    theta = same.theta * np.array([1.0, 1.0, 1.0, 1.1, 1.0])
+    theta[::2, 3] *= 0.9 / 1.1
+    noisy = replace(same, theta=theta)
+
+    def found(judged: Judged, growth: float) -> float:
+        judged = replace(judged, growth=growth * judged.growth)
+        every = np.ones(FRAMES, dtype=bool)
+        result = common_amplitudes(field, ground, noisy, judged, every)
+        return float(result.amplitude[0] / same.theta[0, 3])
+
+    exact = found(field.judge(ground, same), 0.0)
+    judged = field.judge(ground, noisy)
+    assert found(judged, 1.0) == pytest.approx(exact, abs=1e-3)
+    assert found(judged, 0.0) != pytest.approx(exact, abs=0.02)
 
 
 def test_tracks_go_on_through_a_meeting(model: ForwardModel, pool: ThreadPoolExecutor) -> None:

@@ -216,7 +216,7 @@ def test_rows_know_what_their_last_fit_saw(pool: ThreadPoolExecutor) -> None:
     field = _field(counts, pool, READ_E2)
     assert np.isnan(truth.snr).all()
     rows, _, _ = field.fit(ground, truth, sweeps=3)
-    judged = field.judge(ground, rows, brief=True)
+    judged = field.judge(ground, rows)
     error = np.sqrt(judged.fisher[:, 3, 3] / rows.fisher[:, 3, 3])
     assert np.abs(error - 1).max() < 1e-3
     difference = np.abs(rows.snr / np.sqrt(2 * judged.gain) - 1)
