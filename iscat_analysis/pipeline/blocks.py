@@ -289,9 +289,9 @@ def _stiffness(
     """Mean of ∂_i B ∂_j B/(B + read noise) over pixels and averages, without that of noise."""
     total = np.zeros((2, 2))
     for mean, n in zip(means_e, frames, strict=True):
-        slopes = np.stack(np.gradient(mean))[:, used]
-        weight = 1 / np.maximum(mean + read_e2, 1.0)[used]
-        total += (slopes * weight) @ slopes.T / weight.size
+        slopes = np.reshape(np.gradient(mean), (2, -1))
+        weight = (used / np.maximum(mean + read_e2, 1.0)).ravel()
+        total += (slopes * weight) @ slopes.T / used.sum()
         total -= np.eye(2) / (2 * n)  # half the difference of two pixels has half their variance
     return total / len(means_e)
 

@@ -45,6 +45,7 @@ FILMS = 3
 FILM_FRAMES = 40
 """Frames of such a film, at most."""
 
+_OF_FILM = ("frame", "x_px", "y_px", "chi2_reduced")
 _PLACE = ("frame", "x_nm", "y_nm", "z_nm", "mass_kda")
 _ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
 _NAMED = 3  # of pairs of tracks that met, in a message
@@ -341,9 +342,9 @@ def make_films(
         The best first.
     """
     numbers = track_numbers(fits)
-    models = _models(scene, tracks)
+    models, of_film = _models(scene, tracks), fits[list(_OF_FILM)].assign(track=numbers)
     chosen = [
-        (track, why, _shown(fits[numbers == track].sort_values("frame"), worst))
+        (track, why, _shown(of_film[of_film["track"] == track].sort_values("frame"), worst))
         for track, why, worst in _chosen(tracks)
     ]
     chosen = [film for film in chosen if len(film[2])]

@@ -300,13 +300,15 @@ def steadiness_test(
     if count < 2:
         return 1.0
     ends = np.linspace(0, last, count + 1).astype(int)
-    places, errors = track.positions_nm.T, np.sqrt(track.variance_nm2.T)
     common, ratio = most_likely(track), 0.0
     for a, b in pairwise(ends):
-        part = gather(
-            track.frames[a : b + 1], places[a : b + 1], errors[a : b + 1],
-            frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms,
-        )  # fmt: skip
+        part = replace(
+            track,
+            positions_nm=track.positions_nm[:, a : b + 1],
+            variance_nm2=track.variance_nm2[:, a : b + 1],
+            frames=track.frames[a : b + 1],
+            counted=np.arange(b - a),
+        )
         ratio += 2 * (part.likelihood(most_likely(part)).value - part.likelihood(common).value)
     return float(chdtrc(count - 1, max(ratio, 0.0)))
 

@@ -168,19 +168,17 @@ def describe_tracks(
     )
     nearest = nearest_nm(groups)
     exact = {} if masses is None else masses.to_dict("index")
-    records, places = [], {}
+    places = {track: rows.placed() for track, rows in groups.items()}
+    motions = _motions(places, setup, seed, workers, progress)
+    records = []
     for track, rows in groups.items():
-        good, placed = massive[track], rows.placed()
+        motion, tests = motions[track]
         record = _record(
-            track, rows, good, placed, setup, power, correlation, exact.get(track, {})
+            track, rows, massive[track], places[track], motion, setup, power, correlation,
+            exact.get(track, {}),
         )  # fmt: skip
-        record["nearest_nm"] = nearest.get(track, np.inf)
+        record |= {"nearest_nm": nearest.get(track, np.inf), **tests}
         records.append(record)
-        if np.isfinite(record["d_um2_s"]):
-            places[track] = placed
-    tests = _tested(places, setup, seed, workers, progress)
-    for record in records:
-        record |= tests.get(record["track"], {})
         status = _remarks(record, setup)
         record["status"] = str(status[0]) if status else str(TrackStatus.OK)
         crossed = ["crosses"] if record["nearest_nm"] < setup.near_nm else []
@@ -212,6 +210,7 @@ def _record(
     rows: TrackRows,
     good: TrackRows,
     placed: TrackRows,
+    found: Diffusion | None,
     setup: TrackSetup,
     power: float,
     correlation: Correlation | None,
@@ -245,7 +244,6 @@ def _record(
     scale = _scale_error(record, told)
     record["short_way"] = told < _LITTLE_TOLD and scale > 2 * _VAGUE
     record["contrast"] = record["mass_kda"] * of_known(np.median, rows.contrast / rows.mass_kda)
-    found = _diffusion(placed, setup)
     if setup.frame_rate_hz is not None:
         record["n_d_frames"] = 0 if found is None else found.n_positions
     if found is not None:
@@ -345,24 +343,29 @@ def _size(record: Mapping[str, Any], setup: TrackSetup) -> dict[str, float]:
     return size
 
 
-def _tested(
+def _motions(
     places: Mapping[int, TrackRows],
     setup: TrackSetup,
     seed: int,
     workers: int,
     progress: Progress,
-) -> dict[int, dict[str, float]]:
-    """Test the motion of tracks, of some where that is interrupted."""
+) -> dict[int, tuple[Diffusion | None, dict[str, float]]]:
+    """Give D of tracks and the tests of their motion, of some where that is interrupted."""
 
-    def test(track: int) -> dict[str, float]:
-        return _tests(places[track], setup, np.random.default_rng([seed, track]))
+    def motion(track: int) -> tuple[Diffusion | None, dict[str, float]]:
+        found = _diffusion(places[track], setup)
+        if found is None:
+            return None, {}
+        return found, _tests(places[track], setup, np.random.default_rng([seed, track]))
 
-    tested = {}
+    motions = {}
     with threads(workers) as pool, suppress(KeyboardInterrupt):
-        for track, found in zip(places, pool.map(test, places), strict=True):
-            tested[track] = found
-            progress("tracks", len(tested), len(places))
-    return tested
+        for track, found in zip(places, pool.map(motion, places), strict=True):
+            motions[track] = found
+            progress("tracks", len(motions), len(places))
+    for track in places.keys() - motions.keys():
+        motions[track] = _diffusion(places[track], setup), {}
+    return motions
 
 
 def _tests(placed: TrackRows, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:
