@@ -84,39 +84,32 @@ def _add_curvature(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _left_over(data: FloatArray, here: FloatArray, numbers: FloatArray) -> None:
-    """Fill χ², pixels, largest residual and mean light of a square."""
-    chi2 = used = worst = light = 0.0
+def _left_over(data: FloatArray, here: FloatArray, amplitude: float, numbers: FloatArray) -> None:
+    """Fill the last five numbers of a row.
+
+    Where s = a P + a² Q, a ∂²s/∂a² is 2 (∂s/∂a − s/a).
+    """
+    chi2 = used = worst = light = known = more = 0.0
+    inverse = 1.0 / amplitude if amplitude != 0.0 else 0.0
     for i in range(data.shape[1]):
-        d0, d1, d2, d3, s = data[0, i], data[1, i], data[2, i], data[3, i], here[i, 0]
+        d0, d1, d2, d3 = data[0, i], data[1, i], data[2, i], data[3, i]
+        s, ga = here[i, 0], here[i, 4]
         for j in range(s.size):
             rate = d1[j] + d2[j] * s[j] + d3[j]
-            left = (d0[j] - rate) * (d0[j] - rate) / max(rate, FLOOR)
+            per = 1.0 / max(rate, FLOOR)
+            left = (d0[j] - rate) * (d0[j] - rate) * per
             chi2 += left
             worst = max(worst, left)
             used += 1.0 if d2[j] > 0 else 0.0
             light += d2[j]
-    numbers[0], numbers[1] = chi2, used
-    numbers[2], numbers[3] = np.sqrt(worst), light / max(used, 1.0)
-
-
-@kernel(fastmath=FAST, _nrt=False)
-def _growth(data: FloatArray, here: FloatArray, amplitude: float) -> float:
-    """∂ ln F/∂ ln a of the information F on the amplitude a.
-
-    Where s = a P + a² Q, a ∂²s/∂a² is 2 (∂s/∂a − s/a).
-    """
-    known = more = 0.0
-    inverse = 1.0 / amplitude if amplitude != 0.0 else 0.0
-    for i in range(data.shape[1]):
-        d1, d2, d3, s, ga = data[1, i], data[2, i], data[3, i], here[i, 0], here[i, 4]
-        for j in range(s.size):
             slope = d2[j] * ga[j]
-            change = slope / max(d1[j] + d2[j] * s[j] + d3[j], FLOOR)
-            bend = 4.0 * (ga[j] - inverse * s[j])
+            change = slope * per
             known += change * slope
-            more += change * (d2[j] * bend - amplitude * change * slope)
-    return more / known if known > 0.0 else 0.0
+            bend = 4.0 * d2[j] * (ga[j] - inverse * s[j])
+            more += change * (bend - amplitude * change * slope)
+    numbers[0], numbers[1], numbers[2] = chi2, used, np.sqrt(worst)
+    numbers[3] = light / max(used, 1.0)
+    numbers[4] = more / known if known > 0.0 else 0.0
 
 
 @kernel()
@@ -167,7 +160,7 @@ def judge_frames(
     index = np.flatnonzero(free[:4])
     image = np.empty(max(field.drawn, field.side) ** 2)
     square = np.empty(4 * field.side**2)
-    g, work = np.empty(5 * field.side**2), np.empty(BENDS * field.side**2)
+    g, work = np.empty(BENDS * field.side**2), np.empty(10 * field.side**2)
     pull, known = np.empty(5), np.empty((5, 5))
     ways_here = np.empty((4, index.size))
     for t in range(first, last):
@@ -183,8 +176,7 @@ def judge_frames(
                 continue
             ny, nx = r1 - r0, c1 - c0
             pixels = cut(field.pixels, r0, r1, c0, c1)
-            here = g[: 5 * ny * nx].reshape(ny, 5, nx)
-            draw_gradient(near, group[r], p, pixels, profile, here)
+            here = _draw(near, lens_of(near, group[r]), group[r], p, pixels, profile, g)
             data = square[: 4 * ny * nx].reshape(4, ny, nx)
             stage(light, t, canvas.total[t], here, r0, c0, data)
             slopes.squares[r] = r0, r1, c0, c1
@@ -194,8 +186,7 @@ def judge_frames(
                 for j in range(4):
                     f[i, j] = known[i, j]
             numbers[r, 0] = value
-            _left_over(data, here, numbers[r, 1:5])
-            numbers[r, 5] = _growth(data, here, p[3])
+            _left_over(data, here, p[3], numbers[r, 1:])
             if not _directions(f, index, ways_here):
                 continue
             if PART * np.abs(ways_here[:2]).max() > field.pixel_nm:  # as good as singular
@@ -203,11 +194,29 @@ def judge_frames(
             for k in range(index.size):
                 for a in range(4):
                     ways[r, a, k] = ways_here[a, k]
-            lens = lens_of(near, group[r])
             _curve(
-                near, lens, group[r], free, pixels, data, here, p, ways_here, profile, work,
-                turned[r], bias[r],
+                near, lens_of(near, group[r]), group[r], free, pixels, data, here, p, ways_here,
+                profile, work, turned[r], bias[r],
             )  # fmt: skip
+
+
+@kernel()
+def _draw(
+    near: Pictures, lens: Lens, group: int, p: FloatArray, pixels: Pixels, profile: FloatArray,
+    room: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """Draw signal and gradient of a row (ny, 5, nx), and at one height what bends (ny, BENDS, nx).
+
+    What a lens leaves out depends on its type.
+    """
+    ny, nx = pixels.y.size, pixels.x.size
+    if len(lens) == STAMP:
+        bends = room[: BENDS * ny * nx].reshape(ny, BENDS, nx)
+        stamp_bends(near.nodes, lens, pixels, p[0], p[1], p[3], bends)
+        return bends
+    here = room[: 5 * ny * nx].reshape(ny, 5, nx)
+    draw_gradient(near, group, p, pixels, profile, here)
+    return here
 
 
 @kernel()
@@ -222,9 +231,7 @@ def _curve(
     """
     ny, nx = pixels.y.size, pixels.x.size
     if len(lens) == STAMP:
-        bends = work[: BENDS * ny * nx].reshape(ny, BENDS, nx)
-        stamp_bends(near.nodes, lens, pixels, p[0], p[1], p[3], bends)
-        _curve_at_one_height(data, bends, ways, turned, bias)
+        _curve_at_one_height(data, here, ways, turned, bias)
         return
     low = near.first_nm
     high = low + near.step_nm * (near.heights.shape[1] - 1)
@@ -277,8 +284,8 @@ def _observe(data: FloatArray, bends: FloatArray, spread: FloatArray, sums: Floa
     vxy, vxa, vya = 2.0 * spread[0, 1], 2.0 * spread[0, 3], 2.0 * spread[1, 3]
     for i in range(data.shape[1]):
         d0, d1, d2, d3 = data[0, i], data[1, i], data[2, i], data[3, i]
-        s, gx, gy, ga = bends[i, 0], bends[i, 1], bends[i, 2], bends[i, 3]
-        gxx, gxy, gyy = bends[i, 4], bends[i, 5], bends[i, 6]
+        s, gx, gy, ga = bends[i, 0], bends[i, 1], bends[i, 2], bends[i, 4]
+        gxx, gxy, gyy = bends[i, 3], bends[i, 5], bends[i, 6]
         gxa, gya, gaa = bends[i, 7], bends[i, 8], bends[i, 9]
         for j in range(s.size):
             per = 1.0 / max(d1[j] + d2[j] * s[j] + d3[j], FLOOR)

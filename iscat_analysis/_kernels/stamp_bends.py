@@ -30,7 +30,10 @@ if TYPE_CHECKING:
     from iscat_analysis._kernels.lens import StampLens
 
 BENDS = 10
-"""Rows that a row of pixels fills: s, ∂x, ∂y, ∂a, ∂xx, ∂xy, ∂yy, ∂xa, ∂ya, ∂aa of it."""
+"""Rows that a row of pixels fills: s, ∂x, ∂y, ∂xx, ∂a, ∂xy, ∂yy, ∂xa, ∂ya, ∂aa of it.
+
+The first five are those of `signal_gradient`, with ∂xx in the place of ∂z, which is none.
+"""
 
 _SUMS = 5  # of nodes, mixed along y
 _IMAGES = 9  # mixed along x as well
@@ -150,9 +153,9 @@ def _put(lens: StampLens, amplitude: float, images: AnyFloatArray, out: FloatArr
             for j in range(n):
                 image[j] = factor * made[j]
         twice = 2.0 / (amplitude * amplitude) if amplitude else 0.0
-        signal, slope, bend = here[0], here[3], here[9]
+        signal, slope, bend = here[0], here[4], here[9]
         for j in range(n):
             bend[j] = twice * (amplitude * slope[j] - signal[j])
 
 
-_PLACES = (0, 1, 4, 2, 5, 6, 3, 7, 8)  # of the images in a row of pixels
+_PLACES = (0, 1, 3, 2, 5, 6, 4, 7, 8)  # of the images in a row of pixels

@@ -35,6 +35,7 @@ _ABOUT = {
     "residuals": "the goodness of fits",
     "score_test": "the goodness of fits",
     "scoring": "fits",
+    "sharing": "the precision of tracks",
     "sliding": "sums of frames",
     "stepping": "sums of frames",
 }
