@@ -7,7 +7,7 @@ another's squares: each of two takes up a part of what both see, and alone would
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from iscat_analysis._kernels.dense import factorise
 from iscat_analysis._kernels.lattice import FAST
 
 FloatArray = NDArray[np.float64]
+AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 
 _STIFFER, _STIFFEST = 1e-3, 1.0
@@ -71,10 +72,56 @@ def keep_slopes(
     """Fill `out` (k, pixels) with level × gradient of the free parameters."""
     ny, nx = level.shape
     for k in range(index.size):
-        parameter = 1 + index[k]
-        for i in range(ny):
+        for i in range(ny):  # lines by themselves are what the compiler makes vectors of
+            line, light = out[k, i * nx : (i + 1) * nx], level[i]
+            slope = gradient[i, 1 + index[k]]
             for j in range(nx):
-                out[k, i * nx + j] = level[i, j] * gradient[i, parameter, j]
+                line[j] = light[j] * slope[j]
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def look(image: FloatArray, square: IntArray, out: AnyFloatArray) -> int:
+    """Fill `out` with the pixels of a square, line after line, and tell how many they are."""
+    r0, r1, c0, c1 = square
+    nx = c1 - c0
+    for i in range(r1 - r0):
+        line, there = out[i * nx : (i + 1) * nx], image[r0 + i, c0:c1]
+        for j in range(nx):
+            line[j] = there[j]
+    size: int = (r1 - r0) * nx
+    return size
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def put(values: AnyFloatArray, square: IntArray, image: FloatArray) -> None:
+    """Add values, line after line, to the pixels of a square."""
+    r0, r1, c0, c1 = square
+    nx = c1 - c0
+    for i in range(r1 - r0):
+        line, there = values[i * nx : (i + 1) * nx], image[r0 + i, c0:c1]
+        for j in range(nx):
+            there[j] += line[j]
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def product(slope: AnyFloatArray, seen: AnyFloatArray, size: int) -> float:
+    """Sum the products of the first pixels, in the precision of `seen`."""
+    total = seen.dtype.type(0.0)
+    for j in range(size):
+        total += slope[j] * seen[j]
+    return float(total)
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def mix(slopes: NDArray[np.float32], by: FloatArray, size: int, out: AnyFloatArray) -> None:
+    """Fill the first pixels of `out` with slopes (k, side²) times numbers (k)."""
+    first, slope = out.dtype.type(by[0]), slopes[0]
+    for j in range(size):
+        out[j] = first * slope[j]
+    for a in range(1, by.size):
+        factor, slope = out.dtype.type(by[a]), slopes[a]
+        for j in range(size):
+            out[j] += factor * slope[j]
 
 
 @kernel()
@@ -130,6 +177,7 @@ def join_rows(
     """
     k = slopes.values.shape[1]
     block = np.empty((k, k))
+    work = np.empty((1 + 2 * k, slopes.values.shape[2]), dtype=np.float32)
     for c in range(first, last):
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
         n, t = k * rows.size, clusters.frame[c]
@@ -137,7 +185,7 @@ def join_rows(
         for a in range(rows.size):
             joint[k * a : k * (a + 1), k * a : k * (a + 1)] = information[rows[a]]
             for b in range(a):
-                if _overlap(slopes, light, t, totals[t], rows[a], rows[b], block):
+                if _overlap(slopes, light, t, totals[t], rows[a], rows[b], work, block):
                     joint[k * a : k * (a + 1), k * b : k * (b + 1)] = block
         for i in range(n):
             if joint[i, i] > 0.0:
@@ -156,52 +204,63 @@ def join_rows(
 @kernel(fastmath=FAST)
 def _overlap(
     slopes: Slopes, light: Light, t: int, total: NDArray[np.float32], r: int, s: int,
-    out: FloatArray,
+    work: NDArray[np.float32], out: FloatArray,
 ) -> bool:  # fmt: skip
-    """Fill `out` (k, k) with the information that two rows share; tell whether they do."""
+    """Fill `out` (k, k) with the information that two rows share; tell whether they do.
+
+    `work` (1 + 2 k, side²) is room.
+    """
     r0, r1, c0, c1 = slopes.squares[r]
     s0, s1, d0, d1 = slopes.squares[s]
     top, bottom, left, right = max(r0, s0), min(r1, s1), max(c0, d0), min(c1, d1)
     if top >= bottom or left >= right:
         return False
-    k, width = out.shape[0], right - left
-    weight, weighted = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
-    out[:] = 0.0
+    k, nx = out.shape[0], right - left
+    size, power = (bottom - top) * nx, light.power[t]
     for i in range(top, bottom):
-        for j in range(width):
-            level = light.power[t] * light.background[i, left + j]
-            variance = level * (1.0 + total[i, left + j]) + light.read[i, left + j]
+        weight = work[0, (i - top) * nx : (i - top + 1) * nx]
+        background, read = light.background[i, left:right], light.read[i, left:right]
+        others = total[i, left:right]
+        for j in range(nx):
+            variance = power * background[j] * (1.0 + others[j]) + read[j]
             weight[j] = 1.0 / variance if variance > 0.0 else 0.0
-        mine, theirs = (i - r0) * (c1 - c0) + left - c0, (i - s0) * (d1 - d0) + left - d0
-        for a in range(k):
-            for j in range(width):
-                weighted[j] = weight[j] * slopes.values[r, a, mine + j]
-            for b in range(k):
-                felt = np.float32(0.0)
-                for j in range(width):
-                    felt += weighted[j] * slopes.values[s, b, theirs + j]
-                out[a, b] += felt
+    for a in range(k):
+        _look_at_part(slopes.values[r, a], c1 - c0, top - r0, left - c0, nx, size, work[1 + a])
+        _look_at_part(slopes.values[s, a], d1 - d0, top - s0, left - d0, nx, size, work[1 + k + a])
+        mine = work[1 + a]
+        for j in range(size):
+            mine[j] *= work[0, j]
+    for a in range(k):
+        for b in range(k):
+            out[a, b] = product(work[1 + a], work[1 + k + b], size)
     return True
 
 
+@kernel(fastmath=FAST, _nrt=False)
+def _look_at_part(
+    slope: NDArray[np.float32], width: int, top: int, left: int, nx: int, size: int,
+    out: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Fill `out` with lines of nx pixels of a square that is so wide."""
+    for i in range(size // nx):
+        line, there = out[i * nx : (i + 1) * nx], slope[(top + i) * width + left :]
+        for j in range(nx):
+            line[j] = there[j]
+
+
 @kernel(fastmath=FAST)
-def _shift(slopes: Slopes, clusters: Clusters, c: int, move: FloatArray) -> FloatArray:
-    """F⁻¹ G move of a cluster, shape (its rows × k,)."""
+def _shift(
+    slopes: Slopes, clusters: Clusters, c: int, move: FloatArray, seen: NDArray[np.float32]
+) -> FloatArray:
+    """F⁻¹ G move of a cluster, shape (its rows × k,); `seen` is room for a square."""
     rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
     k = slopes.values.shape[1]
     n = k * rows.size
     step = np.empty(n)
     for q in range(rows.size):
-        r0, r1, c0, c1 = slopes.squares[rows[q]]
-        nx = c1 - c0
+        size = look(move, slopes.squares[rows[q]], seen)
         for a in range(k):
-            felt = np.float32(0.0)
-            for i in range(r1 - r0):
-                slope = slopes.values[rows[q], a, i * nx : (i + 1) * nx]
-                here = move[r0 + i, c0:c1]
-                for j in range(nx):
-                    felt += slope[j] * np.float32(here[j])
-            step[k * q + a] = felt
+            step[k * q + a] = product(slopes.values[rows[q], a], seen, size)
     low = clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n)
     for i in range(n):
         for j in range(i):
@@ -232,19 +291,15 @@ def follow_rows(
         Σ Gᵀ F⁻¹ G move is added to it [e].
     """
     k = slopes.values.shape[1]
+    seen = np.empty(slopes.values.shape[2], dtype=np.float32)
     for c in range(first, last):
-        step = _shift(slopes, clusters, c, move)
+        step = _shift(slopes, clusters, c, move, seen)
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
         for q in range(rows.size):
-            r0, r1, c0, c1 = slopes.squares[rows[q]]
-            nx = c1 - c0
-            for a in range(k):
-                by = step[k * q + a]
-                for i in range(r1 - r0):
-                    slope = slopes.values[rows[q], a, i * nx : (i + 1) * nx]
-                    here = out[r0 + i, c0:c1]
-                    for j in range(nx):
-                        here[j] += by * slope[j]
+            square = slopes.squares[rows[q]]
+            size = (square[1] - square[0]) * (square[3] - square[2])
+            mix(slopes.values[rows[q]], step[k * q : k * (q + 1)], size, seen)
+            put(seen, square, out)
 
 
 @kernel()
@@ -270,8 +325,9 @@ def shift_rows(
         Moved.
     """
     k = index.size
+    seen = np.empty(slopes.values.shape[2], dtype=np.float32)
     for c in range(first, last):
-        step = _shift(slopes, clusters, c, move)
+        step = _shift(slopes, clusters, c, move, seen)
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
         for q in range(rows.size):
             for a in range(k):

@@ -36,12 +36,9 @@ class Coupling:
     ) -> None:
         self._slopes, self._rows = judged.slopes, rows
         squares = judged.slopes.squares[rows]
-        squares = squares[squares[:, 1] > squares[:, 0]]
-        if not squares.size:  # none is in the field
-            squares = np.zeros((1, 4), dtype=np.int64)
-        top, bottom = int(squares[:, 0].min()), int(squares[:, 1].max())
-        left, right = int(squares[:, 2].min()), int(squares[:, 3].max())
-        self._corner = top, left
+        top, left = squares[:, 0].min(), squares[:, 2].min()
+        bottom, right = squares[:, 1].max(), squares[:, 3].max()
+        self._squares = squares - np.array([top, top, left, left])
         cut = slice(top, bottom), slice(left, right)
         level = ground.level[cut]
         share = np.where(field.used[cut], level / (level + field.read_e2[cut]), 0.0)
@@ -63,7 +60,7 @@ class Coupling:
         """
         free = self._slopes.values.shape[1]
         out = np.zeros((len(self._rows), free, free))
-        own_shares(self._slopes, self._rows, self._corner, self._weight, out)
+        own_shares(self._slopes, self._rows, self._squares, self._weight, out)
         return out
 
     def sent(self, by: FloatArray) -> FloatArray:
@@ -80,7 +77,7 @@ class Coupling:
             Images.
         """
         out = np.zeros((by.shape[1], *self._weight.shape))
-        send(self._slopes, self._rows, self._corner, by, out)
+        send(self._slopes, self._rows, self._squares, by, out)
         return (out * self._sigma).reshape(len(out), -1)
 
     def followed(self, covariance: FloatArray, images: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -103,5 +100,5 @@ class Coupling:
         seen = images.reshape(-1, *self._weight.shape) * self._sigma
         felt = np.zeros((len(self._rows), len(images), covariance.shape[1]))
         out = np.zeros_like(seen)
-        follow(self._slopes, self._rows, self._corner, covariance, seen, felt, out)
+        follow(self._slopes, self._rows, self._squares, covariance, seen, felt, out)
         return felt, (out * self._sigma).reshape(images.shape)
