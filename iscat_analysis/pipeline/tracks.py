@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from iscat_analysis.config import Config
@@ -17,6 +17,7 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.movie.background import add_frames, start_power
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
+from iscat_analysis.optics.drawing import signals_within
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.materials import material
 from iscat_analysis.pipeline.moving_field import exposure_of
@@ -342,20 +343,23 @@ def make_films(
         The best first.
     """
     numbers = track_numbers(fits)
-    models, of_film = _models(scene, tracks), fits[list(_OF_FILM)].assign(track=numbers)
+    of_film = fits[list(_OF_FILM)].assign(track=numbers)
     chosen = [
         (track, why, _shown(of_film[of_film["track"] == track].sort_values("frame"), worst))
         for track, why, worst in _chosen(tracks)
     ]
     chosen = [film for film in chosen if len(film[2])]
     frames = np.unique([t for *_, rows in chosen for t in rows["frame"]])
-    known = fits["frame"].isin(frames) & numbers.isin(models.keys()) & fits["mass_kda"].notna()
+    known = fits["frame"].isin(frames) & fits["mass_kda"].notna()
     frame, x, y, z, mass = (fits.loc[known, name].to_numpy() for name in _PLACE)
     z = np.clip(z, *scene.wide.z_range_nm)
     theta = np.column_stack([x, y, z, scene.wide.scale.amplitudes(mass)])
-    seen: dict[int, list[_Seen]] = defaultdict(list)
-    for t, track, place in zip(frame.tolist(), numbers[known], theta.tolist(), strict=True):
-        seen[t].append(_Seen(models[track], *place))
+    of_row = numbers[known].to_numpy()
+    seen = [
+        _Seen(model, frame[mine], theta[mine])
+        for track, model in _models(scene, tracks).items()
+        if (mine := of_row == track).any()
+    ]
     return tuple(_film(scene, movie, camera, windows, seen, *film) for film in chosen)
 
 
@@ -403,38 +407,57 @@ def _shown(rows: pd.DataFrame, worst: bool) -> pd.DataFrame:
     return rows.iloc[start : start + FILM_FRAMES]
 
 
+class _Seen(NamedTuple):
+    """A particle: its model, frames, and places in them [nm] with its amplitude, shape (n, 4)."""
+
+    model: ForwardModel
+    frame: NDArray[np.int64]
+    theta: FloatArray
+
+
 def _film(
     scene: Scene,
     movie: FrameSource,
     camera: Camera,
     windows: Sequence[Windows],
-    seen: Mapping[int, Sequence[_Seen]],
+    seen: Sequence[_Seen],
     track: int,
     why: str,
     shown: pd.DataFrame,
 ) -> Film:
-    """Draw some frames of a track."""
-    region = _square(scene, windows[0], shown)
-    pictures = []
-    for frame in shown["frame"].to_numpy(int):
-        here = next(
-            (w for w in windows if w.frames_after[0] <= frame < w.frames_after[1]), windows[0]
+    """Draw data, model and residual of some frames of a track, with all particles in them."""
+    region, frames = _square(scene, windows[0], shown), shown["frame"].to_numpy(int)
+    grid = PixelGrid.region(region.rows, region.columns, scene.pixel_nm)
+    data, model, residual = np.zeros((3, len(frames), *region.shape))
+    for particle in seen:
+        here = np.isin(particle.frame, frames)
+        place = np.searchsorted(frames, particle.frame[here])
+        model[place] += signals_within(particle.model, grid, particle.theta[here])
+    for number, frame in enumerate(frames.tolist()):
+        likelihood = region_likelihood(
+            scene, _single(scene, movie, camera, windows, frame), region, None
         )
-        single = add_frames(here, camera, movie.read(frame, frame + 1), frame)
-        if scene.config.background.power_normalization:
-            single = _at_its_power(scene, here, single)
-        pictures.append(_picture(scene, single, region, seen.get(frame, ())))
-    contrast, model, residual = (np.array(part) for part in zip(*pictures, strict=True))
-    return Film(track, tuple(shown["frame"].astype(int)), why, contrast, model, residual)
+        data[number] = likelihood.measured_signal()
+        information = likelihood.signal_information(model[number])
+        residual[number] = (data[number] - model[number]) * np.sqrt(information)
+        if scene.additive:
+            data[number] *= likelihood.data[2]
+            model[number] *= likelihood.data[2]
+    return Film(track, tuple(frames.tolist()), why, data, model, residual)
 
 
-def _at_its_power(scene: Scene, windows: Windows, single: Windows) -> Windows:
-    """Give a frame its power: what was learnt with the tracks, or what its pixels say."""
+def _single(
+    scene: Scene, movie: FrameSource, camera: Camera, windows: Sequence[Windows], frame: int
+) -> Windows:
+    """Give a frame over its background, at its power: as learnt with the tracks, or as it says."""
+    here = next((w for w in windows if w.frames_after[0] <= frame < w.frames_after[1]), windows[0])
+    single = add_frames(here, camera, movie.read(frame, frame + 1), frame)
+    if not scene.config.background.power_normalization:
+        return single
     if way_of(scene.config) != "tracks":
         return start_power(single)
-    before, after = np.split(windows.power, [windows.n_before])
-    frame = single.frames_after[0] - windows.frames_after[0]
-    return replace(single, power_ratio=float(after[frame] / before.sum()))
+    before, after = np.split(here.power, [here.n_before])
+    return replace(single, power_ratio=float(after[frame - here.frames_after[0]] / before.sum()))
 
 
 def _square(scene: Scene, windows: Windows, rows: pd.DataFrame) -> Region:
@@ -446,37 +469,3 @@ def _square(scene: Scene, windows: Windows, rows: pd.DataFrame) -> Region:
         low = int(np.clip(round(middle - side / 2), 0, size - side))
         spans.append((low, low + side))
     return Region(*spans)
-
-
-class _Seen(NamedTuple):
-    """A particle in a frame [nm], and its amplitude."""
-
-    model: ForwardModel
-    x: float
-    y: float
-    z: float
-    amplitude: float
-
-    def image(self, grid: PixelGrid) -> FloatArray | float:
-        """Draw it; 0 where it is too far away."""
-        far = [
-            max(abs(place - axis[0]), abs(place - axis[-1])) + grid.pixel_nm
-            for place, axis in ((self.x, grid.x_nm), (self.y, grid.y_nm))
-        ]
-        if math.hypot(*far) >= self.model.reach_nm:
-            return 0.0
-        return self.model.amplitude_image(grid, self.x, self.y, self.z, self.amplitude)
-
-
-def _picture(
-    scene: Scene, single: Windows, region: Region, here: Sequence[_Seen]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Draw data, model and residual of one frame, with all particles whose light is known there."""
-    likelihood = region_likelihood(scene, single, region, None)
-    model, grid = np.zeros(region.shape), likelihood.grid
-    for particle in here:
-        model += particle.image(grid)
-    data = likelihood.measured_signal()
-    residual = (data - model) * np.sqrt(likelihood.signal_information(model))
-    unit = likelihood.data[2] if scene.additive else 1.0
-    return data * unit, model * unit, residual

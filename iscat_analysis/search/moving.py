@@ -176,21 +176,14 @@ class FrameFilter:
         In each round the first of every frame that remains is taken, and its side lobes go.
         """
         kept = np.zeros(len(frame), dtype=bool)
+        sure = ~self._are_left_over(frame.astype(np.int64), height, x, y, known)
         left = np.arange(len(frame))
         while left.size:
             begins = np.diff(frame[left], prepend=-1) > 0
             tops = left[begins]
-            if any(map(len, known)):
-                columns = (v[tops].tolist() for v in (height, x, y, frame))
-                sure = np.array([
-                    not self._is_left_over(peak, px, py, known[int(t)])
-                    for peak, px, py, t in zip(*columns, strict=True)
-                ])  # fmt: skip
-            else:
-                sure = np.ones(len(tops), dtype=bool)
-            kept[tops[sure]] = True
-            of = np.cumsum(begins) - 1
-            hides = sure[of] & self._is_lobe(height, x, y, left, tops[of])
+            kept[tops] = sure[tops]
+            top = tops[np.cumsum(begins) - 1]
+            hides = sure[top] & self._is_lobe(height, x, y, left, top)
             left = left[~(begins | hides)]
         return kept
 
@@ -204,15 +197,24 @@ class FrameFilter:
         lobe |= np.hypot(apart_x, apart_y) < NEAR * self._roi_px
         return np.asarray(lobe | beside if self._cautious else lobe)
 
-    def _is_left_over(self, height: float, x: float, y: float, known: FloatArray) -> bool:
-        """Whether a peak may be what the model leaves over of a particle that is known."""
-        if not len(known):
-            return False
-        away = np.hypot(known[:, 0] - x, known[:, 1] - y)
+    def _are_left_over(
+        self,
+        frame: IntArray,
+        height: FloatArray,
+        x: FloatArray,
+        y: FloatArray,
+        known: list[FloatArray],
+    ) -> BoolArray:
+        """Tell which peaks may be what the model leaves over of particles that are known."""
+        places = np.full((len(known), max(map(len, known)), 3), np.nan)
+        for row, there in zip(places, known, strict=True):
+            row[: len(there)] = there
+        known_x, known_y, known_height = np.moveaxis(places[frame], 2, 0)
+        away = np.hypot(known_x - x[:, None], known_y - y[:, None])
         if self._cautious:
-            return bool(away.min() < self._roi_px)
-        near = away < NEAR * self._roi_px
-        return bool(np.any(near & (height < LEFT_OVER * known[:, 2])))
+            return np.asarray((away < self._roi_px).any(axis=1))
+        over = (away < NEAR * self._roi_px) & (height[:, None] < LEFT_OVER * known_height)
+        return np.asarray(over.any(axis=1))
 
     def _snr(self, residual_e: NDArray[np.float32], power: FloatArray) -> NDArray[np.float32]:
         """Give the signal-to-noise ratio of each template at each pixel, shape (n, k, y, x)."""

@@ -46,7 +46,7 @@ def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> N
     for offset in sorted(offsets, key=lambda o: sum(map(abs, o))):  # the nearest leave few others
         beside = at
         for axis in np.flatnonzero(offset):  # at an edge, the outermost pixel
-            moved = np.clip(place[axis] + offset[axis], 0, fields.shape[axis] - 1)
+            moved = np.minimum(np.maximum(place[axis] + offset[axis], 0), fields.shape[axis] - 1)
             beside = beside + apart[axis] * (moved - place[axis])
         kept = values[at] >= values[beside]
         at, place = at[kept], place[:, kept]
@@ -129,7 +129,8 @@ def vertices(lines: NDArray[Any], index: NDArray[np.int64]) -> tuple[FloatArray,
         Height of the vertex above the maximum.
     """
     each, last = np.arange(len(lines)), lines.shape[1] - 1
-    low, mid, high = (lines[each, np.clip(index + k, 0, last)] for k in (-1, 0, 1))
+    before, after = np.maximum(index - 1, 0), np.minimum(index + 1, last)
+    low, mid, high = (lines[each, place] for place in (before, index, after))
     inner = (index > 0) & (index < last) & np.isfinite(low) & np.isfinite(high)
     low, high = np.where(inner, low, mid), np.where(inner, high, mid)
     bend = low - 2 * mid + high

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ from golden_setups import CASES, GOLD, NAMES, PAPER, golden_config, reference_se
 
 from iscat_analysis.bounds import plan
 from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.collected import collected_area_nm2
+from iscat_analysis.optics.drawing import signals_within
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 
 GOLDEN_FIELD = 1e-6  # precision promised by the golden files
@@ -247,3 +250,17 @@ def test_paper_scale_is_the_authors() -> None:
     experiment = plan(config)
     photons = experiment.on_camera * experiment.model.reference**2
     assert photons == pytest.approx(0.0037588628833613463, rel=1e-8)
+
+
+def test_of_particles_drawn_together_those_out_of_reach_are_left_out() -> None:
+    _, model = build({})
+    side = GRID.shape[0] / 2 * GRID.pixel_nm
+    edge = math.sqrt(model.reach_nm**2 - side**2) - side  # along x, of what the model reaches
+    theta = np.array([[0, 0, 100, 60], [edge - 1, 0, 50, 40], [edge + 1, 0, 50, 40.0]])
+    drawn = signals_within(model, GRID, theta)
+    for image, place in zip(drawn[:2], theta[:2], strict=True):
+        assert np.array_equal(image, model.amplitude_image(GRID, *place))
+        assert np.abs(image).max() > 0
+    assert not drawn[2].any()
+    with pytest.raises(ConfigError, match="reach_nm"):
+        model.amplitude_image(GRID, *theta[2])
