@@ -83,13 +83,14 @@ def _add_curvature(
         bias[3] -= 0.5 * b3 / PART**2
 
 
-@kernel(fastmath=FAST, _nrt=False)
+@kernel(fastmath=FAST)
 def _left_over(data: FloatArray, here: FloatArray, amplitude: float, numbers: FloatArray) -> None:
     """Fill the last five numbers of a row.
 
     Where s = a P + a² Q, a ∂²s/∂a² is 2 (∂s/∂a − s/a).
     """
-    chi2 = used = worst = light = known = more = 0.0
+    chi2 = used = light = known = more = 0.0
+    worst = np.zeros(data.shape[2])  # of each column: one for all would keep the loop from vectors
     inverse = 1.0 / amplitude if amplitude != 0.0 else 0.0
     for i in range(data.shape[1]):
         d0, d1, d2, d3 = data[0, i], data[1, i], data[2, i], data[3, i]
@@ -99,7 +100,7 @@ def _left_over(data: FloatArray, here: FloatArray, amplitude: float, numbers: Fl
             per = 1.0 / max(rate, FLOOR)
             left = (d0[j] - rate) * (d0[j] - rate) * per
             chi2 += left
-            worst = max(worst, left)
+            worst[j] = max(worst[j], left)
             used += 1.0 if d2[j] > 0 else 0.0
             light += d2[j]
             slope = d2[j] * ga[j]
@@ -107,7 +108,7 @@ def _left_over(data: FloatArray, here: FloatArray, amplitude: float, numbers: Fl
             known += change * slope
             bend = 4.0 * d2[j] * (ga[j] - inverse * s[j])
             more += change * (bend - amplitude * change * slope)
-    numbers[0], numbers[1], numbers[2] = chi2, used, np.sqrt(worst)
+    numbers[0], numbers[1], numbers[2] = chi2, used, np.sqrt(worst.max())
     numbers[3] = light / max(used, 1.0)
     numbers[4] = more / known if known > 0.0 else 0.0
 
