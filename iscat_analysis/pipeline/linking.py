@@ -277,18 +277,18 @@ def held(config: Config, field: MovingField, rows: Rows) -> tuple[Rows, int]:
     reach = config.optics.wavelength_nm / config.optics.na
     frame, track, theta, group = [], [], [], []
     for k in np.unique(rows.track):
-        mine = rows.only(rows.track == k)
-        if _step_nm2(mine) * _BRIDGE_FRAMES > reach**2:
+        mine = np.flatnonzero(rows.track == k)
+        if _step_nm2(rows, mine) * _BRIDGE_FRAMES > reach**2:
             continue
-        middle = float(np.median(mine.theta[:, 3]))
-        for end, way in ((0, -1), (-1, 1)):
-            first = int(mine.frame[end])
+        middle = float(np.median(rows.theta[mine, 3]))
+        for end, way in ((mine[0], -1), (mine[-1], 1)):
+            first = int(rows.frame[end])
             held = np.clip(first + way * np.arange(1, _BRIDGE_FRAMES + 1), 0, field.frames - 1)
             for t in np.unique(held[held != first]):
                 frame.append(int(t))
                 track.append(int(k))
-                theta.append(np.append(mine.theta[end, :3], [middle, 0.0]))
-                group.append(int(mine.group[end]))
+                theta.append(np.append(rows.theta[end, :3], [middle, 0.0]))
+                group.append(int(rows.group[end]))
     if not frame:
         return rows, 0
     frames, tracks, groups = (np.array(v, dtype=np.int64) for v in (frame, track, group))
@@ -431,7 +431,7 @@ def bridge(config: Config, rows: Rows) -> IntArray:
     reach = config.optics.wavelength_nm / config.optics.na
     tracks = [np.flatnonzero(rows.track == k) for k in np.unique(rows.track)]
     last, first = (np.array([mine[end] for mine in tracks], dtype=np.int64) for end in (-1, 0))
-    square = np.array([_step_nm2(rows.only(mine)) for mine in tracks])
+    square = np.array([_step_nm2(rows, mine) for mine in tracks])
     gap = rows.frame[first] - rows.frame[last][:, None]
     apart = scipy.spatial.distance.cdist(rows.theta[last, :2], rows.theta[first, :2])
     may = (gap > 0) & (gap <= _BRIDGE_FRAMES + 1) & (apart < reach)
@@ -444,10 +444,10 @@ def bridge(config: Config, rows: Rows) -> IntArray:
     return track
 
 
-def _step_nm2(rows: Rows) -> float:
+def _step_nm2(rows: Rows, mine: IntArray) -> float:
     """Return the mean square of a track's steps from frame to frame, from its median."""
-    next_ = np.diff(rows.frame) == 1
-    steps = np.diff(rows.theta[:, :2], axis=0)[next_]
+    next_ = np.diff(rows.frame[mine]) == 1
+    steps = np.diff(rows.theta[mine, :2], axis=0)[next_]
     return float(np.median((steps**2).sum(axis=1)) / np.log(2)) if len(steps) else np.inf
 
 

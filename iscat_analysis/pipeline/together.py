@@ -93,8 +93,9 @@ def warnings_of(fits: pd.DataFrame, frame_rate_hz: float | None) -> Iterator[str
 def _steps_of(fits: pd.DataFrame) -> _Steps | None:
     """Gather the steps of all tracks; None where too few particles are seen at once."""
     sound = fits["status"].eq(Status.OK).groupby(fits["track"]).transform("mean") > _SOUND
-    good = fits[sound & ~fits["status"].isin(NO_PLACE)].sort_values(["track", "frame"])
-    step = good[["track", "frame", "x_nm", "y_nm"]].diff()
+    good = fits.loc[sound & ~fits["status"].isin(NO_PLACE), ["track", "frame", "x_nm", "y_nm"]]
+    good = good.sort_values(["track", "frame"])
+    step = good.diff()
     next_ = ((step["track"] == 0) & (step["frame"] == 1)).to_numpy()
     xy = step.loc[next_, ["x_nm", "y_nm"]].to_numpy(float)
     track, frame = (good.loc[next_, name].to_numpy(dtype=np.int64) for name in ("track", "frame"))

@@ -351,7 +351,8 @@ def make_films(
     chosen = [film for film in chosen if len(film[2])]
     frames = np.unique([t for *_, rows in chosen for t in rows["frame"]])
     known = fits["frame"].isin(frames) & fits["mass_kda"].notna()
-    frame, x, y, z, mass = (fits.loc[known, name].to_numpy() for name in _PLACE)
+    there = fits.loc[known, list(_PLACE)]
+    frame, x, y, z, mass = (there[name].to_numpy() for name in _PLACE)
     z = np.clip(z, *scene.wide.z_range_nm)
     theta = np.column_stack([x, y, z, scene.wide.scale.amplitudes(mass)])
     of_row = numbers[known].to_numpy()
