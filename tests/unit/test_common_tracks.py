@@ -12,7 +12,7 @@ import pytest
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.inference import common
-from iscat_analysis.inference.common import common_amplitudes, shared_errors
+from iscat_analysis.inference.common import common_amplitudes, shared_errors, variances_left
 from iscat_analysis.inference.coupling import Coupling
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Judged, Rows
@@ -265,3 +265,20 @@ def test_a_track_that_ends_is_not_made_longer(
     ground = Ground(mean[-1], np.ones(FRAMES))
     _, added = extended(field, ground, truth, resolution_nm=370.0, reach_nm=600.0)
     assert added == 0
+
+
+@pytest.mark.parametrize("index", [[0, 1, 3], [0, 1, 2, 3]])
+def test_variances_left_are_those_of_inverses_where_there_are_any(index: list[int]) -> None:
+    rng = np.random.default_rng(3)
+    units = np.array([1.0, 1.0, 1e-3, 30.0])
+    ways = rng.normal(size=(300, 6, 4)) * units
+    information = np.swapaxes(ways, 1, 2) @ ways
+    information[7], information[8], information[9] = 0.0, np.nan, -information[9]
+    information[10, 1], information[10, :, 1] = information[10, 0], information[10, :, 0]
+    information[10, 1, 1] = information[10, 0, 0]  # what cannot be told apart
+    found = variances_left(information, np.array(index))
+    assert np.isnan(found[7:11]).all()
+    assert np.isnan(np.delete(found, index, axis=1)).all()
+    sound = np.delete(np.arange(300), [7, 8, 9, 10])
+    inverse = np.linalg.inv(information[np.ix_(sound, index, index)])
+    assert found[np.ix_(sound, index)] == pytest.approx(np.einsum("nii->ni", inverse), rel=1e-9)
