@@ -25,6 +25,9 @@ _STIFFER, _STIFFEST = 1e-3, 1.0
 """What is added to F, relative to its diagonal, for rows that cannot be told from each other: the
 least, and the most where rounding makes of F what no information is."""
 
+_SHY = 0.1
+"""The same, where rows follow one another: what two of them hardly tell apart stays as it is."""
+
 
 class Slopes(NamedTuple):
     """What rows change of the light in their squares; without room, left alone.
@@ -35,10 +38,13 @@ class Slopes(NamedTuple):
         First and last row and column of each, half-open; all 0 where a row is not fitted.
     values : ndarray of float32, shape (rows, k, side²)
         G, w B ∂C for each free parameter [e per unit].
+    moves : ndarray, shape (rows, k)
+        How far the last fit of each row went.
     """
 
     squares: IntArray
     values: NDArray[np.float32]
+    moves: FloatArray
 
 
 class Clusters(NamedTuple):
@@ -56,6 +62,8 @@ class Clusters(NamedTuple):
         Where in `factors` each begins.
     factors : ndarray, shape (sum of (k rows of a cluster)²,)
         Cholesky's factors L of F = L Lᵀ.
+    steps : ndarray, shape (rows, k)
+        By what rows that overlap follow one another.
     """
 
     rows: IntArray
@@ -63,6 +71,7 @@ class Clusters(NamedTuple):
     frame: IntArray
     corners: IntArray
     factors: FloatArray
+    steps: FloatArray
 
 
 @kernel(fastmath=FAST, _nrt=False)
@@ -153,19 +162,36 @@ def find_clusters(squares: IntArray, starts: IntArray, owner: IntArray) -> None:
                         owner[q] = low
 
 
+@kernel(fastmath=FAST)
+def _divide(low: FloatArray, step: FloatArray) -> None:
+    """Multiply a step by F⁻¹, of which L is given."""
+    n = step.size
+    for i in range(n):
+        for j in range(i):
+            step[i] -= low[i, j] * step[j]
+        step[i] /= low[i, i]
+    for i in range(n - 1, -1, -1):
+        step[i] /= low[i, i]
+        for j in range(i):
+            step[j] -= low[i, j] * step[i]
+
+
 @kernel()
 def join_rows(
     slopes: Slopes, clusters: Clusters, light: Light, totals: NDArray[np.float32],
     information: FloatArray, first: int, last: int,
 ) -> None:  # fmt: skip
-    """Factorise the information on the rows of some clusters.
+    """Factorise the information on the rows of some clusters, and let these follow one another.
+
+    Each row was fitted with the others as they were then.  Those that came after it have moved
+    since, and left it a score of -Σ F Δ, which all rows of the cluster take up together.
 
     Parameters
     ----------
     slopes : Slopes
         Of all rows.
     clusters : Clusters
-        Their factors are filled.
+        Their factors and steps are filled.
     light : Light
         The movie.
     totals : ndarray of float32, shape (t, y, x)
@@ -181,12 +207,15 @@ def join_rows(
     for c in range(first, last):
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
         n, t = k * rows.size, clusters.frame[c]
-        joint, scale = np.zeros((n, n)), np.ones(n)
+        joint, scale, step = np.zeros((n, n)), np.ones(n), np.zeros(n)
         for a in range(rows.size):
             joint[k * a : k * (a + 1), k * a : k * (a + 1)] = information[rows[a]]
             for b in range(a):
                 if _overlap(slopes, light, t, totals[t], rows[a], rows[b], work, block):
                     joint[k * a : k * (a + 1), k * b : k * (b + 1)] = block
+                    for i in range(k):
+                        for j in range(k):
+                            step[k * b + j] -= block[i, j] * slopes.moves[rows[a], i]
         for i in range(n):
             if joint[i, i] > 0.0:
                 scale[i] = 1.0 / np.sqrt(joint[i, i])
@@ -196,9 +225,21 @@ def join_rows(
         stiffer = _STIFFER
         while not factorise(joint, np.arange(n), scale, stiffer, low) and stiffer < _STIFFEST:
             stiffer *= 10.0
-        for i in range(n):
-            for j in range(i + 1):
-                low[i, j] /= scale[i]
+        _unscale(low, scale)
+        if rows.size > 1:
+            shy = np.empty((n, n))
+            factorise(joint, np.arange(n), scale, max(stiffer, _SHY), shy)
+            _unscale(shy, scale)
+            _divide(shy, step)
+            clusters.steps[rows] = step.reshape(rows.size, k)
+
+
+@kernel()
+def _unscale(low: FloatArray, scale: FloatArray) -> None:
+    """Turn a factor from `factorise` into that of the matrix itself."""
+    for i in range(low.shape[0]):
+        for j in range(i + 1):
+            low[i, j] /= scale[i]
 
 
 @kernel(fastmath=FAST)
@@ -261,15 +302,7 @@ def _shift(
         size = look(move, slopes.squares[rows[q]], seen)
         for a in range(k):
             step[k * q + a] = product(slopes.values[rows[q], a], seen, size)
-    low = clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n)
-    for i in range(n):
-        for j in range(i):
-            step[i] -= low[i, j] * step[j]
-        step[i] /= low[i, i]
-    for i in range(n - 1, -1, -1):
-        step[i] /= low[i, i]
-        for j in range(i):
-            step[j] -= low[i, j] * step[i]
+    _divide(clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n), step)
     return step
 
 
@@ -334,3 +367,45 @@ def shift_rows(
                 i = index[a]
                 moved = theta[rows[q], i] - step[k * q + a]
                 theta[rows[q], i] = min(max(moved, lower[i]), upper[i])
+
+
+@kernel()
+def move_together(
+    clusters: Clusters, first: int, last: int, index: IntArray, longest: FloatArray,
+    lower: FloatArray, upper: FloatArray, theta: FloatArray,
+) -> None:  # fmt: skip
+    """Let rows that overlap follow one another, to the maximum of all, to first order.
+
+    Parameters
+    ----------
+    clusters : Clusters
+        As `join_rows` left them.
+    first, last : int
+        Clusters first…last − 1.
+    index : ndarray of int, shape (k,)
+        Free parameters.
+    longest : ndarray, shape (5,)
+        Step of a parameter at most, of the amplitude relative; longer ones are shortened with their
+        cluster.
+    lower, upper : ndarray, shape (5,)
+        Bounds of the parameters.
+    theta : ndarray, shape (rows, 5)
+        Moved.
+    """
+    k = index.size
+    for c in range(first, last):
+        rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
+        if rows.size == 1:
+            continue
+        share = 1.0
+        for r in rows:
+            for a in range(k):
+                i, step = index[a], abs(clusters.steps[r, a])
+                most = longest[i] * (abs(theta[r, 3]) if i == 3 else 1.0)
+                if step > most:
+                    share = min(share, most / step)
+        for r in rows:
+            for a in range(k):
+                i = index[a]
+                moved = theta[r, i] + share * clusters.steps[r, a]
+                theta[r, i] = min(max(moved, lower[i]), upper[i])

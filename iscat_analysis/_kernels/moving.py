@@ -135,10 +135,11 @@ def fit_frames(
     image = np.empty(max(field.drawn, field.side) ** 2)
     square, change = np.empty(4 * field.side**2), np.empty(field.side**2)
     gradients = np.empty(10 * field.side**2)
-    step, index = np.empty(5), np.flatnonzero(search.free[:4])
+    step, before, index = np.empty(5), np.empty(5), np.flatnonzero(search.free[:4])
     slope_profile = blank_profile(table_of(near, 0), near.lens, 2)
     fisher = np.empty((5, 5))
     for t in range(first, last):
+        expected[t] = _look_over(light.counts[t])
         ready_frame(
             field, near, far, starts, t, theta, group, canvas, near_profile, far_profile, image
         )
@@ -160,6 +161,7 @@ def fit_frames(
                 for i in range(ny):
                     for j in range(nx):
                         moved[i, j] = -both[0, i, 0, j]
+                before[:] = p
                 outcome[r], last_one, gain[r] = _climb(
                     near, group[r], pixels, data, search, p, both, slope_profile, fisher, step
                 )
@@ -170,8 +172,20 @@ def fit_frames(
                 information[r] = fisher[:4, :4]
                 if slopes.values.size:
                     slopes.squares[r] = r0, r1, c0, c1
+                    for k in range(index.size):
+                        slopes.moves[r, k] = p[index[k]] - before[index[k]]
                     keep_slopes(data[2], here, index, slopes.values[r])
         expected[t] = _add_stretch(light, t, total, stretch)
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def _look_over(frame: NDArray[np.float32]) -> float:
+    """Read a frame in its order, which brings it into the cache; each square would wait for it."""
+    total = np.float32(0.0)
+    for i in range(frame.shape[0]):
+        for j in range(frame.shape[1]):
+            total += frame[i, j]
+    return float(total)
 
 
 @kernel()

@@ -186,7 +186,8 @@ class MovingField:
     ) -> tuple[Rows, Ground, BoolArray]:
         """Fit every row over a background, and give the background under the rows.
 
-        How the rows follow their background is kept for `where_turns_end`.
+        Rows that overlap follow one another in the end.  How all of them follow their background is
+        kept for `where_turns_end`.
 
         Parameters
         ----------
@@ -230,14 +231,16 @@ class MovingField:
             return stretch
 
         stretch = self._sum_of(block)
+        fitted = rows.fitted(theta, fisher, gain) if sweeps else rows
+        self._canvas = Sheet(fitted, canvas, coarse)
         if sweeps:
             own = fisher[:, self.free[:4]][:, :, self.free[:4]]
             self._response = Response(slopes, starts, light, canvas.total, own, self._pool)
+            walls = search.lower, search.upper
+            fitted = replace(fitted, theta=self._response.together(theta, self.free, walls))
         level = np.where(stretch > 0, self.total_e / np.where(stretch > 0, stretch, 1.0), 1.0)
         totals = self.frame_totals
         power = np.where(expected > 0, totals / np.where(expected > 0, expected, 1.0), 1.0)
-        fitted = rows.fitted(theta, fisher, gain) if sweeps else rows
-        self._canvas = Sheet(fitted, canvas, coarse)
         return fitted, Ground(np.maximum(level, 1e-3), power / power.mean()), outcome == CONVERGED
 
     def where_turns_end(self, move: FloatArray, damping: float) -> FloatArray:
@@ -541,4 +544,4 @@ class MovingField:
             most = round(_MORE_ROWS * rows) * free * self._whole.side**2
             self._room_of_slopes = np.empty(most, dtype=np.float32)
         values = self._room_of_slopes[:size].reshape(rows, free, side**2)
-        return Slopes(np.zeros((rows, 4), dtype=np.int64), values)
+        return Slopes(np.zeros((rows, 4), dtype=np.int64), values, np.zeros((rows, free)))

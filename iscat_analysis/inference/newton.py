@@ -18,6 +18,7 @@ from iscat_analysis._kernels.following import (
     find_clusters,
     follow_rows,
     join_rows,
+    move_together,
     shift_rows,
 )
 from iscat_analysis.records import BoolArray, FloatArray
@@ -26,6 +27,8 @@ _PARTS = 8  # of the clusters, that threads take in turn
 _RESIDUE = 0.02  # of a step that is left to the next
 _MOST_STEPS = 40  # of the conjugate gradients
 _FARTHEST = 0.05  # step of the logarithm of the background
+
+_LONGEST = np.array([50.0, 50.0, 20.0, 0.3, 0.0])  # step of rows that overlap [nm], relative
 
 T = TypeVar("T")
 
@@ -66,7 +69,8 @@ class Response:
         edges = np.append(0, np.cumsum(count))
         corners = np.append(0, np.cumsum((slopes.values.shape[1] * count) ** 2))
         frame = np.searchsorted(starts, firsts, side="right") - 1
-        self._clusters = Clusters(rows, edges, frame, corners, np.empty(corners[-1]))
+        factors, steps = np.empty(corners[-1]), np.zeros(slopes.moves.shape)
+        self._clusters = Clusters(rows, edges, frame, corners, factors, steps)
         self._share(
             lambda a, b: join_rows(slopes, self._clusters, light, totals, information, a, b)
         )
@@ -158,4 +162,25 @@ class Response:
         self._share(
             lambda a, b: shift_rows(self._slopes, self._clusters, a, b, step, index, *walls, out)
         )
+        return out
+
+    def together(
+        self, theta: FloatArray, free: BoolArray, walls: tuple[FloatArray, FloatArray]
+    ) -> FloatArray:
+        """Let rows that overlap follow one another, to first order.
+
+        Each was fitted with the others as they were then; those that came after it have moved.
+
+        Parameters
+        ----------
+        theta, free, walls
+            As in `followed`.
+
+        Returns
+        -------
+        ndarray, shape (rows, 5)
+            Where fits of all of them together would end.
+        """
+        out, index = theta.copy(), np.flatnonzero(free[:4])
+        self._share(lambda a, b: move_together(self._clusters, a, b, index, _LONGEST, *walls, out))
         return out

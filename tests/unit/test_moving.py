@@ -282,7 +282,8 @@ def test_rows_in_one_place_follow_as_one(pool: ThreadPoolExecutor, rounded: floa
     """Whatever rounding makes of what each knows alone, each takes up half of what both see."""
     side, level = 12, 100.0
     slope = np.random.default_rng(4).standard_normal((1, 1, side * side)).astype(np.float32)
-    slopes = Slopes(np.tile([0, side, 0, side], (2, 1)), np.repeat(slope, 2, axis=0))
+    squares = np.tile([0, side, 0, side], (2, 1))
+    slopes = Slopes(squares, np.repeat(slope, 2, axis=0), np.zeros((2, 1)))
     light = Light(
         np.full((1, side, side), level, dtype=np.float32), np.ones(1),
         np.full((side, side), level), np.zeros((side, side)),
@@ -297,6 +298,21 @@ def test_rows_in_one_place_follow_as_one(pool: ThreadPoolExecutor, rounded: floa
     move = slope.reshape(side, side) / level
     moved = response.followed(np.zeros((2, 5)), move, free, walls)[:, 3]
     assert moved == pytest.approx(-0.5, rel=0.05)
+
+
+def test_rows_that_overlap_follow_one_another(pool: ThreadPoolExecutor) -> None:
+    """One fit of each ends nearer to the maximum of both than fits of each alone do."""
+    counts, ground, rows = _movie(_paths(0.0) - [[[0.0, 0.0]], [[950.0, 500.0]]], noise=True)
+    field = _field(counts, pool, READ_E2)
+    start = replace(rows, theta=rows.theta + np.array([10.0, -10.0, 0.0, 0.0, 0.0]))
+    end, _ = field.refit(ground, start, sweeps=40)
+    alone, _ = field.refit(ground, start, sweeps=1)
+    together, _, _ = field.fit(ground, start, coarse=True)
+    error = 1 / np.sqrt(end.fisher[:, [0, 1, 3], [0, 1, 3]])
+    left, before = (
+        np.median(np.abs(r.theta - end.theta)[:, [0, 1, 3]] / error) for r in (together, alone)
+    )
+    assert left < before / 3
 
 
 def test_residuals_are_of_the_rows_that_are_asked_for(pool: ThreadPoolExecutor) -> None:
