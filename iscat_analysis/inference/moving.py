@@ -186,8 +186,8 @@ class MovingField:
     ) -> tuple[Rows, Ground, BoolArray]:
         """Fit every row over a background, and give the background under the rows.
 
-        Rows that overlap follow one another in the end.  How all of them follow their background is
-        kept for `where_turns_end`.
+        Rows that overlap follow one another in the end, but those of smaller squares, some of which
+        are only tried.  How all of them follow their background is kept for `where_turns_end`.
 
         Parameters
         ----------
@@ -236,6 +236,7 @@ class MovingField:
         if sweeps:
             own = fisher[:, self.free[:4]][:, :, self.free[:4]]
             self._response = Response(slopes, starts, light, canvas.total, own, self._pool)
+        if sweeps and not coarse:  # among rows that are only tried some would be pushed away
             walls = search.lower, search.upper
             fitted = replace(fitted, theta=self._response.together(theta, self.free, walls))
         level = np.where(stretch > 0, self.total_e / np.where(stretch > 0, stretch, 1.0), 1.0)
