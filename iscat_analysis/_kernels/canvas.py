@@ -267,7 +267,7 @@ def ready_frame(
     rows, columns = total.shape
     first, last = starts[t], starts[t + 1]
     pictures = 0
-    for r in range(first, last) if canvas.drawn[t] else range(0):
+    for r in range(first, last):
         if _is_aside(field, theta[r], canvas.rings[r]):
             pictures += 2
         elif _is_other_size(field, theta[r], canvas.rings[r]):

@@ -36,3 +36,19 @@ def factorise(
             else:
                 return False
     return True
+
+
+@kernel(forceinline=True)
+def solve(lower: FloatArray, values: FloatArray) -> None:
+    """Solve L Lᵀ x = values (n) with a factor L (n, n) from `factorise`, in place."""
+    n = values.size
+    for i in range(n):
+        total = values[i]
+        for k in range(i):
+            total -= lower[i, k] * values[k]
+        values[i] = total / lower[i, i]
+    for i in range(n - 1, -1, -1):
+        total = values[i]
+        for k in range(i + 1, n):
+            total -= lower[k, i] * values[k]
+        values[i] = total / lower[i, i]

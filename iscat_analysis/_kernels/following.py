@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.canvas import Light
-from iscat_analysis._kernels.dense import factorise
+from iscat_analysis._kernels.dense import factorise, solve
 from iscat_analysis._kernels.lattice import FAST
 
 FloatArray = NDArray[np.float64]
@@ -63,7 +63,7 @@ class Clusters(NamedTuple):
     factors : ndarray, shape (sum of (k rows of a cluster)²,)
         Cholesky's factors L of F = L Lᵀ.
     steps : ndarray, shape (rows, k)
-        By what rows that overlap follow one another.
+        By what rows that overlap follow one another; without room, left alone.
     """
 
     rows: IntArray
@@ -162,20 +162,6 @@ def find_clusters(squares: IntArray, starts: IntArray, owner: IntArray) -> None:
                         owner[q] = low
 
 
-@kernel(fastmath=FAST)
-def _divide(low: FloatArray, step: FloatArray) -> None:
-    """Multiply a step by F⁻¹, of which L is given."""
-    n = step.size
-    for i in range(n):
-        for j in range(i):
-            step[i] -= low[i, j] * step[j]
-        step[i] /= low[i, i]
-    for i in range(n - 1, -1, -1):
-        step[i] /= low[i, i]
-        for j in range(i):
-            step[j] -= low[i, j] * step[i]
-
-
 @kernel()
 def join_rows(
     slopes: Slopes, clusters: Clusters, light: Light, totals: NDArray[np.float32],
@@ -225,21 +211,16 @@ def join_rows(
         stiffer = _STIFFER
         while not factorise(joint, np.arange(n), scale, stiffer, low) and stiffer < _STIFFEST:
             stiffer *= 10.0
-        _unscale(low, scale)
-        if rows.size > 1:
+        if rows.size > 1 and clusters.steps.size:
             shy = np.empty((n, n))
             factorise(joint, np.arange(n), scale, max(stiffer, _SHY), shy)
-            _unscale(shy, scale)
-            _divide(shy, step)
+            step *= scale
+            solve(shy, step)
+            step *= scale
             clusters.steps[rows] = step.reshape(rows.size, k)
-
-
-@kernel()
-def _unscale(low: FloatArray, scale: FloatArray) -> None:
-    """Turn a factor from `factorise` into that of the matrix itself."""
-    for i in range(low.shape[0]):
-        for j in range(i + 1):
-            low[i, j] /= scale[i]
+        for i in range(n):
+            for j in range(i + 1):
+                low[i, j] /= scale[i]
 
 
 @kernel(fastmath=FAST)
@@ -302,7 +283,7 @@ def _shift(
         size = look(move, slopes.squares[rows[q]], seen)
         for a in range(k):
             step[k * q + a] = product(slopes.values[rows[q], a], seen, size)
-    _divide(clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n), step)
+    solve(clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n), step)
     return step
 
 

@@ -10,7 +10,7 @@ threads.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,7 +139,8 @@ def fit_frames(
     slope_profile = blank_profile(table_of(near, 0), near.lens, 2)
     fisher = np.empty((5, 5))
     for t in range(first, last):
-        expected[t] = _look_over(light.counts[t])
+        if sweeps:
+            expected[t] = _look_over(light.counts[t])  # kept for a moment, or nothing would be read
         ready_frame(
             field, near, far, starts, t, theta, group, canvas, near_profile, far_profile, image
         )
@@ -276,57 +277,3 @@ def _add_stretch(light: Light, t: int, total: NDArray[np.float32], stretch: Floa
         for j in range(stretch.shape[1]):
             amount += background[i, j] * (1.0 + total[i, j])
     return amount
-
-
-@kernel()
-def common_modes(
-    light: Light,
-    field: Field,
-    near: Pictures,
-    frame: IntArray,
-    theta: FloatArray,
-    group: IntArray,
-    top: int,
-    left: int,
-    index: IntArray,
-    owner: IntArray,
-    out: NDArray[np.floating[Any]],
-) -> None:
-    """Add up what rows of a track change of each pixel's light.
-
-    Parameters
-    ----------
-    light, field, near
-        As in `fit_frames`.
-    frame, group : ndarray of int, shape (n,)
-        Frames and pictures of the rows.
-    theta : ndarray, shape (n, 5)
-        Their estimates.
-    top, left : int
-        First row and column of `out` in the field.
-    index : ndarray of int, shape (k,)
-        Parameters, of (x, y, z, a).
-    owner : ndarray of int, shape (n,)
-        To which image of `out` each row adds.
-    out : ndarray, shape (m, k, y, x)
-        Σ w B ∂C is added to it [e per unit].
-    """
-    rows, columns = light.background.shape
-    background = light.background
-    profile = blank_profile(table_of(near, 0), near.lens, 2)
-    g = np.empty(5 * field.side**2)
-    for k in range(frame.size):
-        p, w = theta[k], light.power[frame[k]]
-        r0, r1, c0, c1 = square_of(field, p, field.side, rows, columns)
-        if r1 <= r0:
-            continue
-        ny, nx = r1 - r0, c1 - c0
-        here = g[: 5 * ny * nx].reshape(ny, 5, nx)
-        pixels = cut(field.pixels, r0, r1, c0, c1)
-        draw_gradient(near, group[k], p, pixels, profile, here)
-        mine = out[owner[k]]
-        for a in range(index.size):
-            for i in range(ny):
-                for j in range(nx):
-                    level = w * background[r0 + i, c0 + j]
-                    mine[a, r0 - top + i, c0 - left + j] += level * here[i, 1 + index[a], j]

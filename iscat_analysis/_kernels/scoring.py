@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
-from iscat_analysis._kernels.dense import factorise
+from iscat_analysis._kernels.dense import factorise, solve
 from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lattice_rows import lattice_span
@@ -367,15 +367,8 @@ def scoring_step(
         return False
     z = np.empty(n)
     for i in range(n):
-        total = score[index[i]] * scale[i]
-        for k in range(i):
-            total -= lower[i, k] * z[k]
-        z[i] = total / lower[i, i]
-    for i in range(n - 1, -1, -1):
-        total = z[i]
-        for k in range(i + 1, n):
-            total -= lower[k, i] * z[k]
-        z[i] = total / lower[i, i]
+        z[i] = score[index[i]] * scale[i]
+    solve(lower, z)
     for i in range(n):
         step[index[i]] = z[i] * scale[i]
     return True

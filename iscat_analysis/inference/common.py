@@ -178,17 +178,12 @@ def variances_left(information: FloatArray, index: IntArray) -> FloatArray:
     """
     out = np.full(information.shape[:2], np.nan)
     scaled, scale = _scaled(information, index)
-    left, least = np.moveaxis(scaled, 0, 2).copy(), np.full(len(scaled), np.inf)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for j in range(index.size):  # Gauss and Jordan's, of all matrices at once
-            pivot = left[j, j].copy()
-            row, column = left[j] / pivot, left[:, j].copy()
-            row[j], column[j], left[:, j] = 1 / pivot, 0.0, 0.0
-            left -= column[:, None] * row
-            left[j] = row
-            least = np.minimum(least, pivot)
-    good = np.flatnonzero(least > _SINGULAR)
-    out[good[:, None], index] = np.einsum("iin->ni", left)[good] * scale[good] ** 2
+    good = np.flatnonzero(np.isfinite(scaled).all(axis=(1, 2)))
+    if not good.size:
+        return out
+    good = good[np.linalg.eigvalsh(scaled[good])[:, 0] > _SINGULAR]
+    inverse = np.einsum("nii->ni", np.linalg.inv(scaled[good])) * scale[good] ** 2
+    out[good[:, None], index] = inverse
     return out
 
 

@@ -19,7 +19,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.canvas import Canvas, Field, Light, add_squares
 from iscat_analysis._kernels.following import Slopes
 from iscat_analysis._kernels.judging import judge_frames
-from iscat_analysis._kernels.moving import Search, common_modes, fit_frames
+from iscat_analysis._kernels.moving import Search, fit_frames
 from iscat_analysis._kernels.scoring import CONVERGED
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.newton import Response
@@ -235,7 +234,9 @@ class MovingField:
         self._canvas = Sheet(fitted, canvas, coarse)
         if sweeps:
             own = fisher[:, self.free[:4]][:, :, self.free[:4]]
-            self._response = Response(slopes, starts, light, canvas.total, own, self._pool)
+            self._response = Response(
+                slopes, starts, light, canvas.total, own, self._pool, joint=not coarse
+            )
         if sweeps and not coarse:  # among rows that are only tried some would be pushed away
             walls = search.lower, search.upper
             fitted = replace(fitted, theta=self._response.together(theta, self.free, walls))
@@ -471,30 +472,6 @@ class MovingField:
 
         self.share(block, -(-times.size // _SWEPT))
         return rows.fitted(theta, fisher, gain), outcome == CONVERGED
-
-    def add_modes(
-        self, ground: Ground, rows: Rows, corner: tuple[int, int], owner: IntArray,
-        out: NDArray[np.floating[Any]],
-    ) -> None:  # fmt: skip
-        """Add what rows change of the light.
-
-        Parameters
-        ----------
-        ground : Ground
-            Background.
-        rows : Rows
-            Particles.
-        corner : (int, int)
-            First row and column of the pixels.
-        owner : ndarray of int, shape (n,)
-            To which image of `out` each row adds.
-        out : ndarray, shape (m, free, y, x)
-            Σ w B ∂C, in the free ones of (x, y, z, a) [e per unit].
-        """
-        common_modes(
-            self._light(ground), self._whole, self._pictures[0], rows.frame, rows.theta, rows.group,
-            *corner, np.flatnonzero(self.free[:4]), owner, out,
-        )  # fmt: skip
 
     def on_wall(self, rows: Rows) -> BoolArray:
         """Tell which rows ended on a wall of the search.

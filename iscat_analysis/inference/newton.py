@@ -27,7 +27,6 @@ _PARTS = 8  # of the clusters, that threads take in turn
 _RESIDUE = 0.02  # of a step that is left to the next
 _MOST_STEPS = 40  # of the conjugate gradients
 _FARTHEST = 0.05  # step of the logarithm of the background
-
 _LONGEST = np.array([50.0, 50.0, 20.0, 0.3, 0.0])  # step of rows that overlap [nm], relative
 
 T = TypeVar("T")
@@ -50,6 +49,8 @@ class Response:
         On the free parameters of each row alone.
     pool : ThreadPoolExecutor
         Runs parts of the clusters; the results do not depend on its size.
+    joint : bool
+        Whether `together` is asked for.
     """
 
     def __init__(
@@ -60,6 +61,8 @@ class Response:
         totals: NDArray[np.float32],
         information: FloatArray,
         pool: ThreadPoolExecutor,
+        *,
+        joint: bool = False,
     ) -> None:
         self._slopes, self._pool = slopes, pool
         owner = np.empty(starts[-1], dtype=np.int64)
@@ -69,7 +72,7 @@ class Response:
         edges = np.append(0, np.cumsum(count))
         corners = np.append(0, np.cumsum((slopes.values.shape[1] * count) ** 2))
         frame = np.searchsorted(starts, firsts, side="right") - 1
-        factors, steps = np.empty(corners[-1]), np.zeros(slopes.moves.shape)
+        factors, steps = np.empty(corners[-1]), np.zeros(slopes.moves.shape if joint else (0, 0))
         self._clusters = Clusters(rows, edges, frame, corners, factors, steps)
         self._share(
             lambda a, b: join_rows(slopes, self._clusters, light, totals, information, a, b)

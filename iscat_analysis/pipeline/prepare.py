@@ -138,18 +138,18 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         run.tell(swapped)
     summary: dict[str, Any] = {}
     looking: Future[Changes] | None = None
-    raw = movie
     if tracked:  # meanwhile, at the light as it is; again if anything of it is unsteady
-        looking = beside(look_at_changes, raw, config, camera, span)
+        looking = beside(look_at_changes, movie, config, camera, span)
     judged = judge_light(movie, config, camera)
     for text in judged.messages:
         run.tell(f"{movie.name}: {text}")
+    unsteady = judged.movie is not movie or judged.lines is not None
     movie, lines = judged.movie, judged.lines
     steady = movie
     if lines is not None:
         summary["lines"] = lines.summary
         steady = movie.seen_as(SteadyFrames(movie, lines, camera))
-    if way == "sliding":
+    if way == "sliding" or (tracked and unsteady):
         looking = beside(look_at_changes, steady, config, camera, span)
     configured = config
     opened: Opening | None = None
@@ -164,7 +164,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     other_kind = ""
     if looking is not None:
         changes = looking.result()
-        if config.optics.na != configured.optics.na or (tracked and steady is not raw):
+        if config.optics.na != configured.optics.na:
             changes = look_at_changes(steady, config, camera, span)
         summary["changes"] = changes_summary(changes)
         other_kind = (as_landing if tracked else as_moving)(changes, movie.name)
