@@ -86,6 +86,8 @@ class Field(NamedTuple):
         Sides of the square that is fitted and of that which is drawn [pixels].
     slack : ndarray, shape (4,)
         How far x, y, z [nm] and the amplitude, relative, may be from where the rings were drawn.
+    alike : bool
+        Whether the pictures for drawing are good enough for the fitted square as well.
     """
 
     pixels: Pixels
@@ -93,6 +95,7 @@ class Field(NamedTuple):
     side: int
     drawn: int
     slack: FloatArray
+    alike: bool
 
 
 class Canvas(NamedTuple):
@@ -287,8 +290,13 @@ def ready_frame(
             _add_rings(far, field, k, rings, -1.0, inner, outer, far_profile, image, total)
         if aside or anew:
             rings[:] = square[:] = now
-            there = square_of(field, now, field.drawn, rows, columns)
-            add_row(far, field, k, now, 1.0, there, far_profile, image, total)
+            outer = square_of(field, now, field.drawn, rows, columns)
+            if field.alike:
+                add_row(far, field, k, now, 1.0, outer, far_profile, image, total)
+                continue
+            inner = square_of(field, now, field.side, rows, columns)
+            add_row(near, field, k, now, 1.0, inner, near_profile, image, total)
+            _add_rings(far, field, k, now, 1.0, inner, outer, far_profile, image, total)
             continue
         if _is_other_size(field, now, rings):
             # b P + b² Q minus a P + a² Q is (b - a)/(b + a) times the signal of a + b

@@ -236,7 +236,7 @@ def _put_signal(
 ) -> None:  # fmt: skip
     """Write the signal into `out`, or add it to what is there."""
     rows, n = out.shape
-    line = sizes(lens, n)[0]
+    line, by = sizes(lens, n)[0], out.dtype.type(factor)
     for row in range(rows):
         if row % STRIP == 0:
             begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, False, at, f)
@@ -244,7 +244,7 @@ def _put_signal(
         begin += line
         if adds:
             for j in range(n):
-                here[j] += factor * s[j]
+                here[j] += by * s[j]
         else:
             for j in range(n):
-                here[j] = factor * s[j]
+                here[j] = by * s[j]

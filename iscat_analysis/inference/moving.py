@@ -23,7 +23,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.canvas import Canvas, Field, Light, add_squares
+from iscat_analysis._kernels.canvas import Canvas, Field, Light, Pictures, add_squares
 from iscat_analysis._kernels.following import Slopes
 from iscat_analysis._kernels.judging import judge_frames
 from iscat_analysis._kernels.moving import Search, fit_frames
@@ -108,9 +108,10 @@ class MovingField:
         pixels = near.pixels(grid)
         wavelength = near.optics.wavelength_nm
         slack = _SLACK * np.array([pixel_nm, pixel_nm, wavelength, 1.0])
-        self._whole = Field(pixels, pixel_nm, roi_px, DRAWN * roi_px, slack)
-        self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, roi_px, slack)
-        if z_range_nm is not None:  # the rings tell one fringe from the next, and reach far
+        along_z = z_range_nm is not None
+        self._whole = Field(pixels, pixel_nm, roi_px, DRAWN * roi_px, slack, along_z)
+        self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, roi_px, slack, True)
+        if along_z:  # the rings tell one fringe from the next, and reach far
             self._coarse = self._whole
         self._canvas: Sheet | None = None
         self._room_of_slopes = np.empty(0, dtype=np.float32)
@@ -136,7 +137,8 @@ class MovingField:
         self._book = PictureBook(
             near, far,
             pixel_nm=pixel_nm,
-            half_px=min((self._whole.drawn + 1) / 2, farthest) + 1,
+            near_px=(roi_px + 1) / 2 + _SLACK[0] + reach / pixel_nm,
+            far_px=min((self._whole.drawn + 1) / 2, farthest) + 1,
             z_range_nm=z_range_nm,
         )  # fmt: skip
         self._pictures = self._book.of(np.zeros(1))
@@ -209,7 +211,7 @@ class MovingField:
             Which fits did.
         """
         light = self._light(ground)
-        near, far = self._pictures
+        near, far = self._pictures_for(coarse=coarse)
         theta = rows.theta.copy()
         starts = rows.starts(self.frames)
         outcome = np.full(len(theta), CONVERGED, dtype=np.int64)
@@ -363,7 +365,7 @@ class MovingField:
         """Draw the rows of some frames alone."""
         within = rows.only((rows.frame >= first) & (rows.frame < last))
         canvas = blank(np.empty_like(self.counts_e[first:last]), within)
-        near, far = self._pictures
+        near, far = self._pictures_for(coarse=True)
         light = self._light(ground)
         part = light._replace(counts=light.counts[first:last], power=light.power[first:last])
         starts = np.searchsorted(within.frame, np.arange(first, last + 1)).astype(np.int64)
@@ -392,7 +394,7 @@ class MovingField:
         """
         n = len(rows.frame)
         light = self._light(ground)
-        near, far = self._pictures
+        near, far = self._pictures_for(coarse=False)
         starts = rows.starts(self.frames)
         fisher, turned, ways = np.empty((3, n, 4, 4))
         bias, numbers = np.empty((n, 4)), np.empty((n, 6))
@@ -452,7 +454,7 @@ class MovingField:
             Which fits did.
         """
         light = self._light(ground)
-        near, far = self._pictures
+        near, far = self._pictures_for(coarse=True)
         times, frame = np.unique(rows.frame, return_inverse=True)
         light = light._replace(counts=light.counts[times], power=light.power[times])
         starts = np.searchsorted(frame, np.arange(times.size + 1)).astype(np.int64)
@@ -490,6 +492,11 @@ class MovingField:
         near = (rows.theta <= search.lower + 1e-6) | (rows.theta >= search.upper - 1e-6)
         near[:, 3] &= rows.theta[:, 3] >= search.upper[3]  # no mass is the end of none
         return np.asarray((near & self.free).any(axis=1))
+
+    def _pictures_for(self, *, coarse: bool) -> tuple[Pictures, Pictures]:
+        """Pictures to fit and to draw; what is drawn coarsely reaches no farther than the former."""
+        near, far = self._pictures
+        return near, near if coarse and not self.free[2] else far
 
     def _light(self, ground: Ground) -> Light:
         level, read = (np.where(self.used, part, 0.0) for part in (ground.level, self.read_e2))

@@ -10,7 +10,7 @@ from iscat_analysis._kernels.canvas import Pictures
 from iscat_analysis._kernels.lens import RoundLens
 from iscat_analysis.optics.blur import blurred, spreads
 from iscat_analysis.optics.forward import ForwardModel
-from iscat_analysis.optics.stamp import sample_picture, weights_between
+from iscat_analysis.optics.stamp import BAND, RINGS, sample_picture, weights_between
 from iscat_analysis.optics.waves import axial_table
 from iscat_analysis.records import FloatArray
 
@@ -24,8 +24,8 @@ class PictureBook:
         Models of a sharp picture, for the fitted square and for that which is drawn.
     pixel_nm : float
         Side of a pixel [nm].
-    half_px : float
-        How far from a particle its picture is drawn at a fixed height [pixels].
+    near_px, far_px : float
+        How far from a particle its picture is fitted and drawn at a fixed height [pixels].
     z_range_nm : tuple of float or None
         Range of the tables along z; None for the model's height alone [nm].
     """
@@ -36,11 +36,13 @@ class PictureBook:
         far: ForwardModel,
         *,
         pixel_nm: float,
-        half_px: float,
+        near_px: float,
+        far_px: float,
         z_range_nm: tuple[float, float] | None,
     ) -> None:
         self._near, self._far = near, far
-        self._pixel_nm, self._half_px, self._z_range = pixel_nm, half_px, z_range_nm
+        self._pixel_nm, self._z_range = pixel_nm, z_range_nm
+        self._near_px, self._far_px = near_px, far_px
 
     def of(self, variances_nm2: FloatArray) -> tuple[Pictures, Pictures]:
         """Make the pictures of some blurs.
@@ -60,25 +62,40 @@ class PictureBook:
                 _along_z(self._near, variances_nm2, self._z_range),
                 _along_z(self._far, variances_nm2, self._z_range),
             )
-        inverse = self._one_height.lens.inv_step
-        windows = [
-            sum(
-                share * weights_between(v * inverse**2)
-                for share, v in spreads(float(q), each_axis=True)
-            )
-            for q in variances_nm2
-        ]
-        one = self._one_height._replace(windows=np.stack(windows))
-        return one, one
+        return (
+            _blurred(self._sharp_near, variances_nm2, BAND),
+            _blurred(self._sharp_far, variances_nm2, RINGS),
+        )
 
     @cached_property
-    def _one_height(self) -> Pictures:
-        """Sharp picture at the fixed height."""
-        lens, samples = sample_picture(self._far, self._pixel_nm, self._half_px)
-        return Pictures(
-            samples.reshape(1, 1, 1, 2, -1), 0.0, 1.0, 0.0, lens, lens.window[None],
-            samples.astype(np.float32),
-        )  # fmt: skip
+    def _sharp_near(self) -> Pictures:
+        return _at_one_height(self._far, self._pixel_nm, self._near_px, BAND)
+
+    @cached_property
+    def _sharp_far(self) -> Pictures:
+        return _at_one_height(self._far, self._pixel_nm, self._far_px, RINGS)
+
+
+def _at_one_height(model: ForwardModel, pixel_nm: float, half_px: float, band: float) -> Pictures:
+    """Sharp picture at the model's height."""
+    lens, samples = sample_picture(model, pixel_nm, half_px, band)
+    return Pictures(
+        samples.reshape(1, 1, 1, 2, -1), 0.0, 1.0, 0.0, lens, lens.window[None],
+        samples.astype(np.float32),
+    )  # fmt: skip
+
+
+def _blurred(sharp: Pictures, variances_nm2: FloatArray, band: float) -> Pictures:
+    """Give a picture at one height the weights of every blur."""
+    inverse = sharp.lens.inv_step
+    windows = [
+        sum(
+            share * weights_between(v * inverse**2, band)
+            for share, v in spreads(float(q), each_axis=True)
+        )
+        for q in variances_nm2
+    ]
+    return sharp._replace(windows=np.stack(windows))
 
 
 def _along_z(

@@ -32,11 +32,15 @@ if TYPE_CHECKING:
 BAND = 0.8
 """Largest u of the interference: the sharp picture errs by 4e-6, its gradient by 1e-5."""
 
+RINGS = 1.6
+"""The same, of what is far from its particle: rings of the interference err by 1e-3 of themselves,
+and light that was scattered twice is as good as gone."""
+
 _BEYOND = 1e-3  # weight of the band from there to twice that, where there is little light
 _POINTS = 24  # of the quadrature over each band
 
 
-def samples_per_pixel(optics: Optics, pixel_nm: float) -> int:
+def samples_per_pixel(optics: Optics, pixel_nm: float, band: float = BAND) -> int:
     """Give how many samples per pixel the picture needs along each axis.
 
     Parameters
@@ -45,6 +49,8 @@ def samples_per_pixel(optics: Optics, pixel_nm: float) -> int:
         Of the model.
     pixel_nm : float
         Side of a pixel [nm].
+    band : float
+        Largest u of the interference.
 
     Returns
     -------
@@ -53,7 +59,7 @@ def samples_per_pixel(optics: Optics, pixel_nm: float) -> int:
     """
     bandwidth = 2 * math.pi / optics.wavelength_nm * optics.na
     bandwidth *= 2 if optics.scheme == "darkfield" else 1
-    return max(1, math.ceil(bandwidth * pixel_nm / BAND))
+    return max(1, math.ceil(bandwidth * pixel_nm / band))
 
 
 def margin_nm(optics: Optics, pixel_nm: float) -> float:
@@ -75,7 +81,7 @@ def margin_nm(optics: Optics, pixel_nm: float) -> float:
 
 
 def sample_picture(
-    model: ForwardModel, pixel_nm: float, half_px: float
+    model: ForwardModel, pixel_nm: float, half_px: float, band: float = BAND
 ) -> tuple[StampLens, FloatArray]:
     """Sample the picture of a particle at the model's height.
 
@@ -87,6 +93,8 @@ def sample_picture(
         Side of a pixel [nm].
     half_px : float
         Largest distance of a pixel from the particle along an axis [pixels].
+    band : float
+        Largest u of the interference.
 
     Returns
     -------
@@ -96,7 +104,7 @@ def sample_picture(
         P and Q of a P + a² Q, columns in the order that `iscat_analysis._kernels.stamp` needs; 0
         beyond the model's reach.
     """
-    fine = samples_per_pixel(model.optics, pixel_nm)
+    fine = samples_per_pixel(model.optics, pixel_nm, band)
     step = pixel_nm / fine
     half = math.ceil(half_px * fine) + TAPS
     nodes = np.asarray(step * np.arange(-half, half + 1), dtype=np.float64)
@@ -121,18 +129,20 @@ def sample_picture(
     per_phase = math.ceil(nodes.size / fine)
     padded = np.pad(samples, ((0, 0), (0, 0), (0, per_phase * fine - nodes.size)))
     phased = padded.reshape(2, nodes.size, per_phase, fine).swapaxes(2, 3)
-    lens = StampLens(1 / step, half, weights_between(0.0), fine)
+    lens = StampLens(1 / step, half, weights_between(0.0, band), fine)
     return lens, np.ascontiguousarray(phased.reshape(2, nodes.size, -1))
 
 
 @lru_cache(256)
-def weights_between(variance: float) -> FloatArray:
+def weights_between(variance: float, band: float = BAND) -> FloatArray:
     """Weights of the samples around a place, for a blur.
 
     Parameters
     ----------
     variance : float
         Of the blur, in units of the squared distance of the samples.
+    band : float
+        Largest u of the interference.
 
     Returns
     -------
@@ -140,7 +150,7 @@ def weights_between(variance: float) -> FloatArray:
         Coefficients of the powers of t ∈ [0, 1), the place after the fourth sample.
     """
     points, quadrature = np.polynomial.legendre.leggauss(_POINTS)
-    u = BAND * np.concatenate([(points + 1) / 2, (points + 3) / 2])
+    u = band * np.concatenate([(points + 1) / 2, (points + 3) / 2])
     root = np.sqrt(np.concatenate([quadrature, _BEYOND**2 * quadrature]))
     waves = np.exp(1j * np.outer(u, np.arange(TAPS) - (TAPS // 2 - 1))) * root[:, None]
     t = (1 - np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))) / 2
