@@ -18,6 +18,7 @@ from iscat_analysis._kernels.dense import factorise, solve
 from iscat_analysis._kernels.lattice import FAST
 
 FloatArray = NDArray[np.float64]
+AnyArray = NDArray[Any]
 AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 
@@ -29,6 +30,10 @@ _SHY = 0.1
 """The same, where rows follow one another: what two of them hardly tell apart stays as it is."""
 
 
+_LARGEST = 32767.0
+"""Of the numbers in which slopes are kept, for the root of the sum of all squares of a slope."""
+
+
 class Slopes(NamedTuple):
     """What rows change of the light in their squares; without room, left alone.
 
@@ -36,14 +41,17 @@ class Slopes(NamedTuple):
     ----------
     squares : ndarray of int, shape (rows, 4)
         First and last row and column of each, half-open; all 0 where a row is not fitted.
-    values : ndarray of float32, shape (rows, k, side²)
-        G, w B ∂C for each free parameter [e per unit].
+    values : ndarray of int16, shape (rows, k, side²)
+        G, w B ∂C for each free parameter, over `units`: half the memory of single precision.
+    units : ndarray, shape (rows, k)
+        What one of them stands for [e per unit of the parameter].
     moves : ndarray, shape (rows, k)
         How far the last fit of each row went.
     """
 
     squares: IntArray
-    values: NDArray[np.float32]
+    values: NDArray[np.int16]
+    units: FloatArray
     moves: FloatArray
 
 
@@ -76,16 +84,22 @@ class Clusters(NamedTuple):
 
 @kernel(fastmath=FAST, _nrt=False)
 def keep_slopes(
-    level: FloatArray, gradient: FloatArray, index: IntArray, out: NDArray[np.float32]
-) -> None:
-    """Fill `out` (k, pixels) with level × gradient of the free parameters."""
+    level: FloatArray, gradient: FloatArray, index: IntArray, slopes: Slopes, row: int,
+    room: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Keep level × gradient of the free parameters of a row; `room` is for a square."""
     ny, nx = level.shape
     for k in range(index.size):
         for i in range(ny):  # lines by themselves are what the compiler makes vectors of
-            line, light = out[k, i * nx : (i + 1) * nx], level[i]
+            line, light = room[i * nx : (i + 1) * nx], level[i]
             slope = gradient[i, 1 + index[k]]
             for j in range(nx):
                 line[j] = light[j] * slope[j]
+        length = np.sqrt(product(room, room, ny * nx))  # no pixel is larger
+        slopes.units[row, k] = length / _LARGEST
+        per, out = np.float32(_LARGEST / length), slopes.values[row, k]
+        for j in range(ny * nx):
+            out[j] = np.int16(np.rint(per * room[j]))
 
 
 @kernel(fastmath=FAST, _nrt=False)
@@ -113,24 +127,26 @@ def put(values: AnyFloatArray, square: IntArray, image: FloatArray) -> None:
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def product(slope: AnyFloatArray, seen: AnyFloatArray, size: int) -> float:
+def product(slope: AnyArray, seen: AnyFloatArray, size: int) -> float:
     """Sum the products of the first pixels, in the precision of `seen`."""
     total = seen.dtype.type(0.0)
     for j in range(size):
-        total += slope[j] * seen[j]
+        total += seen.dtype.type(slope[j]) * seen[j]
     return float(total)
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def mix(slopes: NDArray[np.float32], by: FloatArray, size: int, out: AnyFloatArray) -> None:
-    """Fill the first pixels of `out` with slopes (k, side²) times numbers (k)."""
-    first, slope = out.dtype.type(by[0]), slopes[0]
+def mix(
+    slopes: NDArray[np.int16], units: FloatArray, by: FloatArray, size: int, out: AnyFloatArray
+) -> None:
+    """Fill the first pixels of `out` with slopes (k, side²), in their units, times numbers (k)."""
+    first, slope = out.dtype.type(units[0] * by[0]), slopes[0]
     for j in range(size):
-        out[j] = first * slope[j]
+        out[j] = first * out.dtype.type(slope[j])
     for a in range(1, by.size):
-        factor, slope = out.dtype.type(by[a]), slopes[a]
+        factor, slope = out.dtype.type(units[a] * by[a]), slopes[a]
         for j in range(size):
-            out[j] += factor * slope[j]
+            out[j] += factor * out.dtype.type(slope[j])
 
 
 @kernel()
@@ -247,8 +263,8 @@ def _overlap(
             variance = power * background[j] * (1.0 + others[j]) + read[j]
             weight[j] = 1.0 / variance if variance > 0.0 else 0.0
     for a in range(k):
-        _look_at_part(slopes.values[r, a], c1 - c0, top - r0, left - c0, nx, size, work[1 + a])
-        _look_at_part(slopes.values[s, a], d1 - d0, top - s0, left - d0, nx, size, work[1 + k + a])
+        _look_at_part(slopes, r, a, c1 - c0, top - r0, left - c0, nx, size, work[1 + a])
+        _look_at_part(slopes, s, a, d1 - d0, top - s0, left - d0, nx, size, work[1 + k + a])
         mine = work[1 + a]
         for j in range(size):
             mine[j] *= work[0, j]
@@ -260,14 +276,15 @@ def _overlap(
 
 @kernel(fastmath=FAST, _nrt=False)
 def _look_at_part(
-    slope: NDArray[np.float32], width: int, top: int, left: int, nx: int, size: int,
+    slopes: Slopes, row: int, k: int, width: int, top: int, left: int, nx: int, size: int,
     out: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Fill `out` with lines of nx pixels of a square that is so wide."""
+    """Fill `out` with lines of nx pixels of a slope whose square is so wide."""
+    slope, unit = slopes.values[row, k], np.float32(slopes.units[row, k])
     for i in range(size // nx):
         line, there = out[i * nx : (i + 1) * nx], slope[(top + i) * width + left :]
         for j in range(nx):
-            line[j] = there[j]
+            line[j] = unit * np.float32(there[j])
 
 
 @kernel(fastmath=FAST)
@@ -282,7 +299,9 @@ def _shift(
     for q in range(rows.size):
         size = look(move, slopes.squares[rows[q]], seen)
         for a in range(k):
-            step[k * q + a] = product(slopes.values[rows[q], a], seen, size)
+            step[k * q + a] = slopes.units[rows[q], a] * product(
+                slopes.values[rows[q], a], seen, size
+            )
     solve(clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n), step)
     return step
 
@@ -312,7 +331,8 @@ def follow_rows(
         for q in range(rows.size):
             square = slopes.squares[rows[q]]
             size = (square[1] - square[0]) * (square[3] - square[2])
-            mix(slopes.values[rows[q]], step[k * q : k * (q + 1)], size, seen)
+            r = rows[q]
+            mix(slopes.values[r], slopes.units[r], step[k * q : k * (q + 1)], size, seen)
             put(seen, square, out)
 
 

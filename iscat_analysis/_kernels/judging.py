@@ -160,7 +160,7 @@ def judge_frames(
     profile = blank_profile(table_of(near, 0), near.lens, 2)
     index = np.flatnonzero(free[:4])
     image = np.empty(max(field.drawn, field.side) ** 2)
-    square = np.empty(4 * field.side**2)
+    square, room = np.empty(4 * field.side**2), np.empty(field.side**2, dtype=np.float32)
     g, work = np.empty(BENDS * field.side**2), np.empty(10 * field.side**2)
     pull, known = np.empty(5), np.empty((5, 5))
     ways_here = np.empty((4, index.size))
@@ -181,7 +181,7 @@ def judge_frames(
             data = square[: 4 * ny * nx].reshape(4, ny, nx)
             stage(light, t, canvas.total[t], here, r0, c0, data)
             slopes.squares[r] = r0, r1, c0, c1
-            keep_slopes(data[2], here, index, slopes.values[r])
+            keep_slopes(data[2], here, index, slopes, r, room)
             value = place_score(data, here, len(near.lens) != STAMP, pull, known)
             for i in range(4):
                 for j in range(4):

@@ -134,7 +134,7 @@ def fit_frames(
     far_profile = blank_profile(table_of(far, 0), far.lens, 1)
     image = np.empty(max(field.drawn, field.side) ** 2)
     square, change = np.empty(4 * field.side**2), np.empty(field.side**2)
-    gradients = np.empty(10 * field.side**2)
+    gradients, room = np.empty(10 * field.side**2), np.empty(field.side**2, dtype=np.float32)
     step, before, index = np.empty(5), np.empty(5), np.flatnonzero(search.free[:4])
     slope_profile = blank_profile(table_of(near, 0), near.lens, 2)
     fisher = np.empty((5, 5))
@@ -175,7 +175,7 @@ def fit_frames(
                     slopes.squares[r] = r0, r1, c0, c1
                     for k in range(index.size):
                         slopes.moves[r, k] = p[index[k]] - before[index[k]]
-                    keep_slopes(data[2], here, index, slopes.values[r])
+                    keep_slopes(data[2], here, index, slopes, r, room)
         expected[t] = _add_stretch(light, t, total, stretch)
 
 

@@ -40,14 +40,14 @@ def own_shares(
     work = np.empty(slopes.values.shape[2])
     weighted = np.empty(slopes.values.shape[2])
     for q in range(rows.size):
-        values = slopes.values[rows[q]]
+        values, units = slopes.values[rows[q]], slopes.units[rows[q]]
         size = look(weight, squares[q], work)
         for a in range(k):
-            slope = values[a]
+            slope, unit = values[a], units[a]
             for j in range(size):
-                weighted[j] = work[j] * slope[j]
+                weighted[j] = unit * work[j] * slope[j]
             for b in range(a + 1):
-                out[q, a, b] = out[q, b, a] = product(values[b], weighted, size)
+                out[q, a, b] = out[q, b, a] = units[b] * product(values[b], weighted, size)
 
 
 @kernel(fastmath=FAST)
@@ -67,10 +67,10 @@ def send(
     """
     work = np.empty(slopes.values.shape[2])
     for q in range(rows.size):
-        values, square = slopes.values[rows[q]], squares[q]
+        values, units, square = slopes.values[rows[q]], slopes.units[rows[q]], squares[q]
         size = (square[1] - square[0]) * (square[3] - square[2])
         for v in range(by.shape[1]):
-            mix(values, by[q, v], size, work)
+            mix(values, units, by[q, v], size, work)
             put(work, square, out[v])
 
 
@@ -97,14 +97,14 @@ def follow(
     k = slopes.values.shape[1]
     work, by = np.empty(slopes.values.shape[2]), np.empty(k)
     for q in range(rows.size):
-        values, square = slopes.values[rows[q]], squares[q]
+        values, units, square = slopes.values[rows[q]], slopes.units[rows[q]], squares[q]
         for v in range(images.shape[0]):
             size = look(images[v], square, work)
             for a in range(k):
-                felt[q, v, a] = product(values[a], work, size)
+                felt[q, v, a] = units[a] * product(values[a], work, size)
             for a in range(k):
                 by[a] = 0.0
                 for b in range(k):
                     by[a] += covariance[q, a, b] * felt[q, v, b]
-            mix(values, by, size, work)
+            mix(values, units, by, size, work)
             put(work, square, out[v])

@@ -114,7 +114,7 @@ class MovingField:
         if along_z:  # the rings tell one fringe from the next, and reach far
             self._coarse = self._whole
         self._canvas: Sheet | None = None
-        self._room_of_slopes = np.empty(0, dtype=np.float32)
+        self._room_of_slopes = np.empty(0, dtype=np.int16)
         self.free = np.array([True, True, z_range_nm is not None, True, False])
         reach = window_nm(pixel_nm)
         half = pixel_nm / 2 + _BEYOND * wavelength / near.optics.na
@@ -527,6 +527,7 @@ class MovingField:
         if self._room_of_slopes.size < size:
             # It is cleared where it is first used, as long as a fit takes: once, for all to come.
             most = round(_MORE_ROWS * rows) * free * self._whole.side**2
-            self._room_of_slopes = np.empty(most, dtype=np.float32)
+            self._room_of_slopes = np.empty(most, dtype=np.int16)
         values = self._room_of_slopes[:size].reshape(rows, free, side**2)
-        return Slopes(np.zeros((rows, 4), dtype=np.int64), values, np.zeros((rows, free)))
+        squares, units, moves = np.zeros((rows, 4), dtype=np.int64), *np.zeros((2, rows, free))
+        return Slopes(squares, values, units, moves)

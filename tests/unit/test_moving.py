@@ -16,7 +16,7 @@ import trackpy
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis._kernels.canvas import Light
-from iscat_analysis._kernels.following import Slopes
+from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.bias import first_order_bias
@@ -281,14 +281,16 @@ def test_rows_follow_a_step_of_their_background(
 def test_rows_in_one_place_follow_as_one(pool: ThreadPoolExecutor, rounded: float) -> None:
     """Whatever rounding makes of what each knows alone, each takes up half of what both see."""
     side, level = 12, 100.0
-    slope = np.random.default_rng(4).standard_normal((1, 1, side * side)).astype(np.float32)
+    slope = np.random.default_rng(4).standard_normal((1, 1, side * side))
     squares = np.tile([0, side, 0, side], (2, 1))
-    slopes = Slopes(squares, np.repeat(slope, 2, axis=0), np.zeros((2, 1)))
+    unit = 1e-4
+    values = np.repeat(np.rint(slope / unit).astype(np.int16), 2, axis=0)
+    slopes = Slopes(squares, values, np.full((2, 1), unit), np.zeros((2, 1)))
     light = Light(
         np.full((1, side, side), level, dtype=np.float32), np.ones(1),
         np.full((side, side), level), np.zeros((side, side)),
     )  # fmt: skip
-    own = float(np.sum(slope.astype(float) ** 2)) / level
+    own = float(np.sum(slope**2)) / level
     response = Response(
         slopes, np.array([0, 2]), light, np.zeros((1, side, side), dtype=np.float32),
         np.full((2, 1, 1), rounded * own), pool,
@@ -298,6 +300,26 @@ def test_rows_in_one_place_follow_as_one(pool: ThreadPoolExecutor, rounded: floa
     move = slope.reshape(side, side) / level
     moved = response.followed(np.zeros((2, 5)), move, free, walls)[:, 3]
     assert moved == pytest.approx(-0.5, rel=0.05)
+
+
+def test_slopes_are_kept_in_half_the_memory() -> None:
+    """To a few ten-thousandths of all of a slope, of squares at the edge too; of nothing, nothing."""
+    rng = np.random.default_rng(6)
+    ny, nx, side = 11, 7, 16
+    level = rng.uniform(900.0, 1100.0, (ny, nx))
+    gradient = rng.standard_normal((ny, 5, nx)) * np.array([1.0, 1e-6, 3.0, 5.0, 1e3])[:, None]
+    gradient[:, 2] = 0.0
+    index = np.array([0, 1, 3])
+    slopes = Slopes(
+        np.zeros((1, 4), dtype=np.int64), np.zeros((1, 3, side**2), dtype=np.int16),
+        np.zeros((1, 3)), np.zeros((1, 3)),
+    )  # fmt: skip
+    keep_slopes(level, gradient, index, slopes, 0, np.zeros(side**2, dtype=np.float32))
+    kept = (slopes.values[0, :, : ny * nx] * slopes.units[0][:, None]).reshape(3, ny, nx)
+    exact = level * np.moveaxis(gradient, 1, 0)[1 + index]
+    assert np.all(kept[1] == 0.0)
+    for k in (0, 2):
+        assert np.linalg.norm(kept[k] - exact[k]) < 5e-4 * np.linalg.norm(exact[k])
 
 
 def test_rows_that_overlap_follow_one_another(pool: ThreadPoolExecutor) -> None:
