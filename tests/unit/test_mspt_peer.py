@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ def test_derivatives_are_those_of_the_cost() -> None:
     at, step = TRUTH * 1.05, 1e-5
     assert mspt.cost(at, image) == pytest.approx(0.5 * ((picture(at) - image) ** 2).sum())
 
-    def slope(of: object) -> np.ndarray:
+    def slope(of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         return np.array([(of(at + d) - of(at - d)) / (2 * step) for d in step * np.eye(7)])
 
     gradient, hessian = mspt.gradient(at, image), mspt.hessian(at, image)
