@@ -96,7 +96,7 @@ def fit_frames(
     information: FloatArray,
     gain: FloatArray,
     expected: FloatArray,
-    stretch: FloatArray,
+    sums: NDArray[np.float32],
 ) -> None:
     """Fit the rows of frames first…last − 1, each `sweeps` times.
 
@@ -126,8 +126,8 @@ def fit_frames(
         Filled with its log-likelihood over that without the particle, the others in place.
     expected : ndarray, shape (t,)
         Filled with the photoelectrons expected in the used pixels at power 1.
-    stretch : ndarray, shape (y, x)
-        Added to: Σ w (1 + C) over the frames.
+    sums : ndarray of float32, shape (y, x)
+        Added to: Σ w C over the frames.
     """
     rows, columns = light.background.shape
     near_profile = blank_profile(table_of(near, 0), near.lens, 1)
@@ -138,6 +138,7 @@ def fit_frames(
     step, before, index = np.empty(5), np.empty(5), np.flatnonzero(search.free[:4])
     slope_profile = blank_profile(table_of(near, 0), near.lens, 2)
     fisher = np.empty((5, 5))
+    background, amount = light.background.astype(np.float32), light.background.sum()
     for t in range(first, last):
         if sweeps:
             expected[t] = _look_over(light.counts[t])  # kept for a moment, or nothing would be read
@@ -176,7 +177,7 @@ def fit_frames(
                     for k in range(index.size):
                         slopes.moves[r, k] = p[index[k]] - before[index[k]]
                     keep_slopes(data[2], here, index, slopes, r, room)
-        expected[t] = _add_stretch(light, t, total, stretch)
+        expected[t] = amount + _add_signals(total, background, light.power[t], sums)
 
 
 @kernel(fastmath=FAST, _nrt=False)
@@ -267,13 +268,15 @@ def _add_signal(here: FloatArray, step: FloatArray, out: FloatArray) -> None:
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _add_stretch(light: Light, t: int, total: NDArray[np.float32], stretch: FloatArray) -> float:
-    """Add w (1 + C) of a frame to `stretch`; return what the used pixels expect at power 1."""
-    amount, w = 0.0, light.power[t]
-    background = light.background
-    for i in range(stretch.shape[0]):
-        for j in range(stretch.shape[1]):
-            stretch[i, j] += w * (1.0 + total[i, j])
-        for j in range(stretch.shape[1]):
-            amount += background[i, j] * (1.0 + total[i, j])
-    return amount
+def _add_signals(
+    total: NDArray[np.float32], background: NDArray[np.float32], power: float,
+    sums: NDArray[np.float32],
+) -> float:  # fmt: skip
+    """Add w C of a frame to `sums`; return Σ B C.  Both are small, so that single precision does."""
+    amount, w = np.float32(0.0), np.float32(power)
+    for i in range(sums.shape[0]):
+        signal, light, out = total[i], background[i], sums[i]
+        for j in range(signal.size):
+            out[j] += w * signal[j]
+            amount += light[j] * signal[j]
+    return float(amount)

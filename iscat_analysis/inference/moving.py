@@ -15,10 +15,11 @@ informations, so that Newton's method sees where the turns would end (`settle`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -222,16 +223,16 @@ class MovingField:
         slopes = self._slopes_of(len(theta), field.side if sweeps else 0)
         expected = np.zeros(self.frames)
 
-        def block(first: int) -> FloatArray:
-            stretch = np.zeros(self.used.shape)
+        def block(first: int) -> NDArray[np.float32]:
+            sums = np.zeros(self.used.shape, dtype=np.float32)
             fit_frames(
                 light, field, near, far, search, starts, first,
                 min(first + _BLOCK, self.frames), sweeps, theta, rows.group, canvas, slopes,
-                outcome, fisher, gain, expected, stretch,
+                outcome, fisher, gain, expected, sums,
             )  # fmt: skip
-            return stretch
+            return sums
 
-        stretch = self._sum_of(block)
+        stretch = ground.power.sum() + self._sum_of(block)
         fitted = rows.fitted(theta, fisher, gain) if sweeps else rows
         self._canvas = Sheet(fitted, canvas, coarse)
         if sweeps:
@@ -373,7 +374,8 @@ class MovingField:
         fit_frames(
             part, self._coarse, near, far, self._search, starts, 0, last - first, 0, within.theta,
             within.group, canvas, self._slopes_of(n, 0), np.zeros(n, dtype=np.int64),
-            within.fisher, within.snr, np.zeros(last - first), np.zeros(self.used.shape),
+            within.fisher, within.snr, np.zeros(last - first),
+            np.zeros(self.used.shape, dtype=np.float32),
         )  # fmt: skip
         return canvas.total
 
@@ -469,7 +471,7 @@ class MovingField:
             fit_frames(
                 light, self._coarse, near, far, self._search, starts, first,
                 min(first + _SWEPT, times.size), sweeps, theta, rows.group, canvas, slopes,
-                outcome, fisher, gain, expected, np.zeros(self.used.shape),
+                outcome, fisher, gain, expected, np.zeros(self.used.shape, dtype=np.float32),
             )  # fmt: skip
 
         self.share(block, -(-times.size // _SWEPT))
@@ -494,7 +496,7 @@ class MovingField:
         return np.asarray((near & self.free).any(axis=1))
 
     def _pictures_for(self, *, coarse: bool) -> tuple[Pictures, Pictures]:
-        """Pictures to fit and to draw; what is drawn coarsely reaches no farther than the former."""
+        """Give the pictures to fit and to draw, which are the same where little is drawn."""
         near, far = self._pictures
         return near, near if coarse and not self.free[2] else far
 
@@ -502,10 +504,10 @@ class MovingField:
         level, read = (np.where(self.used, part, 0.0) for part in (ground.level, self.read_e2))
         return Light(self.counts_e, ground.power, level, read)
 
-    def _sum_of(self, block: Callable[[int], FloatArray]) -> FloatArray:
+    def _sum_of(self, block: Callable[[int], NDArray[np.floating[Any]]]) -> FloatArray:
         """Run blocks of frames and add what they give, in their order."""
-        parts: Sequence[FloatArray] = list(self._pool.map(block, range(0, self.frames, _BLOCK)))
-        total = parts[0].copy()
+        parts = list(self._pool.map(block, range(0, self.frames, _BLOCK)))
+        total = parts[0].astype(np.float64)
         for part in parts[1:]:
             total += part
         return total

@@ -303,7 +303,7 @@ def test_rows_in_one_place_follow_as_one(pool: ThreadPoolExecutor, rounded: floa
 
 
 def test_slopes_are_kept_in_half_the_memory() -> None:
-    """To a few ten-thousandths of all of a slope, of squares at the edge too; of nothing, nothing."""
+    """To a few ten-thousandths of a slope, of squares at the edge too; of nothing, nothing."""
     rng = np.random.default_rng(6)
     ny, nx, side = 11, 7, 16
     level = rng.uniform(900.0, 1100.0, (ny, nx))
