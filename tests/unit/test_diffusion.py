@@ -427,11 +427,11 @@ def test_the_most_likely_exponent() -> None:
     lags = fractional.Lags.of(track)
     straight = np.outer([30.0, -30.0], track.frames)
     for moved in (track, replace(track, positions_nm=track.positions_nm + straight)):
-        lost = lambda at, moved=moved: (
-            -fractional._likelihood(  # noqa: E731
-                moved, lags, math.exp(at[0]), min(max(at[1], 0.02), 1.98)
-            ).value
-        )
+
+        def lost(at: np.ndarray, moved: Displacements = moved) -> float:
+            exponent = min(max(at[1], 0.02), 1.98)
+            return -fractional._likelihood(moved, lags, math.exp(at[0]), exponent).value
+
         best = minimize(lost, [12.0, 1.2], method="Nelder-Mead", options={"xatol": 1e-6})
         found = fractional.most_likely_power(moved, 0.5 * math.exp(best.x[0]))
         assert found.value == pytest.approx(-best.fun, abs=1e-3)
