@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.displacements import Displacements
@@ -25,8 +24,9 @@ _EXPONENTS = (0.02, 1.98)
 _LN_D = 20.0  # from ln D of free diffusion at most
 _FLASH = 1e-2  # an exposure this small a part of a lag blurs by a series; the closed form cancels
 _PART = 1e-3  # of an exponent, for the derivatives of the mean-squared displacement
-_SETTLED = 0.1  # standard errors: a step of Newton's method leaves about the square of its length
-_MOST, _HALVINGS = 50, 30  # steps, and halvings of each
+_SETTLED = 0.1  # standard errors: of a step of Newton's method that is the last one
+_MOST = 50  # steps
+_SMALL = 80  # rows of a matrix that is not halved to be inverted
 
 
 class Fractional(NamedTuple):
@@ -160,13 +160,11 @@ def _likelihood(track: Displacements, lags: Lags, d: float, exponent: float) -> 
         flat[:: n + 1] += main
         flat[1 :: n + 1] += beside
         flat[n :: n + 1] += beside
-        factor, failed = lapack.dpotrf(sigma, lower=True, overwrite_a=True)
-        if failed:
+        try:
+            inverse, log_determinant = _inverse(sigma)
+        except np.linalg.LinAlgError:
             return _There(-math.inf, slope, curvature, information)
-        value -= float(np.log(np.diag(factor)).sum())
-        half = lapack.dpotri(factor, lower=True, overwrite_c=True)[0]
-        inverse = half + half.T
-        inverse.reshape(n * n)[:: n + 1] /= 2
+        value -= log_determinant / 2
         z = inverse @ steps
         value -= float(steps @ z) / 2
         by_d = -main[:, None] * inverse  # Σ_a W
@@ -186,6 +184,28 @@ def _likelihood(track: Displacements, lags: Lags, d: float, exponent: float) -> 
         curvature += force @ inverse @ force.T - told - second / 2
         information += told
     return _There(value, slope, curvature, information)
+
+
+def _inverse(sigma: FloatArray) -> tuple[FloatArray, float]:
+    """Invert a covariance by halves, and give the logarithm of its determinant.
+
+    That is products almost alone, during which, unlike in LAPACK's own inverse as SciPy calls it,
+    other threads go on.
+    """
+    n = len(sigma)
+    if n <= _SMALL:
+        factor = np.linalg.cholesky(sigma)
+        return np.linalg.inv(sigma), 2 * float(np.log(np.diag(factor)).sum())
+    half = n // 2
+    first, one = _inverse(sigma[:half, :half])
+    slopes = first @ sigma[:half, half:]
+    last, other = _inverse(sigma[half:, half:] - sigma[half:, :half] @ slopes)
+    out = np.empty_like(sigma)
+    out[half:, half:] = last
+    np.negative(slopes @ last, out=out[:half, half:])
+    out[half:, :half] = out[:half, half:].T
+    np.subtract(first, out[:half, half:] @ slopes.T, out=out[:half, :half])
+    return out, one + other
 
 
 def _msd(track: Displacements, lags: FloatArray, exponent: float) -> FloatArray:

@@ -319,4 +319,4 @@ def _free_track(track: Displacements, d: float, rng: np.random.Generator) -> Dis
     mean = np.cumsum(between, axis=1) + during / 2
     mean += math.sqrt(d * e / 6) * rng.standard_normal(shape)
     mean += np.sqrt(track.variance_nm2) * rng.standard_normal(shape)
-    return replace(track, positions_nm=mean)
+    return track.moved(mean)
