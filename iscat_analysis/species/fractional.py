@@ -136,10 +136,9 @@ def _newton(here: _There, least: FloatArray, most: FloatArray) -> tuple[FloatArr
     bends = here.curvature
     if not (bends[1, 1] > 0 and np.linalg.det(bends) > 0):
         bends = here.information
-    step = np.linalg.solve(bends, here.slope)
-    alpha = float(np.clip(step[1], least[1], most[1]))
+    alpha = float(np.clip(np.linalg.solve(bends, here.slope)[1], least[1], most[1]))
     ln_d = (here.slope[0] - bends[0, 1] * alpha) / bends[0, 0]
-    step = np.array([float(np.clip(ln_d, least[0], most[0])), alpha])
+    step: FloatArray = np.array([float(np.clip(ln_d, least[0], most[0])), alpha])
     return step, float(here.slope @ step - step @ bends @ step / 2)
 
 
@@ -195,7 +194,8 @@ def _inverse(sigma: FloatArray) -> tuple[FloatArray, float]:
     n = len(sigma)
     if n <= _SMALL:
         factor = np.linalg.cholesky(sigma)
-        return np.linalg.inv(sigma), 2 * float(np.log(np.diag(factor)).sum())
+        out = np.asarray(np.linalg.inv(sigma), dtype=np.float64)
+        return out, 2 * float(np.log(np.diag(factor)).sum())
     half = n // 2
     first, one = _inverse(sigma[:half, :half])
     slopes = first @ sigma[:half, half:]
