@@ -106,11 +106,17 @@ class Camera:
             At or above the well depth, at the full scale of the stored type, or at that of a
             converter of fewer bits, see `converter_ceiling`.
         """
-        full: BoolArray = counts >= converter_ceiling(counts)
-        if self.full_scale_adu is not None:
+        full: BoolArray = np.zeros(counts.shape, dtype=np.bool_)
+        top = counts.max(initial=0)  # which tells what need not be asked of every pixel
+        ceiling = converter_ceiling(counts)
+        if not top < ceiling:
+            full |= counts >= ceiling
+        if self.full_scale_adu is not None and not top < self.full_scale_adu:
             full |= counts >= self.full_scale_adu
         if self.well_depth_e is not None:
-            full |= self.to_electrons(counts) >= self.well_depth_e
+            most = (float(top) - np.asarray(self.offset_adu)) * self.gain_e_per_adu
+            if not np.all(most < self.well_depth_e):
+                full |= self.to_electrons(counts) >= self.well_depth_e
         return full
 
     def read_variance_e2(self, shape: tuple[int, int]) -> FloatArray:

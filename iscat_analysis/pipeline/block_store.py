@@ -23,6 +23,7 @@ from iscat_analysis.pipeline.noise import Noise, judge_beside
 from iscat_analysis.pipeline.resume import Shelf, packed_views, unpacked_views
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import BoolArray, EventView, FloatArray, FrameSource, Progress, Windows
+from iscat_analysis.threads import beside
 
 
 @dataclass(frozen=True)
@@ -160,32 +161,33 @@ def analyse_block(
         scene, movie, camera, span,
         check=check, pool=pool, progress=progress, inner=inner, cautious=cautious,
     )  # fmt: skip
-    table, inside = moving_table(scene, moving, first), moving.field.holds(moving.rows.theta)
-    best = table.loc[table[inside].groupby("track")["snr"].idxmax()]
-    field, rows = moving.field, moving.rows
-    ground = moving.ground
+    field, ground, rows = moving.field, moving.ground, moving.rows
 
     def without(count: int) -> FloatArray:
+        pictures.result()  # of which all frames are drawn
         light: FloatArray = ground.level * ground.power[:count, None, None]
         return light + field.residual(ground, rows, 0, count)
 
-    noise = Noise()
     if not goes_on[0]:
         seen = rows.frame + first, rows.theta[:, :2]
-        noise = judge_beside(scene, movie, camera, span, seen, field.used, without)
-    aligned = None if goes_on[0] else align(scene, moving)  # draws all frames, for the views too
+        pictures = beside(align, scene, moving)
+        judged = beside(judge_beside, scene, movie, camera, span, seen, field.used, without)
+    table, inside = moving_table(scene, moving, first), field.holds(rows.theta)
+    masses = common_masses(scene, moving)
+    best = table.loc[table[inside].groupby("track")["snr"].idxmax()]
+    aligned, noise = None, Noise()
+    if not goes_on[0]:
+        aligned, noise = pictures.result(), judged.result()
     return Block(
         span=span,
         rows=replace(rows, frame=rows.frame + first),
         error=typical_error(moving.judged.fisher) if len(rows.frame) else 0.0,
         table=table,
         inside=inside,
-        masses=common_masses(scene, moving),
-        views=tuple(
-            row_view(moving.field, moving.ground, moving.rows, int(row)) for row in best.index
-        ),
-        level=moving.ground.level,
-        power=moving.ground.power,
+        masses=masses,
+        views=tuple(row_view(field, ground, rows, int(row)) for row in best.index),
+        level=ground.level,
+        power=ground.power,
         total_e=field.total_e,
         used=field.used,
         saturated=field.saturated,

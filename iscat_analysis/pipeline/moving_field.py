@@ -169,8 +169,11 @@ def _noisy(
             squares += (counts_e[t] / light[t] - counts_e[t + 1] / light[t + 1]) ** 2
     noise = squares / (2 * len(firsts) * np.maximum(variance_e2, 1.0))
     most = max(_NOISY, float(chdtri(len(firsts), _BY_CHANCE)) / len(firsts))
-    around = median_filter(noise, size=_AROUND, mode="nearest")
-    return np.asarray(noise > most * np.maximum(around, 1.0))
+    noisy = noise > most
+    if noisy.any():  # else nobody needs to know how noisy those around are
+        around = median_filter(noise, size=_AROUND, mode="nearest")
+        noisy &= noise > most * around
+    return np.asarray(noisy)
 
 
 def search_frames(

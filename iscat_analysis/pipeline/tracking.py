@@ -38,7 +38,7 @@ from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.pipeline.tracked_optics import Begun, learn_from_tracks
 from iscat_analysis.records import EventView, FloatArray, FrameSource, Progress, Windows
 from iscat_analysis.search.moving import link
-from iscat_analysis.threads import threads
+from iscat_analysis.threads import beside, threads
 
 _STEPS = 100  # of the progress of a block
 
@@ -73,11 +73,12 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         run.tell(kept.message)
     run.clock.lap("model")
     check = checked(movie, camera)
+    shaking = beside(shaking_warning, movie, camera, (first, last))
     with threads(config.compute.workers) as pool:
         plan = plan_blocks(movie, config, camera, check=check, span=kept.span, mapper=pool.map)
     if message := plan.message(movie.name):
         run.tell(message)
-    shaken = shaking_warning(movie, camera, (first, last))
+    shaken = shaking.result()
     if shaken:
         run.tell(f"{movie.name}: {shaken}")
     run.clock.lap("background")

@@ -382,17 +382,17 @@ def _chosen(tracks: pd.DataFrame) -> Iterator[tuple[int, str, bool]]:
     good = tracks[tracks["status"] == TrackStatus.OK].sort_values(
         ["n_frames", "mass_scatter"], ascending=[False, True]
     )
-    for row in good.head(FILMS).itertuples():
-        yield int(row.track), f"one of the longest that are ok: {row.n_frames} frames", False
+    for track, frames in good[["track", "n_frames"]].head(FILMS).to_numpy().tolist():
+        yield track, f"one of the longest that are ok: {frames} frames", False
     rank = tracks["status"].map([str(status) for status in TrackStatus].index)
     bad = tracks.assign(rank=rank)[tracks["status"] != TrackStatus.OK]
     shown = bad[bad["status"] != TrackStatus.FEW_FRAMES].sort_values(
         ["rank", "n_frames"], ascending=[True, False]
     )
-    for row in shown.head(FILMS).itertuples():
-        yield int(row.track), TrackStatus(row.status).advice, True
+    for track, status in shown[["track", "status"]].head(FILMS).to_numpy().tolist():
+        yield track, TrackStatus(status).advice, True
     rest = good.iloc[FILMS:].sort_values("mass_scatter", ascending=False)
-    for row in rest.head(max(0, FILMS - len(shown))).itertuples():
+    for row in rest[["track", "mass_scatter"]].head(max(0, FILMS - len(shown))).itertuples():
         text = f"ok; its frames scatter most, {row.mass_scatter:.2f} times their errors"
         yield int(row.track), text, True
 

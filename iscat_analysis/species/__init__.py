@@ -29,9 +29,9 @@ concentrations, with the law of `mass_action`, and `kinetics` the rates of landi
 
 A track tells a diffusion coefficient: `displacements` has the likelihood of its steps, with errors
 and motion blur, `diffusion` the estimate and the size that follows, and `motion` asks whether the
-particle diffuses freely.  `tracks` puts all that and the mass (`common_mass`) into one row per
-track, with the refractive index (`refraction`) of particles in a volume.  `common_change` asks
-whether the masses of all tracks change together.
+particle diffuses freely, or with an exponent (`fractional`).  `tracks` puts all that and the mass
+(`common_mass`) into one row per track, with the refractive index (`refraction`) of particles in a
+volume.  `common_change` asks whether the masses of all tracks change together.
 """
 
 from __future__ import annotations

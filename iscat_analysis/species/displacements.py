@@ -11,7 +11,7 @@ of one frame and equal errors).  So Σ(D) = E + D·A with three bands.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -30,6 +30,7 @@ _RATES_HZ = (1e-6, 1e9)
 _LENGTHS_NM = (1e-6, 1e9)  # the smallest error and the largest place
 _MOST_RATIO = 1e5  # of the errors of a track; their squares must not drown in one another
 _MOST_FRAMES = 2**53  # beyond, not every frame has a number of its own
+_OF_TIMES = ("gaps_s", "linked", "error", "rate")  # and of errors alone, of `Displacements`
 _ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
 
 
@@ -108,6 +109,23 @@ class Displacements:
         """A: its diagonal, shape (m,), and the band beside it, (m − 1,) [s]."""
         blur = self.exposure_s / 3
         return 2 * (self.gaps_s - blur), np.where(self.linked, blur, 0.0)
+
+    def moved(self, positions_nm: FloatArray) -> Displacements:
+        """Give a track of the same frames and errors at other places.
+
+        Parameters
+        ----------
+        positions_nm : ndarray, shape (c, n)
+            The places.
+
+        Returns
+        -------
+        Displacements
+            It has what is known of this one's times and errors, which takes longer than its D.
+        """
+        track = replace(self, positions_nm=positions_nm)
+        vars(track).update({name: getattr(self, name) for name in _OF_TIMES})
+        return track
 
     def likelihood(self, d_nm2_s: float) -> Likelihood:
         """Log-likelihood of free diffusion.

@@ -12,20 +12,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
-import scipy
-from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solve_triangular
+from numpy.typing import ArrayLike
 from scipy.special import chdtrc
 
 from iscat_analysis._kernels.well import most_likely_well
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, shown
-from iscat_analysis.records import FloatArray
 from iscat_analysis.species.diffusion import most_likely
 from iscat_analysis.species.displacements import Displacements, gather
+from iscat_analysis.species.fractional import most_likely_power
 
 _UM2 = 1e6  # nm²
 STRETCH = 40
@@ -35,11 +32,8 @@ _MOST_STRETCHES = 25
 MOST_POSITIONS = 4000
 """Of a track whose exponent is tested."""
 
-_EXPONENTS = (0.02, 1.98)
-_FLASH = 1e-2  # an exposure this small a part of a lag blurs by a series; the closed form cancels
 _STIFFEST = 3.0  # times the frame rate: there a well is flat noise within one frame
 _SOFTEST = 0.3  # per length of the track: there a well is not felt
-_PART = 1e-4  # of an exponent, for the derivative of the covariance
 
 
 @dataclass(frozen=True)
@@ -146,29 +140,14 @@ def anomalous_test(
     free = most_likely(track)
     if not free > 0:
         return AnomalousTest(1.0, 0.0, math.nan, math.nan, 0.0)
-    lags = _Lags.of(track)
-    unit = 1 / math.sqrt(track.steps_nm.size)  # of ln D and the exponent: about their errors
-
-    def at(theta: FloatArray) -> tuple[float, float]:
-        return free * math.exp(unit * theta[0]), 1 + unit * float(theta[1])
-
-    def lost(theta: FloatArray) -> float:
-        d, exponent = at(theta)
-        return -_dense(track, d * _covariance(track, lags, exponent))
-
-    found = scipy.optimize.minimize(
-        lost, [0.0, 0.0], method="L-BFGS-B",
-        bounds=[(-20.0 / unit, 20.0 / unit), [(end - 1) / unit for end in _EXPONENTS]],
-        options={"ftol": 1e-7, "eps": _PART / unit},
-    )  # fmt: skip
-    d, exponent = at(found.x)
-    ratio = max(2 * (-float(found.fun) - track.likelihood(free).value), 0.0)
+    found = most_likely_power(track, free)
+    ratio = max(2 * (found.value - track.likelihood(free).value), 0.0)
     return AnomalousTest(
         p_value=float(chdtrc(1, ratio)),
         ratio=ratio,
-        exponent=exponent,
-        sigma_exponent=_exponent_error(track, lags, d, exponent),
-        d_um2_s=d / _UM2,
+        exponent=found.exponent,
+        sigma_exponent=found.sigma_exponent,
+        d_um2_s=found.d_nm2_s / _UM2,
     )
 
 
@@ -313,77 +292,6 @@ def steadiness_test(
     return float(chdtrc(count - 1, max(ratio, 0.0)))
 
 
-class _Lags(NamedTuple):
-    """Every distance in time between two frames, in frames, and which pair has which."""
-
-    distinct: FloatArray
-    which: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, track: Displacements) -> _Lags:
-        pairs = np.abs(np.subtract.outer(track.frames, track.frames))
-        longest = int(pairs[0, -1])
-        if longest < pairs.size:  # few gaps or none: all lags up to the longest
-            return cls(np.arange(longest + 1.0), pairs)
-        distinct, which = np.unique(pairs, return_inverse=True)
-        return cls(distinct.astype(float), which.reshape(pairs.shape))
-
-
-def _covariance(track: Displacements, lags: _Lags, exponent: float) -> FloatArray:
-    """Covariance of displacements for D = 1: −½ of the second difference of the MSD of averages.
-
-    |t|^α averaged over two exposures is [(t+e)^(α+2) + |t−e|^(α+2) − 2 t^(α+2)]/[e² (α+1)(α+2)].
-    """
-    e, t = track.exposure_s / track.interval_s, lags.distinct
-    smooth = t**exponent
-    if e > 0:
-        high = exponent + 2
-        closed = (t + e) ** high + np.abs(t - e) ** high - 2 * t**high
-        closed /= e**2 * (exponent + 1) * high
-        far = t * _FLASH > e
-        series = 1 + exponent * (exponent - 1) / 12 * (e / np.where(far, t, 1.0)) ** 2
-        smooth = np.where(far, smooth * series, closed)
-    msd = 2 * track.interval_s * (smooth - smooth[0])
-    return np.asarray(-0.5 * np.diff(np.diff(msd[lags.which], axis=0), axis=1))
-
-
-def _with_errors(track: Displacements, motion: FloatArray) -> FloatArray:
-    """Covariance of displacements along each axis, (c, n, n)."""
-    main, beside = track.error
-    axes, n = main.shape
-    sigma = np.broadcast_to(motion, (axes, n, n)).copy()
-    flat = sigma.reshape(axes, n * n)
-    flat[:, :: n + 1] += main
-    flat[:, 1 :: n + 1] += beside
-    flat[:, n :: n + 1] += beside
-    return sigma
-
-
-def _dense(track: Displacements, motion: FloatArray) -> float:
-    """Log-likelihood with any covariance of the motion; −∞ where rounding spoils it."""
-    try:
-        factors = np.linalg.cholesky(_with_errors(track, motion))
-    except np.linalg.LinAlgError:
-        return -math.inf
-    value = 0.0
-    for factor, steps in zip(factors, track.steps_nm, strict=True):
-        white = solve_triangular(factor, steps, lower=True, check_finite=False)
-        value -= float(white @ white) / 2 + float(np.log(np.diag(factor)).sum())
-    return value - track.steps_nm.size * math.log(2 * math.pi) / 2
-
-
-def _exponent_error(track: Displacements, lags: _Lags, d: float, exponent: float) -> float:
-    """Give the standard error of α, D being unknown as well."""
-    there = d * _covariance(track, lags, exponent)
-    sides = [d * _covariance(track, lags, exponent + s) for s in (-_PART, _PART)]
-    slope = (sides[1] - sides[0]) / (2 * _PART)
-    information = np.zeros((2, 2))
-    for sigma in _with_errors(track, there):
-        parts = np.split(np.linalg.solve(sigma, np.hstack([there, slope])), 2, axis=1)
-        information += [[0.5 * np.sum(a * b.T) for a in parts] for b in parts]
-    return float(math.sqrt(np.linalg.inv(information)[1, 1]))
-
-
 def _well(track: Displacements, free: float) -> tuple[float, float, float]:
     """Find the well of highest likelihood: the ratio, D [nm²/s] and κ [1/s]."""
     none = track.likelihood(free).value
@@ -411,4 +319,4 @@ def _free_track(track: Displacements, d: float, rng: np.random.Generator) -> Dis
     mean = np.cumsum(between, axis=1) + during / 2
     mean += math.sqrt(d * e / 6) * rng.standard_normal(shape)
     mean += np.sqrt(track.variance_nm2) * rng.standard_normal(shape)
-    return replace(track, positions_nm=mean)
+    return track.moved(mean)

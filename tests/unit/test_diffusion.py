@@ -7,6 +7,7 @@ exposures, and matrices of full size; the code under test has displacements and 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy.stats import multivariate_normal, norm
 import iscat_analysis as ia
 from iscat_analysis._kernels.diffusion import displacement_likelihoods
 from iscat_analysis._kernels.well import harmonic_likelihoods, most_likely_well
-from iscat_analysis.species import diffusion, motion
+from iscat_analysis.species import diffusion, fractional, motion
 from iscat_analysis.species.displacements import Displacements, gather
 
 EXACT = 1e-9  # of float64, after a factorisation of a hundred rows
@@ -249,7 +250,8 @@ def test_the_covariance_based_estimate_has_its_error() -> None:
 @pytest.mark.parametrize("exposure", [0.0, 0.005, 0.6, 1.0])
 def test_blur_of_anomalous_motion(exponent: float, exposure: float) -> None:
     track = make_track(n=5, missing=0.5, exposure=exposure)
-    found = motion._covariance(track, motion._Lags.of(track), exponent)
+    lags = fractional.Lags.of(track)
+    found = fractional.covariance(lags, fractional._msd(track, lags.distinct, exponent))
     dt, start = track.interval_s, track.frames.astype(float)
 
     def averaged(lag: float) -> float:
@@ -383,6 +385,57 @@ def test_a_track_that_another_took_over_has_no_one_d() -> None:
     assert p_of(motion.STRETCH * 2, 0) == 1.0  # one displacement fewer than two stretches
     free = np.array([p_of(400, 0) for _ in range(60)])
     assert abs(free.mean() - 0.5) < 4 / math.sqrt(12 * 60)
+
+
+@pytest.mark.parametrize("exponent", [0.4, 1.0, 1.7])
+def test_slopes_of_the_likelihood_of_an_exponent(exponent: float) -> None:
+    track = make_track(n=40, missing=0.3, exposure=0.7)
+    lags, at = fractional.Lags.of(track), np.array([math.log(0.1e6), exponent])
+    part = 1e-5 * np.eye(2)
+
+    def told(at: np.ndarray) -> Any:
+        return fractional._likelihood(track, lags, math.exp(at[0]), at[1])
+
+    def covariances(at: np.ndarray) -> np.ndarray:
+        one = fractional.covariance(lags, fractional._msd(track, lags.distinct, at[1]))
+        sigma = np.array([math.exp(at[0]) * one + np.diag(main) for main in track.error[0]])
+        for among, beside in zip(sigma, track.error[1], strict=True):
+            among += np.diag(beside, 1) + np.diag(beside, -1)
+        return sigma
+
+    there, sigma = told(at), covariances(at)
+    value = sum(
+        multivariate_normal.logpdf(steps, cov=one)
+        for steps, one in zip(track.steps_nm, sigma, strict=True)
+    )
+    assert there.value == pytest.approx(value, rel=EXACT)
+    sides = [(told(at - h), told(at + h)) for h in part]
+    slope = [(b.value - a.value) / 2e-5 for a, b in sides]
+    assert there.slope == pytest.approx(slope, rel=SLOPE, abs=1e-4)
+    bends = [(a.slope - b.slope) / 2e-5 for a, b in sides]
+    close = 1e-3 * float(there.information[1, 1])  # of the MSD, second differences of α
+    assert there.curvature == pytest.approx(np.array(bends), rel=1e-4, abs=close)
+    turns = [(covariances(at + h) - covariances(at - h)) / 2e-5 for h in part]
+    by = [np.linalg.solve(sigma, turn) for turn in turns]
+    information = [[np.einsum("cij,cji", one, other) / 2 for one in by] for other in by]
+    assert there.information == pytest.approx(np.array(information), rel=1e-4)
+
+
+def test_the_most_likely_exponent() -> None:
+    """From a start far off, against a search that knows no slopes; at the end of its range too."""
+    track = make_track(n=80, missing=0.2)
+    lags = fractional.Lags.of(track)
+    straight = np.outer([30.0, -30.0], track.frames)
+    for moved in (track, replace(track, positions_nm=track.positions_nm + straight)):
+
+        def lost(at: np.ndarray, moved: Displacements = moved) -> float:
+            exponent = min(max(at[1], 0.02), 1.98)
+            return -fractional._likelihood(moved, lags, math.exp(at[0]), exponent).value
+
+        best = minimize(lost, [12.0, 1.2], method="Nelder-Mead", options={"xatol": 1e-6})
+        found = fractional.most_likely_power(moved, 0.5 * math.exp(best.x[0]))
+        assert found.value == pytest.approx(-best.fun, abs=1e-3)
+        assert abs(found.exponent - best.x[1]) < 0.03 * found.sigma_exponent
 
 
 def test_a_direction_is_found() -> None:
