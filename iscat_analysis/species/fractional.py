@@ -25,6 +25,7 @@ _LN_D = 20.0  # from ln D of free diffusion at most
 _FLASH = 1e-2  # an exposure this small a part of a lag blurs by a series; the closed form cancels
 _PART = 1e-3  # of an exponent, for the derivatives of the mean-squared displacement
 _SETTLED = 0.1  # standard errors: of a step of Newton's method that is the last one
+_NO_STEP = 1e-6  # of ln D and α
 _MOST = 50  # steps
 _SMALL = 80  # rows of a matrix that is not halved to be inverted
 
@@ -107,20 +108,26 @@ def most_likely_power(track: Displacements, free: float) -> Fractional:
     -------
     Fractional
         Its last step is shorter than a tenth of the errors, so that the gain that the parabola
-        promises is that of the likelihood, and the information before it that after it.
+        promises is that of the likelihood, and the information before it that after it.  Where
+        rounding spoils the likelihood of free diffusion, the standard error is NaN.
     """
     lags = Lags.of(track)
     at = np.array([math.log(free), 1.0])
     low, high = np.array([at[0] - _LN_D, _EXPONENTS[0]]), np.array([at[0] + _LN_D, _EXPONENTS[1]])
     here = _likelihood(track, lags, free, 1.0)
+    if not math.isfinite(here.value):
+        return Fractional(here.value, free, 1.0, math.nan)
     for _ in range(_MOST):
         step, gain = _newton(here, low - at, high - at)
         if 2 * gain < _SETTLED**2:
             break
         there = _likelihood(track, lags, *_powers(at + step))
-        while not there.value > here.value:
+        while not there.value > here.value and np.abs(step).max() > _NO_STEP:
             step /= 2
             there = _likelihood(track, lags, *_powers(at + step))
+        if not there.value > here.value:  # rounding is all that is left
+            step, gain = np.zeros(2), 0.0
+            break
         at, here = at + step, there
     sigma = math.sqrt(float(np.linalg.inv(here.information)[1, 1]))
     return Fractional(here.value + gain, *_powers(at + step), sigma)
