@@ -272,7 +272,7 @@ def _add_signals(
     total: NDArray[np.float32], background: NDArray[np.float32], power: float,
     sums: NDArray[np.float32],
 ) -> float:  # fmt: skip
-    """Add w C of a frame to `sums`; return Σ B C.  Both are small, so that single precision does."""
+    """Add w C of a frame to `sums`; return Σ B C.  Single precision does, as both are small."""
     amount, w = np.float32(0.0), np.float32(power)
     for i in range(sums.shape[0]):
         signal, light, out = total[i], background[i], sums[i]
