@@ -53,7 +53,7 @@ _PASSES = 40
 _SLACK = np.array([0.1, 0.1, 0.01, 0.05])
 """How far particles may go from their rings: pixels, wavelengths, relative."""
 _ANY = 1e300
-_MORE_ROWS = 1.25  # for which there is room, than those of the first fit
+_MORE_ROWS = 2.0  # for which there is room, than those of the first fit: untouched it is free
 _BEYOND = 1.0  # resolutions λ/NA outside the field, from where a particle is still seen
 
 
