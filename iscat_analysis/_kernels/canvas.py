@@ -8,7 +8,7 @@ than `Field.slack` only its fitted square is drawn anew, and its rings stay wher
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from iscat_analysis._kernels.scoring import picture_at, span
 from iscat_analysis._kernels.stamp import add_stamp, stamp_gradient
 
 FloatArray = NDArray[np.float64]
+AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
@@ -39,8 +40,9 @@ class Pictures(NamedTuple):
         What turns a profile into a signal, but for its window.
     windows : ndarray, shape (groups or 1, degree + 1, TAPS)
         Those of the blurs.
-    nodes : ndarray of float32, shape (2, n, n)
-        The samples of a picture at one height once more, from which it is drawn; none along z.
+    nodes : ndarray, shape (2, n, n)
+        The samples of a picture at one height once more, from which it is drawn, in single
+        precision; none along z.  Gradients are in the precision of these.
     """
 
     heights: FloatArray
@@ -49,7 +51,7 @@ class Pictures(NamedTuple):
     kappa: float
     lens: Lens
     windows: FloatArray
-    nodes: NDArray[np.float32]
+    nodes: AnyFloatArray
 
 
 class Light(NamedTuple):
@@ -184,7 +186,7 @@ def add_row(
 
 @kernel()
 def _add_row(
-    table: AxialTable, lens: Lens, nodes: NDArray[np.float32], theta: FloatArray, sign: float,
+    table: AxialTable, lens: Lens, nodes: AnyFloatArray, theta: FloatArray, sign: float,
     pixels: Pixels, profile: FloatArray, image: FloatArray, there: NDArray[np.float32],
 ) -> None:  # fmt: skip
     """Do the same as `add_row`; what a lens leaves out depends on an argument's type."""
@@ -201,7 +203,7 @@ def _add_row(
 @kernel()
 def draw_gradient(
     pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
-    profile: FloatArray, out: FloatArray,
+    profile: FloatArray, out: AnyFloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (ny, 5, nx) with the signal of one row and its gradient."""
     table, lens = table_of(pictures, group), lens_of(pictures, group)
@@ -210,7 +212,7 @@ def draw_gradient(
 
 @kernel()
 def _draw_gradient(
-    table: AxialTable, lens: Lens, nodes: NDArray[np.float32], theta: FloatArray, pixels: Pixels,
+    table: AxialTable, lens: Lens, nodes: AnyFloatArray, theta: FloatArray, pixels: Pixels,
     profile: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Do the same as `draw_gradient`; what a lens leaves out depends on an argument's type."""
@@ -232,7 +234,7 @@ def add(there: NDArray[np.float32], sign: float, image: FloatArray) -> None:
 
 @kernel(fastmath=FAST, _nrt=False)
 def stage(
-    light: Light, t: int, total: NDArray[np.float32], own: FloatArray, r0: int, c0: int,
+    light: Light, t: int, total: NDArray[np.float32], own: AnyFloatArray, r0: int, c0: int,
     data: FloatArray,
 ) -> None:  # fmt: skip
     """Fill the constants of a square's likelihood, with the other particles in its background.

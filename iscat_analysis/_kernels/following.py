@@ -84,7 +84,7 @@ class Clusters(NamedTuple):
 
 @kernel(fastmath=FAST, _nrt=False)
 def keep_slopes(
-    level: FloatArray, gradient: FloatArray, index: IntArray, slopes: Slopes, row: int,
+    level: FloatArray, gradient: AnyFloatArray, index: IntArray, slopes: Slopes, row: int,
     room: NDArray[np.float32],
 ) -> None:  # fmt: skip
     """Keep level × gradient of the free parameters of a row; `room` is for a square."""

@@ -182,7 +182,7 @@ def judge_frames(
             stage(light, t, canvas.total[t], here, r0, c0, data)
             slopes.squares[r] = r0, r1, c0, c1
             keep_slopes(data[2], here, index, slopes, r, room)
-            value = place_score(data, here, len(near.lens) != STAMP, pull, known)
+            value = place_score(data, here, near.lens, pull, known)
             for i in range(4):
                 for j in range(4):
                     f[i, j] = known[i, j]

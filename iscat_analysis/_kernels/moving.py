@@ -10,7 +10,7 @@ threads.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,6 @@ from iscat_analysis._kernels.canvas import (
 from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.lens import STAMP
 from iscat_analysis._kernels.place_score import place_score
 from iscat_analysis._kernels.scoring import (
     CONVERGED,
@@ -45,6 +44,7 @@ from iscat_analysis._kernels.scoring import (
 )
 
 FloatArray = NDArray[np.float64]
+AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
@@ -134,7 +134,8 @@ def fit_frames(
     far_profile = blank_profile(table_of(far, 0), far.lens, 1)
     image = np.empty(max(field.drawn, field.side) ** 2)
     square, change = np.empty(4 * field.side**2), np.empty(field.side**2)
-    gradients, room = np.empty(10 * field.side**2), np.empty(field.side**2, dtype=np.float32)
+    gradients = np.empty(10 * field.side**2, near.nodes.dtype)
+    room = np.empty(field.side**2, dtype=np.float32)
     step, before, index = np.empty(5), np.empty(5), np.flatnonzero(search.free[:4])
     slope_profile = blank_profile(table_of(near, 0), near.lens, 2)
     fisher = np.empty((5, 5))
@@ -193,7 +194,7 @@ def _look_over(frame: NDArray[np.float32]) -> float:
 @kernel()
 def _climb(
     near: Pictures, group: int, pixels: Pixels, data: FloatArray, search: Search, p: FloatArray,
-    both: FloatArray, profile: FloatArray, fisher: FloatArray, step: FloatArray,
+    both: AnyFloatArray, profile: FloatArray, fisher: FloatArray, step: FloatArray,
 ) -> tuple[int, int, float]:  # fmt: skip
     """Fit one row from p, at which both[0] is drawn.
 
@@ -208,8 +209,7 @@ def _climb(
     for i in range(5):
         lower[i] = max(search.lower[i], p[i] - search.reach[i])
         upper[i] = min(search.upper[i], p[i] + search.reach[i])
-    with_z = len(near.lens) != STAMP
-    at, value = 0, place_score(data, both[0], with_z, score, fisher)
+    at, value = 0, place_score(data, both[0], near.lens, score, fisher)
     for _ in range(search.passes):
         gain = _step(search, p, lower, upper, score, fisher, step, trial)
         if gain == np.inf:
@@ -218,7 +218,7 @@ def _climb(
             p[:] = trial
             return CONVERGED, at, value + gain
         draw_gradient(near, group, trial, pixels, profile, both[1 - at])
-        there = place_score(data, both[1 - at], with_z, score, fisher)
+        there = place_score(data, both[1 - at], near.lens, score, fisher)
         if not there > value:
             break
         p[:], value, at = trial, there, 1 - at
@@ -230,7 +230,7 @@ def _climb(
         lower, upper, search.max_step, search.tolerance, search.passes, p, score, fisher, -np.inf,
     )  # fmt: skip  # np.int64: a constant would be compiled for by itself
     draw_gradient(near, group, p, pixels, profile, both[0])
-    place_score(data, both[0], with_z, score, fisher)
+    place_score(data, both[0], near.lens, score, fisher)
     step[:] = 0.0
     return outcome, 0, value
 
@@ -258,7 +258,7 @@ def _step(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _add_signal(here: FloatArray, step: FloatArray, out: FloatArray) -> None:
+def _add_signal(here: AnyFloatArray, step: FloatArray, out: FloatArray) -> None:
     """Add the signal after a small step to `out`."""
     dx, dy, dz, da = step[0], step[1], step[2], step[3]
     for i in range(out.shape[0]):

@@ -7,11 +7,14 @@ height, z.  All three share the expected counts and one division per pixel.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lens import STAMP, Lens
 from iscat_analysis._kernels.scoring import (
     POISSON,
     SERIES,
@@ -21,6 +24,7 @@ from iscat_analysis._kernels.scoring import (
 )
 
 FloatArray = NDArray[np.float64]
+AnyFloatArray = NDArray[np.floating[Any]]
 
 _LEAST = 1e-100
 """Least expected count, as `FLOOR` of `scoring`, but its square is a number too."""
@@ -28,7 +32,7 @@ _LEAST = 1e-100
 
 @kernel()
 def place_score(
-    data: FloatArray, here: FloatArray, with_z: bool, score: FloatArray, fisher: FloatArray
+    data: FloatArray, here: AnyFloatArray, lens: Lens, score: FloatArray, fisher: FloatArray
 ) -> float:
     """Fill score and Fisher matrix of (x, y, z, a), and give the log-likelihood.
 
@@ -38,8 +42,8 @@ def place_score(
         Constants of the likelihood.
     here : ndarray, shape (ny, 5, nx)
         Signal and its gradient.
-    with_z : bool
-        Whether the picture changes with z; where not, what belongs to z is 0.
+    lens : Lens
+        Of the picture; where it is of one height, what belongs to z is 0.
     score, fisher : ndarray, shape (5,), (5, 5)
         Filled; 0 for the level.
 
@@ -48,7 +52,7 @@ def place_score(
     float
         Over that without the particle.
     """
-    if with_z:
+    if len(lens) != STAMP:
         image_score(np.int64(POISSON), data, 1.0, here, score, fisher)
         score[4] = 0.0
         for i in range(5):
@@ -63,7 +67,7 @@ def place_score(
 
 @kernel(fastmath=FAST, _nrt=False)
 def _flat_score(
-    data: FloatArray, here: FloatArray, score: FloatArray, fisher: FloatArray
+    data: FloatArray, here: AnyFloatArray, score: FloatArray, fisher: FloatArray
 ) -> tuple[float, int]:
     """Do it without z; tell as well in how many pixels the series of the logarithm is no good."""
     b0 = b1 = b3 = f00 = f01 = f03 = f11 = f13 = f33 = value = 0.0

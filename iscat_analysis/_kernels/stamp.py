@@ -179,7 +179,7 @@ def _make_strip(
 @kernel()
 def stamp_gradient(
     profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
-    amplitude: float, out: FloatArray,
+    amplitude: float, out: AnyFloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (ny, 5, nx) with signal and gradient of an image; ∂s/∂z is 0."""
     f = _begin(profile, lens, pixels, x_p, y_p, amplitude)
@@ -189,7 +189,7 @@ def stamp_gradient(
 @kernel(fastmath=FAST, _nrt=False)
 def _fill_gradient(
     profile: AnyFloatArray, lens: StampLens, amplitude: float, at: IntArray, f: AnyFloatArray,
-    out: FloatArray,
+    out: AnyFloatArray,
 ) -> None:  # fmt: skip
     rows, n = out.shape[0], out.shape[2]
     line, _, _, strip = sizes(lens, n)
@@ -199,7 +199,7 @@ def _fill_gradient(
         here = out[row]
         for k in range(3):  # one after the other: among ten arrays the compiler gives up on vectors
             made, image = f[begin + k * strip : begin + k * strip + n], here[k]
-            factor = -amplitude if k else amplitude
+            factor = out.dtype.type(-amplitude if k else amplitude)
             for j in range(n):
                 image[j] = factor * made[j]
         made, image = f[begin + 3 * strip : begin + 3 * strip + n], here[4]

@@ -110,5 +110,5 @@ def _along_z(
     window = np.zeros((1, 0, 0)) if isinstance(lens, RoundLens) else lens.window[None]
     return Pictures(
         heights, one.first_nm, one.step_nm, one.kappa, lens, window,
-        np.zeros((2, 0, 0), dtype=np.float32),
+        np.zeros((2, 0, 0)),
     )  # fmt: skip

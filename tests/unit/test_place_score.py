@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from iscat_analysis._kernels.lattice import DEGREE, TAPS
+from iscat_analysis._kernels.lens import RoundLens, StampLens
 from iscat_analysis._kernels.place_score import place_score
 from iscat_analysis._kernels.scoring import POISSON, image_score, image_value
 
 ROUNDING = 1e-11  # of sums over pixels in another order
+ALONG_Z = RoundLens(0.1, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0)
+ONE_HEIGHT = StampLens(0.1, 40, np.zeros((DEGREE + 1, TAPS)), 2)
 
 
 @pytest.mark.parametrize("with_z", [False, True])
@@ -26,7 +30,8 @@ def test_one_pass_says_what_three_say(with_z, contrast, read_e2):
     data[:, 4, 2:5] = 0.0  # pixels that are not used
 
     score, fisher = np.full(5, np.nan), np.full((5, 5), np.nan)
-    value = place_score(data, here, with_z, score, fisher)
+    lens = ALONG_Z if with_z else ONE_HEIGHT
+    value = place_score(data, here, lens, score, fisher)
 
     wanted_score, wanted = np.empty(5), np.empty((5, 5))
     image_score(POISSON, data, 1.0, here, wanted_score, wanted)
@@ -37,3 +42,18 @@ def test_one_pass_says_what_three_say(with_z, contrast, read_e2):
     np.testing.assert_allclose(fisher, wanted, rtol=0, atol=ROUNDING * np.abs(wanted).max())
     assert np.isfinite(value)
     assert fisher[2, 2] > 0 if with_z else not fisher[2].any()
+
+
+def test_gradients_in_single_precision_lose_only_their_own_rounding():
+    rng = np.random.default_rng(4)
+    here = rng.uniform(-0.01, 0.01, (11, 5, 9)).astype(np.float32)
+    light = rng.uniform(3e3, 5e3, (11, 9))
+    data = np.stack([rng.poisson(light).astype(float), light, light, np.zeros_like(light)])
+    found = [(np.empty(5), np.empty((5, 5))) for _ in range(2)]
+    values = [
+        place_score(data, signal, ONE_HEIGHT, *into)
+        for signal, into in zip((here, here.astype(float)), found, strict=True)
+    ]
+    assert values[0] == pytest.approx(values[1], rel=ROUNDING)
+    np.testing.assert_allclose(found[0][0], found[1][0], rtol=1e-9)
+    np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-9, atol=1e-12)
