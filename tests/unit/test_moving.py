@@ -17,6 +17,7 @@ from scenes import PIXEL_NM, make_config
 
 from iscat_analysis._kernels.canvas import Light
 from iscat_analysis._kernels.following import Slopes, keep_slopes
+from iscat_analysis._kernels.stamp import add_stamp
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.bias import first_order_bias
@@ -27,6 +28,7 @@ from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.inference.settling import first_ground, settle
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.optics.stamp import BAND, RINGS, sample_picture
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.pipeline.extension import extended
 from iscat_analysis.pipeline.moving import diffusion_of
@@ -320,6 +322,26 @@ def test_slopes_are_kept_in_half_the_memory() -> None:
     assert np.all(kept[1] == 0.0)
     for k in (0, 2):
         assert np.linalg.norm(kept[k] - exact[k]) < 5e-4 * np.linalg.norm(exact[k])
+
+
+@pytest.mark.parametrize(("brighter", "most"), [(1.0, 1e-3), (100.0, 5e-3)])
+def test_rings_are_drawn_from_half_the_samples(brighter: float, most: float) -> None:
+    """Their error is small beside them, of gold too, whose scattered light these samples miss."""
+    model = forward_model(_config(), 1e4)
+    grid = PixelGrid.region((0, 61), (0, 61), PIXEL_NM)
+    mass = brighter * MASSES[0]
+    x, y, amplitude = 30.3 * PIXEL_NM, 29.6 * PIXEL_NM, float(model.scale.amplitude(mass))
+    exact = model.image(grid, x, y, model.height_nm, mass)
+    far = np.maximum(*np.abs(np.indices((61, 61)) - 30)) > ROI / 2
+    errors, fine = {}, {}
+    for band in (BAND, RINGS):
+        lens, samples = sample_picture(model, PIXEL_NM, 33.0, band)
+        drawn = np.zeros(exact.shape, dtype=np.float32)
+        add_stamp(samples.astype(np.float32), lens, model.pixels(grid), x, y, amplitude, 1.0, drawn)
+        errors[band], fine[band] = (drawn - exact)[far].std() / exact[far].std(), lens.fine
+    assert fine == {BAND: 2, RINGS: 1}
+    assert errors[RINGS] < most
+    assert errors[BAND] < errors[RINGS] / 10
 
 
 def test_rows_that_overlap_follow_one_another(pool: ThreadPoolExecutor) -> None:
