@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -133,8 +134,8 @@ def contrast_map(before: FloatArray, after: FloatArray, weight: MapArray, out: M
 
     Parameters
     ----------
-    before, after : ndarray, shape (y, x)
-        Photoelectrons.
+    before, after : ndarray, shape (k, y, x)
+        Photoelectrons of blocks of frames, which are summed.
     weight : ndarray, shape (y, x)
         Information of a pixel; 0 where it is not used.
     out : ndarray, shape (y, x) or larger
@@ -145,19 +146,26 @@ def contrast_map(before: FloatArray, after: FloatArray, weight: MapArray, out: M
     float
         Power after over power before.
     """
-    rows, columns = before.shape
+    rows, columns = weight.shape
+    sums = np.zeros((2, rows, columns))
     total_before = 0.0
     total_after = 0.0
     for i in range(rows):
+        for k in range(before.shape[0]):
+            for j in range(columns):
+                sums[0, i, j] += before[k, i, j]
+        for k in range(after.shape[0]):
+            for j in range(columns):
+                sums[1, i, j] += after[k, i, j]
         for j in range(columns):
             if weight[i, j] > 0:
-                total_before += before[i, j]
-                total_after += after[i, j]
+                total_before += sums[0, i, j]
+                total_after += sums[1, i, j]
     ratio = total_after / total_before
     for i in range(rows):
         for j in range(columns):
             if weight[i, j] > 0:
-                out[i, j] = weight[i, j] * (after[i, j] / (ratio * before[i, j]) - 1.0)
+                out[i, j] = weight[i, j] * (sums[1, i, j] / (ratio * sums[0, i, j]) - 1.0)
             else:
                 out[i, j] = 0.0
     return ratio
@@ -201,3 +209,46 @@ def step_peaks(maps: MapArray, threshold: float) -> NDArray[np.int64]:
     for n in range(len(found)):
         out[n, 0], out[n, 1], out[n, 2] = found[n]
     return out
+
+
+@kernel()
+def in_shadow(
+    peaks: FloatArray,
+    frames: tuple[int, int],
+    distances: tuple[float, float, float],
+    shares: tuple[float, float],
+) -> BoolArray:
+    """Tell which peaks may be lobes of an earlier one, or the same step.
+
+    Parameters
+    ----------
+    peaks : ndarray, shape (n, 4)
+        Frame, x and y [pixels], height; highest first.
+    frames : (int, int)
+        Apart, below which two near each other are the same, and up to which one is another's lobe.
+    distances : (float, float, float)
+        Below which two are the same, lobes are near ones, and there are lobes [pixels].
+    shares : (float, float)
+        Of the higher peak, which near and far lobes stay below.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        True for these.
+    """
+    hidden = np.zeros(len(peaks), dtype=np.bool_)
+    for own in range(len(peaks)):
+        for higher in range(own):
+            apart = abs(peaks[own, 0] - peaks[higher, 0])
+            if apart > frames[1]:
+                continue
+            dx = abs(peaks[own, 1] - peaks[higher, 1])
+            dy = abs(peaks[own, 2] - peaks[higher, 2])
+            away = max(dx, dy)
+            share = shares[0] if away < distances[1] else shares[1]
+            if (away < distances[2] and peaks[own, 3] < share * peaks[higher, 3]) or (
+                apart < frames[0] and math.hypot(dx, dy) < distances[0]
+            ):
+                hidden[own] = True
+                break
+    return hidden

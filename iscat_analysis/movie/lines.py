@@ -28,7 +28,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.lighting import Surface
 from iscat_analysis.movie.spectrum import measure_spectrum
 from iscat_analysis.movie.stack import Stack
-from iscat_analysis.records import CountSource, FloatArray, StackMetadata
+from iscat_analysis.records import CountSource, FloatArray, Mapper, StackMetadata
 
 _LEAST_LIT = 0.25  # of a line's pixels that must be usable
 
@@ -227,7 +227,11 @@ class SteadyFrames:
 
 
 def find_lines(
-    counts: NDArray[Any], camera: Camera, surface: Surface | None = None
+    counts: NDArray[Any],
+    camera: Camera,
+    surface: Surface | None = None,
+    *,
+    mapper: Mapper = map,
 ) -> Lines | None:
     """Look for rows and columns that flicker.
 
@@ -239,6 +243,8 @@ def find_lines(
         Counts → photoelectrons.
     surface : Surface, optional
         Smooth changes of the light, from `iscat_analysis.movie.lighting.find_surface`.
+    mapper : callable
+        `map`, or the one of a pool.
 
     Returns
     -------
@@ -256,7 +262,7 @@ def find_lines(
     if surface is not None:  # both parts of what is divided out are relative to the same light
         lines = replace(lines, surface=replace(surface, light_e=lines.light_e))
         even = lines.divided(counts, camera)
-    spectrum = measure_spectrum(even, camera)
+    spectrum = measure_spectrum(even, camera, mapper=mapper)
     if spectrum is not None and any(spectrum.shared):
         return replace(lines, shares=spectrum.shared)
     return None if surface is None else lines

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.special import chdtri
 
+from iscat_analysis._kernels.unsteady import add_scatter, block_extremes, block_powers
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.units import count, listed
@@ -86,25 +87,30 @@ def find_unsteady(
     freedom = int((frames - 1).sum()), len(blocks) - 1
     if freedom[0] < _FEWEST or freedom[1] < 4:
         return None
-    light = camera.to_electrons(np.sum([b.sum(axis=0, dtype=np.float64) for b in blocks], axis=0)
-                                / frames.sum())  # fmt: skip
+    shape = blocks[0].shape[1:]
+    summed = np.zeros(shape)
+    highest, still = blocks[0][0].copy(), np.ones(shape, dtype=np.bool_)
+    for block in blocks:
+        block_extremes(block, summed, highest, still)
+    light = camera.to_electrons(summed / frames.sum())
     lit = light > max(_LEAST_E, 0.1 * float(np.median(light)))
-    lit &= ~camera.saturated(np.max([block.max(axis=0) for block in blocks], axis=0))
+    lit &= ~camera.saturated(highest)
     level = float(light[lit].mean()) if lit.any() else 0.0
     if lit.mean() < 0.5:
         return None
     variance = np.where(lit, light + camera.read_variance_e2(light.shape), np.inf)
-    fast, slow = _Scatter(light.shape), _Scatter(light.shape)
-    found = lit & np.all([np.ptp(block, axis=0) == 0 for block in blocks if len(block) > 1], axis=0)
+    gain, offset = (
+        np.ascontiguousarray(np.broadcast_to(np.asarray(value, dtype=np.float64), shape))
+        for value in (camera.gain_e_per_adu, camera.offset_adu)
+    )
+    fast, slow = _Scatter(shape), _Scatter(shape)
+    found = lit & still
+    mean, change = np.empty(shape), np.empty(shape)
     for block in blocks:
-        electrons = camera.to_electrons(block)
-        power = electrons[:, lit].mean(axis=1) / level
+        power = block_powers(block, gain, offset, lit) / level
         if power.min() <= 0:
             return None
-        electrons /= power[:, None, None]
-        mean = electrons.mean(axis=0)
-        for frame in electrons:
-            fast.add(frame - mean)
+        add_scatter(block, gain, offset, power, mean, change, fast.squares, fast.products)
         slow.add((mean - light) * np.sqrt(len(block)))
     for scatter, number in ((fast, freedom[0]), (slow, freedom[1])):
         ratio = np.where(lit, scatter.squares / variance / number, 0.0)
@@ -134,19 +140,19 @@ class _Scatter:
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.squares = np.zeros(shape)
-        self._products = np.zeros((2, *shape))
+        self.products = np.zeros((2, *shape))
 
     def add(self, image: FloatArray) -> None:
         """Add one image."""
         padded = np.pad(image, 1, mode="reflect")
         self.squares += image**2
-        self._products[0] += image * (padded[:-2, 1:-1] + padded[2:, 1:-1]) / 2
-        self._products[1] += image * (padded[1:-1, :-2] + padded[1:-1, 2:]) / 2
+        self.products[0] += image * (padded[:-2, 1:-1] + padded[2:, 1:-1]) / 2
+        self.products[1] += image * (padded[1:-1, :-2] + padded[1:-1, 2:]) / 2
 
     @property
     def beside(self) -> FloatArray:
         """Products with the pixels beside along y or x, whichever follow more."""
-        largest: FloatArray = self._products.max(axis=0)
+        largest: FloatArray = self.products.max(axis=0)
         return largest
 
 

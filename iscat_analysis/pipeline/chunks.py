@@ -24,7 +24,7 @@ HALO = 2
 """Windows on either side of a chunk's core: a step, its neighbours, and theirs."""
 
 _MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
-_PIECE_BYTES = 8 * 2**20
+_PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
 
 class Reader:

@@ -38,6 +38,7 @@ _ABOUT = {
     "sharing": "the precision of tracks",
     "sliding": "sums of frames",
     "stepping": "sums of frames",
+    "unsteady": "sums of frames",
 }
 _PICTURES = "the picture of a particle"
 

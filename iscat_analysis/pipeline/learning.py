@@ -18,6 +18,7 @@ import numpy as np
 from iscat_analysis.calibration.optics import (
     FREE,
     LEAST_SIGHTS,
+    MOST_SIGHTS,
     Neighbours,
     OpticsCalibration,
     Settings,
@@ -62,7 +63,7 @@ that are not alone do not suffice."""
 LEAST_TESTED = 4
 """Bright particles without which the optics are not even tested."""
 
-_TESTED = 24
+_TESTED = 24  # the brightest
 _MOST_STEP_NM = 5e3  # farther than the model's pictures reach
 _LEAST_SCAN_NM = 10.0  # over all frames; a step in µm stays below it
 _NOISE = "its noise is not what the camera's numbers predict; the analysis goes on as configured"
@@ -127,8 +128,10 @@ def learn_optics(
     ):
         return config, {}
     tested: dict[str, Any] = {}
+    first_tested = optics.calibrate == "auto" and way_of(config) == "sliding"
     with threads(config.compute.workers) as pool:
-        sights, others = bright_sights(movie, config, camera, pool, opening)
+        enough = _TESTED if first_tested else MOST_SIGHTS
+        sights, others = bright_sights(movie, config, camera, pool, opening, enough)
         alone, source = len(sights), {"movie": movie.name}
         try:
             if alone < LEAST_TESTED and way_of(config) == "fixed":
@@ -139,6 +142,9 @@ def learn_optics(
             if len(sights) < LEAST_TESTED:
                 raise DataError(_too_few(movie.name, len(sights)))
             median = _median_p(sights, config, others, pool.map)
+            if first_tested and median < REJECTED_P:  # learning them takes more particles
+                sights, others = bright_sights(movie, config, camera, pool, opening)
+                alone, median = len(sights), _median_p(sights, config, others, pool.map)
             if optics.calibrate == "auto" and median < REJECTED_P and not heights_free(config):
                 pairs, median = _not_alone(sights, config, others, pool.map)
                 sights = [sight for k, sight in enumerate(sights) if k not in pairs]

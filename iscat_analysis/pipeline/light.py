@@ -21,7 +21,7 @@ from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import BoolArray
 from iscat_analysis.search.changes import least_beside, spot_of
 from iscat_analysis.search.sliding import longest_window, measure_frames
-from iscat_analysis.threads import one_thread_algebra
+from iscat_analysis.threads import threads
 
 PAIRS = 12
 """Places in a movie at which the light of some frames is compared with that of later ones."""
@@ -146,9 +146,9 @@ def judge_lines(
     counts = movie.read(first, max(first, min(last, movie.shape[0], first + SPECTRUM_FRAMES)))
     if not len(counts):
         return None
-    with one_thread_algebra():
+    with threads(config.compute.workers) as pool:
         surface = find_surface([(p.before, p.after) for p in pairs], camera, window)
-    return find_lines(counts[_good(counts, camera)], camera, surface)
+        return find_lines(counts[_good(counts, camera)], camera, surface, mapper=pool.map)
 
 
 def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:

@@ -193,6 +193,9 @@ class Neighbours:
         self, ratio: FloatArray, step: Step, before: slice, after: slice, region: Region
     ) -> None:
         """Multiply the pixels of a region that a step's image covers with `factor`."""
+        turn = step.at.frame - self._chunk.first
+        if self._pattern is None and not before.start < turn < after.stop:
+            return  # there in all of these frames, or in none
         shared = self.shared(step, region)
         if shared is None:
             return

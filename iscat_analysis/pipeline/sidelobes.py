@@ -12,15 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from iscat_analysis._kernels.sliding import in_shadow
 from iscat_analysis.pipeline.neighbours import Step
-from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, is_hidden, size_on_ring
 from iscat_analysis.search.sliding import STRIDES, MapArray, Peak
 from iscat_analysis.search.templates import FAR_LOBE, LARGEST_IMAGE, NEAR, SIDELOBE
 
 _RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
 _RINGS = 0.04  # the same for the rest of its region
-_TOGETHER = 64  # peaks that are compared at once with all higher ones
 
 
 @dataclass(frozen=True)
@@ -85,22 +84,13 @@ class Sieve:
 
         A peak that waits makes others wait too, or its own rings would be taken for particles.
         """
-        table = np.array([(p.frame, p.x_px, p.y_px, abs(p.snr)) for p in peaks])
-        blocks = (slice(k, k + _TOGETHER) for k in range(0, len(table), _TOGETHER))
-        return [waits for rows in blocks for waits in self._in_shadow(table, rows).tolist()]
-
-    def _in_shadow(self, table: FloatArray, rows: slice) -> BoolArray:
-        """Tell which rows may be lobes of an earlier, higher one; columns: frame, x, y, height."""
-        reach = STRIDES * self.stride
-        own, higher = table[rows, None], table[None, : rows.stop]
-        frames, dx, dy = (np.abs(higher[..., k] - own[..., k]) for k in range(3))
-        away = np.maximum(dx, dy)
-        share = np.where(away < self.roi_px, SIDELOBE, FAR_LOBE)
-        lobe = (away < LARGEST_IMAGE * self.roi_px) & (own[..., 3] < share * higher[..., 3])
-        same = (frames < reach) & (np.hypot(dx, dy) < NEAR * self.roi_px)
-        hidden = (frames <= reach + self.stride) & (lobe | same)
-        waits: BoolArray = np.any(np.tril(hidden, rows.start - 1), axis=1)
-        return waits
+        table = np.array([(p.frame, p.x_px, p.y_px, abs(p.snr)) for p in peaks]).reshape(-1, 4)
+        reach, side = STRIDES * self.stride, self.roi_px
+        hidden: list[bool] = in_shadow(
+            table, (reach, reach + self.stride), (NEAR * side, side, LARGEST_IMAGE * side),
+            (SIDELOBE, FAR_LOBE),
+        ).tolist()  # fmt: skip
+        return hidden
 
     def _is_residue(self, step: Step, peak: Peak) -> bool:
         """Whether a peak may be a residual of a fitted step, whose model is never quite right."""

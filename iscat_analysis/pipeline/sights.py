@@ -65,6 +65,7 @@ def bright_sights(
     camera: Camera,
     pool: ThreadPoolExecutor,
     opening: Opening | None = None,
+    enough: int = MOST_SIGHTS,
 ) -> tuple[list[Sight], list[Sight]]:
     """Find the bright particles of a movie, in the way in which it is analysed.
 
@@ -83,6 +84,8 @@ def bright_sights(
         Runs the search.
     opening : Opening, optional
         Of a landing movie, where it was judged; its reader keeps what is read here.
+    enough : int
+        Bright steps of a landing movie after which no further chunk is searched.
 
     Returns
     -------
@@ -93,10 +96,10 @@ def bright_sights(
     """
     if way_of(config) == "sliding":
         if opening is not None:
-            return landing_sights(opening.reader, opening.window, config, pool)
+            return landing_sights(opening.reader, opening.window, config, pool, enough)
         reader = Reader(movie, camera, *fitted_frames(movie, config), counts_budget(config))
         window = judge_window(reader, config, pool.map)[2]
-        return landing_sights(reader, window, config, pool)
+        return landing_sights(reader, window, config, pool, enough)
     if heights_free(config) and way_of(config) == "fixed":
         return [], []
     windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
@@ -120,7 +123,7 @@ def kind_of(config: Config) -> str:
 
 
 def landing_sights(
-    reader: Reader, window: int, config: Config, pool: ThreadPoolExecutor
+    reader: Reader, window: int, config: Config, pool: ThreadPoolExecutor, enough: int
 ) -> tuple[list[Sight], list[Sight]]:
     """Find bright steps of a landing movie, chunk by chunk until there are enough.
 
@@ -134,6 +137,8 @@ def landing_sights(
         Resolved.
     pool : ThreadPoolExecutor
         Runs the search.
+    enough : int
+        Bright steps after which no further chunk is searched.
 
     Returns
     -------
@@ -159,7 +164,7 @@ def landing_sights(
         found += alone
         rest += every
         bright = [step for step in found if step.snr > FAINTEST]
-        if len(bright) >= MOST_SIGHTS:
+        if len(bright) >= enough:
             break
     bright.sort(key=lambda step: -step.snr)
     unique = _without_repeats(bright)

@@ -89,6 +89,7 @@ class TaskBuilder:
         self._neighbours = neighbours
         self._roi_px = scene.roi_px
         self._stride = int(chunk.edges[1] - chunk.edges[0])
+        self._read_e2 = chunk.camera.read_variance_e2(chunk.shape)
 
     def build(
         self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]]
@@ -140,7 +141,7 @@ class TaskBuilder:
                 ratio[here] *= self._neighbours.own_factor(step, *cuts, inside)
             with_it = cuts[1] if step.sign > 0 else cuts[0]
             offset = moving.shift(with_it) - moving.at(at.frame)
-        read = chunk.camera.read_variance_e2(chunk.shape)[region.slices]
+        read = self._read_e2[region.slices]
         variances = [n_before * read, n_after * read]
         if step.sign < 0:
             before, after, ratio = after, before, 1 / ratio

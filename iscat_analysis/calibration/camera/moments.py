@@ -154,7 +154,7 @@ def moments_of(
             )
         highest = np.maximum(highest, counts.max(axis=0))
         lowest = np.minimum(lowest, counts.min(axis=0))
-        block = counts.astype(np.float64)
+        block = counts.astype(np.float64, copy=False)
         total += block.sum(axis=0)
         if last is not None:
             block = np.concatenate([last[np.newaxis], block])

@@ -1,0 +1,130 @@
+"""How the counts of pixels scatter, and those beside them along: frames as they are stored."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels import kernel
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@kernel()
+def block_extremes(
+    counts: NDArray[Any], summed: FloatArray, highest: NDArray[Any], still: BoolArray
+) -> None:
+    """Sum frames, and see which pixels change.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Stored counts.
+    summed : ndarray, shape (y, x)
+        The frames are added to it.
+    highest : ndarray, shape (y, x)
+        Updated with the highest count of every pixel.
+    still : ndarray of bool, shape (y, x)
+        Made false where a pixel changes.
+    """
+    frames, rows, columns = counts.shape
+    for t in range(frames):
+        for i in range(rows):
+            for j in range(columns):
+                c = counts[t, i, j]
+                summed[i, j] += c
+                highest[i, j] = max(highest[i, j], c)
+                still[i, j] &= c == counts[0, i, j]
+
+
+@kernel()
+def block_powers(
+    counts: NDArray[Any], gain: FloatArray, offset: FloatArray, lit: BoolArray
+) -> FloatArray:
+    """Mean photoelectrons of every frame.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Stored counts.
+    gain, offset : ndarray, shape (y, x)
+        Of the camera.
+    lit : ndarray of bool, shape (y, x)
+        Pixels to take.
+
+    Returns
+    -------
+    ndarray, shape (t,)
+        Per pixel [e].
+    """
+    frames, rows, columns = counts.shape
+    powers = np.zeros(frames)
+    for t in range(frames):
+        number = 0
+        for i in range(rows):
+            line = 0.0
+            for j in range(columns):
+                if lit[i, j]:
+                    line += gain[i, j] * (counts[t, i, j] - offset[i, j])
+                    number += 1
+            powers[t] += line
+        powers[t] /= number
+    return powers
+
+
+@kernel()
+def add_scatter(
+    counts: NDArray[Any],
+    gain: FloatArray,
+    offset: FloatArray,
+    powers: FloatArray,
+    mean: FloatArray,
+    change: FloatArray,
+    squares: FloatArray,
+    products: FloatArray,
+) -> None:
+    """Add what frames have beyond their mean, squared, and times what those beside have.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Stored counts.
+    gain, offset : ndarray, shape (y, x)
+        Of the camera.
+    powers : ndarray, shape (t,)
+        What each frame is divided by.
+    mean : ndarray, shape (y, x)
+        Filled with the mean of the frames [e].
+    change : ndarray, shape (y, x)
+        Scratch.
+    squares : ndarray, shape (y, x)
+        Added to.
+    products : ndarray, shape (2, y, x)
+        Added to, along y and x, with the mean of the pixels on both sides; at the border both are
+        the one inside.
+    """
+    frames, rows, columns = counts.shape
+    mean[:] = 0.0
+    for t in range(frames):
+        for i in range(rows):
+            for j in range(columns):
+                mean[i, j] += gain[i, j] * (counts[t, i, j] - offset[i, j]) / powers[t]
+    for i in range(rows):
+        for j in range(columns):
+            mean[i, j] /= frames
+    for t in range(frames):
+        for i in range(rows):
+            for j in range(columns):
+                electrons = gain[i, j] * (counts[t, i, j] - offset[i, j])
+                change[i, j] = electrons / powers[t] - mean[i, j]
+        for i in range(rows):
+            above, below = abs(i - 1), rows - 1 - abs(rows - 2 - i)
+            for j in range(columns):
+                left, right = abs(j - 1), columns - 1 - abs(columns - 2 - j)
+                own = change[i, j]
+                squares[i, j] += own**2
+                products[0, i, j] += own * (change[above, j] + change[below, j]) / 2
+                products[1, i, j] += own * (change[i, left] + change[i, right]) / 2
