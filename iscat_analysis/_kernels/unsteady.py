@@ -121,10 +121,17 @@ def add_scatter(
                 electrons = gain[i, j] * (counts[t, i, j] - offset[i, j])
                 change[i, j] = electrons / powers[t] - mean[i, j]
         for i in range(rows):
-            above, below = abs(i - 1), rows - 1 - abs(rows - 2 - i)
+            above, below = _beside(i, rows)
             for j in range(columns):
-                left, right = abs(j - 1), columns - 1 - abs(columns - 2 - j)
+                left, right = _beside(j, columns)
                 own = change[i, j]
                 squares[i, j] += own**2
                 products[0, i, j] += own * (change[above, j] + change[below, j]) / 2
                 products[1, i, j] += own * (change[i, left] + change[i, right]) / 2
+
+
+@kernel()
+def _beside(place: int, size: int) -> tuple[int, int]:
+    """Give the places on both sides, at the border twice the one inside, alone twice itself."""
+    last = size - 1
+    return min(abs(place - 1), last), max(last - abs(last - 1 - place), 0)
