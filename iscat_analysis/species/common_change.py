@@ -8,6 +8,7 @@ frames are fitted by one parabola in time.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -17,7 +18,8 @@ from iscat_analysis.records import FloatArray
 
 _DEGREE = 2
 _FEWEST_TRACKS = 3
-_SURE = 1e-4  # chance of it, whichever track is left out: one that changes is no drift
+_SURE = 1e-4  # chance of it, whichever two tracks are left out: what two exchange is no drift
+_SUSPECTS = 12  # that change most by themselves; two of these are left out in turn
 
 
 def common_change(
@@ -52,11 +54,14 @@ def common_change(
         pull.append(slopes.T @ (weight * (mass / mean - 1)))
     if len(pull) < _FEWEST_TRACKS:
         return 0.0
-    every, whole = np.sum(pull, axis=0), np.sum(information, axis=0)
+    pulls, known = np.array(pull), np.array(information)
+    every, whole = pulls.sum(axis=0), known.sum(axis=0)
     least = chdtri(_DEGREE, _SURE)
-    for mine, known in zip(pull, information, strict=True):
-        rest = every - mine
-        if rest @ np.linalg.pinv(whole - known) @ rest < least:
+    own = np.einsum("ni,nij,nj->n", pulls, np.linalg.pinv(known), pulls)
+    suspects = np.argsort(-own)[:_SUSPECTS].tolist()
+    for left_out in (*combinations(suspects, 1), *combinations(suspects, 2)):
+        rest = every - pulls[[*left_out]].sum(axis=0)
+        if rest @ np.linalg.pinv(whole - known[[*left_out]].sum(axis=0)) @ rest < least:
             return 0.0
     found = np.linalg.pinv(whole) @ every
     change = legendre.legval(np.linspace(-1, 1, last - first), np.append(0.0, found))
