@@ -213,7 +213,7 @@ def draw_gradient(
 @kernel()
 def _draw_gradient(
     table: AxialTable, lens: Lens, nodes: AnyFloatArray, theta: FloatArray, pixels: Pixels,
-    profile: FloatArray, out: FloatArray,
+    profile: FloatArray, out: AnyFloatArray,
 ) -> None:  # fmt: skip
     """Do the same as `draw_gradient`; what a lens leaves out depends on an argument's type."""
     if len(lens) == STAMP:

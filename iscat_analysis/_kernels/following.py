@@ -329,9 +329,9 @@ def follow_rows(
         step = _shift(slopes, clusters, c, move, seen)
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
         for q in range(rows.size):
-            square = slopes.squares[rows[q]]
-            size = (square[1] - square[0]) * (square[3] - square[2])
             r = rows[q]
+            square = slopes.squares[r]
+            size = (square[1] - square[0]) * (square[3] - square[2])
             mix(slopes.values[r], slopes.units[r], step[k * q : k * (q + 1)], size, seen)
             put(seen, square, out)
 

@@ -134,8 +134,8 @@ def contrast_map(before: FloatArray, after: FloatArray, weight: MapArray, out: M
 
     Parameters
     ----------
-    before, after : ndarray, shape (k, y, x)
-        Photoelectrons of blocks of frames, which are summed.
+    before, after : ndarray, shape (y, x)
+        Photoelectrons.
     weight : ndarray, shape (y, x)
         Information of a pixel; 0 where it is not used.
     out : ndarray, shape (y, x) or larger
@@ -146,26 +146,19 @@ def contrast_map(before: FloatArray, after: FloatArray, weight: MapArray, out: M
     float
         Power after over power before.
     """
-    rows, columns = weight.shape
-    sums = np.zeros((2, rows, columns))
+    rows, columns = before.shape
     total_before = 0.0
     total_after = 0.0
     for i in range(rows):
-        for k in range(before.shape[0]):
-            for j in range(columns):
-                sums[0, i, j] += before[k, i, j]
-        for k in range(after.shape[0]):
-            for j in range(columns):
-                sums[1, i, j] += after[k, i, j]
         for j in range(columns):
             if weight[i, j] > 0:
-                total_before += sums[0, i, j]
-                total_after += sums[1, i, j]
+                total_before += before[i, j]
+                total_after += after[i, j]
     ratio = total_after / total_before
     for i in range(rows):
         for j in range(columns):
             if weight[i, j] > 0:
-                out[i, j] = weight[i, j] * (sums[1, i, j] / (ratio * sums[0, i, j]) - 1.0)
+                out[i, j] = weight[i, j] * (after[i, j] / (ratio * before[i, j]) - 1.0)
             else:
                 out[i, j] = 0.0
     return ratio

@@ -100,11 +100,8 @@ def add_scatter(
         Filled with the mean of the frames [e].
     change : ndarray, shape (y, x)
         Scratch.
-    squares : ndarray, shape (y, x)
-        Added to.
-    products : ndarray, shape (2, y, x)
-        Added to, along y and x, with the mean of the pixels on both sides; at the border both are
-        the one inside.
+    squares, products : ndarray, shape (y, x) and (2, y, x)
+        Added to, as by `add_image`.
     """
     frames, rows, columns = counts.shape
     mean[:] = 0.0
@@ -120,14 +117,31 @@ def add_scatter(
             for j in range(columns):
                 electrons = gain[i, j] * (counts[t, i, j] - offset[i, j])
                 change[i, j] = electrons / powers[t] - mean[i, j]
-        for i in range(rows):
-            above, below = _beside(i, rows)
-            for j in range(columns):
-                left, right = _beside(j, columns)
-                own = change[i, j]
-                squares[i, j] += own**2
-                products[0, i, j] += own * (change[above, j] + change[below, j]) / 2
-                products[1, i, j] += own * (change[i, left] + change[i, right]) / 2
+        add_image(change, squares, products)
+
+
+@kernel()
+def add_image(image: FloatArray, squares: FloatArray, products: FloatArray) -> None:
+    """Add an image squared, and times the mean of the pixels on both sides.
+
+    Parameters
+    ----------
+    image : ndarray, shape (y, x)
+        What pixels have beyond their mean.
+    squares : ndarray, shape (y, x)
+        Added to.
+    products : ndarray, shape (2, y, x)
+        Added to, along y and x; at the border both sides are the one inside.
+    """
+    rows, columns = image.shape
+    for i in range(rows):
+        above, below = _beside(i, rows)
+        for j in range(columns):
+            left, right = _beside(j, columns)
+            own = image[i, j]
+            squares[i, j] += own**2
+            products[0, i, j] += own * (image[above, j] + image[below, j]) / 2
+            products[1, i, j] += own * (image[i, left] + image[i, right]) / 2
 
 
 @kernel()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.special import chdtri
 
-from iscat_analysis._kernels.unsteady import add_scatter, block_extremes, block_powers
+from iscat_analysis._kernels.unsteady import add_image, add_scatter, block_extremes, block_powers
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.units import count, listed
@@ -144,10 +144,7 @@ class _Scatter:
 
     def add(self, image: FloatArray) -> None:
         """Add one image."""
-        padded = np.pad(image, 1, mode="reflect")
-        self.squares += image**2
-        self.products[0] += image * (padded[:-2, 1:-1] + padded[2:, 1:-1]) / 2
-        self.products[1] += image * (padded[1:-1, :-2] + padded[1:-1, 2:]) / 2
+        add_image(image, self.squares, self.products)
 
     @property
     def beside(self) -> FloatArray:

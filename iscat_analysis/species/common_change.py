@@ -59,7 +59,7 @@ def common_change(
     least = chdtri(_DEGREE, _SURE)
     own = np.einsum("ni,nij,nj->n", pulls, np.linalg.pinv(known), pulls)
     suspects = np.argsort(-own)[:_SUSPECTS].tolist()
-    for left_out in (*combinations(suspects, 1), *combinations(suspects, 2)):
+    for left_out in (*combinations(range(len(pulls)), 1), *combinations(suspects, 2)):
         rest = every - pulls[[*left_out]].sum(axis=0)
         if rest @ np.linalg.pinv(whole - known[[*left_out]].sum(axis=0)) @ rest < least:
             return 0.0

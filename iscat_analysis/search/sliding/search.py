@@ -193,8 +193,10 @@ def sliding_maps(
         if min(powers) <= 0:
             snr[j] = 0.0
             return
+        before = chunk.blocks_e[low:middle].sum(axis=0)
+        after = chunk.blocks_e[middle:high].sum(axis=0)
         image = np.zeros(matched.size, dtype=np.float32)
-        contrast_map(chunk.blocks_e[low:middle], chunk.blocks_e[middle:high], matched.weight, image)
+        contrast_map(before, after, matched.weight, image)
         if explained is not None:
             known = explained(
                 j,
