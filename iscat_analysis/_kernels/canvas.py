@@ -235,13 +235,13 @@ def add(there: NDArray[np.float32], sign: float, image: FloatArray) -> None:
 @kernel(fastmath=FAST, _nrt=False)
 def stage(
     light: Light, t: int, total: NDArray[np.float32], own: AnyFloatArray, r0: int, c0: int,
-    data: FloatArray,
+    data: AnyFloatArray,
 ) -> None:  # fmt: skip
     """Fill the constants of a square's likelihood, with the other particles in its background.
 
     `own` (ny, 5, nx) begins with the particle's own signal.
     """
-    w, last = light.power[t], c0 + data.shape[2]
+    w, last, one = light.power[t], c0 + data.shape[2], data.dtype.type(1.0)
     for i in range(data.shape[1]):  # among more arrays at once the compiler gives up on vectors
         r = r0 + i
         seen, base, level, noise = data[0, i], data[1, i], data[2, i], data[3, i]
@@ -249,7 +249,7 @@ def stage(
         for j in range(level.size):
             level[j] = w * background[j]
         for j in range(level.size):
-            base[j] = level[j] * (1.0 + others[j] - mine[j])
+            base[j] = level[j] * (one + others[j] - mine[j])
         read, counts = light.read[r, c0:last], light.counts[t, r, c0:last]
         for j in range(level.size):
             noise[j] = read[j]

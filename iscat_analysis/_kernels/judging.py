@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,11 +26,12 @@ from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import STAMP, Lens
-from iscat_analysis._kernels.place_score import place_score
+from iscat_analysis._kernels.place_score import LEAST, place_score
 from iscat_analysis._kernels.scoring import FLOOR, blank_profile
 from iscat_analysis._kernels.stamp_bends import BENDS, stamp_bends
 
 FloatArray = NDArray[np.float64]
+AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
@@ -84,33 +87,37 @@ def _add_curvature(
 
 
 @kernel(fastmath=FAST)
-def _left_over(data: FloatArray, here: FloatArray, amplitude: float, numbers: FloatArray) -> None:
+def _left_over(
+    data: AnyFloatArray, here: AnyFloatArray, amplitude: float, numbers: FloatArray
+) -> None:
     """Fill the last five numbers of a row.
 
     Where s = a P + a² Q, a ∂²s/∂a² is 2 (∂s/∂a − s/a).
     """
-    chi2 = used = light = known = more = 0.0
-    worst = np.zeros(data.shape[2])  # of each column: one for all would keep the loop from vectors
-    inverse = 1.0 / amplitude if amplitude != 0.0 else 0.0
+    zero, one, four = data.dtype.type(0.0), data.dtype.type(1.0), data.dtype.type(4.0)
+    least, a = data.dtype.type(LEAST), data.dtype.type(amplitude)
+    chi2 = used = light = known = more = zero
+    worst = np.zeros_like(data[0, 0])  # of each column: one for all would keep the loop from vectors
+    inverse = one / a if a != zero else zero
     for i in range(data.shape[1]):
         d0, d1, d2, d3 = data[0, i], data[1, i], data[2, i], data[3, i]
         s, ga = here[i, 0], here[i, 4]
         for j in range(s.size):
             rate = d1[j] + d2[j] * s[j] + d3[j]
-            per = 1.0 / max(rate, FLOOR)
+            per = one / max(rate, least)
             left = (d0[j] - rate) * (d0[j] - rate) * per
             chi2 += left
             worst[j] = max(worst[j], left)
-            used += 1.0 if d2[j] > 0 else 0.0
+            used += one if d2[j] > zero else zero
             light += d2[j]
             slope = d2[j] * ga[j]
             change = slope * per
             known += change * slope
-            bend = 4.0 * d2[j] * (ga[j] - inverse * s[j])
-            more += change * (bend - amplitude * change * slope)
+            bend = four * d2[j] * (ga[j] - inverse * s[j])
+            more += change * (bend - a * change * slope)
     numbers[0], numbers[1], numbers[2] = chi2, used, np.sqrt(worst.max())
-    numbers[3] = light / max(used, 1.0)
-    numbers[4] = more / known if known > 0.0 else 0.0
+    numbers[3] = light / max(used, one)
+    numbers[4] = more / known if known > zero else zero
 
 
 @kernel()
@@ -160,8 +167,8 @@ def judge_frames(
     profile = blank_profile(table_of(near, 0), near.lens, 2)
     index = np.flatnonzero(free[:4])
     image = np.empty(max(field.drawn, field.side) ** 2)
-    square, room = np.empty(4 * field.side**2), np.empty(field.side**2, dtype=np.float32)
-    g, work = np.empty(BENDS * field.side**2), np.empty(10 * field.side**2)
+    square, room = np.empty(4 * field.side**2, near.nodes.dtype), np.empty(field.side**2, np.float32)
+    g, work = np.empty(BENDS * field.side**2, near.nodes.dtype), np.empty(10 * field.side**2)
     pull, known = np.empty(5), np.empty((5, 5))
     ways_here = np.empty((4, index.size))
     for t in range(first, last):
@@ -204,8 +211,8 @@ def judge_frames(
 @kernel()
 def _draw(
     near: Pictures, lens: Lens, group: int, p: FloatArray, pixels: Pixels, profile: FloatArray,
-    room: FloatArray,
-) -> FloatArray:  # fmt: skip
+    room: AnyFloatArray,
+) -> AnyFloatArray:  # fmt: skip
     """Draw signal and gradient of a row (ny, 5, nx), and at one height what bends (ny, BENDS, nx).
 
     What a lens leaves out depends on its type.
@@ -222,8 +229,8 @@ def _draw(
 
 @kernel()
 def _curve(
-    near: Pictures, lens: Lens, group: int, free: BoolArray, pixels: Pixels, data: FloatArray,
-    here: FloatArray, p: FloatArray, ways: FloatArray, profile: FloatArray, work: FloatArray,
+    near: Pictures, lens: Lens, group: int, free: BoolArray, pixels: Pixels, data: AnyFloatArray,
+    here: AnyFloatArray, p: FloatArray, ways: FloatArray, profile: FloatArray, work: FloatArray,
     turned: FloatArray, bias: FloatArray,
 ) -> None:  # fmt: skip
     """Fill O V of a row and add to its bias; what a lens leaves out depends on its type.
@@ -255,10 +262,11 @@ def _curve(
 
 @kernel()
 def _curve_at_one_height(
-    data: FloatArray, bends: FloatArray, ways: FloatArray, turned: FloatArray, bias: FloatArray
-) -> None:
+    data: AnyFloatArray, bends: AnyFloatArray, ways: FloatArray, turned: FloatArray,
+    bias: FloatArray,
+) -> None:  # fmt: skip
     """Do it with the second derivatives of a picture at one height (ny, BENDS, nx)."""
-    sums, spread = np.zeros(9), np.zeros((4, 4))
+    sums, spread = np.zeros(9), np.zeros((4, 4), bends.dtype)
     for a in range(4):
         for b in range(4):
             for k in range(ways.shape[1]):
@@ -278,22 +286,25 @@ def _curve_at_one_height(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _observe(data: FloatArray, bends: FloatArray, spread: FloatArray, sums: FloatArray) -> None:
+def _observe(
+    data: AnyFloatArray, bends: AnyFloatArray, spread: AnyFloatArray, sums: FloatArray
+) -> None:
     """Sum the observed information in xx, xy, xa, yy, ya, aa, and Σ β²/λ tr(F⁻¹ ∂²s) ∂s."""
-    o0 = o1 = o2 = o3 = o4 = o5 = b0 = b1 = b2 = 0.0
+    one, two, least = data.dtype.type(1.0), data.dtype.type(2.0), data.dtype.type(LEAST)
+    o0 = o1 = o2 = o3 = o4 = o5 = b0 = b1 = b2 = data.dtype.type(0.0)
     vxx, vyy, vaa = spread[0, 0], spread[1, 1], spread[3, 3]
-    vxy, vxa, vya = 2.0 * spread[0, 1], 2.0 * spread[0, 3], 2.0 * spread[1, 3]
+    vxy, vxa, vya = two * spread[0, 1], two * spread[0, 3], two * spread[1, 3]
     for i in range(data.shape[1]):
         d0, d1, d2, d3 = data[0, i], data[1, i], data[2, i], data[3, i]
         s, gx, gy, ga = bends[i, 0], bends[i, 1], bends[i, 2], bends[i, 4]
         gxx, gxy, gyy = bends[i, 3], bends[i, 5], bends[i, 6]
         gxa, gya, gaa = bends[i, 7], bends[i, 8], bends[i, 9]
         for j in range(s.size):
-            per = 1.0 / max(d1[j] + d2[j] * s[j] + d3[j], FLOOR)
-            over = d0[j] * per
-            pull = d2[j] * (over - 1.0)
-            weight = d2[j] * d2[j] * per
-            bend = weight * over
+            rate = d1[j] + d2[j] * s[j] + d3[j]
+            per = one / max(rate, least)
+            pull = d2[j] * per * (d0[j] - rate)
+            weight = d2[j] * per * d2[j]
+            bend = weight * per * d0[j]
             o0 += bend * gx[j] * gx[j] - pull * gxx[j]
             o1 += bend * gx[j] * gy[j] - pull * gxy[j]
             o2 += bend * gx[j] * ga[j] - pull * gxa[j]

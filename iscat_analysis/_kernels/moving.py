@@ -21,7 +21,6 @@ from iscat_analysis._kernels.canvas import (
     Field,
     Light,
     Pictures,
-    add,
     cut,
     draw_gradient,
     lens_of,
@@ -133,7 +132,8 @@ def fit_frames(
     near_profile = blank_profile(table_of(near, 0), near.lens, 1)
     far_profile = blank_profile(table_of(far, 0), far.lens, 1)
     image = np.empty(max(field.drawn, field.side) ** 2)
-    square, change = np.empty(4 * field.side**2), np.empty(field.side**2)
+    square = np.empty(4 * field.side**2, near.nodes.dtype)
+    change = np.empty(field.side**2, near.nodes.dtype)
     gradients = np.empty(10 * field.side**2, near.nodes.dtype)
     room = np.empty(field.side**2, dtype=np.float32)
     step, before, index = np.empty(5), np.empty(5), np.flatnonzero(search.free[:4])
@@ -160,17 +160,16 @@ def fit_frames(
                 draw_gradient(near, group[r], p, pixels, slope_profile, both[0])
                 data = square[: 4 * ny * nx].reshape(4, ny, nx)
                 stage(light, t, total, both[0], r0, c0, data)
-                moved = change[: ny * nx].reshape(ny, nx)
+                signal = change[: ny * nx].reshape(ny, nx)
                 for i in range(ny):
                     for j in range(nx):
-                        moved[i, j] = -both[0, i, 0, j]
+                        signal[i, j] = both[0, i, 0, j]
                 before[:] = p
                 outcome[r], last_one, gain[r] = _climb(
                     near, group[r], pixels, data, search, p, both, slope_profile, fisher, step
                 )
                 here = both[last_one]
-                _add_signal(here, step, moved)
-                add(total[r0:r1, c0:c1], 1.0, moved)
+                _add_signal(here, step, signal, total[r0:r1, c0:c1])
                 canvas.squares[r] = p
                 information[r] = fisher[:4, :4]
                 if slopes.values.size:
@@ -193,7 +192,7 @@ def _look_over(frame: NDArray[np.float32]) -> float:
 
 @kernel()
 def _climb(
-    near: Pictures, group: int, pixels: Pixels, data: FloatArray, search: Search, p: FloatArray,
+    near: Pictures, group: int, pixels: Pixels, data: AnyFloatArray, search: Search, p: FloatArray,
     both: AnyFloatArray, profile: FloatArray, fisher: FloatArray, step: FloatArray,
 ) -> tuple[int, int, float]:  # fmt: skip
     """Fit one row from p, at which both[0] is drawn.
@@ -226,8 +225,9 @@ def _climb(
         if search.free[i]:
             p[i] = min(max(p[i], lower[i]), upper[i])
     value, _, outcome = maximize(
-        table_of(near, group), lens_of(near, group), pixels, np.int64(POISSON), data, search.free,
-        lower, upper, search.max_step, search.tolerance, search.passes, p, score, fisher, -np.inf,
+        table_of(near, group), lens_of(near, group), pixels, np.int64(POISSON),
+        data.astype(np.float64), search.free, lower, upper, search.max_step, search.tolerance,
+        search.passes, p, score, fisher, -np.inf,
     )  # fmt: skip  # np.int64: a constant would be compiled for by itself
     draw_gradient(near, group, p, pixels, profile, both[0])
     place_score(data, both[0], near.lens, score, fisher)
@@ -258,13 +258,17 @@ def _step(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _add_signal(here: AnyFloatArray, step: FloatArray, out: FloatArray) -> None:
-    """Add the signal after a small step to `out`."""
-    dx, dy, dz, da = step[0], step[1], step[2], step[3]
+def _add_signal(
+    here: AnyFloatArray, step: FloatArray, before: AnyFloatArray, out: NDArray[np.float32]
+) -> None:
+    """Add the signal after a small step to `out`, minus what it was before."""
+    dx, dy = here.dtype.type(step[0]), here.dtype.type(step[1])
+    dz, da = here.dtype.type(step[2]), here.dtype.type(step[3])
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             sideways = dx * here[i, 1, j] + dy * here[i, 2, j]
-            out[i, j] += here[i, 0, j] + sideways + dz * here[i, 3, j] + da * here[i, 4, j]
+            moved = here[i, 0, j] + sideways + dz * here[i, 3, j] + da * here[i, 4, j]
+            out[i, j] += np.float32(moved - before[i, j])
 
 
 @kernel(fastmath=FAST, _nrt=False)

@@ -3,6 +3,14 @@
 The same as `image_score` and `image_value` of `iscat_analysis._kernels.scoring` say of a POISSON
 image at level 1, without what no fit of a frame asks for: the level and, of a picture at one
 height, z.  All three share the expected counts and one division per pixel.
+
+With n counts where b are expected without the particle and δ more with it, w = δ/(2b + δ), the
+log-likelihood n ln(1 + δ/b) − δ is worked out as
+
+    (n − b) 2 artanh w + w² (2 b w (1/3 + w²/5 + …) − 2 b − δ),
+
+the artanh by its series.  No term of it is larger than what it tells, so that single precision,
+which the processor does twice as fast, is enough.
 """
 
 from __future__ import annotations
@@ -20,19 +28,18 @@ from iscat_analysis._kernels.scoring import (
     SERIES,
     image_score,
     image_value,
-    twice_artanh,
 )
 
 FloatArray = NDArray[np.float64]
 AnyFloatArray = NDArray[np.floating[Any]]
 
-_LEAST = 1e-100
-"""Least expected count, as `FLOOR` of `scoring`, but its square is a number too."""
+LEAST = 1e-15
+"""Least expected count, as `FLOOR` of `scoring`, but its square is a number in single precision."""
 
 
 @kernel()
 def place_score(
-    data: FloatArray, here: AnyFloatArray, lens: Lens, score: FloatArray, fisher: FloatArray
+    data: AnyFloatArray, here: AnyFloatArray, lens: Lens, score: FloatArray, fisher: FloatArray
 ) -> float:
     """Fill score and Fisher matrix of (x, y, z, a), and give the log-likelihood.
 
@@ -61,28 +68,34 @@ def place_score(
         return value
     value, beyond = _flat_score(data, here, score, fisher)
     if beyond:
-        value = image_value(np.int64(POISSON), data, 1.0, here)
+        value = image_value(np.int64(POISSON), data.astype(np.float64), 1.0, here)
     return value
 
 
 @kernel(fastmath=FAST, _nrt=False)
 def _flat_score(
-    data: FloatArray, here: AnyFloatArray, score: FloatArray, fisher: FloatArray
-) -> tuple[float, int]:
+    data: AnyFloatArray, here: AnyFloatArray, score: FloatArray, fisher: FloatArray
+) -> tuple[float, float]:
     """Do it without z; tell as well in how many pixels the series of the logarithm is no good."""
-    b0 = b1 = b3 = f00 = f01 = f03 = f11 = f13 = f33 = value = 0.0
-    beyond = 0
+    zero, one, two = data.dtype.type(0.0), data.dtype.type(1.0), data.dtype.type(2.0)
+    least, series = data.dtype.type(LEAST), data.dtype.type(SERIES)
+    t3, t5, t7 = one / data.dtype.type(3.0), one / data.dtype.type(5.0), one / data.dtype.type(7.0)
+    t9, t11 = one / data.dtype.type(9.0), one / data.dtype.type(11.0)
+    b0 = b1 = b3 = f00 = f01 = f03 = f11 = f13 = f33 = value = beyond = zero
     for i in range(data.shape[1]):
         c0, c1, c2, c3 = data[0, i], data[1, i], data[2, i], data[3, i]
         s, gx, gy, ga = here[i, 0], here[i, 1], here[i, 2], here[i, 4]
         for j in range(s.size):
-            base, change = max(c1[j] + c3[j], _LEAST), c2[j] * s[j]
-            rate, middle = max(base + change, _LEAST), 2.0 * base + change
-            per = 1.0 / (rate * middle)  # of both quotients, as it takes longer than the rest
-            beyond += abs(change) >= SERIES * base
-            value += c0[j] * twice_artanh(change * (rate * per)) - change
+            base, change = max(c1[j] + c3[j], least), c2[j] * s[j]
+            rate, middle = max(base + change, least), two * base + change
+            per = one / (rate * middle)  # of both quotients, as it takes longer than the rest
+            beyond += one if abs(change) >= series * base else zero
+            w = change * (rate * per)
+            w2 = w * w
+            tail = w * (t3 + w2 * (t5 + w2 * (t7 + w2 * (t9 + w2 * t11))))
+            value += two * (c0[j] - base) * (w + w2 * tail) + w2 * (two * base * tail - middle)
             bend = c2[j] * (middle * per)
-            pull = c0[j] * bend - c2[j]
+            pull = (c0[j] - rate) * bend
             bend *= c2[j]
             b0 += pull * gx[j]
             b1 += pull * gy[j]

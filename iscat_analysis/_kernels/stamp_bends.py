@@ -54,7 +54,7 @@ def _bending_taps(window: FloatArray, t: float, scale: float, out: AnyFloatArray
 @kernel()
 def stamp_bends(
     profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
-    amplitude: float, out: FloatArray,
+    amplitude: float, out: AnyFloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (ny, BENDS, nx) with signal, gradient and second derivatives of an image."""
     _, block, made, strip = sizes(lens, pixels.x.size)
@@ -138,24 +138,25 @@ def _mix_along(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _put(lens: StampLens, amplitude: float, images: AnyFloatArray, out: FloatArray) -> None:
+def _put(lens: StampLens, amplitude: float, images: AnyFloatArray, out: AnyFloatArray) -> None:
     """Write a strip's images; the particle moves against the nodes."""
     rows, n = out.shape[0], out.shape[2]
     line, _, _, strip = sizes(lens, n)
+    one, a = out.dtype.type(1.0), out.dtype.type(amplitude)
     for row in range(rows):
         here = out[row]
         for k in range(_IMAGES):
             made = images[k * strip + row * line : k * strip + row * line + n]
             if k < 6:
-                image, factor = here[_PLACES[k]], -amplitude if k in (1, 3) else amplitude
+                image, factor = here[_PLACES[k]], -a if k in (1, 3) else a
             else:
-                image, factor = here[_PLACES[k]], 1.0 if k == 6 else -1.0
+                image, factor = here[_PLACES[k]], one if k == 6 else -one
             for j in range(n):
                 image[j] = factor * made[j]
-        twice = 2.0 / (amplitude * amplitude) if amplitude else 0.0
+        twice = out.dtype.type(2.0 / (amplitude * amplitude) if amplitude else 0.0)
         signal, slope, bend = here[0], here[4], here[9]
         for j in range(n):
-            bend[j] = twice * (amplitude * slope[j] - signal[j])
+            bend[j] = twice * (a * slope[j] - signal[j])
 
 
 _PLACES = (0, 1, 3, 2, 5, 6, 4, 7, 8)  # of the images in a row of pixels

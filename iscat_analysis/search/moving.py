@@ -32,6 +32,9 @@ LEFT_OVER = 0.2
 """Of a particle's signal-to-noise ratio that a candidate beside it must reach when what was fitted
 has been taken off: less may be what the model leaves over."""
 
+_HIGHER = 2.5
+"""What rings may be through optics that are not the model's, over those of the model."""
+
 _FIELDS = 32  # of frames and templates that are filtered at a time
 
 
@@ -108,6 +111,10 @@ class FrameFilter:
         norm = self._cut(rfft2(light, self._padded) * rfft2(flipped**2, self._padded))
         norm = np.sqrt(np.maximum(norm, 1e-9 * norm.max()))
         self._norm = norm[self._layers].astype(np.float32)
+        # Side lobes of a peak, over it: of several heights they are as high as `SIDELOBE` says.
+        self._lobe = SIDELOBE
+        if len(self._layers) == 1:
+            self._lobe = min(SIDELOBE, _HIGHER * _ring(images[self._layers[0]], NEAR * roi_px))
         self._duals = rfft2(flipped[self._layers].astype(np.float32), self._padded)
 
     def find(
@@ -193,7 +200,7 @@ class FrameFilter:
         """Whether peaks may be side lobes of others, which are higher."""
         apart_x, apart_y = x[one] - x[other], y[one] - y[other]
         beside = np.maximum(np.abs(apart_x), np.abs(apart_y)) < self._roi_px
-        lobe = height[one] < height[other] * np.where(beside, SIDELOBE, FAR_LOBE)
+        lobe = height[one] < height[other] * np.where(beside, self._lobe, FAR_LOBE)
         lobe |= np.hypot(apart_x, apart_y) < NEAR * self._roi_px
         return np.asarray(lobe | beside if self._cautious else lobe)
 
@@ -227,6 +234,14 @@ class FrameFilter:
         (rows, columns), half = self._share.shape, self._half
         full = irfft2(spectrum, self._padded)
         return np.asarray(full[..., half : half + rows, half : half + columns])
+
+
+def _ring(image: FloatArray, beyond_px: float) -> float:
+    """How high a filter's answer to its own image is beyond a distance, over its peak."""
+    side = 2 * len(image)
+    answer = irfft2(np.abs(rfft2(image, (side, side))) ** 2, (side, side))
+    along = side * np.fft.fftfreq(side)
+    return float(answer[np.hypot(along, along[:, None]) >= beyond_px].max() / answer[0, 0])
 
 
 def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int) -> IntArray:
