@@ -36,7 +36,7 @@ def _exchanged(rows: Rows, after: int) -> Rows:
 
 
 def _same(one: Rows, two: Rows) -> bool:
-    """Whether every place is in the same track: rows of a frame are in the order of their tracks."""
+    """Whether all places are in the same tracks, by which the rows of a frame are in order."""
     return np.array_equal(one.track, two.track) and np.array_equal(one.theta, two.theta)
 
 
