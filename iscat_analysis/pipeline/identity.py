@@ -1,82 +1,56 @@
 """Who is who after a meeting.
 
 Within a resolution two particles make one picture, and the fits of each may go on with the other.
-What they did before and after tells: their steps, by how fast each diffuses, and their masses.  Of
-two ways to join the parts before with those after, each part of a particle with n steps whose
-squares add up to 2 S along the two axes has the log-likelihood −N ln (S/N), N and S of both of its
-parts, less ½ n n'/(n + n') (m − m')²/σ² for mean masses m and m' of n and n' frames.
+What they did before and after tells: how fast each diffuses, how far it went meanwhile, and its
+mass.  The evidence that a part before a meeting and one after it are of one particle is the Bayes
+factor against two particles that have nothing to do with each other:
 
-Of two that were one for a while, one track may have ended when they met, and a new one begun when
-they parted: no particle vanishes beside another.  It goes on either in that one or in the other.
+- N steps from frame to frame are normal along two axes, of an unknown variance whose inverse is
+  exponential, with the mean 1/b of the movie.  If their squares add up to 2 S, their marginal
+  likelihood is (2π)^−N N! b/(b + S)^(N+1).  The way from one part to the other, in τ frames, is one
+  more step, of τ times the variance; that to another particle leads anywhere within reach.
+- Masses are median amplitudes.  That of n frames has the variance π σ²/2n, and that of what its
+  neighbours do to all of them; masses of two particles differ as those of the movie.
+
+Three may meet when one comes to two that are together.  A track may end in a meeting, and another
+begin there: two particles had one track for a while, or one of them two.  So the parts before and
+after are joined in that way, of all, which has most evidence.  What was linked weighs something in
+it, and so does that no particle vanishes beside another.
 """
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from iscat_analysis.inference.rows import Rows
+from iscat_analysis.records import FloatArray
 
 LEAST_GAIN = 8.0
 """In log-likelihood, from which on two tracks exchange what comes after a meeting: of pairs that
-were followed rightly, one in e⁸ at most is exchanged by chance."""
+were followed rightly, one in e⁸ at most is exchanged by chance.  As much speaks against a particle
+that ends in a meeting in which another begins."""
 
-MERGED_FRAMES = 30
+MERGED_FRAMES = 100
 """For which two particles may be one picture, and one track."""
 
-_LEAST_STEPS = 5  # of each part
 _APART_FRAMES = 5  # in which two must be apart before they meet again
+_NEIGHBOURS_FRAMES = 300  # who stay beside each other for longer are met by others one by one
+_NEVER = -1e9  # in log-likelihood
+_MASS_ERROR = 0.02  # of what neighbours do to all frames of a part, relative
 
 IntArray = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class _Part:
-    """What a track did for a while.
-
-    Attributes
-    ----------
-    steps : int
-        From frame to frame.
-    square : float
-        Half the sum of their squares [nm²].
-    frames : int
-        In which its amplitude was fitted.
-    mass : float
-        Mean amplitude.
-    """
-
-    steps: int
-    square: float
-    frames: int
-    mass: float
-
-    @classmethod
-    def of(cls, rows: Rows, mine: IntArray) -> _Part:
-        """Gather it from some of the rows."""
-        theta = rows.theta[mine]
-        moved = np.diff(theta[:, :2], axis=0)[np.diff(rows.frame[mine]) == 1]
-        mass = float(theta[:, 3].mean()) if len(theta) else 0.0
-        return cls(len(moved), float((moved**2).sum()) / 2, len(theta), mass)
-
-    def alone(self) -> float:
-        """Log-likelihood of a particle of which there is no more."""
-        return float(-self.steps * np.log(self.square / self.steps))
-
-    def with_(self, other: _Part, error: float) -> float:
-        """Log-likelihood that both are one particle."""
-        steps, square = self.steps + other.steps, self.square + other.square
-        weight = self.frames * other.frames / (self.frames + other.frames)
-        apart = (self.mass - other.mass) / error
-        return float(-steps * np.log(square / steps) - 0.5 * weight * apart**2)
-
-
 def identified(rows: Rows, *, near_nm: float, error: float) -> Rows:
-    """Exchange what comes after a meeting between two tracks where that is far more likely.
+    """Exchange what comes after meetings between tracks where that is far more likely.
 
     Parameters
     ----------
@@ -90,101 +64,286 @@ def identified(rows: Rows, *, near_nm: float, error: float) -> Rows:
     Returns
     -------
     Rows
-        The same places, some of them in other tracks.
+        The same places, some of them in other tracks.  Where a particle had two tracks at a time,
+        the fainter one is left out.
     """
-    track = _continued(rows, near_nm, error)
-    rows = Rows.of(rows.frame, track, rows.theta, _groups(rows, track))
     track = rows.track.copy()
-    meetings = sorted(_meetings(rows, near_nm))
-    for number, met in enumerate(meetings):
-        one, two = met.tracks
-        parts = []
-        for k in met.tracks:
-            until = next((m.first for m in meetings[number + 1 :] if k in m.tracks), np.inf)
-            mine = np.flatnonzero(track == k)
-            when = rows.frame[mine]
-            parts += [
-                _Part.of(rows, mine[when < met.first]),
-                _Part.of(rows, mine[(when > met.last) & (when < until)]),
-            ]
-        if min(part.steps for part in parts) < _LEAST_STEPS:
-            continue
-        (a, a_later), (b, b_later) = parts[:2], parts[2:]
-        kept = a.with_(a_later, error) + b.with_(b_later, error)
-        exchanged = a.with_(b_later, error) + b.with_(a_later, error)
-        if exchanged - kept > LEAST_GAIN:
-            later = rows.frame > met.closest
-            mine, other = later & (track == one), later & (track == two)
-            track[mine], track[other] = two, one
-    return Rows.of(rows.frame, track, rows.theta, _groups(rows, track))
+    typical = _Typical.of(rows, near_nm, error)
+    meetings = _meetings(rows, near_nm)
+    number = np.repeat(np.arange(len(meetings)), [len(met.rows) for met in meetings])
+    met_rows = np.concatenate([track[:0], *(met.rows for met in meetings)])
+    for k, met in enumerate(meetings):
+        later = met_rows[number > k]
+        labels = np.unique(track[met.rows])
+        sides = [_side(rows, track, int(one), met, later, typical) for one in labels if one >= 0]
+        for path in _paths(sides, typical):
+            _follow(rows, track, path, met)
+    kept = track >= 0
+    group = _groups(rows, track)
+    return Rows.of(rows.frame[kept], track[kept], rows.theta[kept], group[kept])
 
 
-def _continued(rows: Rows, near_nm: float, error: float) -> IntArray:
-    """Let tracks that ended beside another go on, with what began beside it or with the other."""
-    track = rows.track.copy()
-    waiting = np.unique(track).tolist()
-    while waiting:
-        one = waiting.pop(0)
-        of_one = np.flatnonzero(track == one)
-        found = _parted(rows, track, of_one[-1], near_nm) if of_one.size else None
-        if found is None:
-            continue
-        end = of_one[-1]
-        two, new = found
-        of_two, of_new = (np.flatnonzero(track == k) for k in (two, new))
-        when, begun = rows.frame[of_two], rows.frame[of_new[0]]
-        mine, fresh = (_Part.of(rows, own) for own in (of_one, of_new))
-        before = _Part.of(rows, of_two[when < rows.frame[end]])
-        after = _Part.of(rows, of_two[when > begun])
-        if min(part.steps for part in (mine, fresh, before, after)) < _LEAST_STEPS:
-            continue
-        straight = mine.with_(fresh, error) + before.with_(after, error)
-        crossed = mine.with_(after, error) + before.with_(fresh, error)
-        apart = mine.alone() + fresh.alone() + before.with_(after, error)
-        if max(straight, crossed) - apart < -LEAST_GAIN:
-            continue
-        if crossed > straight:
-            track[(track == two) & (rows.frame > rows.frame[end])] = one
-            track[track == new] = two
-        else:
-            track[track == new] = one
-        waiting += [one, two]
-    return track
+@dataclass(frozen=True)
+class _Part:
+    """What a track did for a while.
+
+    Attributes
+    ----------
+    steps : float
+        From frame to frame, so many as say as much as their median does.
+    square : float
+        Half the sum of their squares [nm²].
+    mass, variance : float
+        Median amplitude, and its variance.
+    frames : ndarray of int, shape (2,)
+        The first and the last.
+    places : ndarray, shape (2, 2)
+        Where it was in them [nm].
+    """
+
+    steps: float
+    square: float
+    mass: float
+    variance: float
+    frames: IntArray
+    places: FloatArray
 
 
-def _parted(rows: Rows, track: IntArray, end: int, near_nm: float) -> tuple[int, int] | None:
-    """Find a track beside which another ended, and the first that began beside that one then."""
-    last = int(rows.frame[end])
-    beside = _beside(rows, end, near_nm)
-    if not beside.size:
-        return None
-    first, stop = np.searchsorted(rows.frame, [last + 1, last + MERGED_FRAMES + 1])
-    numbers, births = np.unique(track[first:stop], return_index=True)
-    for born in np.sort(first + births[~np.isin(numbers, track[:first])]):
-        for i in _beside(rows, born, near_nm):
-            if track[i] in track[beside] and track[i] != track[end]:
-                return int(track[i]), int(track[born])
-    return None
+@dataclass(frozen=True)
+class _Typical:
+    """What is expected of a particle of which nothing is known.
+
+    Attributes
+    ----------
+    step_nm2 : float
+        Variance of its steps along an axis.
+    mass, variance : float
+        Of amplitudes.
+    near_nm, error : float
+        As of `identified`.
+    """
+
+    step_nm2: float
+    mass: float
+    variance: float
+    near_nm: float
+    error: float
+
+    @classmethod
+    def of(cls, rows: Rows, near_nm: float, error: float) -> _Typical:
+        """Gather it from all rows."""
+        order = np.lexsort((rows.frame, rows.track))
+        next_ = (np.diff(rows.track[order]) == 0) & (np.diff(rows.frame[order]) == 1)
+        step = _step_nm2(np.diff(rows.theta[order, :2], axis=0)[next_])
+        mass = rows.theta[:, 3] if len(order) else np.zeros(1)
+        least = (1e-3 * near_nm) ** 2  # of what does not move at all
+        return cls(max(step, least), float(np.median(mass)), float(mass.var()), near_nm, error)
+
+    def part(self, rows: Rows, mine: IntArray) -> _Part | None:
+        """Gather what some of the rows say; None if there are none."""
+        if not mine.size:
+            return None
+        theta, frame = rows.theta[mine], rows.frame[mine]
+        moved = np.diff(theta[:, :2], axis=0)[np.diff(frame) == 1]
+        steps = len(moved) * math.log(2) ** 2  # a median is as good as the mean of so many
+        mass = float(np.median(theta[:, 3]))
+        variance = math.pi / 2 * self.error**2 / len(mine) + (_MASS_ERROR * mass) ** 2
+        square = steps * _step_nm2(moved)
+        return _Part(steps, square, mass, variance, frame[[0, -1]], theta[[0, -1], :2])
+
+    def evidence(self, before: _Part | None, after: _Part | None) -> float:
+        """Logarithm of the Bayes factor that both are one particle; 0 where one is not known."""
+        if before is None or after is None:
+            return 0.0
+        took = int(after.frames[0] - before.frames[1])
+        if took <= 0:
+            return -math.inf  # one particle is not twice in a frame
+        way = float(((after.places[0] - before.places[1]) ** 2).sum()) / (2 * took)
+        moved = (
+            self._marginal(before.steps + after.steps + 1, before.square + after.square + way)
+            - self._marginal(before.steps, before.square)
+            - self._marginal(after.steps, after.square)
+            + math.log(self.near_nm**2 / (2 * took))
+        )
+        known = self.variance / (self.variance + before.variance)
+        mass = self.mass + known * (before.mass - self.mass)
+        variance = known * before.variance + after.variance
+        weighed = _normal(after.mass - mass, variance)
+        return moved + weighed - _normal(after.mass - self.mass, self.variance + after.variance)
+
+    def _marginal(self, steps: float, square: float) -> float:
+        """Log-likelihood of steps whatever their variance, but for (2π)^−N."""
+        prior = math.log(self.step_nm2)
+        return math.lgamma(steps + 1) + prior - (steps + 1) * math.log(self.step_nm2 + square)
 
 
-def _beside(rows: Rows, row: int, near_nm: float) -> IntArray:
-    """Give the rows near another one of their frame."""
-    first, stop = np.searchsorted(rows.frame, rows.frame[row] + np.arange(2))
-    apart = np.hypot(*(rows.theta[first:stop, :2] - rows.theta[row, :2]).T)
-    near = first + np.flatnonzero(apart < near_nm)
-    return np.asarray(near[near != row])
+def _step_nm2(moved: FloatArray) -> float:
+    """Variance of steps along an axis, from the median of their squares along both; 0 of none."""
+    return float(np.median((moved**2).sum(axis=1))) / math.log(4) if len(moved) else 0.0
+
+
+def _normal(off: float, variance: float) -> float:
+    """Logarithm of a normal density, but for 2π."""
+    return -(off**2 / variance + math.log(variance)) / 2
 
 
 class _Meeting(NamedTuple):
-    """When two tracks were within reach; the frame in which they were nearest comes last."""
+    """When tracks were within reach of one another.
+
+    Attributes
+    ----------
+    rows : ndarray of int
+        All that were, in order.
+    pairs : ndarray of int, shape (n, 2)
+        Those that were near each other, the nearest first.
+    """
+
+    rows: IntArray
+    pairs: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """A track in a meeting.
+
+    Attributes
+    ----------
+    track : int
+        Its number.
+    first, last : int
+        Frames in which others are near it.
+    before, after : _Part or None
+        Until the first, and from the last to the next meeting.
+    begins, ends : bool
+        Whether it does so in the meeting, or a few frames from it.
+    """
+
+    track: int
+    first: int
+    last: int
+    before: _Part | None
+    after: _Part | None
+    begins: bool
+    ends: bool
+
+
+def _side(
+    rows: Rows, track: IntArray, one: int, met: _Meeting, later: IntArray, typical: _Typical
+) -> _Side:
+    """Gather what a track does; `later` are the rows of the meetings to come."""
+    mine = np.flatnonzero(track == one)
+    frame = rows.frame[mine]
+    first, last = rows.frame[met.rows[track[met.rows] == one]][[0, -1]].tolist()
+    coming = rows.frame[later[track[later] == one]]
+    until = coming[coming > last].min(initial=int(frame[-1]) + 1)
+    before = typical.part(rows, mine[frame < first])
+    after = typical.part(rows, mine[(frame > last) & (frame < until)])
+    begins, ends = first - frame[0] <= _APART_FRAMES, frame[-1] - last <= _APART_FRAMES
+    return _Side(one, first, last, before, after, bool(begins), bool(ends))
+
+
+def _paths(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
+    """Give those of which each goes on as the next one did; a cycle ends with its first."""
+    come = [side for side in sides if not side.begins]
+    go = [side for side in sides if not side.ends]
+    if not come or not go:
+        return
+    gain = LEAST_GAIN + np.array([[typical.evidence(a.before, b.after) for b in go] for a in come])
+    linked = np.array([[a is b for b in go] for a in come])
+    # what fits nothing may end or begin here if it does, and else goes on all the same
+    least = np.array([[0.0 if a.ends or b.begins else _NEVER for b in go] for a in come])
+    worth = np.maximum(gain, least) + LEAST_GAIN / 2 * linked
+    moves: dict[_Side, _Side] = {}
+    for i, j in zip(*scipy.optimize.linear_sum_assignment(worth, maximize=True), strict=True):
+        a, b = come[i], go[j]
+        if not linked[i, j] and gain[i, j] > least[i, j]:
+            moves[a] = b
+    while moves:
+        path = [next((side for side in moves if side not in moves.values()), next(iter(moves)))]
+        while path[-1] in moves:
+            path.append(moves.pop(path[-1]))
+        yield path
+
+
+def _follow(rows: Rows, track: IntArray, path: list[_Side], met: _Meeting) -> None:
+    """Let each of a path go on as the next one did, all from one frame on."""
+    numbers = [side.track for side in path]
+    mine = [np.flatnonzero(track == k) for k in numbers]
+    low, high = max(side.first for side in path), min(side.last for side in path)
+    near = rows.frame[met.pairs[np.isin(track[met.pairs], numbers).all(axis=1), 0]]
+    near = near[(near >= low) & (near <= high)]
+    cut = int(near[0]) if near.size else (low + high) // 2
+    cycle = path[0] is path[-1]
+    end = int(rows.frame[mine[0][-1]]) if path[0].ends and not cycle else -1
+    begin = rows.frame[mine[-1][0]] if path[-1].begins and not cycle else rows.frame[-1] + 1
+    cuts = np.full(len(path), max(end, min(cut, begin - 1)))
+    if begin <= end:  # in these frames there is a track too many
+        both = [own[(rows.frame[own] >= begin) & (rows.frame[own] <= end)] for own in mine]
+        faintest = int(np.argmin([rows.theta[own, 3].sum() for own in both]))
+        track[both[faintest]] = -1
+        cuts[faintest + 1 :] = begin - 1
+    elif not cycle and not path[0].ends:
+        track[mine[0][rows.frame[mine[0]] > cuts[0]]] = numbers[-1]
+    for k in range(1, len(path)):
+        track[mine[k][rows.frame[mine[k]] > cuts[k]]] = numbers[k - 1]
+
+
+class _Pair(NamedTuple):
+    """When two tracks were within reach of each other: frames, tracks and pairs of rows."""
 
     first: int
     last: int
     tracks: tuple[int, int]
-    closest: int
+    rows: IntArray
 
 
-def _meetings(rows: Rows, near_nm: float) -> Iterator[_Meeting]:
+def _meetings(rows: Rows, near_nm: float) -> list[_Meeting]:
+    """Give the meetings in order."""
+    pairs = sorted(_pairs(rows, near_nm))
+    number = np.arange(len(pairs))
+    for one, two in _of_one(rows, pairs):
+        number[number == number[two]] = number[one]
+    out = []
+    for k in np.unique(number):
+        met = np.concatenate([pairs[i].rows for i in np.flatnonzero(number == k)])
+        apart = np.hypot(*(rows.theta[met[:, 0], :2] - rows.theta[met[:, 1], :2]).T)
+        out.append(_Meeting(np.unique(met), met[np.argsort(apart)]))
+    return sorted(out, key=lambda met: int(met.rows[0]))
+
+
+def _of_one(rows: Rows, pairs: list[_Pair]) -> Iterator[tuple[int, int]]:
+    """Give those that are of one meeting: a track is in both, at once or soon after one another.
+
+    What ends beside another meets it until, beside that, something begins.
+    """
+    numbers, firsts = np.unique(rows.track, return_index=True)
+    begins = dict(zip(numbers.tolist(), rows.frame[firsts].tolist(), strict=True))
+    ends = dict(zip(rows.track.tolist(), rows.frame.tolist(), strict=True))  # the last one stays
+    born: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    spans: dict[int, list[tuple[int, int, int]]] = defaultdict(list)
+    for k, pair in enumerate(pairs):
+        for one, other in (pair.tracks, pair.tracks[::-1]):
+            if pair.first - begins[other] <= _APART_FRAMES:
+                born[one].append((pair.first, k))
+    for k, pair in enumerate(pairs):
+        brief = pair.last - pair.first <= _NEIGHBOURS_FRAMES
+        for one, other in (pair.tracks, pair.tracks[::-1]):
+            until = pair.last
+            if ends[other] - pair.last <= _APART_FRAMES:
+                soon = (b for b in born[one] if 0 < b[0] - pair.last <= MERGED_FRAMES)
+                until, parted = next(soon, (until, k))
+                yield k, parted
+            if brief or until > pair.last:
+                spans[one].append((pair.first if brief else pair.last, until, k))
+    for of_track in spans.values():
+        reach, held = -math.inf, -1
+        for first, last, k in sorted(of_track):
+            if first <= reach + _APART_FRAMES:
+                yield held, k
+            reach, held = max(reach, last), k
+
+
+def _pairs(rows: Rows, near_nm: float) -> Iterator[_Pair]:
     """Give the meetings of every pair of tracks."""
     one, two = rows.pairs_within(near_nm).T
     swapped = rows.track[one] > rows.track[two]
@@ -192,14 +351,12 @@ def _meetings(rows: Rows, near_nm: float) -> Iterator[_Meeting]:
     order = np.lexsort((rows.frame[one], rows.track[two], rows.track[one]))
     one, two = one[order], two[order]
     frame, tracks = rows.frame[one], np.stack([rows.track[one], rows.track[two]], axis=1)
-    apart = np.hypot(*(rows.theta[one, :2] - rows.theta[two, :2]).T)
     others = (np.diff(tracks, axis=0) != 0).any(axis=1) | (np.diff(frame) > _APART_FRAMES)
     for together in np.split(np.arange(len(one)), np.flatnonzero(others) + 1):
         if together.size:
-            first, last = together[[0, -1]]
-            closest = together[np.argmin(apart[together])]
-            of = int(tracks[first, 0]), int(tracks[first, 1])
-            yield _Meeting(int(frame[first]), int(frame[last]), of, int(frame[closest]))
+            first, last = frame[together[[0, -1]]].tolist()
+            of = int(tracks[together[0], 0]), int(tracks[together[0], 1])
+            yield _Pair(first, last, of, np.stack([one[together], two[together]], axis=1))
 
 
 def _groups(rows: Rows, track: IntArray) -> IntArray:
