@@ -51,7 +51,7 @@ def first_ground(field: MovingField, *, follow_power: bool) -> Ground:
     level = np.empty(field.used.shape)
 
     def median(row: int) -> None:
-        each = np.ascontiguousarray((field.counts_e[some, row] * scale[:, None]).T)
+        each = np.ascontiguousarray((field.exposures.electrons(some, row) * scale[:, None]).T)
         level[row] = np.median(each, axis=1, overwrite_input=True)
 
     field.share(median, len(level))

@@ -21,6 +21,7 @@ from iscat_analysis._kernels.stamp import add_stamp
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.bias import first_order_bias
+from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.newton import Response
 from iscat_analysis.inference.noise import poisson
@@ -95,7 +96,7 @@ def _field(counts: np.ndarray, pool: ThreadPoolExecutor, read_e2: float = 0.0) -
     config = _config()
     near = forward_model(config, math.sqrt(2) * (ROI / 2 + 6) * PIXEL_NM)
     return MovingField(
-        counts.astype(np.float32), np.full(SHAPE, read_e2), np.ones(SHAPE, dtype=bool),
+        Exposures(counts.astype(np.float32)), np.full(SHAPE, read_e2), np.ones(SHAPE, dtype=bool),
         near, forward_model(config, 1e4), pixel_nm=PIXEL_NM, roi_px=ROI, z_range_nm=None,
         largest=1e6, pool=pool,
     )  # fmt: skip
@@ -289,7 +290,7 @@ def test_rows_in_one_place_follow_as_one(pool: ThreadPoolExecutor, rounded: floa
     values = np.repeat(np.rint(slope / unit).astype(np.int16), 2, axis=0)
     slopes = Slopes(squares, values, np.full((2, 1), unit), np.zeros((2, 1)))
     light = Light(
-        np.full((1, side, side), level, dtype=np.float32), np.ones(1),
+        np.full((1, side, side), level, dtype=np.float32), 1.0, 0.0, np.ones(1),
         np.full((side, side), level), np.zeros((side, side)),
     )  # fmt: skip
     own = float(np.sum(slope**2)) / level
