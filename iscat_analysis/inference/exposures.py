@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.canvas import Counts
 from iscat_analysis.records import FloatArray
 
+
 @dataclass(frozen=True)
 class Exposures:
     """Counts, and what they stand for.

@@ -174,7 +174,7 @@ def _noisy(exposures: Exposures, light_e: FloatArray, variance_e2: FloatArray) -
     firsts = np.arange(0, frames - 1, max(2, frames // _PAIRS))
     light = light_e / (light_e.mean() or 1.0)
     squares = np.zeros(variance_e2.shape)
-    for t in firsts:
+    for t in firsts.tolist():
         if light[t] > 0 and light[t + 1] > 0:
             one, other = exposures.electrons(t), exposures.electrons(t + 1)
             squares += (one / light[t] - other / light[t + 1]) ** 2

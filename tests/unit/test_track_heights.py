@@ -49,8 +49,9 @@ def test_rows_come_into_their_fringe(
     frames, track = np.arange(FRAMES), np.full(FRAMES, 0 if tracked else -1)
     with ThreadPoolExecutor(1) as pool:
         field = MovingField(
-            Exposures(rng.poisson(mean).astype(np.float32)), np.zeros(SHAPE), np.ones(SHAPE, dtype=bool),
-            near, model, pixel_nm=PIXEL_NM, roi_px=ROI, z_range_nm=span, largest=1e9, pool=pool,
+            Exposures(rng.poisson(mean).astype(np.float32)), np.zeros(SHAPE),
+            np.ones(SHAPE, dtype=bool), near, model, pixel_nm=PIXEL_NM, roi_px=ROI,
+            z_range_nm=span, largest=1e9, pool=pool,
         )  # fmt: skip
         ground = Ground(np.full(SHAPE, LEVEL_E), np.ones(FRAMES))
         rows = Rows.of(frames, track, start)
