@@ -25,6 +25,8 @@ FloatArray = NDArray[np.float64]
 AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+Counts = NDArray[np.uint16] | NDArray[np.float32]
+"""Of which the one at hand is compiled for."""
 
 
 class Pictures(NamedTuple):
@@ -59,8 +61,10 @@ class Light(NamedTuple):
 
     Attributes
     ----------
-    counts : ndarray of float32, shape (t, y, x)
-        Photoelectrons [e].
+    counts : ndarray of uint16 or float32, shape (t, y, x)
+        As stored [counts].
+    gain, offset : float
+        A count less the offset stands for so many photoelectrons [e/count, counts].
     power : ndarray, shape (t,)
         Power of each frame, 1 on average.
     background : ndarray, shape (y, x)
@@ -69,7 +73,9 @@ class Light(NamedTuple):
         Variance of the read noise; 0 there too [e²].
     """
 
-    counts: NDArray[np.float32]
+    counts: Counts
+    gain: float
+    offset: float
     power: FloatArray
     background: FloatArray
     read: FloatArray
@@ -242,6 +248,7 @@ def stage(
     `own` (ny, 5, nx) begins with the particle's own signal.
     """
     w, last, one = light.power[t], c0 + data.shape[2], data.dtype.type(1.0)
+    gain, offset = light.gain, light.offset
     for i in range(data.shape[1]):  # among more arrays at once the compiler gives up on vectors
         r = r0 + i
         seen, base, level, noise = data[0, i], data[1, i], data[2, i], data[3, i]
@@ -254,7 +261,8 @@ def stage(
         for j in range(level.size):
             noise[j] = read[j]
         for j in range(level.size):
-            seen[j] = noise[j] + (counts[j] if level[j] > 0.0 else np.float32(0.0))
+            electrons = gain * (np.float64(counts[j]) - offset)
+            seen[j] = noise[j] + (electrons if level[j] > 0.0 else 0.0)
 
 
 @kernel()
@@ -345,6 +353,36 @@ def _add_rings(
             add_row(pictures, field, group, theta, sign, part, profile, image, total)
 
 
+@kernel(fastmath=FAST, _nrt=False)
+def leave_over(
+    light: Light, signal: NDArray[np.float32], first: int, out: NDArray[np.float32]
+) -> None:
+    """Take off frames what is expected of them.
+
+    Parameters
+    ----------
+    light : Light
+        The movie.
+    signal : ndarray of float32, shape (n, y, x)
+        Of all rows of each frame.
+    first : int
+        Number of the first of these frames.
+    out : ndarray of float32, shape (n, y, x)
+        Filled with photoelectrons [e]; 0 in pixels that are not used.
+    """
+    gain, offset = light.gain, light.offset
+    for t in range(out.shape[0]):
+        w = light.power[first + t]
+        for i in range(out.shape[1]):
+            counts, background = light.counts[first + t, i], light.background[i]
+            rows, left = signal[t, i], out[t, i]
+            for j in range(left.size):
+                level = w * background[j]
+                electrons = gain * (np.float64(counts[j]) - offset)
+                over = electrons - level * (1.0 + rows[j])
+                left[j] = over if background[j] > 0.0 else 0.0
+
+
 @kernel()
 def add_squares(
     light: Light, total: NDArray[np.float32], frame: IntArray, corner: IntArray, owner: IntArray,
@@ -377,8 +415,7 @@ def add_squares(
             for j in range(max(left, 0), min(left + side, columns)):
                 level = light.power[t] * light.background[i, j]
                 if level > 0.0:
-                    mine[0, i - top, j - left] += light.counts[t, i, j] - level * (
-                        1.0 + total[t, i, j]
-                    )
+                    electrons = light.gain * (np.float64(light.counts[t, i, j]) - light.offset)
+                    mine[0, i - top, j - left] += electrons - level * (1.0 + total[t, i, j])
                     mine[1, i - top, j - left] += level
                     mine[2, i - top, j - left] += light.read[i, j]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.canvas import (
     Canvas,
+    Counts,
     Field,
     Light,
     Pictures,
@@ -181,12 +182,12 @@ def fit_frames(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _look_over(frame: NDArray[np.float32]) -> float:
+def _look_over(frame: Counts) -> float:
     """Read a frame in its order, which brings it into the cache; each square would wait for it."""
     total = np.float32(0.0)
     for i in range(frame.shape[0]):
         for j in range(frame.shape[1]):
-            total += frame[i, j]
+            total += np.float32(frame[i, j])
     return float(total)
 
 

@@ -24,11 +24,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.canvas import Canvas, Field, Light, Pictures, add_squares
+from iscat_analysis._kernels.canvas import (
+    Canvas,
+    Field,
+    Light,
+    Pictures,
+    add_squares,
+    leave_over,
+)
 from iscat_analysis._kernels.following import Slopes
 from iscat_analysis._kernels.judging import judge_frames
 from iscat_analysis._kernels.moving import Search, fit_frames
 from iscat_analysis._kernels.scoring import CONVERGED
+from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.newton import Response
 from iscat_analysis.inference.pictures import PictureBook
@@ -62,8 +70,8 @@ class MovingField:
 
     Parameters
     ----------
-    counts_e : ndarray of float32, shape (t, y, x)
-        Photoelectrons [e].
+    exposures : Exposures
+        The frames.
     read_e2 : ndarray, shape (y, x)
         Variance of the read noise of a frame [e²].
     used : ndarray of bool, shape (y, x)
@@ -86,7 +94,7 @@ class MovingField:
 
     def __init__(
         self,
-        counts_e: NDArray[np.float32],
+        exposures: Exposures,
         read_e2: FloatArray,
         used: BoolArray,
         near: ForwardModel,
@@ -99,7 +107,7 @@ class MovingField:
         pool: ThreadPoolExecutor,
         saturated: BoolArray | None = None,
     ) -> None:
-        self.counts_e, self.used = counts_e, used
+        self.exposures, self.used = exposures, used
         self.saturated = np.zeros_like(used) if saturated is None else saturated
         self.read_e2 = np.ascontiguousarray(np.broadcast_to(read_e2, used.shape), dtype=float)
         self._pool = pool
@@ -147,30 +155,33 @@ class MovingField:
     @cached_property
     def _room(self) -> NDArray[np.float32]:
         """Of the canvas, shape (t, y, x)."""
-        return np.empty_like(self.counts_e)
+        return np.empty(self.exposures.counts.shape, dtype=np.float32)
 
     @cached_property
     def total_e(self) -> FloatArray:
         """Photoelectrons of all frames, shape (y, x) [e]."""
-        return self._sum_of(
-            lambda first: np.sum(self.counts_e[first : first + _BLOCK], axis=0, dtype=np.float64)
+        counts = self.exposures.counts
+        total = self._sum_of(
+            lambda first: np.sum(counts[first : first + _BLOCK], axis=0, dtype=np.float64)
         )
+        return self.exposures.in_electrons(total, self.frames)
 
     @cached_property
     def frame_totals(self) -> FloatArray:
         """Photoelectrons in the used pixels of each frame, shape (t,) [e]."""
-        unused = self.counts_e[:, ~self.used].sum(axis=1, dtype=np.float64)
+        counts = self.exposures.counts
+        unused = counts[:, ~self.used].sum(axis=1, dtype=np.float64)
         blocks = range(0, self.frames, _BLOCK)
         parts = self._pool.map(
-            lambda first: self.counts_e[first : first + _BLOCK].sum(axis=(1, 2), dtype=np.float64),
-            blocks,
+            lambda first: counts[first : first + _BLOCK].sum(axis=(1, 2), dtype=np.float64), blocks
         )
-        return np.asarray(np.concatenate(list(parts)) - unused)
+        total = np.concatenate(list(parts)) - unused
+        return self.exposures.in_electrons(total, int(self.used.sum()))
 
     @property
     def frames(self) -> int:
         """Frames in the movie."""
-        return len(self.counts_e)
+        return len(self.exposures.counts)
 
     def set_blurs(self, variances_nm2: FloatArray) -> None:
         """Make the pictures that `Rows.group` numbers.
@@ -319,16 +330,12 @@ class MovingField:
         ndarray of float32, shape (last - first, y, x)
             Photoelectrons [e]; 0 in pixels that are not used.
         """
-        here = slice(first, last)
         if self._canvas is not None and self._canvas.rows is rows and self._canvas.coarse:
-            signal = self._canvas.canvas.total[here]
+            signal = self._canvas.canvas.total[first:last]
         else:
             signal = self._signal(ground, rows, first, last)
-        left = np.add(signal, 1.0, dtype=np.float32)
-        left *= ground.level.astype(np.float32)
-        left *= ground.power[here, None, None].astype(np.float32)
-        np.subtract(self.counts_e[here], left, out=left)
-        left[:, ~self.used] = 0.0
+        left = np.empty_like(signal)
+        leave_over(self._light(ground), signal, first, left)
         return left
 
     def add_squares(
@@ -364,10 +371,9 @@ class MovingField:
 
     def _signal(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
         """Draw the rows of some frames alone."""
-        within = rows.only((rows.frame >= first) & (rows.frame < last))
-        canvas = blank(np.empty_like(self.counts_e[first:last]), within)
+        within, light = rows.only((rows.frame >= first) & (rows.frame < last)), self._light(ground)
+        canvas = blank(np.empty(light.counts[first:last].shape, dtype=np.float32), within)
         near, far = self._pictures_for(coarse=True)
-        light = self._light(ground)
         part = light._replace(counts=light.counts[first:last], power=light.power[first:last])
         starts = np.searchsorted(within.frame, np.arange(first, last + 1)).astype(np.int64)
         n = len(within.frame)
@@ -461,7 +467,7 @@ class MovingField:
         light = light._replace(counts=light.counts[times], power=light.power[times])
         starts = np.searchsorted(frame, np.arange(times.size + 1)).astype(np.int64)
         theta, n = rows.theta.copy(), len(frame)
-        canvas = blank(np.empty_like(light.counts), rows)
+        canvas = blank(np.empty(light.counts.shape, dtype=np.float32), rows)
         outcome = np.zeros(n, dtype=np.int64)
         fisher, gain = np.empty((n, 4, 4)), np.empty(n)
         slopes, expected = self._slopes_of(n, 0), np.zeros(times.size)
@@ -502,7 +508,8 @@ class MovingField:
 
     def _light(self, ground: Ground) -> Light:
         level, read = (np.where(self.used, part, 0.0) for part in (ground.level, self.read_e2))
-        return Light(self.counts_e, ground.power, level, read)
+        shot = self.exposures
+        return Light(shot.counts, shot.gain, shot.offset, ground.power, level, read)
 
     def _sum_of(self, block: Callable[[int], NDArray[np.floating[Any]]]) -> FloatArray:
         """Run blocks of frames and add what they give, in their order."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.medians import middle
 from iscat_analysis.records import BoolArray
 
 MOST_TURNS = 12
@@ -51,8 +52,8 @@ def first_ground(field: MovingField, *, follow_power: bool) -> Ground:
     level = np.empty(field.used.shape)
 
     def median(row: int) -> None:
-        each = np.ascontiguousarray((field.counts_e[some, row] * scale[:, None]).T)
-        level[row] = np.median(each, axis=1, overwrite_input=True)
+        each = field.exposures.electrons(some, row) * scale[:, None]
+        level[row] = middle(np.ascontiguousarray(each.T))
 
     field.share(median, len(level))
     return Ground(np.maximum(level, 1e-3), power)

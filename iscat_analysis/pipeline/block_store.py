@@ -22,7 +22,7 @@ from iscat_analysis.pipeline.moving_table import common_masses, moving_table
 from iscat_analysis.pipeline.noise import Noise, judge_beside
 from iscat_analysis.pipeline.resume import Shelf, packed_views, unpacked_views
 from iscat_analysis.pipeline.scene import Scene
-from iscat_analysis.records import BoolArray, EventView, FloatArray, FrameSource, Progress, Windows
+from iscat_analysis.records import BoolArray, CountSource, EventView, FloatArray, Progress, Windows
 from iscat_analysis.threads import beside
 
 
@@ -115,7 +115,7 @@ class Block:
 
 def analyse_block(
     scene: Scene,
-    movie: FrameSource,
+    movie: CountSource,
     camera: Camera,
     span: tuple[int, int],
     *,
@@ -131,7 +131,7 @@ def analyse_block(
     ----------
     scene : Scene
         From `iscat_analysis.pipeline.moving_field.track_scene`.
-    movie : FrameSource
+    movie : CountSource
         The movie.
     camera : Camera
         Counts → photoelectrons.

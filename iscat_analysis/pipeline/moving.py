@@ -48,7 +48,7 @@ from iscat_analysis.pipeline.linking import (
 )
 from iscat_analysis.pipeline.moving_field import exposure_of, load_field, search_frames
 from iscat_analysis.pipeline.scene import Scene
-from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress
+from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
 from iscat_analysis.search.moving import Sightings, load_linker
 from iscat_analysis.species.diffusion import estimate_diffusion
 from iscat_analysis.threads import beside
@@ -115,7 +115,7 @@ class Moving:
 
 def follow(
     scene: Scene,
-    movie: FrameSource,
+    movie: CountSource,
     camera: Camera,
     span: tuple[int, int],
     *,
@@ -131,7 +131,7 @@ def follow(
     ----------
     scene : Scene
         From `track_scene`.
-    movie : FrameSource
+    movie : CountSource
         The movie.
     camera : Camera
         Counts → photoelectrons.

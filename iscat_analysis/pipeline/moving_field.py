@@ -13,12 +13,13 @@ from scipy.special import chdtri
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.scene import Scene, make_scene
-from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress
+from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
 from iscat_analysis.search.moving import FrameFilter, Sightings
 from iscat_analysis.units import count
 
@@ -80,20 +81,20 @@ def track_scene(config: Config, field_px: tuple[int, int], frames: int) -> Scene
 
 def load_field(
     scene: Scene,
-    movie: FrameSource,
+    movie: CountSource,
     camera: Camera,
     span: tuple[int, int],
     check: Callable[[NDArray[Any], int], None],
     pool: ThreadPoolExecutor,
     progress: Progress,
 ) -> MovingField:
-    """Read the frames as photoelectrons.
+    """Read the frames, which stay as they are stored where that takes less memory.
 
     Parameters
     ----------
     scene : Scene
         From `track_scene`.
-    movie : FrameSource
+    movie : CountSource
         The movie.
     camera : Camera
         Counts → photoelectrons.
@@ -124,14 +125,15 @@ def load_field(
             f"move from what they move over; {LEAST_FRAMES} are needed, or background.frames "
             "without particles"
         )
-    counts = np.empty((frames, *shape), dtype=np.float32)
+    exposures = _room_for((frames, *shape), movie.dtype, camera)
+    counts = exposures.counts
     saturated, total, light = np.zeros(shape, dtype=bool), np.zeros(shape), np.empty(frames)
 
     def read_some(start: int) -> tuple[BoolArray, FloatArray]:
         raw = movie.read(start, min(start + _BLOCK, last))
         check(raw, start)
         part = counts[start - first : start - first + len(raw)]
-        part[:] = camera.to_electrons(raw)
+        part[:] = raw if counts.dtype == np.uint16 else camera.to_electrons(raw)
         light[start - first :][: len(raw)] = part.mean(axis=(1, 2), dtype=np.float64)
         full = np.asarray(camera.saturated(raw).any(axis=0))
         return full, np.sum(part, axis=0, dtype=np.float64)
@@ -142,31 +144,40 @@ def load_field(
         total += added
         progress("background", min(start + _BLOCK, last) - first, frames)
     read = np.broadcast_to(camera.read_variance_e2(shape), shape)
+    total, light = exposures.in_electrons(total, frames), exposures.in_electrons(light, 1)
     masked = saturated | find_defects(total, frames * read)
-    masked |= _noisy(counts, light, total / frames + read)
+    masked |= _noisy(exposures, light, total / frames + read)
     nominal = abs(scene.model.scale.amplitude(scene.model.material.mass_kda))
     free_z = scene.mode == "joint"
     return MovingField(
-        counts, read, ~masked, scene.model, scene.wide,
+        exposures, read, ~masked, scene.model, scene.wide,
         pixel_nm=scene.pixel_nm, roi_px=scene.roi_px,
         z_range_nm=scene.config.fit.z_range_nm if free_z else None,
         largest=100 * nominal, pool=pool, saturated=saturated,
     )  # fmt: skip
 
 
-def _noisy(
-    counts_e: NDArray[np.float32], light_e: FloatArray, variance_e2: FloatArray
-) -> BoolArray:
+def _room_for(shape: tuple[int, int, int], stored: np.dtype[Any], camera: Camera) -> Exposures:
+    """Make room for frames, of the stored numbers where these are small and one gain is theirs."""
+    gain, offset = camera.gain_e_per_adu, camera.offset_adu
+    if np.can_cast(stored, np.uint16) and isinstance(gain, float) and isinstance(offset, float):
+        return Exposures(np.empty(shape, dtype=np.uint16), gain, offset)
+    return Exposures(np.empty(shape, dtype=np.float32))
+
+
+def _noisy(exposures: Exposures, light_e: FloatArray, variance_e2: FloatArray) -> BoolArray:
     """Tell which pixels have far more noise than their light, and than the pixels around them.
 
     Particles that move change the light from frame to frame as well, of many pixels together.
     """
-    firsts = np.arange(0, len(counts_e) - 1, max(2, len(counts_e) // _PAIRS))
+    frames = len(light_e)
+    firsts = np.arange(0, frames - 1, max(2, frames // _PAIRS))
     light = light_e / (light_e.mean() or 1.0)
     squares = np.zeros(variance_e2.shape)
-    for t in firsts:
+    for t in firsts.tolist():
         if light[t] > 0 and light[t + 1] > 0:
-            squares += (counts_e[t] / light[t] - counts_e[t + 1] / light[t + 1]) ** 2
+            one, other = exposures.electrons(t), exposures.electrons(t + 1)
+            squares += (one / light[t] - other / light[t + 1]) ** 2
     noise = squares / (2 * len(firsts) * np.maximum(variance_e2, 1.0))
     most = max(_NOISY, float(chdtri(len(firsts), _BY_CHANCE)) / len(firsts))
     noisy = noise > most

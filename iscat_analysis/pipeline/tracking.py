@@ -36,7 +36,14 @@ from iscat_analysis.pipeline.results import Compared, Followed, Found, lines_of,
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.pipeline.tracked_optics import Begun, learn_from_tracks
-from iscat_analysis.records import EventView, FloatArray, FrameSource, Progress, Windows
+from iscat_analysis.records import (
+    CountSource,
+    EventView,
+    FloatArray,
+    FrameSource,
+    Progress,
+    Windows,
+)
 from iscat_analysis.search.moving import link
 from iscat_analysis.threads import beside, threads
 
@@ -143,7 +150,7 @@ def _nothing_found(scene: Scene, block: Block) -> str:
 
 def track_movie(
     scene: Scene,
-    movie: FrameSource,
+    movie: CountSource,
     camera: Camera,
     plan: Plan,
     store: BlockStore,
@@ -159,7 +166,7 @@ def track_movie(
     ----------
     scene : Scene
         From `iscat_analysis.pipeline.moving_field.track_scene`.
-    movie : FrameSource
+    movie : CountSource
         The movie.
     camera : Camera
         Counts → photoelectrons.
@@ -210,7 +217,7 @@ def track_movie(
 
 def _analysed(
     scene: Scene,
-    movie: FrameSource,
+    movie: CountSource,
     camera: Camera,
     plan: Plan,
     store: BlockStore,

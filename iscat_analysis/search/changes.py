@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from iscat_analysis.medians import middle
 from iscat_analysis.search.peaks import maxima
 
 CLEAR = 12.0
@@ -110,16 +111,8 @@ def _of_spots(
 
 def _median_deviation(values: NDArray[np.floating]) -> float:
     """Median of the magnitudes of deviations from the median."""
-    deviation = values.ravel() - _middle(values.flatten())
-    return _middle(np.abs(deviation, out=deviation))
-
-
-def _middle(values: NDArray[np.floating]) -> float:
-    """Give the median of finite values, and sort them by halves: NumPy looks for NaN as long."""
-    half = values.size // 2
-    values.partition(half)
-    upper = values[half]
-    return float(upper if values.size % 2 else (values[:half].max() + upper) / 2)
+    deviation = values.ravel() - middle(values.flatten())
+    return float(middle(np.abs(deviation, out=deviation)))
 
 
 def least_beside(spot_px: float) -> float:

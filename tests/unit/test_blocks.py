@@ -36,7 +36,7 @@ from iscat_analysis.pipeline.blocks import (
 from iscat_analysis.pipeline.joining import combine_masses, join_tracks
 from iscat_analysis.pipeline.linking import unlike
 from iscat_analysis.pipeline.moving import follow
-from iscat_analysis.pipeline.moving_field import track_scene
+from iscat_analysis.pipeline.moving_field import load_field, track_scene
 from iscat_analysis.pipeline.moving_table import common_masses, moving_table, table_of_tracks
 from iscat_analysis.pipeline.resume import partial_folder
 from iscat_analysis.threads import threads
@@ -65,6 +65,10 @@ def _config(**track: Any) -> Config:
 
 def _unchecked(counts: Any, first: int) -> None:
     """Refuse nothing."""
+
+
+def _untold(stage: str, done: int, total: int) -> None:
+    """Tell nobody."""
 
 
 @pytest.fixture(scope="module")
@@ -307,6 +311,32 @@ def _whole(counts: np.ndarray, config: Config) -> tuple[pd.DataFrame, pd.DataFra
         parted=False,
     )  # fmt: skip
     return table, common_masses(scene, moving)
+
+
+@pytest.mark.parametrize(
+    ("stored", "offset", "kept"),
+    [
+        (np.uint16, 5.0, np.uint16),
+        (np.uint8, 5.0, np.uint16),
+        (np.int16, 5.0, np.float32),
+        (np.float32, 5.0, np.float32),
+        (np.uint16, np.linspace(4.0, 6.0, 576).reshape(24, 24), np.float32),
+    ],
+)
+def test_frames_are_kept_as_they_are_stored_where_one_gain_is_theirs(
+    stored: type, offset: Any, kept: type
+) -> None:
+    counts = np.random.default_rng(1).integers(90, 110, (30, 24, 24)).astype(stored)
+    camera = Camera(gain_e_per_adu=GAIN, offset_adu=offset)
+    scene = track_scene(_config(), (24, 24), len(counts))
+    electrons = camera.to_electrons(counts[4:])
+    with threads(2) as pool:
+        field = load_field(scene, Stack(counts), camera, (4, 30), _unchecked, pool, _untold)
+        total, totals = field.total_e, field.frame_totals
+    assert field.exposures.counts.dtype == kept
+    np.testing.assert_allclose(field.exposures.electrons(slice(None)), electrons, rtol=1e-6)
+    np.testing.assert_allclose(total, electrons.sum(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(totals, electrons[:, field.used].sum(axis=1), rtol=1e-6)
 
 
 def test_a_movie_that_fits_and_stands_still_is_followed_as_one(

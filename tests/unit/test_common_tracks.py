@@ -14,6 +14,7 @@ from scenes import PIXEL_NM, make_config
 from iscat_analysis.inference import common
 from iscat_analysis.inference.common import common_amplitudes, shared_errors, variances_left
 from iscat_analysis.inference.coupling import Coupling
+from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Judged, Rows
 from iscat_analysis.inference.settling import settle
@@ -59,7 +60,8 @@ def _expected(model: ForwardModel, paths: np.ndarray) -> tuple[np.ndarray, Rows]
 
 def _field(model: ForwardModel, counts: np.ndarray, pool: ThreadPoolExecutor) -> MovingField:
     return MovingField(
-        counts.astype(np.float32), np.zeros(SHAPE), np.ones(SHAPE, dtype=bool), model, model,
+        Exposures(counts.astype(np.float32)), np.zeros(SHAPE), np.ones(SHAPE, dtype=bool), model,
+        model,
         pixel_nm=PIXEL_NM, roi_px=ROI, z_range_nm=None, largest=1e6, pool=pool,
     )  # fmt: skip
 

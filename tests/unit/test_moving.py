@@ -21,6 +21,7 @@ from iscat_analysis._kernels.stamp import add_stamp
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.bias import first_order_bias
+from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.newton import Response
 from iscat_analysis.inference.noise import poisson
@@ -91,11 +92,15 @@ def _movie(paths: np.ndarray, *, noise: bool) -> tuple[np.ndarray, Ground, Rows]
     return counts if noise else expected, Ground(level, power), Rows.of(frame, track, theta)
 
 
-def _field(counts: np.ndarray, pool: ThreadPoolExecutor, read_e2: float = 0.0) -> MovingField:
+def _field(
+    counts: np.ndarray | Exposures, pool: ThreadPoolExecutor, read_e2: float = 0.0
+) -> MovingField:
+    if isinstance(counts, np.ndarray):
+        counts = Exposures(counts.astype(np.float32))
     config = _config()
     near = forward_model(config, math.sqrt(2) * (ROI / 2 + 6) * PIXEL_NM)
     return MovingField(
-        counts.astype(np.float32), np.full(SHAPE, read_e2), np.ones(SHAPE, dtype=bool),
+        counts, np.full(SHAPE, read_e2), np.ones(SHAPE, dtype=bool),
         near, forward_model(config, 1e4), pixel_nm=PIXEL_NM, roi_px=ROI, z_range_nm=None,
         largest=1e6, pool=pool,
     )  # fmt: skip
@@ -289,7 +294,7 @@ def test_rows_in_one_place_follow_as_one(pool: ThreadPoolExecutor, rounded: floa
     values = np.repeat(np.rint(slope / unit).astype(np.int16), 2, axis=0)
     slopes = Slopes(squares, values, np.full((2, 1), unit), np.zeros((2, 1)))
     light = Light(
-        np.full((1, side, side), level, dtype=np.float32), np.ones(1),
+        np.full((1, side, side), level, dtype=np.float32), 1.0, 0.0, np.ones(1),
         np.full((side, side), level), np.zeros((side, side)),
     )  # fmt: skip
     own = float(np.sum(slope**2)) / level
@@ -371,6 +376,25 @@ def test_residuals_are_of_the_rows_that_are_asked_for(pool: ThreadPoolExecutor) 
     field.draw(ground, rows)
     field.draw(ground, start)
     assert np.abs(field.residual(ground, start, 0, FRAMES) - alone).max() < 1.0
+
+
+def test_counts_are_fitted_as_the_photoelectrons_that_they_stand_for(
+    pool: ThreadPoolExecutor,
+) -> None:
+    """As stored, with a gain and an offset, or converted: fits, sums and what is left over."""
+    gain, offset = 12.5, 96.0
+    electrons, ground, rows = _movie(_paths(30.0), noise=True)
+    counts = np.rint(electrons / gain + offset).astype(np.uint16)
+    converted = _field(gain * (counts - offset), pool, READ_E2)
+    stored = _field(Exposures(counts, gain, offset), pool, READ_E2)
+    (one, light, _), (other, same, _) = (f.fit(ground, rows) for f in (converted, stored))
+    np.testing.assert_allclose(other.theta, one.theta, rtol=1e-6)
+    np.testing.assert_allclose(same.level, light.level, rtol=1e-6)
+    np.testing.assert_allclose(same.power, light.power, rtol=1e-6)
+    first = first_ground(converted, follow_power=True)
+    np.testing.assert_allclose(first_ground(stored, follow_power=True).level, first.level, 1e-6)
+    left, over = (f.residual(ground, rows, 3, 9) for f in (converted, stored))
+    np.testing.assert_allclose(over, left, atol=0.1)  # e, of noise 630
 
 
 def test_what_extends_tracks_is_told_as_it_was_fitted(pool: ThreadPoolExecutor) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scenes import PIXEL_NM, make_config
 
+from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.optics.forward import PixelGrid, forward_model
@@ -48,8 +49,9 @@ def test_rows_come_into_their_fringe(
     frames, track = np.arange(FRAMES), np.full(FRAMES, 0 if tracked else -1)
     with ThreadPoolExecutor(1) as pool:
         field = MovingField(
-            rng.poisson(mean).astype(np.float32), np.zeros(SHAPE), np.ones(SHAPE, dtype=bool),
-            near, model, pixel_nm=PIXEL_NM, roi_px=ROI, z_range_nm=span, largest=1e9, pool=pool,
+            Exposures(rng.poisson(mean).astype(np.float32)), np.zeros(SHAPE),
+            np.ones(SHAPE, dtype=bool), near, model, pixel_nm=PIXEL_NM, roi_px=ROI,
+            z_range_nm=span, largest=1e9, pool=pool,
         )  # fmt: skip
         ground = Ground(np.full(SHAPE, LEVEL_E), np.ones(FRAMES))
         rows = Rows.of(frames, track, start)
