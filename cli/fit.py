@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from iscat_analysis.records import Analysis
 
 FLAGGED = 3
-_LARGE_BYTES = 2**27  # of a movie, whose analysis takes longer than loading what draws
+_LARGE_BYTES = 2**27  # of a movie that is large
 ROWS_SHOWN = 20
 GAP = 3  # characters between the columns of a table on a terminal
 
@@ -133,8 +134,8 @@ def fit(
         from iscat_analysis.draughtsman import Draughtsman
 
         with closing(Draughtsman()) as pen:
-            if resolved.background.method != "sliding" or not _is_large(stack):
-                pen.start()  # first, because it has as much to load
+            if sys.platform != "linux" or _is_large(stack):
+                pen.start()  # first: later it would have less to load, but no processor for itself
             from iscat_analysis.movie.addresses import MARK, beside
             from iscat_analysis.pipeline import fit_stack
             from iscat_analysis.places import open_place
@@ -178,7 +179,7 @@ def fit(
 
 
 def _is_large(stack: Path) -> bool:
-    """Whether memory for figures is better taken when that for its chunks is free again."""
+    """Whether both processors are busy from the moment at which the movie is opened."""
     return stack.is_file() and stack.stat().st_size > _LARGE_BYTES
 
 
