@@ -132,17 +132,22 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if way != "sliding":  # windows that slide pass over frames that repeat
         _refuse_still(seen, f"{movie.name}: frames {start} to {stop - 1}")
     refuse_overflow(seen, movie.name)
-    digest = beside(movie.sha256)
     swapped = axes_warning(movie.name, seen)
     if swapped:
         run.tell(swapped)
     summary: dict[str, Any] = {}
     looking: Future[Changes] | None = None
     opening: Future[Opening] | None = None
-    looked_at = tracked or way == "sliding"
+
+    def reader_of(frames: Stack) -> Reader:
+        return Reader(frames, camera, *span, counts_budget(config))
+
     with one_thread_algebra():  # in all threads until the light is judged
-        if looked_at:  # meanwhile, in the light as it is; again if anything of it is unsteady
-            looking, opening = _begun(movie, config, camera, span, way)
+        # meanwhile, in the light as it is; again if anything of it is unsteady
+        if way == "sliding":
+            opening = beside(judge_opening, reader_of(movie), config)
+        elif tracked:
+            looking = beside(look_at_changes, movie, config, camera, span)
         judged = judge_light(movie, config, camera)
         for text in judged.messages:
             run.tell(f"{movie.name}: {text}")
@@ -152,9 +157,12 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         if lines is not None:
             summary["lines"] = lines.summary
             steady = movie.seen_as(SteadyFrames(movie, lines, camera))
-        if looked_at and unsteady:
-            looking, opening = _begun(steady, config, camera, span, way)
+        if way == "sliding" and unsteady:
+            opening = beside(judge_opening, reader_of(steady), config)
         opened = None if opening is None else opening.result()
+    if way == "sliding" or (tracked and unsteady):
+        looking = beside(look_at_changes, steady, config, camera, span)
+    digest = beside(movie.sha256)
     configured = config
     config, learned = learn_optics(
         steady, config, camera, tell=run.tell, notify=run.notify, opening=opened
@@ -176,17 +184,6 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     return Prepared(
         movie, steady, config, camera, way, lines, opened, other_kind, digest, summary
     )  # fmt: skip
-
-
-def _begun(
-    movie: Stack, config: Config, camera: Camera, span: tuple[int, int], way: Way
-) -> tuple[Future[Changes], Future[Opening] | None]:
-    """Begin to look at what changes in a movie and, where windows slide, to judge its noise."""
-    looking = beside(look_at_changes, movie, config, camera, span)
-    if way != "sliding":
-        return looking, None
-    reader = Reader(movie, camera, *span, counts_budget(config))
-    return looking, beside(judge_opening, reader, config)
 
 
 def _refuse_still(counts: NDArray[Any], name: str) -> None:
