@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
     from iscat_analysis.records import Analysis
 
 FLAGGED = 3
-_LARGE_BYTES = 2**27  # of a movie that is large
+_LARGE_BYTES = 2**27  # of a movie, whose analysis takes longer than loading what draws
 ROWS_SHOWN = 20
 GAP = 3  # characters between the columns of a table on a terminal
 
@@ -134,8 +133,8 @@ def fit(
         from iscat_analysis.draughtsman import Draughtsman
 
         with closing(Draughtsman()) as pen:
-            if sys.platform != "linux" or _is_large(stack):
-                pen.start()  # first: later it would have less to load, but no processor for itself
+            if resolved.background.method != "sliding" or not _is_large(stack):
+                pen.start()  # first, because it has as much to load
             from iscat_analysis.movie.addresses import MARK, beside
             from iscat_analysis.pipeline import fit_stack
             from iscat_analysis.places import open_place
@@ -179,7 +178,7 @@ def fit(
 
 
 def _is_large(stack: Path) -> bool:
-    """Whether both processors are busy from the moment at which the movie is opened."""
+    """Whether memory for figures is better taken when that for its chunks is free again."""
     return stack.is_file() and stack.stat().st_size > _LARGE_BYTES
 
 
