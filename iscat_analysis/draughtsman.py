@@ -2,61 +2,78 @@
 
 Loading Matplotlib and drawing take as long as the rest of a small run.  The process loads it while
 a movie is analysed, and then draws while tables are written.  What it has loaded is 100 MB, so that
-it is started for a large movie when most of the work is done.  It is started from a file of this
-package, never from the user's script, and ends when the process that started it does.
+it is started for a large movie when most of the work is done.  On Linux it is a copy of the process
+that starts it, and has what that has loaded; elsewhere it is started from a file of this package,
+never from the user's script.  It ends when the process that started it does.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
 import pickle
-import signal
 import subprocess
 import sys
-from concurrent.futures import Future
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-from iscat_analysis.threads import beside, processors
+from iscat_analysis.copies import Copy, LostError
+from iscat_analysis.threads import processors
 
 if TYPE_CHECKING:
     from iscat_analysis.records import Analysis
+
+_DRAWING = "iscat_analysis.report.drawing"
+
+Order: TypeAlias = "tuple[Analysis, Path, int] | Mapping[str, Any] | None"
+"""What to begin with, the summary to end with, or nothing yet: get ready."""
 
 
 class Draughtsman:
     """The process, which is still to be started, and is ended by `close`."""
 
     def __init__(self) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
-        self._answer: Future[tuple[bytes, bytes | None]] | None = None
+        self._other: _Other | None = None
+        self._thread = ThreadPoolExecutor(1)  # that asks it one thing after the other
+        self._begun = False
+        self._answer: Future[Any] | None = None
 
     def start(self) -> None:
         """Start it, once; not where this process has Matplotlib loaded, or none can be started."""
-        if self._process is None and "matplotlib" not in sys.modules:
-            self._process = _started()
+        if self._other is None and "matplotlib" not in sys.modules:
+            self._other = _started()
+            if self._other is not None:
+                self._thread.submit(self._other.do, None)
 
-    def begin(self, analysis: Analysis, folder: Path, most: int) -> bool:
-        """Let it draw what `iscat_analysis.report.drawing.draw` would, once.
+    def begin(self, analysis: Analysis, folder: Path, most: int) -> None:
+        """Let it draw what does not depend on the species, once and where there is such a process.
 
         Parameters
         ----------
         analysis : Analysis
-            What was found.
+            What was found, perhaps without species.
         folder : Path
             An existing folder.
         most : int
             Events whose images are drawn, at most.
-
-        Returns
-        -------
-        bool
-            Whether it does.
         """
-        if self._answer is not None or self._process is None or self._process.poll() is not None:
-            return False
-        order = pickle.dumps((analysis, folder, most), pickle.HIGHEST_PROTOCOL)
-        self._answer = beside(self._process.communicate, order)
-        return True
+        if not self._begun and self._other is not None:
+            self._begun = True
+            self._thread.submit(self._other.do, (analysis, folder, most))
+
+    def end(self, summary: Mapping[str, Any]) -> None:
+        """Let it draw the rest of what was begun.
+
+        Parameters
+        ----------
+        summary : mapping
+            Of the whole analysis.
+        """
+        if self._begun and self._other is not None:
+            self._answer = self._thread.submit(self._other.do, summary)
 
     def page(self) -> str | None:
         """Wait until all is drawn.
@@ -64,38 +81,98 @@ class Draughtsman:
         Returns
         -------
         str or None
-            The page; None where the process failed, and another has to draw.
+            The page; None where nothing was begun or the process failed, and another has to draw.
         """
-        if self._answer is None or self._process is None:
+        if self._answer is None:
             return None
-        page, _ = self._answer.result()
-        return None if self._process.returncode else page.decode("utf-8")
+        try:
+            page: str = self._answer.result()
+        except Exception:  # noqa: BLE001  # whoever draws instead finds it again
+            return None
+        return page
 
     def close(self) -> None:
         """End the process, and its copy, whatever they are at."""
-        if self._process is None:
-            return
-        if self._process.poll() is None:
-            if sys.platform == "win32":
-                self._process.kill()
-            else:
-                os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None and self._answer is None:
-                pipe.close()
+        if self._other is not None:
+            self._other.end()
+        self._thread.shutdown()
+        if self._other is not None:
+            self._other.close()
 
 
-def _started() -> subprocess.Popen[bytes] | None:
+class _Other(Protocol):
+    """What asks another process."""
+
+    def do(self, order: Order) -> Any:
+        """Have it get ready, begin to draw, or end."""
+
+    def end(self) -> None:
+        """End it, whatever it is at."""
+
+    def close(self) -> None:
+        """Close what led to it."""
+
+
+def _started() -> _Other | None:
     """Start the process, where there is a processor for it."""
-    if processors() < 2 or not sys.executable or getattr(sys, "frozen", False):
+    if processors() < 2:
         return None
     try:
-        return subprocess.Popen(
-            [sys.executable, "-P", "-m", "iscat_analysis.report.drawing"],
+        if sys.platform == "linux":
+            return Copy(_Copied())
+        if sys.executable and not getattr(sys, "frozen", False):
+            return _Program()
+    except OSError:
+        pass
+    return None
+
+
+class _Copied:
+    """What is done in a copy of this process."""
+
+    def __init__(self) -> None:
+        self._desk: Any = None
+
+    def __call__(self, order: Order) -> str | None:
+        if order is None:
+            self._desk = importlib.import_module(_DRAWING).Desk()
+            return None
+        if isinstance(order, tuple):
+            self._desk.begin(*order)
+            return None
+        page: str = self._desk.page(order)
+        return page
+
+
+class _Program:
+    """A process that has nothing of this one."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", _DRAWING],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},  # a process with threads has no copies
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
             start_new_session=True,  # Ctrl-C is for the process that started it
         )  # fmt: skip
-    except OSError:
-        return None
+
+    def do(self, order: Order) -> str | None:
+        if order is None:  # it gets ready by itself
+            return None
+        sent = pickle.dumps(order, pickle.HIGHEST_PROTOCOL)
+        if isinstance(order, tuple) and self._process.stdin is not None:
+            self._process.stdin.write(sent)
+            return None
+        page, _ = self._process.communicate(sent)
+        if self._process.returncode:
+            raise LostError
+        return page.decode("utf-8")
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    def close(self) -> None:
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with suppress(OSError):  # what it was sent is still on the way
+                    pipe.close()

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -68,7 +68,7 @@ def processors() -> int:
 
 
 def beside(work: Callable[..., T], *arguments: Any) -> Future[T]:
-    """Begin work in a thread of its own.
+    """Begin work in a thread of its own, with no more threads than are allotted to this one.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def beside(work: Callable[..., T], *arguments: Any) -> Future[T]:
         Its result.
     """
     pool = ThreadPoolExecutor(1)
-    begun = pool.submit(work, *arguments)
+    begun = pool.submit(copy_context().run, work, *arguments)
     pool.shutdown(wait=False)
     return begun
 

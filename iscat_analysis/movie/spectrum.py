@@ -213,16 +213,24 @@ def measure_spectrum(
     if light < _LIGHT_E:
         return None
 
+    whole = bool(used.all())
+
+    def lit(image: FloatArray) -> FloatArray:
+        return image.ravel() if whole else image[used]
+
     def change(start: int) -> tuple[FloatArray, float] | None:
         # in its expected errors, with the size beyond which it is no noise
         before, after = (gain * (counts[k] - offset) for k in (start, start + 1))
-        powers = [float(frame[used].mean()) / light for frame in (before, after)]
+        powers = [float(lit(frame).mean()) / light for frame in (before, after)]
         if min(powers) <= 0:
             return None
         variance = sum((q * mean + read) / q**2 for q in powers)
-        z = np.where(used, (after / powers[1] - before / powers[0]), 0.0)
-        z /= np.sqrt(np.where(used, variance, 1.0))
-        return z, _OUTLIER * float(np.median(np.abs(z[used]))) / _NORMAL_QUARTILE
+        z = after / powers[1] - before / powers[0]
+        if not whole:
+            z, variance = np.where(used, z, 0.0), np.where(used, variance, 1.0)
+        z /= np.sqrt(variance)
+        middle = float(np.median(np.abs(lit(z)), overwrite_input=True))
+        return z, _OUTLIER * middle / _NORMAL_QUARTILE
 
     def outliers(found: tuple[FloatArray, float] | None) -> int:
         return 0 if found is None else int(np.count_nonzero(np.abs(found[0]) > found[1]))

@@ -20,7 +20,7 @@ LeftOut = tuple[BoolArray, NDArray[Any]]
 """Pixels that are left out (y, x), and the counts of each in the dark."""
 
 _MB = 1_000_000
-_BLOCK_BYTES = 2**20
+_BLOCK_BYTES = 2**22  # that are hashed before another thread is waited for
 
 
 class Frames(Protocol):
@@ -386,12 +386,12 @@ class Stack:
             for _, block in self.chunks():
                 digest.update(block.data)
             return digest.hexdigest()
-        digest = hashlib.sha256()
+        digest, room = hashlib.sha256(), memoryview(bytearray(_BLOCK_BYTES))
         for path in self._files:
             try:
-                with path.open("rb") as file:
-                    while data := file.read(_BLOCK_BYTES):
-                        digest.update(data)
+                with path.open("rb", buffering=0) as file:
+                    while length := file.readinto(room):
+                        digest.update(room[:length])
             except OSError as error:
                 raise DataError(f"{path}: cannot be read ({error.strerror})") from None
         digest.update(self._part.encode("utf-8", "backslashreplace"))

@@ -61,9 +61,10 @@ def shared_light(
     if power.min() <= 0:
         return None
     pixels *= (power.mean() / power)[:, None]
+    light = pixels.mean(axis=0)
     near, apart, far = (
-        float(np.median(np.square(pixels[lag:] - pixels[:-lag]).mean(axis=0) / pixels.mean(axis=0)))
-        for lag in (1, _APART, _FAR)
+        float(np.median(np.einsum("tp,tp->p", change, change) / len(change) / light))
+        for change in (pixels[lag:] - pixels[:-lag] for lag in (1, _APART, _FAR))
     )
     if apart <= 0 or far <= 0:
         return None

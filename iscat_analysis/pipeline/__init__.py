@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,7 +36,7 @@ from iscat_analysis.pipeline.tracking import find_moving
 from iscat_analysis.pipeline.ways import Way, way_of
 from iscat_analysis.places import Here, Place
 from iscat_analysis.records import Analysis, Progress, silent
-from iscat_analysis.report import EVENT_FIGURES, write_report
+from iscat_analysis.report import EVENT_FIGURES, atomic_folder, fill_report
 from iscat_analysis.report.output import claim_output
 
 if TYPE_CHECKING:
@@ -119,22 +119,33 @@ def fit_stack(
     stack = path_in("`stack`", stack)
     folder = beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
+    figures = FEW_FIGURES if way_of(config) == "sliding" else EVENT_FIGURES
     with claim_output(folder, overwrite):
-        with open_stack(stack) as movie:
-            analysis = analyse(
-                movie,
-                config,
-                progress=told,
-                notify=notify,
-                command=command,
-                partial=partial_folder(folder.resolve()),
-                inject=inject,
-                place=place,
-            )
-        figures = FEW_FIGURES if way_of(config) == "sliding" else EVENT_FIGURES
-        write_report(
-            analysis, folder, overwrite=overwrite, event_figures=figures, draughtsman=draughtsman
-        )
+        with ExitStack() as writing:
+            buildings: list[Path] = []
+
+            def begin_report(known: Analysis) -> None:
+                building = writing.enter_context(atomic_folder(folder, overwrite))
+                buildings.append(building)
+                if draughtsman is not None:
+                    # where anything fails, nobody draws into a folder that is being removed
+                    writing.push(lambda failed, *_: draughtsman.close() if failed else None)
+                    (building / "figures").mkdir()
+                    draughtsman.begin(known, building / "figures", figures)
+
+            with open_stack(stack) as movie:
+                analysis = analyse(
+                    movie,
+                    config,
+                    progress=told,
+                    notify=notify,
+                    command=command,
+                    partial=partial_folder(folder.resolve()),
+                    inject=inject,
+                    place=place,
+                    begin_report=begin_report,
+                )
+            fill_report(analysis, buildings[0], event_figures=figures, draughtsman=draughtsman)
         if not analysis.summary["interrupted"]:
             shutil.rmtree(partial_folder(folder.resolve()), ignore_errors=True)
     if analysis.summary["interrupted"]:
@@ -142,6 +153,10 @@ def fit_stack(
         notify(f"interrupted; what was finished is in {folder}")
         raise KeyboardInterrupt
     return analysis
+
+
+def _nobody_draws(known: Analysis) -> None:
+    """Do nothing."""
 
 
 def analyse(
@@ -154,6 +169,7 @@ def analyse(
     partial: Path | None = None,
     inject: int = 0,
     place: Place | None = None,
+    begin_report: Callable[[Analysis], None] = _nobody_draws,
 ) -> Analysis:
     """Analyse an open movie.
 
@@ -170,6 +186,8 @@ def analyse(
         so that an interrupted run can be resumed; without it nothing is kept.
     inject, place
         As in `fit_stack`.
+    begin_report : callable
+        Given what was found before its species are known, which takes a while in a large movie.
 
     Returns
     -------
@@ -187,7 +205,7 @@ def analyse(
     workers = 1 if tracked else config.compute.workers
     kept = freed_memory_kept() if tracked else nullcontext()
     with kept, compiling(notify, workers, needed_parts(config)) as compilation:
-        run = Run(notify, progress, compilation, partial, place or Here(), inject)
+        run = Run(notify, progress, compilation, partial, place or Here(), inject, begin_report)
         ready = prepare(movie, config, run)  # load, calibrate
         found = FIND[ready.way](ready, run)  # background, detect, fit, posterior, bounds
         extra, stopped = injected(ready, run, found)

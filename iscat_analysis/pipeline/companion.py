@@ -2,47 +2,35 @@
 
 Threads of one process take turns at Python, so that two of them analyse chunks no faster than one.
 The second process is a copy of the first, made when the models are ready and their kernels loaded:
-it shares their memory, has nothing to load, and opens the movie again for itself.  It asks for no
-input, writes nothing but its results, ignores interrupts, which are the first one's business, and
-ends with it.  Systems other than Linux, on which a copy of a process with threads may not go on,
-have none.
+it shares their memory, has nothing to load, and opens the movie again for itself.  Systems other
+than Linux have none (`iscat_analysis.copies`).
 """
 
 from __future__ import annotations
 
-import gc
-import io
 import os
 import pickle
 import queue
-import signal
-import struct
 import sys
 import threading
 import time
-import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
-from contextlib import suppress
-from typing import IO, Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 from iscat_analysis.config import Config
+from iscat_analysis.copies import Copy, LostError
 from iscat_analysis.memory import give_back_freed_memory
 from iscat_analysis.pipeline.chunk_work import ChunkSetting
 from iscat_analysis.places import Here, Place
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.threads import allotted, is_allotted, processors
 
-_LENGTH = struct.Struct("<Q")
 _LOOK_S = 0.2  # between two looks at whether an interrupt has come
 _PATIENCE, _PATIENCE_S = 10.0, 30.0  # for its last item: times the longest of ours, and more
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-
-class _LostError(Exception):
-    """The second process has ended."""
 
 
 class Pair:
@@ -97,7 +85,7 @@ class Pair:
         waiting = deque(enumerate(items))
         done: queue.SimpleQueue[tuple[int, R] | Exception] = queue.SimpleQueue()
         try:
-            other = _Copy(lambda number: work(items[number]))
+            other = Copy(lambda number: work(items[number]))
         except OSError:  # there is no room for another process
             yield from Here().each(work, items)
             return
@@ -110,7 +98,7 @@ class Pair:
                     return
                 try:
                     done.put((number, other.do(number)))
-                except _LostError:
+                except LostError:
                     waiting.appendleft((number, item))
                     return
                 except Exception as error:  # noqa: BLE001  # raised where results are asked for
@@ -181,109 +169,3 @@ def paired(place: Place, config: Config, setting: ChunkSetting, chunks: int) -> 
         return place
     give_back_freed_memory()  # two processes hold it
     return Pair(config.compute.workers)
-
-
-class _Copy:
-    """A copy of this process.
-
-    Parameters
-    ----------
-    work : callable
-        Number of an item → what the copy sends back.
-    """
-
-    def __init__(self, work: Callable[[int], Any]) -> None:
-        theirs, asking = os.pipe()
-        telling, answers = os.pipe()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # that there are other threads
-            try:
-                self.pid = os.fork()
-            except OSError:
-                for pipe in (theirs, asking, telling, answers):
-                    os.close(pipe)
-                raise
-        if not self.pid:
-            _serve(work, theirs, answers, (asking, telling))
-        os.close(theirs)
-        os.close(answers)
-        self._ended = False
-        self._asking, self._telling = os.fdopen(asking, "wb"), os.fdopen(telling, "rb")
-
-    def do(self, number: int) -> Any:
-        """Have an item done, and wait for it."""
-        try:
-            _send(self._asking, number)
-            failed, result = _received(self._telling)
-        except (OSError, EOFError):
-            raise _LostError from None
-        if failed:
-            raise result
-        return result
-
-    def end(self) -> None:
-        """End it, whatever it is at; once, because its number may then be another's."""
-        if self._ended:
-            return
-        self._ended = True
-        with suppress(OSError):  # somebody else has buried it
-            os.kill(self.pid, signal.SIGKILL)
-            os.waitpid(self.pid, 0)
-
-    def close(self) -> None:
-        """Close what led to it."""
-        for pipe in (self._asking, self._telling):
-            with suppress(OSError):
-                pipe.close()
-
-
-def _send(pipe: IO[bytes], value: Any) -> None:
-    sent = pickle.dumps(value)
-    pipe.write(_LENGTH.pack(len(sent)))
-    pipe.write(sent)
-    pipe.flush()
-
-
-def _received(pipe: IO[bytes]) -> Any:
-    (length,) = _LENGTH.unpack(_exactly(pipe, _LENGTH.size))
-    return pickle.loads(_exactly(pipe, length))
-
-
-def _exactly(pipe: IO[bytes], length: int) -> bytes:
-    part = pipe.read(length)
-    if len(part) < length:
-        raise EOFError
-    return part
-
-
-def _serve(
-    work: Callable[[int], Any], asked: int, answers: int, others: tuple[int, int]
-) -> NoReturn:
-    """Do what is asked for, as a copy, until nobody asks any more."""
-    try:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        gc.freeze()  # what belongs to the other process is not for this one to end
-        sys.stdout = sys.stderr = io.StringIO()
-        for pipe in others:
-            os.close(pipe)
-        numbers: queue.SimpleQueue[int] = queue.SimpleQueue()
-
-        def listen() -> None:
-            try:
-                with os.fdopen(asked, "rb") as pipe:
-                    while True:
-                        numbers.put(_received(pipe))
-            finally:
-                os._exit(0)  # in the middle of an item, too: nobody waits for it
-
-        threading.Thread(target=listen, daemon=True).start()
-        with os.fdopen(answers, "wb") as out:
-            while True:
-                number = numbers.get()
-                try:
-                    result = False, work(number)
-                except Exception as error:  # noqa: BLE001  # for the other process to raise
-                    result = True, error
-                _send(out, result)
-    finally:
-        os._exit(1)

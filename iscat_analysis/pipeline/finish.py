@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.results import Found
 from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.pipeline.run import Run
-from iscat_analysis.pipeline.summary import summary_of
+from iscat_analysis.pipeline.summary import species_of, summary_of
 from iscat_analysis.pipeline.together import warnings_of
 from iscat_analysis.pipeline.tracks import make_films, tracks_of
 from iscat_analysis.places import versions
@@ -135,7 +136,7 @@ def gather(
         "interrupted": interrupted,
         "warnings": run.warnings,
     }
-    return Analysis(
+    analysis = Analysis(
         config_toml=config_to_toml(config),
         mode=scene.mode,
         scheme=config.optics.scheme,
@@ -153,3 +154,5 @@ def gather(
         tracks=tracks,
         films=films,
     )
+    run.begin_report(analysis)
+    return replace(analysis, summary=summary | species_of(scene, table))

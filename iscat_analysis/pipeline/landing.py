@@ -196,7 +196,8 @@ def analyse_landings(
         try:
             with closing(_finished(finish, len(plan), place, merged, posterior)) as finished:
                 for frames_done, stopped in finished:
-                    progress("landing", frames_done, last - first)
+                    if frames_done < last - first:
+                        progress("landing", frames_done, last - first)
                     if stopped:
                         interrupted = True
                         break
@@ -204,6 +205,8 @@ def analyse_landings(
             pool.shutdown(wait=False, cancel_futures=True)
             interrupted = True
     reader.forget()
+    if not interrupted:  # and their memory is free again
+        progress("landing", last - first, last - first)
     fits, views, repeats = merged.result()
     light = merged.light()
     wanted = config.background.drift_correction

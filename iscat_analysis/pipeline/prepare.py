@@ -33,7 +33,7 @@ from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.tracks import judge_times
 from iscat_analysis.pipeline.ways import Way, way_of, way_said
 from iscat_analysis.search.changes import Changes
-from iscat_analysis.threads import beside
+from iscat_analysis.threads import beside, one_thread_algebra
 
 _OPENING = 64  # frames that are looked at before anything else
 
@@ -128,33 +128,42 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
     start, stop = config.background.recorded or span
     stop = min(stop, start + _OPENING, movie.shape[0])
-    opening = movie.read(start, max(start, stop))
+    seen = movie.read(start, max(start, stop))
     if way != "sliding":  # windows that slide pass over frames that repeat
-        _refuse_still(opening, f"{movie.name}: frames {start} to {stop - 1}")
-    refuse_overflow(opening, movie.name)
-    digest = beside(movie.sha256)
-    swapped = axes_warning(movie.name, opening)
+        _refuse_still(seen, f"{movie.name}: frames {start} to {stop - 1}")
+    refuse_overflow(seen, movie.name)
+    swapped = axes_warning(movie.name, seen)
     if swapped:
         run.tell(swapped)
     summary: dict[str, Any] = {}
     looking: Future[Changes] | None = None
-    if tracked:  # meanwhile, at the light as it is; again if anything of it is unsteady
-        looking = beside(look_at_changes, movie, config, camera, span)
-    judged = judge_light(movie, config, camera)
-    for text in judged.messages:
-        run.tell(f"{movie.name}: {text}")
-    unsteady = judged.movie is not movie or judged.lines is not None
-    movie, lines = judged.movie, judged.lines
-    steady = movie
-    if lines is not None:
-        summary["lines"] = lines.summary
-        steady = movie.seen_as(SteadyFrames(movie, lines, camera))
+    opening: Future[Opening] | None = None
+
+    def reader_of(frames: Stack) -> Reader:
+        return Reader(frames, camera, *span, counts_budget(config))
+
+    with one_thread_algebra():  # in all threads until the light is judged
+        # meanwhile, in the light as it is; again if anything of it is unsteady
+        if way == "sliding":
+            opening = beside(judge_opening, reader_of(movie), config)
+        elif tracked:
+            looking = beside(look_at_changes, movie, config, camera, span)
+        judged = judge_light(movie, config, camera)
+        for text in judged.messages:
+            run.tell(f"{movie.name}: {text}")
+        unsteady = judged.movie is not movie or judged.lines is not None
+        movie, lines = judged.movie, judged.lines
+        steady = movie
+        if lines is not None:
+            summary["lines"] = lines.summary
+            steady = movie.seen_as(SteadyFrames(movie, lines, camera))
+        if way == "sliding" and unsteady:
+            opening = beside(judge_opening, reader_of(steady), config)
+        opened = None if opening is None else opening.result()
     if way == "sliding" or (tracked and unsteady):
         looking = beside(look_at_changes, steady, config, camera, span)
+    digest = beside(movie.sha256)
     configured = config
-    opened: Opening | None = None
-    if way == "sliding":
-        opened = judge_opening(Reader(steady, camera, *span, counts_budget(config)), config)
     config, learned = learn_optics(
         steady, config, camera, tell=run.tell, notify=run.notify, opening=opened
     )

@@ -11,7 +11,7 @@ from iscat_analysis.inference.noise import compile_maximisation, compile_values
 from iscat_analysis.pipeline.compilation import Compilation
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.places import Place
-from iscat_analysis.records import Progress
+from iscat_analysis.records import Analysis, Progress
 
 Notify = Callable[[str], None]
 
@@ -58,6 +58,8 @@ class Run:
         Where the chunks of a landing movie are analysed.
     inject : int
         Known particles to add to a landing movie in a second run.
+    begin_report : callable
+        Given what was found before its species are known.
     clock : Clock
         Seconds per stage.
     warnings : list of str
@@ -70,6 +72,7 @@ class Run:
     partial: Path | None
     place: Place
     inject: int
+    begin_report: Callable[[Analysis], None]
     clock: Clock = field(default_factory=Clock)
     warnings: list[str] = field(default_factory=list)
 

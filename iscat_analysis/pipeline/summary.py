@@ -30,7 +30,7 @@ def summary_of(
     timings: Mapping[str, float],
     achieved: Mapping[str, Achieved] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """Gather counts, medians and efficiency, for ``summary.json``.
+    """Gather counts, medians and efficiency, for ``summary.json``; `species_of` has the rest.
 
     Parameters
     ----------
@@ -48,13 +48,12 @@ def summary_of(
     Returns
     -------
     dict
-        Nested plain values.
+        Nested plain values; nothing where species will be.
     """
     good = table[table["status"] == Status.OK]
     free = free_parameters(scene.mode, table)
     conflict = {"z_nm", "mass_kda"} <= set(free) and len(good) > 0
     cost = _holevo_over_quantum(scene, good["z_nm"].to_numpy(float)) if conflict else {}
-    distribution = _distribution(scene, good)
     precision = {}
     for name in free:
         sigma, crb, qcrb = (good[f"{kind}_{name}"] for kind in ("sigma", "crb", "qcrb"))
@@ -91,10 +90,30 @@ def summary_of(
             "n_scattered": _median(good["n_scattered"]),
         },
         "precision": precision,
-        "distribution": distribution,
-        "across_particles": _across(scene, table, distribution),
+        "distribution": None,
+        "across_particles": [],
         "seconds": {name: round(value, 3) for name, value in timings.items()},
     }
+
+
+def species_of(scene: Scene, table: pd.DataFrame) -> dict[str, Any]:
+    """Describe the species of all events, which takes as long as drawing what does not need them.
+
+    Parameters
+    ----------
+    scene : Scene
+        Models and configuration.
+    table : pandas.DataFrame
+        The events.
+
+    Returns
+    -------
+    dict
+        What ``summary.json`` says of them.
+    """
+    distribution = _distribution(scene, table[table["status"] == Status.OK])
+    across = _across(scene, table, distribution)
+    return {"distribution": distribution, "across_particles": across}
 
 
 def _repeats(found: Achieved) -> dict[str, Any]:

@@ -29,6 +29,7 @@ __all__ = [
     "OUTPUT_NAMES",
     "atomic_folder",
     "check_output",
+    "fill_report",
     "render_page",
     "render_report",
     "write_report",
@@ -83,15 +84,34 @@ def write_report(
         The folder exists and may not be replaced, or cannot be written.
     """
     with atomic_folder(folder, overwrite) as building:
-        pictures = building / "figures"
-        pictures.mkdir()
-        begun = draughtsman is not None and draughtsman.begin(analysis, pictures, event_figures)
-        write_tables(analysis, building)
-        write_posterior(analysis, building / "posterior.nc")
-        page = draughtsman.page() if draughtsman is not None and begun else None
-        if page is None:
-            from iscat_analysis.report.drawing import draw
-
-            page = draw(analysis, pictures, event_figures)
-        (building / "report.html").write_text(page, encoding="utf-8")
+        fill_report(analysis, building, event_figures=event_figures, draughtsman=draughtsman)
     return folder
+
+
+def fill_report(
+    analysis: Analysis, folder: Path, *, event_figures: int, draughtsman: Draughtsman | None
+) -> None:
+    """Write a report into a folder of its own.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        What was found.
+    folder : Path
+        Empty but for figures that `draughtsman` has begun to draw into ``figures``.
+    event_figures, draughtsman
+        As for `write_report`.
+    """
+    pictures = folder / "figures"
+    pictures.mkdir(exist_ok=True)
+    if draughtsman is not None:
+        draughtsman.begin(analysis, pictures, event_figures)
+        draughtsman.end(analysis.summary)
+    write_tables(analysis, folder)
+    write_posterior(analysis, folder / "posterior.nc")
+    page = None if draughtsman is None else draughtsman.page()
+    if page is None:
+        from iscat_analysis.report.drawing import Drawing
+
+        page = Drawing(analysis, pictures, event_figures, together=False).page(analysis)
+    (folder / "report.html").write_text(page, encoding="utf-8")

@@ -1,8 +1,8 @@
 """The figures and the page of an analysis, drawn by one process or by two.
 
-Run as ``python -m iscat_analysis.report.drawing``, this is the process that
-`iscat_analysis.draughtsman` starts.  It reads what to draw from stdin, writes the page to stdout,
-and has drawn all if it ends with status 0.
+The process of `iscat_analysis.draughtsman` has a `Desk`.  One that is no copy is run as
+``python -m iscat_analysis.report.drawing``: it reads what to draw from stdin, writes the page to
+stdout, and has drawn all if it ends with status 0.
 """
 
 from __future__ import annotations
@@ -11,8 +11,11 @@ import gc
 import os
 import pickle
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 from markupsafe import Markup
 
@@ -26,45 +29,61 @@ from iscat_analysis.threads import processors
 _MOST_SHARED = 256  # figures that two processes take from each other: a number is one byte
 
 
-def draw(analysis: Analysis, folder: Path, most: int, *, together: bool = False) -> str:
-    """Draw all figures into a folder, and make the page.
+class Drawing:
+    """The figures and the page of an analysis, begun before its species are known.
 
     Parameters
     ----------
     analysis : Analysis
-        What was found.
+        What was found, perhaps without species.
     folder : Path
         An existing folder.
     most : int
         Events whose images are drawn, at most.
     together : bool
-        On Linux a copy of this process draws as well.  Only for a process that has no threads,
-        which a copy would lack.
-
-    Returns
-    -------
-    str
-        The page.
-
-    Raises
-    ------
-    RuntimeError
-        The copy could not draw what it had taken.
+        On Linux a copy of this process draws as well, and begins at once.  Only for a process whose
+        threads do nothing that a copy would lack.
     """
-    table = event_table(analysis)
-    shown = list(page_sketches(analysis, table))
-    # what takes longest comes early, so that both processes end together
-    sketches = [*event_figures(analysis, most), *reversed(shown)]
-    copy, taken = None, iter(sketches)
-    if together and sys.platform == "linux" and len(sketches) <= _MOST_SHARED:
-        copy, taken = _copied(sketches, folder)
-    about = page_context(analysis, table, folder)
-    figures = publish(drawn(taken), folder)
-    if copy is not None:
-        _, status = os.waitpid(copy, 0)
-        if status:
-            raise RuntimeError(f"a process that drew figures ended with status {status}")
-    return page_of(about, dict(_gathered(shown, figures, folder)))
+
+    def __init__(self, analysis: Analysis, folder: Path, most: int, *, together: bool) -> None:
+        self._folder = folder
+        self._table = event_table(analysis)
+        shown = page_sketches(analysis, self._table)
+        # the field, which takes longest, comes first, so that both processes end together
+        sketches = [*shown, *event_figures(analysis, most)]
+        self._names = {name for name, _ in sketches}
+        self._copy, self._left = None, iter(sketches)
+        if together and sys.platform == "linux" and len(sketches) <= _MOST_SHARED:
+            self._copy, self._left = _copied(sketches, folder)
+
+    def page(self, analysis: Analysis) -> str:
+        """Draw what is left, and make the page.
+
+        Parameters
+        ----------
+        analysis : Analysis
+            The same, with all that was found.
+
+        Returns
+        -------
+        str
+            The page.
+
+        Raises
+        ------
+        RuntimeError
+            The copy could not draw what it had taken.
+        """
+        folder = self._folder
+        shown = list(page_sketches(analysis, self._table))
+        late = [sketch for sketch in shown if sketch[0] not in self._names]
+        about = page_context(analysis, self._table, folder)
+        figures = publish(drawn(chain(late, self._left)), folder)
+        if self._copy is not None:
+            _, status = os.waitpid(self._copy, 0)
+            if status:
+                raise RuntimeError(f"a process that drew figures ended with status {status}")
+        return page_of(about, dict(_gathered(shown, figures, folder)))
 
 
 def _copied(sketches: Sequence[Sketch], folder: Path) -> tuple[int, Iterator[Sketch]]:
@@ -101,19 +120,56 @@ def _gathered(
             yield name, inline_svg(file.read_text(encoding="utf-8"), name)
 
 
+class Desk:
+    """What a process does that does nothing but draw one analysis."""
+
+    def __init__(self) -> None:
+        gc.disable()  # the process is short, and what it makes stays
+        for name in templates().list_templates():  # compiled while the other process is at work
+            templates().get_template(name)
+        self._begun: tuple[Drawing, Analysis] | None = None
+
+    def begin(self, analysis: Analysis, folder: Path, most: int) -> None:
+        """Begin to draw.
+
+        Parameters
+        ----------
+        analysis, folder, most
+            As for `Drawing`.
+        """
+        self._begun = Drawing(analysis, folder, most, together=processors() > 1), analysis
+
+    def page(self, summary: Mapping[str, Any]) -> str:
+        """Draw what is left.
+
+        Parameters
+        ----------
+        summary : mapping
+            Of the whole analysis.
+
+        Returns
+        -------
+        str
+            The page.
+        """
+        if self._begun is None:
+            raise RuntimeError("nothing was begun")
+        drawing, analysis = self._begun
+        return drawing.page(replace(analysis, summary=summary))
+
+
 def main() -> None:
     """Draw what stdin holds, where it holds anything."""
-    for name in templates().list_templates():  # compiled while the other process is at work
-        templates().get_template(name)
-    try:  # not until stdin ends: a copy of the other process may hold it open
-        order = pickle.Unpickler(sys.stdin.buffer).load()
+    desk, orders = Desk(), sys.stdin.buffer
+    try:
+        desk.begin(*pickle.Unpickler(orders).load())
+        page = desk.page(pickle.Unpickler(orders).load())
     except EOFError:
         return
-    sys.stdout.buffer.write(draw(*order, together=processors() > 1).encode("utf-8"))
+    sys.stdout.buffer.write(page.encode("utf-8"))
 
 
 if __name__ == "__main__":
-    gc.disable()  # the process is short, and what it makes stays
     main()
     sys.stdout.flush()
     os._exit(0)  # what is loaded takes 0.15 s to be tidied away

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from iscat_analysis.draughtsman import Draughtsman
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.records import Analysis
 from iscat_analysis.report import write_report
-from iscat_analysis.report.drawing import draw
+from iscat_analysis.report.drawing import Drawing
 from iscat_analysis.study.simulate import write_stack
 from iscat_analysis.threads import processors
 
@@ -67,14 +67,16 @@ def test_it_draws_the_same_report(
 ) -> None:
     pictures = tmp_path / "figures"
     pictures.mkdir()
-    assert pen.begin(analysis, pictures, 12)
+    known = {"distribution": None, "across_particles": []}
+    pen.begin(replace(analysis, summary={**analysis.summary, **known}), pictures, 12)
+    pen.begin(analysis, tmp_path / "nowhere", 12)  # which it does once
+    pen.end(analysis.summary)
     page = pen.page()
     assert page is not None
     drawn = {name for name in expected if name.startswith("figures")}
     assert len(drawn) > 8
     assert contents(tmp_path) == {name: expected[name] for name in drawn}
     assert page.encode() == expected["report.html"]
-    assert not pen.begin(analysis, pictures, 12), "it draws once"
 
 
 def test_a_report_is_written_with_it(
@@ -84,7 +86,7 @@ def test_a_report_is_written_with_it(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("iscat_analysis.report.drawing.draw", None)  # nothing is drawn here
+    monkeypatch.setattr("iscat_analysis.report.drawing.Drawing", None)  # nothing is drawn here
     assert contents(write_report(analysis, tmp_path / "out", draughtsman=pen)) == expected
 
 
@@ -97,12 +99,11 @@ def test_where_it_fails_the_report_is_drawn_here(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    process = pen._process
+    end = pen._other.end
     if when == "before":
-        process.kill()
-        process.wait()
+        end()
     else:
-        monkeypatch.setattr("iscat_analysis.report.write_tables", lambda *_: process.kill())
+        monkeypatch.setattr("iscat_analysis.report.write_tables", lambda *_: end())
     found = contents(write_report(analysis, tmp_path / "out", draughtsman=pen))
     tables = {name for name in expected if name.partition(".")[0] in ("fits", "summary", "config")}
     assert found == {k: v for k, v in expected.items() if when == "before" or k not in tables}
@@ -115,9 +116,8 @@ def test_it_ends_with_its_copy_whatever_they_are_at(
     while not any(tmp_path.iterdir()):  # until it draws
         time.sleep(0.01)
     pen.close()
-    assert pen._process.returncode == -signal.SIGKILL
     assert pen.page() is None
-    wait_until_gone(os.killpg, pen._process.pid)
+    wait_until_gone(os.killpg, pen._other.pid)
 
 
 def test_it_ends_when_the_command_is_killed(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_it_ends_when_the_command_is_killed(tmp_path: Path) -> None:
         "import sys, time; from contextlib import closing\n"
         "from iscat_analysis.draughtsman import Draughtsman\n"
         "with closing(Draughtsman()) as pen:\n"
-        "    pen.start(); print(pen._process.pid, flush=True); time.sleep(60)"
+        "    pen.start(); print(pen._other.pid, flush=True); time.sleep(60)"
     )
     command = [sys.executable, "-c", text]
     with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=tmp_path) as process:
@@ -139,7 +139,7 @@ def test_a_process_that_has_matplotlib_draws_itself() -> None:
     assert "matplotlib" in sys.modules
     with closing(Draughtsman()) as pen:
         pen.start()
-        assert pen._process is None
+        assert pen._other is None
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be bound")
@@ -150,21 +150,47 @@ def test_a_job_on_one_processor_starts_none() -> None:
         "every = os.sched_getaffinity(0)\n"
         "for allowed in ({min(every)}, every):\n"
         "    os.sched_setaffinity(0, allowed)\n"
-        "    with closing(Draughtsman()) as pen: pen.start(); print(pen._process is None)"
+        "    with closing(Draughtsman()) as pen: pen.start(); print(pen._other is None)"
     )
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["True", "False"]
 
 
+@pytest.mark.parametrize("platform", ["linux", "darwin"])
 def test_one_that_cannot_be_started_is_done_without(
-    analysis: Analysis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    platform: str, analysis: Analysis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def full(*_: object) -> None:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
     monkeypatch.delitem(sys.modules, "matplotlib")
+    monkeypatch.setattr(module.sys, "platform", platform)
+    monkeypatch.setattr(module, "Copy", full)
     monkeypatch.setattr(module.sys, "executable", "/nowhere/python")
     with closing(Draughtsman()) as pen:
         pen.start()
-        assert not pen.begin(analysis, tmp_path, 12)
+        pen.begin(analysis, tmp_path, 12)
+        pen.end(analysis.summary)
         assert pen.page() is None
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_where_there_are_no_copies_a_program_draws(
+    there: bool,
+    analysis: Analysis,
+    expected: dict[str, bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delitem(sys.modules, "matplotlib")
+    monkeypatch.setattr(module.sys, "platform", "darwin")
+    with closing(Draughtsman()) as pen:
+        pen.start()
+        monkeypatch.undo()
+        pen.begin(analysis, tmp_path if there else tmp_path / "nowhere", 12)
+        pen.end(analysis.summary)
+        page = pen.page()
+    assert (page or "").encode() == (expected["report.html"] if there else b"")
 
 
 def test_it_is_started_at_the_latest_when_the_chunks_of_a_movie_are_done(tmp_path: Path) -> None:
@@ -196,7 +222,7 @@ def test_what_the_copy_cannot_draw_is_an_error(
 
     monkeypatch.setattr("iscat_analysis.report.drawing.publish", fail)
     with pytest.raises(RuntimeError, match="ended with status"):
-        draw(analysis, tmp_path, 12, together=True)
+        Drawing(analysis, tmp_path, 12, together=True).page(analysis)
 
 
 def test_a_fit_loads_matplotlib_in_the_other_process_only() -> None:
