@@ -158,7 +158,7 @@ def most_likely_diffusion(
     rate_next: FloatArray,
     scale: float,
 ) -> float:
-    """Maximise the likelihood of free diffusion: a ladder of D, finer ones, Newton's method.
+    """Maximise the likelihood of free diffusion: Newton's method from a ladder of D, or a finer one.
 
     Parameters
     ----------
@@ -184,15 +184,15 @@ def most_likely_diffusion(
         highest = int(np.argmax(values))
         best = ladder[highest]
         low, high = ladder[max(highest - 1, 0)], ladder[min(highest + 1, ladder.size - 1)]
+        for _ in range(_NEWTON):
+            there = displacement_likelihood(steps, error, error_next, rate, rate_next, best)
+            if not there[2] < 0.0:
+                break
+            step = -there[1] / there[2]
+            if not low <= best + step <= high:
+                break
+            best += step
+            if abs(step) < _FINE * scale:
+                return float(best)
         ladder = np.linspace(low, high, _RUNGS)
-    for _ in range(_NEWTON):
-        there = displacement_likelihood(steps, error, error_next, rate, rate_next, best)
-        if not there[2] < 0.0:
-            break
-        step = -there[1] / there[2]
-        if not low <= best + step <= high:
-            break
-        best += step
-        if abs(step) < _FINE * scale:
-            break
     return float(best)

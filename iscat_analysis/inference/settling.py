@@ -16,7 +16,7 @@ MOST_TURNS = 12
 
 _SETTLED = 0.1  # step of the background, in its own standard deviations, that is the last one
 _FORESEEN = 0.02  # the same, of the next step if it shrinks as the last one did
-_ROUGHLY = 4.0  # step that is the last one while particles are still being looked for
+_ROUGHLY = 2.0  # step that is the last one while particles are still being looked for
 # Frames in fewer of which particles hardly leave their places: what lies between the background and
 # a particle is then a step of many pixels together, which is small in each.
 _SHORT = 60

@@ -208,9 +208,10 @@ def follow(
     rows = linked(config, rows, mass_places(config, rows), inner=inner)
     resolution = config.optics.wavelength_nm / config.optics.na
     for number in range(ROUNDS):
+        # at first nothing is only tried, and the search has settled nearly all
         rows, ground, done = settle(
             field, ground, rows, follow_power=follow_power, follow_level=follow_level,
-            turns=_NEXT_TURNS, coarse=True,
+            turns=_NEXT_TURNS if number else 1, coarse=True,
         )  # fmt: skip
         rows, added = trimmed(rows), 0
         if not cautious:

@@ -359,8 +359,9 @@ def _motions(
         return found, _tests(places[track], setup, np.random.default_rng([seed, track]))
 
     motions = {}
+    longest_first = sorted(places, key=lambda track: -len(places[track].frame))
     with threads(workers) as pool, suppress(KeyboardInterrupt):
-        for track, found in zip(places, pool.map(motion, places), strict=True):
+        for track, found in zip(longest_first, pool.map(motion, longest_first), strict=True):
             motions[track] = found
             progress("tracks", len(motions), len(places))
     for track in places.keys() - motions.keys():
