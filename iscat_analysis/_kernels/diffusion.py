@@ -158,7 +158,7 @@ def most_likely_diffusion(
     rate_next: FloatArray,
     scale: float,
 ) -> float:
-    """Maximise the likelihood of free diffusion: Newton's method from a ladder of D, or a finer one.
+    """Maximise the likelihood of free diffusion by Newton's method, from one or two ladders of D.
 
     Parameters
     ----------

@@ -97,7 +97,8 @@ def _left_over(
     zero, one, four = data.dtype.type(0.0), data.dtype.type(1.0), data.dtype.type(4.0)
     least, a = data.dtype.type(LEAST), data.dtype.type(amplitude)
     chi2 = used = light = known = more = zero
-    worst = np.zeros_like(data[0, 0])  # of each column: one for all would keep the loop from vectors
+    # of each column: one for all would keep the loop from vectors
+    worst = np.zeros_like(data[0, 0])
     inverse = one / a if a != zero else zero
     for i in range(data.shape[1]):
         d0, d1, d2, d3 = data[0, i], data[1, i], data[2, i], data[3, i]
@@ -167,8 +168,9 @@ def judge_frames(
     profile = blank_profile(table_of(near, 0), near.lens, 2)
     index = np.flatnonzero(free[:4])
     image = np.empty(max(field.drawn, field.side) ** 2)
-    square, room = np.empty(4 * field.side**2, near.nodes.dtype), np.empty(field.side**2, np.float32)
-    g, work = np.empty(BENDS * field.side**2, near.nodes.dtype), np.empty(10 * field.side**2)
+    square = np.empty(4 * field.side**2, near.nodes.dtype)
+    g = np.empty(BENDS * field.side**2, near.nodes.dtype)
+    room, work = np.empty(field.side**2, np.float32), np.empty(10 * field.side**2)
     pull, known = np.empty(5), np.empty((5, 5))
     ways_here = np.empty((4, index.size))
     for t in range(first, last):

@@ -22,7 +22,6 @@ from iscat_analysis._kernels.canvas import (
     Field,
     Light,
     Pictures,
-    add_row,
     cut,
     draw_gradient,
     lens_of,
@@ -48,10 +47,6 @@ FloatArray = NDArray[np.float64]
 AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-
-
-_SMALL = 0.02
-"""Gain in log-likelihood of a step that the gradient tells the change of a picture of."""
 
 
 class Search(NamedTuple):
@@ -171,17 +166,11 @@ def fit_frames(
                     for j in range(nx):
                         signal[i, j] = both[0, i, 0, j]
                 before[:] = p
-                outcome[r], last_one, gain[r], promised = _climb(
+                outcome[r], last_one, gain[r] = _climb(
                     near, group[r], pixels, data, search, p, both, slope_profile, fisher, step
                 )
-                here, there = both[last_one], total[r0:r1, c0:c1]
-                if promised < _SMALL:
-                    _add_signal(here, step, signal, there)
-                else:
-                    _take_off(signal, there)
-                    add_row(
-                        near, field, group[r], p, 1.0, (r0, r1, c0, c1), near_profile, image, total
-                    )
+                here = both[last_one]
+                _add_signal(here, step, signal, total[r0:r1, c0:c1])
                 canvas.squares[r] = p
                 information[r] = fisher[:4, :4]
                 if slopes.values.size:
@@ -206,14 +195,15 @@ def _look_over(frame: Counts) -> float:
 def _climb(
     near: Pictures, group: int, pixels: Pixels, data: AnyFloatArray, search: Search, p: FloatArray,
     both: AnyFloatArray, profile: FloatArray, fisher: FloatArray, step: FloatArray,
-) -> tuple[int, int, float, float]:  # fmt: skip
+) -> tuple[int, int, float]:  # fmt: skip
     """Fit one row from p, at which both[0] is drawn.
 
     As long as they lie inside the box and improve, the steps of Fisher scoring are taken as they
     are: every picture is drawn once.  `maximize` takes over where they do not.
 
-    Returns how the fit ended, which of `both` holds the picture at the estimate minus `step`, the
-    log-likelihood over that without the particle, and what that last step is to gain of it.
+    Returns how the fit ended, which of `both` holds the picture at the estimate minus `step`, which
+    the last step leaves so small that the gradient tells the rest, and the log-likelihood over that
+    without the particle.
     """
     lower, upper, trial, score = np.empty(5), np.empty(5), np.empty(5), np.empty(5)
     for i in range(5):
@@ -226,7 +216,7 @@ def _climb(
             break
         if gain < search.tolerance:
             p[:] = trial
-            return CONVERGED, at, value + gain, gain
+            return CONVERGED, at, value + gain
         draw_gradient(near, group, trial, pixels, profile, both[1 - at])
         there = place_score(data, both[1 - at], near.lens, score, fisher)
         if not there > value:
@@ -243,7 +233,7 @@ def _climb(
     draw_gradient(near, group, p, pixels, profile, both[0])
     place_score(data, both[0], near.lens, score, fisher)
     step[:] = 0.0
-    return outcome, 0, value, 0.0
+    return outcome, 0, value
 
 
 @kernel()
@@ -280,14 +270,6 @@ def _add_signal(
             sideways = dx * here[i, 1, j] + dy * here[i, 2, j]
             moved = here[i, 0, j] + sideways + dz * here[i, 3, j] + da * here[i, 4, j]
             out[i, j] += np.float32(moved - before[i, j])
-
-
-@kernel(fastmath=FAST, _nrt=False)
-def _take_off(signal: AnyFloatArray, out: NDArray[np.float32]) -> None:
-    """Take a signal off a part of a frame."""
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[i, j] -= np.float32(signal[i, j])
 
 
 @kernel(fastmath=FAST, _nrt=False)

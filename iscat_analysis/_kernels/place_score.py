@@ -114,4 +114,4 @@ def _flat_score(
     fisher[0, 1] = fisher[1, 0] = f01
     fisher[0, 3] = fisher[3, 0] = f03
     fisher[1, 3] = fisher[3, 1] = f13
-    return value, beyond
+    return float(value), float(beyond)

@@ -56,7 +56,7 @@ COARSE = 2
 _BLOCK = 32  # frames that one thread takes at a time
 _SWEPT = 4  # the same, where every row is fitted several times
 _TOLERANCE = 2e-4  # as in `Likelihood.maximize`
-_PASSING, _ROUGH = 0.02, 0.5  # the same, of fits that the next turn goes on with, and coarse ones
+_PASSING = 0.02  # the same, of a fit that the next turn goes on with
 _PASSES = 40
 _SLACK = np.array([0.1, 0.1, 0.01, 0.05])
 """How far particles may go from their rings: pixels, wavelengths, relative."""
@@ -230,9 +230,7 @@ class MovingField:
         fisher, gain = np.empty((len(theta), 4, 4)), np.empty(len(theta))
         canvas = self._canvas_for(rows, coarse=coarse)
         field = self._coarse if coarse else self._whole
-        search = self._search
-        if sweeps == 1:
-            search = search._replace(tolerance=_ROUGH if coarse else _PASSING)
+        search = self._search if sweeps > 1 else self._search._replace(tolerance=_PASSING)
         slopes = self._slopes_of(len(theta), field.side if sweeps else 0)
         expected = np.zeros(self.frames)
 

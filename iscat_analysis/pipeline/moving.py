@@ -63,8 +63,8 @@ _LEAST_POSITIONS = 4  # of a track whose D is fitted
 _USELESS = 300.0  # times the median error of a track: such a place says nothing
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
-_FEW = 5e-3  # of all rows: tracks that grow by no more are as long as they get
-_FEW_MORE = 0.01  # the same: a search that adds no more is the last
+_FEW = 0.01  # of all rows: a search that adds no more is the last, and an extension
+_FEW_TRIED = 5e-3  # the same, of one with places that are only tried, which the next one judges
 _FLOOD = 0.15  # rows in an area of (λ/NA)², beyond which they are no particles
 _FULL = 2  # searches of all frames, after which some of them tell whether to go on
 _FIRST_HEIGHTS = 1  # searches after which every row is put into its fringe
@@ -171,11 +171,11 @@ def follow(
     for number in range(ROUNDS):
         progress("track", number, total)
         before = len(rows.frame)
-        enough = round(_FEW_MORE * before) if number >= _FULL else 0
+        enough = round(_FEW * before) if number >= _FULL else 0
         found = search_frames(
             scene, field, ground, rows, pool, enough=enough, cautious=cautious
         )  # fmt: skip
-        if number and len(found.frame) <= _FEW_MORE * before:
+        if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(scene, rows, found)
         if len(np.unique(rows.frame)) < len(rows.frame):  # there may be a choice
@@ -202,7 +202,7 @@ def follow(
                 turns=_NEXT_TURNS, coarse=True,
             )  # fmt: skip
         _refuse_flood(config, field, rows)
-        if number and len(rows.frame) <= (1 + _FEW_MORE) * before:
+        if number and len(rows.frame) <= (1 + _FEW) * before:
             break
     progress("track", ROUNDS, total)
     rows = linked(config, rows, mass_places(config, rows), inner=inner)
@@ -226,7 +226,7 @@ def follow(
         # the background that is told of all frames, before these are fitted over it
         _, found_ground, _ = field.fit(ground, typical(rows), sweeps=0, coarse=True)
         ground = replace(ground, level=found_ground.level) if follow_level else ground
-        if added <= _FEW * len(rows.frame):
+        if added <= (_FEW_TRIED if number < _HELD_ROUNDS else _FEW) * len(rows.frame):
             break
     rows = _told_apart(config, trimmed(rows))
     for stage in range(2):

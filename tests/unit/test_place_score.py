@@ -57,3 +57,29 @@ def test_gradients_in_single_precision_lose_only_their_own_rounding():
     assert values[0] == pytest.approx(values[1], rel=ROUNDING)
     np.testing.assert_allclose(found[0][0], found[1][0], rtol=1e-9)
     np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("level_e", [4e3, 4e5, 4e7])
+def test_single_precision_is_enough_for_a_fit(level_e):
+    rng = np.random.default_rng(5)
+    side = 32
+    here = rng.uniform(-1.0, 1.0, (side, 5, side)) * 3 / np.sqrt(level_e)
+    light = rng.uniform(0.7, 1.3, (side, side)) * level_e
+    seen = rng.poisson(light * (1 + here[:, 0]))
+    data = np.stack([seen, light, light, np.full_like(light, 30.0)]).astype(np.float32)
+    data[0] += data[3]
+    here = here.astype(np.float32)
+
+    score, fisher = np.empty(5), np.empty((5, 5))
+    value = place_score(data, here, ONE_HEIGHT, score, fisher)
+
+    exact_score, exact = np.empty(5), np.empty((5, 5))
+    wide = data.astype(float), here.astype(float), ONE_HEIGHT, exact_score, exact
+    exact_value = place_score(*wide)
+    free = [0, 1, 3]
+    sigma = np.sqrt(np.diag(exact)[free])
+    off = np.abs(score - exact_score)[free] / sigma  # standard deviations of the estimates
+    rounding = side**2 * float(np.finfo(np.float32).eps)  # at worst, of sums of so many terms
+    assert off.max() < rounding * np.sqrt(np.abs(exact_value))
+    assert value == pytest.approx(exact_value, abs=rounding * side**2)
+    np.testing.assert_allclose(fisher, exact, rtol=0, atol=rounding * np.abs(exact).max())
