@@ -11,7 +11,8 @@ Exit status 1 where a promise is broken.
 ``--median`` takes the median of each pixel for the background.
 
 Megabytes of input per second are of movies of 13 particles, of which ten are in view, and of those
-of 14 above.
+of 14 above.  The former are analysed twice: the second pass does not wait for memory that the host
+of a virtual machine has yet to give.
 
 The peers are trackpy's ``locate`` and MSPT's fit (``_mspt.py``) on the first frames of each movie,
 over the median of all, in turns with the package.  Rates are per second of wall time.  That of the
@@ -241,15 +242,18 @@ def timed(counts: np.ndarray, settings: Mapping[str, Any]) -> tuple[ia.Result, f
 
 
 def with_ten(settings: Mapping[str, Any], count: int) -> dict[str, float]:
-    """Speed with ten particles in view, the median of some movies."""
+    """Speed with ten particles in view, the median of some movies, of a first and a second pass."""
     seconds, in_view = [], []
     for seed in TEN_SEEDS[:count]:
         movie = wander(SHAPE, seed=seed, species=TEN)
-        seconds.append(timed(movie.counts, settings)[1])
+        seconds.append([timed(movie.counts, settings)[1] for _ in range(2)])
         in_view.append(movie.truth["inside"].sum() / SHAPE[0])
-        print(seed, f"{seconds[-1]:.1f} s, {in_view[-1]:.1f} particles in view", flush=True)
+        once, again = seconds[-1]
+        print(seed, f"{once:.1f}, {again:.1f} s, {in_view[-1]:.1f} particles in view", flush=True)
+    once, again = MEGABYTES / np.median(seconds, axis=0)
     return {
-        "megabytes_per_second": float(MEGABYTES / np.median(seconds)),
+        "megabytes_per_second": float(once),
+        "megabytes_per_second_once_more": float(again),
         "particles_in_view": float(np.median(in_view)),
     }
 
