@@ -31,6 +31,7 @@ import scipy
 from numpy.typing import NDArray
 
 from iscat_analysis.inference.rows import Rows
+from iscat_analysis.pipeline.linking import mean_square
 from iscat_analysis.records import FloatArray
 
 LEAST_GAIN = 8.0
@@ -178,8 +179,8 @@ class _Typical:
 
 
 def _step_nm2(moved: FloatArray) -> float:
-    """Variance of steps along an axis, from the median of their squares along both; 0 of none."""
-    return float(np.median((moved**2).sum(axis=1))) / math.log(4) if len(moved) else 0.0
+    """Variance of steps along an axis; 0 of none."""
+    return mean_square(moved) / 2 if len(moved) else 0.0
 
 
 def _normal(off: float, variance: float) -> float:

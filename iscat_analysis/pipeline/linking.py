@@ -448,7 +448,23 @@ def _step_nm2(rows: Rows, mine: IntArray) -> float:
     """Return the mean square of a track's steps from frame to frame, from its median."""
     next_ = np.diff(rows.frame[mine]) == 1
     steps = np.diff(rows.theta[mine, :2], axis=0)[next_]
-    return float(np.median((steps**2).sum(axis=1)) / np.log(2)) if len(steps) else np.inf
+    return mean_square(steps) if len(steps) else np.inf
+
+
+def mean_square(steps: FloatArray) -> float:
+    """Give the mean square of normal steps, from its median, to which stray ones do little.
+
+    Parameters
+    ----------
+    steps : ndarray, shape (n, 2)
+        At least one, in a plane.
+
+    Returns
+    -------
+    float
+        Along both axes together.
+    """
+    return float(np.median((steps**2).sum(axis=1)) / np.log(2))
 
 
 def numbered(rows: Rows) -> Rows:
