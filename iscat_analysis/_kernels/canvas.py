@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
@@ -238,6 +239,12 @@ def add(there: NDArray[np.float32], sign: float, image: FloatArray) -> None:
             there[i, j] += np.float32(sign * image[i, j])
 
 
+@njit(inline="always")
+def _electrons(light: Light, counts: int | float) -> float:
+    """Photoelectrons of a pixel's counts."""
+    return light.gain * (np.float64(counts) - light.offset)
+
+
 @kernel(fastmath=FAST, _nrt=False)
 def stage(
     light: Light, t: int, total: NDArray[np.float32], own: AnyFloatArray, r0: int, c0: int,
@@ -248,7 +255,6 @@ def stage(
     `own` (ny, 5, nx) begins with the particle's own signal.
     """
     w, last, one = light.power[t], c0 + data.shape[2], data.dtype.type(1.0)
-    gain, offset = light.gain, light.offset
     for i in range(data.shape[1]):  # among more arrays at once the compiler gives up on vectors
         r = r0 + i
         seen, base, level, noise = data[0, i], data[1, i], data[2, i], data[3, i]
@@ -261,8 +267,7 @@ def stage(
         for j in range(level.size):
             noise[j] = read[j]
         for j in range(level.size):
-            electrons = gain * (np.float64(counts[j]) - offset)
-            seen[j] = noise[j] + (electrons if level[j] > 0.0 else 0.0)
+            seen[j] = noise[j] + (_electrons(light, counts[j]) if level[j] > 0.0 else 0.0)
 
 
 @kernel()
@@ -370,7 +375,6 @@ def leave_over(
     out : ndarray of float32, shape (n, y, x)
         Filled with photoelectrons [e]; 0 in pixels that are not used.
     """
-    gain, offset = light.gain, light.offset
     for t in range(out.shape[0]):
         w = light.power[first + t]
         for i in range(out.shape[1]):
@@ -378,8 +382,7 @@ def leave_over(
             rows, left = signal[t, i], out[t, i]
             for j in range(left.size):
                 level = w * background[j]
-                electrons = gain * (np.float64(counts[j]) - offset)
-                over = electrons - level * (1.0 + rows[j])
+                over = _electrons(light, counts[j]) - level * (1.0 + rows[j])
                 left[j] = over if background[j] > 0.0 else 0.0
 
 
@@ -415,7 +418,7 @@ def add_squares(
             for j in range(max(left, 0), min(left + side, columns)):
                 level = light.power[t] * light.background[i, j]
                 if level > 0.0:
-                    electrons = light.gain * (np.float64(light.counts[t, i, j]) - light.offset)
+                    electrons = _electrons(light, light.counts[t, i, j])
                     mine[0, i - top, j - left] += electrons - level * (1.0 + total[t, i, j])
                     mine[1, i - top, j - left] += level
                     mine[2, i - top, j - left] += light.read[i, j]
