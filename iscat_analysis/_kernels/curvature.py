@@ -132,14 +132,17 @@ def observed_information(
 
 
 @kernel()
-def invert(matrix: FloatArray, scale: FloatArray, active: BoolArray, out: FloatArray) -> bool:
+def invert(matrix: FloatArray, like: FloatArray, active: BoolArray, out: FloatArray) -> bool:
     """Fill `out` (5, 5) with the inverse of a positive matrix on the active parameters, else 0.
 
-    `scale` (5) makes it a matrix with diagonal near one.  False, and NaN, if it is not positive.
+    The diagonal of `like` (5, 5) is about that of the matrix.  False, and NaN, if it is not
+    positive.
     """
     index = np.flatnonzero(active)
     n = index.size
-    lower, inverse = np.zeros((n, n)), np.zeros((n, n))
+    lower, inverse, scale = np.zeros((n, n)), np.zeros((n, n)), np.empty(5)
+    for i in range(5):
+        scale[i] = 1.0 / np.sqrt(max(like[i, i], FLOOR))
     out[:] = 0.0
     if not factorise(matrix, index, scale[index], 0.0, lower):
         out[:] = np.nan
@@ -225,12 +228,9 @@ def first_order_bias(
     out: FloatArray,
 ) -> None:
     """Fill `out` (5) with the bias of order 1/N, NaN where the free parameters are not known."""
-    fisher, inverse = np.empty((5, 5)), np.empty((5, 5))
-    score, scale = np.empty(5), np.empty(5)
+    fisher, inverse, score = np.empty((5, 5)), np.empty((5, 5)), np.empty(5)
     image_score(kind, data, level, rows, score, fisher)
-    for i in range(5):
-        scale[i] = 1.0 / np.sqrt(max(fisher[i, i], FLOOR))
-    invert(fisher, scale, free, inverse)
+    invert(fisher, fisher, free, inverse)
     t = np.empty((3, rows.shape[2]))
     sums = np.zeros(5)
     for row in range(rows.shape[0]):
@@ -239,3 +239,63 @@ def first_order_bias(
         out[i] = 0.0
         for j in range(5):
             out[i] -= 0.5 * inverse[i, j] * sums[j]
+
+
+@kernel()
+def errors_and_bias(
+    kind: int,
+    data: FloatArray,
+    level: float,
+    rows: FloatArray,
+    like: FloatArray,
+    free: BoolArray,
+    moving: BoolArray,
+    slope: float,
+    sigma: FloatArray,
+    covariance: FloatArray,
+    bias: FloatArray,
+) -> bool:
+    """Fill what the likelihood says of the errors of a fit.
+
+    Parameters
+    ----------
+    kind, data, level, rows
+        As in `observed_information`.
+    like : ndarray, shape (5, 5)
+        The expected information nearby, whose diagonal scales the observed one.
+    free, moving : ndarray of bool, shape (5,)
+        What was fitted, and what of it is not on a wall.
+    slope : float
+        By which errors of the amplitude are multiplied.
+    sigma : ndarray, shape (4,)
+        Filled with the errors of x, y, z and the amplitude; NaN where not free.
+    covariance : ndarray, shape (n, n)
+        Filled with that of the n free ones among these.
+    bias : ndarray, shape (5,)
+        Filled with the first-order bias.
+
+    Returns
+    -------
+    bool
+        Whether the observed information is positive; all are NaN where it is not.
+    """
+    information, inverse = np.empty((5, 5)), np.empty((5, 5))
+    observed_information(kind, data, level, rows, information)
+    known = invert(information, like, free, inverse)
+    n = 0
+    for i in range(4):
+        sigma[i] = np.nan
+        if free[i]:
+            m = 0
+            for j in range(4):
+                if free[j]:
+                    unit = (slope if i == 3 else 1.0) * (slope if j == 3 else 1.0)
+                    covariance[n, m] = inverse[i, j] * unit
+                    m += 1
+            sigma[i] = np.sqrt(covariance[n, n])
+            n += 1
+    if known:
+        first_order_bias(kind, data, level, rows, moving, bias)
+    else:
+        bias[:] = np.nan
+    return known

@@ -17,13 +17,13 @@ the level is a nuisance, and bounds count it as one.
 from __future__ import annotations
 
 import math
+from itertools import compress
 
 import numpy as np
 
-from iscat_analysis._kernels.curvature import invert
-from iscat_analysis.inference.bias import first_order_bias
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
+from iscat_analysis.inference.precision import precision
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     PARAMETERS,
@@ -108,29 +108,26 @@ def search_box(
     names = FREE_PARAMETERS[mode]
     grid = likelihood.grid
     reach = window_nm(grid.pixel_nm)
-    x, y = start.x_px * grid.pixel_nm, start.y_px * grid.pixel_nm
-    amplitude = abs(likelihood.model.scale.amplitude(start.mass_kda))
-    nominal = abs(likelihood.model.scale.amplitude(likelihood.model.material.mass_kda))
-    largest = 100 * max(amplitude, nominal)
+    x, y, _, amplitude, _ = fixed = start_theta(likelihood, start).tolist()
+    largest = 100 * max(abs(amplitude), abs(likelihood.model.nominal_amplitude))
     signed = "z_nm" not in names and likelihood.model.rho > 0
     half = grid.pixel_nm / 2
-    free = np.array([name in names for name in PARAMETERS] + [level])
-    fixed = start_theta(likelihood, start)
-    lower = np.array([
-        max(x - reach, grid.x_nm[0] - half),
-        max(y - reach, grid.y_nm[0] - half),
-        z_range_nm[0],
-        -largest if signed else 0.0,
-        -1.0,
-    ])  # fmt: skip
-    upper = np.array([
-        min(x + reach, grid.x_nm[-1] + half),
-        min(y + reach, grid.y_nm[-1] + half),
-        z_range_nm[1],
-        largest,
-        1.0,
-    ])  # fmt: skip
-    return Box(free, np.where(free, lower, fixed), np.where(free, upper, fixed))
+    free = [name in names for name in PARAMETERS] + [level]
+    lower = (
+        max(x - reach, grid.x_nm[0] - half), max(y - reach, grid.y_nm[0] - half), z_range_nm[0],
+        -largest if signed else 0.0, -1.0,
+    )  # fmt: skip
+    upper = (
+        min(x + reach, grid.x_nm[-1] + half), min(y + reach, grid.y_nm[-1] + half), z_range_nm[1],
+        largest, 1.0,
+    )  # fmt: skip
+    low, high = (
+        np.array(
+            [end if moves else value for moves, end, value in zip(free, ends, fixed, strict=True)]
+        )
+        for ends in (lower, upper)
+    )
+    return Box(np.array(free), low, high)
 
 
 def fit_particle(
@@ -171,14 +168,14 @@ def fit_particle(
     best = optima[0]
     model = likelihood.model
     alternatives = _alternatives(optima, model.fringe_nm)
-    names = tuple(name for name, free in zip(PARAMETERS, box.free[:4], strict=True) if free)
     derivatives = likelihood.derivatives(best.theta, box.free)
-    sigma, covariance = _uncertainty(likelihood, best, box, derivatives)
-    chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free, derivatives)
     walls = _walls(best.theta, box)
+    slope = abs(model.scale.slope(float(best.theta[AMPLITUDE])))
+    known, sigma, covariance, bias = precision(
+        likelihood, best.theta, best.fisher, box.free, derivatives, walls=walls, slope=slope
+    )
+    chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free, derivatives)
     flags = []
-    particle = box.free[:4]
-    known = bool(np.isfinite(sigma[particle]).all())
     if not best.converged or not known:
         flags.append(Status.NOT_CONVERGED)
     if _at_bound(likelihood, best.theta, walls, sigma[2]):
@@ -189,11 +186,10 @@ def fit_particle(
         flags.append(Status.POOR_FIT)
     estimate = best.theta
     if correct_bias and known:
-        bias = first_order_bias(likelihood, best.theta, box.free & ~walls, derivatives)
         size = np.abs(bias[:4])
-        size[AMPLITUDE] *= abs(model.scale.slope(float(best.theta[AMPLITUDE])))
+        size[AMPLITUDE] *= slope
         # an expansion whose first term exceeds the error has lost its meaning
-        if (size <= sigma)[particle].all():
+        if (size <= sigma)[box.free[:4]].all():
             estimate = np.minimum(np.maximum(estimate - bias, box.lower), box.upper)
     x, y, z, amplitude = (float(value) for value in estimate[:4])
     if box.free[AMPLITUDE] and model.scale.off_line(estimate[AMPLITUDE], sigma[AMPLITUDE], OUTWARD):
@@ -207,7 +203,7 @@ def fit_particle(
         theta=best.theta,
         estimate=estimate,
         box=box,
-        free=names,
+        free=tuple(compress(PARAMETERS, box.free)),
         sigma=sigma,
         covariance=covariance,
         contrast=model.amplitude_contrast(z, amplitude, "between" if box.free[2] else "exact"),
@@ -280,7 +276,7 @@ def _optima(likelihood: Likelihood, start: Candidate, box: Box) -> list[Optimum]
     shows that the optimum cannot be within `FOLLOWED` of the best.
     """
     theta = start_theta(likelihood, start)
-    theta = np.where(box.free, np.clip(theta, box.lower, box.upper), theta)
+    theta = np.minimum(np.maximum(theta, box.lower), box.upper)  # what is not free has no room
     if not box.free[2]:
         return [likelihood.maximize(theta, box.free, box.lower, box.upper)]
     optima: list[Optimum] = []
@@ -327,26 +323,6 @@ def _alternatives(optima: list[Optimum], fringe_nm: float) -> tuple[Alternative,
     return tuple(
         sorted((Alternative(*one) for one in kept[1:]), key=lambda a: a.log_likelihood_gap)
     )
-
-
-def _uncertainty(
-    likelihood: Likelihood, best: Optimum, box: Box, derivatives: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """σ of (x, y, z, mass) and the covariance of the free ones; NaN unless positive definite."""
-    free = box.free
-    information = likelihood.observed_information(best.theta, derivatives)
-    scale = 1 / np.sqrt(np.maximum(best.fisher.diagonal(), 1e-300))
-    inverse = np.empty((5, 5))
-    sigma = np.full(4, np.nan)
-    known = invert(information, scale, free, inverse)
-    slope = abs(likelihood.model.scale.slope(float(best.theta[AMPLITUDE])))
-    inverse[AMPLITUDE] *= slope
-    inverse[:, AMPLITUDE] *= slope
-    particle = np.flatnonzero(free[:4])
-    covariance = inverse[particle][:, particle]
-    if known:
-        sigma[particle] = np.sqrt(covariance.diagonal())
-    return sigma, covariance
 
 
 def _walls(theta: FloatArray, box: Box) -> BoolArray:

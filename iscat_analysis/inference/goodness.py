@@ -17,14 +17,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betainc, gammainc, gammaincc, pdtr, pdtrc
 
-from iscat_analysis._kernels.residuals import residuals, suspects
-from iscat_analysis._kernels.score_test import mode_statistic
+from iscat_analysis._kernels.goodness import look
 from iscat_analysis._kernels.scoring import CONDITIONAL, POISSON
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 
@@ -122,51 +120,28 @@ def three_tests(
     independent of the fitted directions, is compared with its information (C. R. Rao, Proc. Camb.
     Phil. Soc. 44, 50, 1948).
     """
-    view = _look(likelihood, theta, derivatives)
+    rows = likelihood.derivatives(theta) if derivatives is None else derivatives
     free = np.asarray(free, dtype=np.bool_)
-    chi2, spread_p = _scatter(view, int(np.count_nonzero(free)))
-    if not math.isfinite(spread_p):
-        return chi2, (math.nan, math.nan, math.nan)
-    return chi2, (spread_p, _structure(likelihood, theta, free, view), _outlier(view))
-
-
-@dataclass(frozen=True)
-class _View:
-    """One fit as its pixels see it."""
-
-    data: FloatArray  # (4, ny, nx)
-    kind: int
-    rows: FloatArray  # (ny, 5 or more, nx), signal and derivatives
-    rate: FloatArray  # (ny, nx), expected counts after landing
-    residual: FloatArray  # (ny, nx), in standard deviations
-    terms: FloatArray  # (ny, 4, nx), see `residuals`
-    chi2: float  # and what else `residuals` returns
-    pixels: int
-    excess: float
-    largest_excess: float
-    least_rate: float
-
-
-def _look(likelihood: Likelihood, theta: FloatArray, rows: FloatArray | None) -> _View:
-    if rows is None:
-        rows = likelihood.derivatives(theta)
-    rate, residual = np.empty((2, *likelihood.grid.shape))
-    terms = np.empty((rate.shape[0], 4, rate.shape[1]))
-    level, kind, data = math.exp(theta[LEVEL]), likelihood.kind, likelihood.data
-    totals = residuals(kind, data, level, rows, rate, residual, terms)
-    return _View(data, kind, rows, rate, residual, terms, *totals)
-
-
-def _scatter(view: _View, fitted: int) -> tuple[float, float]:
-    chi2, cells, excess = view.chi2, view.pixels, view.excess
-    if view.kind == POISSON and view.least_rate < POOLED_COUNTS:
-        residual, kurtosis = _pooled(view)
+    optics, grid = likelihood.model.optics, likelihood.grid
+    rate, tails = np.empty(grid.shape), np.empty((3, _SUSPECTS))
+    chi2, pixels, excess, least_rate, mode_chi2, modes, mode_excess, least, count = look(
+        likelihood.kind, likelihood.data, math.exp(theta[LEVEL]), rows, grid.x_nm, grid.y_nm, theta,
+        WAIST * optics.wavelength_nm / optics.na, ORDER, free, _DEPENDENT, _NORMAL, MANY_COUNTS,
+        rate, tails,
+    )  # fmt: skip
+    cells = pixels
+    if likelihood.kind == POISSON and least_rate < POOLED_COUNTS:
+        residual, kurtosis = _pooled(likelihood, rate)
         chi2, cells, excess = float(residual @ residual), residual.size, float(kurtosis.sum())
-    freedom = cells - fitted
+    freedom = cells - int(np.count_nonzero(free))
     if freedom <= 0:
-        return math.nan, math.nan
+        return math.nan, (math.nan, math.nan, math.nan)
     above = _gamma_above(chi2, freedom, excess / cells)
-    return chi2 / freedom, 2 * min(above, 1 - above)
+    structure = _gamma_above(mode_chi2, modes, mode_excess) if modes else 1.0
+    if count:
+        least = min(least, 2 * float(_tails(likelihood.kind, *tails[:, :count]).min()))
+    outlier = _least_of_all(likelihood, rate, pixels, least)
+    return chi2 / freedom, (2 * min(above, 1 - above), structure, outlier)
 
 
 def _gamma_above(chi2: float, freedom: float, excess: float) -> float:
@@ -175,12 +150,12 @@ def _gamma_above(chi2: float, freedom: float, excess: float) -> float:
     return float(gammaincc(freedom / spread / 2, chi2 / spread / 2))
 
 
-def _pooled(view: _View) -> tuple[FloatArray, FloatArray]:
+def _pooled(likelihood: Likelihood, rate: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residuals in standard deviations and their excess kurtosis, cells of few counts pooled."""
-    used = view.data[2] > 0
-    rate = view.rate[used]
+    used = likelihood.data[2] > 0
+    rate = rate[used]
     few = rate < POOLED_COUNTS
-    excess = view.data[0][used] - rate
+    excess = likelihood.data[0][used] - rate
     order = np.argsort(-rate[few])
     bins = (np.cumsum(rate[few][order]) / POOLED_COUNTS).astype(int)
     pooled = (np.bincount(bins, v[few][order]) for v in (rate, excess))
@@ -191,24 +166,12 @@ def _pooled(view: _View) -> tuple[FloatArray, FloatArray]:
     return excess / np.sqrt(rate), 1 / rate
 
 
-def _structure(likelihood: Likelihood, theta: FloatArray, free: BoolArray, view: _View) -> float:
-    optics, grid = likelihood.model.optics, likelihood.grid
-    chi2, freedom, excess = mode_statistic(
-        grid.x_nm, grid.y_nm, theta, WAIST * optics.wavelength_nm / optics.na, ORDER, view.rows,
-        view.terms, free, _DEPENDENT, view.largest_excess, _NORMAL,
-    )  # fmt: skip
-    return _gamma_above(chi2, freedom, excess) if freedom else 1.0
-
-
-def _outlier(view: _View) -> float:
-    tails = np.empty((3, _SUSPECTS))
-    least, count = suspects(view.kind, view.data, view.rate, view.residual, MANY_COUNTS, tails)
-    if count:
-        least = min(least, 2 * float(_tails(view.kind, *tails[:, :count]).min()))
-    if view.kind == CONDITIONAL:
-        return -math.expm1(view.pixels * math.log1p(-min(least, 1 - 1e-16)))
+def _least_of_all(likelihood: Likelihood, rate: FloatArray, pixels: int, least: float) -> float:
+    """Probability that the least likely of all pixels has a tail of at most `least`."""
+    if likelihood.kind == CONDITIONAL:
+        return -math.expm1(pixels * math.log1p(-min(least, 1 - 1e-16)))
     # counts are whole: what each pixel can attain below `least` is less than that
-    below = _attainable(view.rate[view.data[2] > 0], least)
+    below = _attainable(rate[likelihood.data[2] > 0], least)
     return -math.expm1(float(np.sum(np.log1p(-np.minimum(below, 1 - 1e-16)))))
 
 

@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis._kernels.scoring import CONDITIONAL, POISSON
 from iscat_analysis.errors import DataError
-from iscat_analysis.inference.bias import first_order_bias
 from iscat_analysis.inference.checks import mask_of, pixels_of
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.precision import precision
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 
 FloatArray = NDArray[np.float64]
@@ -286,8 +286,7 @@ def compile_values(model: ForwardModel, parts: Collection[str] = PARTS) -> None:
         likelihood.scan_heights(theta[2:3], theta, (0.0, 2.0))
     free = np.array([True, True, False, True, False])
     derivatives = likelihood.derivatives(theta, free)
-    likelihood.observed_information(theta, derivatives)
-    first_order_bias(likelihood, theta, free, derivatives)
+    precision(likelihood, theta, np.eye(5), free, derivatives)
     goodness_of_fit(likelihood, theta, free, derivatives)
 
 

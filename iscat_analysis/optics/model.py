@@ -119,6 +119,11 @@ class ForwardModel:
         """Period λ/(2 n_s) of the interference with height in iSCAT [nm]."""
         return self.optics.wavelength_nm / (2 * self.optics.n_sample)
 
+    @cached_property
+    def nominal_amplitude(self) -> float:
+        """Amplitude of the material's nominal mass."""
+        return self.scale.amplitude(self.material.mass_kda)
+
     def profile(self, z_nm: float, orders: int = 2) -> FloatArray:
         """Profile of the field at a height.
 

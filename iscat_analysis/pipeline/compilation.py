@@ -20,11 +20,13 @@ _PATIENCE_S = 1.0  # of compilation, before it is announced
 _BETWEEN_S = 4.0  # from one line to the next
 _ROOM = f"{_kernels.__name__}."
 _SHARED = ("radial", "image", "scoring")  # whose kernels the other process compiles half of
-_THEIRS = ("curvature", "hessian", "residuals", "score_test")  # all of whose kernels it compiles
+# All of whose kernels it compiles.
+_THEIRS = ("curvature", "goodness", "hessian", "residuals", "score_test")
 _ABOUT = {
     "curvature": "the precision of fits",
     "diffusion": "diffusion",
     "drift": "the drift of the pattern",
+    "goodness": "the goodness of fits",
     "hessian": "the precision of fits",
     "judging": "the precision of tracks",
     "mixture": "species",

@@ -17,9 +17,9 @@ from numba.core import event
 
 import iscat_analysis
 from iscat_analysis import _kernels
+from iscat_analysis._kernels.goodness import look
 from iscat_analysis._kernels.hessian import signal_hessian
 from iscat_analysis._kernels.scan import scan_heights
-from iscat_analysis._kernels.score_test import mode_statistic
 from iscat_analysis._kernels.scoring import maximize, value_batch
 from iscat_analysis.config import load_config
 from iscat_analysis.inference import ahead
@@ -134,7 +134,7 @@ def test_the_second_process_ends_with_the_first(monkeypatch):
 
 
 def test_the_second_process_compiles_what_the_first_needs():
-    shared = (value_batch, signal_hessian, scan_heights, mode_statistic)
+    shared = (value_batch, signal_hessian, scan_heights, look)
     others = set(maximize.signatures)  # of other tests
     ahead.main(PARTS)
     assert gc.isenabled()  # only a process that is short does without

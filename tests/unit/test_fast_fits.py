@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from scenes import PIXEL_NM, gold, make_config
 
+from iscat_analysis._kernels.curvature import first_order_bias
 from iscat_analysis._kernels.hessian import PAIRS
 from iscat_analysis._kernels.image import signal_image
 from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.config import Calibration
 from iscat_analysis.inference import noise
-from iscat_analysis.inference.bias import first_order_bias
 from iscat_analysis.inference.fit import FOLLOWED, fit_particle, search_box
 from iscat_analysis.inference.goodness import ORDER, WAIST, _gamma_above, three_tests
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
+from iscat_analysis.inference.precision import precision
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import BoolArray, Candidate, FloatArray
 
@@ -128,14 +129,44 @@ def _bias(which: Likelihood, theta: FloatArray, free: BoolArray) -> FloatArray:
 def test_bias(case: Case, free: tuple[bool, ...]) -> None:
     which, free_array = case.likelihood, np.array(free)
     derivatives = which.derivatives(case.theta)
-    got = first_order_bias(which, case.theta, free_array, derivatives)
+    got, lost = np.empty((2, 5))
+    level = math.exp(case.theta[LEVEL])
+    first_order_bias(which.kind, which.data, level, derivatives, free_array, got)
     slow = _bias(which, case.theta, free_array)
     scale = 1 / np.sqrt(np.diag(which.score_fisher(case.theta)[2]))
     np.testing.assert_allclose(got / scale, slow / scale, atol=1e-9)
     assert np.abs(slow / scale).max() > 1e-5
     nowhere = case.theta * np.array([1, 1, 1, 0, 1])
-    lost = first_order_bias(which, nowhere, free_array, which.derivatives(nowhere))
+    none = which.derivatives(nowhere)
+    first_order_bias(which.kind, which.data, level, none, free_array, lost)
     assert np.isnan(lost).any() or not case.model.rho
+
+
+@pytest.mark.parametrize("free", FREE)
+def test_errors_are_those_of_the_observed_information(case: Case, free: tuple[bool, ...]) -> None:
+    theta, free_array, slope = case.theta * [1, 1, 1, 1, 0], np.array(free), 1.7
+    which = noise.asimov_conditional(case.model, GRID, theta, 1e4, 200, 200)
+    fisher = which.score_fisher(theta)[2]
+    derivatives = which.derivatives(theta)
+    known, sigma, covariance, bias = precision(
+        which, theta, fisher, free_array, derivatives, slope=slope
+    )
+    assert known
+    observed = which.observed_information(theta)[np.ix_(free_array, free_array)]
+    unit = np.array([1, 1, 1, slope])[free_array[:4]]
+    dense = np.linalg.inv(observed)[: unit.size, : unit.size] * np.outer(unit, unit)
+    errors = np.sqrt(dense.diagonal())
+    size = np.outer(errors, errors)
+    np.testing.assert_allclose(covariance / size, dense / size, atol=1e-8)
+    np.testing.assert_allclose(sigma[free_array[:4]], errors, rtol=1e-8)
+    assert np.isnan(sigma[~free_array[:4]]).all()
+    walls = np.arange(5) == 1
+    *_, without = precision(which, theta, fisher, free_array, derivatives, walls=walls)
+    assert without[1] == 0.0 != bias[1]
+    poor = replace(which, data=which.data * np.array([0.0, 1.0, 1.0, 1.0])[:, None, None])
+    nothing, *lost = precision(poor, theta, fisher, free_array, derivatives)
+    assert not nothing
+    assert all(np.isnan(one).all() for one in lost)
 
 
 # ---- the score test ------------------------------------------------------------------------------

@@ -16,11 +16,11 @@ import trackpy
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis._kernels.canvas import Light
+from iscat_analysis._kernels.curvature import first_order_bias
 from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.stamp import add_stamp
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.inference.bias import first_order_bias
 from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.newton import Response
@@ -205,7 +205,9 @@ def test_rows_are_fitted_by_the_one_likelihood(pool: ThreadPoolExecutor) -> None
         square = np.ix_(index, index)
         assert np.allclose((judged.observed[row] * scale)[square],
                            (observed[:4, :4] * scale)[square], atol=SECOND)  # fmt: skip
-        bias = first_order_bias(likelihood, theta, free, likelihood.derivatives(theta))
+        bias = np.empty(5)
+        rows_at = likelihood.derivatives(theta)
+        first_order_bias(likelihood.kind, likelihood.data, 1.0, rows_at, free, bias)
         assert np.allclose(judged.bias[row] / sigma, bias[:4] / sigma, atol=SECOND)
         residuals = likelihood.residuals(theta)
         assert judged.chi2[row] == pytest.approx(np.nansum(residuals**2), rel=1e-5)

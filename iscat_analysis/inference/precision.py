@@ -1,0 +1,75 @@
+"""What the likelihood says of the errors of a fit, its bias of order 1/N among them.
+
+A position that is fitted follows the noise to where it adds to the particle, so that the amplitude
+comes out too large, by about 1/SNR²: 1 % at 10, 11 % at 3.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.curvature import errors_and_bias
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+def precision(
+    likelihood: Likelihood,
+    theta: FloatArray,
+    fisher: FloatArray,
+    free: BoolArray,
+    derivatives: FloatArray,
+    *,
+    walls: BoolArray | None = None,
+    slope: float = 1.0,
+) -> tuple[bool, FloatArray, FloatArray, FloatArray]:
+    """Errors and bias of a maximum of the likelihood.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        The one that was maximised.
+    theta : ndarray, shape (5,)
+        Where it has its maximum.
+    fisher : ndarray, shape (5, 5)
+        Expected information there or nearby, which gives the observed one its scale.
+    free : ndarray of bool, shape (5,)
+        What was fitted.
+    derivatives : ndarray, shape (ny, ROWS, nx)
+        Of the signal at θ, from `Likelihood.derivatives`.
+    walls : ndarray of bool, shape (5,), optional
+        What of it lies on a wall and has no bias.
+    slope : float
+        Units of the amplitude's error for one of the amplitude.
+
+    Returns
+    -------
+    known : bool
+        Whether the observed information is positive; where it is not, all that follows is NaN.
+    sigma : ndarray, shape (4,)
+        Standard deviations of x, y, z and the amplitude; NaN where not free.
+    covariance : ndarray, shape (n, n)
+        Of the n free ones among these.
+    bias : ndarray, shape (5,)
+        Expected estimate minus truth, to order 1/N, in units of θ; 0 where not free, NaN where the
+        Fisher information is singular.
+
+    Notes
+    -----
+    For counts of an exponential family with natural parameter η(θ) and variance V(η), the bias is
+    −½ F⁻¹ Σ ∂η [V′ tr(F⁻¹ ∂η ∂ηᵀ) + V tr(F⁻¹ ∂²η)], the sum over pixels: D. R. Cox and E. J. Snell,
+    J. R. Stat. Soc. B 30, 248 (1968), in the form of M. J. Box, ibid. 33, 171 (1971).
+    """
+    n = int(np.count_nonzero(free[:4]))
+    sigma, covariance, bias = np.empty(4), np.empty((n, n)), np.empty(5)
+    moving = free if walls is None else free & ~walls
+    known = errors_and_bias(
+        likelihood.kind, likelihood.data, math.exp(theta[LEVEL]), derivatives, fisher, free, moving,
+        slope, sigma, covariance, bias,
+    )  # fmt: skip
+    return known, sigma, covariance, bias
