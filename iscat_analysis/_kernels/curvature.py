@@ -281,7 +281,7 @@ def errors_and_bias(
     """
     information, inverse = np.empty((5, 5)), np.empty((5, 5))
     observed_information(kind, data, level, rows, information)
-    known = invert(information, like, free, inverse)
+    known: bool = invert(information, like, free, inverse)
     n = 0
     for i in range(4):
         sigma[i] = np.nan

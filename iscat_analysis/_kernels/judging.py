@@ -156,7 +156,7 @@ def judge_frames(
         parameters, and O the observed information; NaN where the information is singular.
     bias : ndarray, shape (rows, 4)
         Filled with what the score is expected to be off by through curvature, −½ Σ V tr(F⁻¹∂²η) ∂η:
-        F⁻¹ times it is the bias of order 1/N (see `iscat_analysis.inference.bias`).
+        F⁻¹ times it is the bias of order 1/N (see `iscat_analysis.inference.precision`).
     numbers : ndarray, shape (rows, 6)
         Filled with the log-likelihood over that without the particle, χ², pixels, the largest
         residual in standard deviations, mean background of the square [e], and ∂ ln F/∂ ln a of the
