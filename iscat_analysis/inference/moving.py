@@ -161,7 +161,7 @@ class MovingField:
     def total_e(self) -> FloatArray:
         """Photoelectrons of all frames, shape (y, x) [e]."""
         counts = self.exposures.counts
-        total = self._sum_of(
+        total = self.sum_of(
             lambda first: np.sum(counts[first : first + _BLOCK], axis=0, dtype=np.float64)
         )
         return self.exposures.in_electrons(total, self.frames)
@@ -243,7 +243,7 @@ class MovingField:
             )  # fmt: skip
             return sums
 
-        stretch = ground.power.sum() + self._sum_of(block)
+        stretch = ground.power.sum() + self.sum_of(block)
         fitted = rows.fitted(theta, fisher, gain) if sweeps else rows
         self._canvas = Sheet(fitted, canvas, coarse)
         if sweeps:
@@ -417,8 +417,50 @@ class MovingField:
             )  # fmt: skip
             return np.zeros(1)
 
-        self._sum_of(block)
+        self.sum_of(block)
         return Judged.of(fisher, turned, ways, bias, numbers, slopes, free=self.free[:4])
+
+    def drawn(self, ground: Ground, rows: Rows) -> NDArray[np.float32]:
+        """Draw the whole squares of all rows anew.
+
+        Parameters
+        ----------
+        ground : Ground
+            Background.
+        rows : Rows
+            Particles.
+
+        Returns
+        -------
+        ndarray of float32, shape (t, y, x)
+            Signal of all rows of each frame, until the next fit.
+        """
+        self.draw_anew()
+        self.fit(ground, rows, sweeps=0)
+        return self._canvas_for(rows, coarse=False).total
+
+    def sum_of(
+        self, block: Callable[[int], NDArray[np.floating[Any]]], frames: int = _BLOCK
+    ) -> FloatArray:
+        """Run blocks of frames and add what they give, in their order.
+
+        Parameters
+        ----------
+        block : callable
+            Takes the first frame of a block.
+        frames : int
+            In a block.
+
+        Returns
+        -------
+        ndarray
+            The sum, in double precision.
+        """
+        parts = list(self._pool.map(block, range(0, self.frames, frames)))
+        total = parts[0].astype(np.float64)
+        for part in parts[1:]:
+            total += part
+        return total
 
     def share(self, task: Callable[[int], None], count: int) -> None:
         """Run a numbered task for every number below `count`, several at a time."""
@@ -510,14 +552,6 @@ class MovingField:
         level, read = (np.where(self.used, part, 0.0) for part in (ground.level, self.read_e2))
         shot = self.exposures
         return Light(shot.counts, shot.gain, shot.offset, ground.power, level, read)
-
-    def _sum_of(self, block: Callable[[int], NDArray[np.floating[Any]]]) -> FloatArray:
-        """Run blocks of frames and add what they give, in their order."""
-        parts = list(self._pool.map(block, range(0, self.frames, _BLOCK)))
-        total = parts[0].astype(np.float64)
-        for part in parts[1:]:
-            total += part
-        return total
 
     def _canvas_for(self, rows: Rows, *, coarse: bool) -> Canvas:
         """Give the canvas, with the frames marked in which it holds other rows than these."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from iscat_analysis.inference.climbing import AMPLIFIED, climb
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.medians import middle
@@ -114,6 +115,8 @@ def settle(
         last, length = length, float(np.linalg.norm(move / sigma))
         damping *= _STIFFER if length > last else _SOFTER if length < last / 2 else 1.0
         step = field.where_turns_end(move, damping)
+        if not coarse and np.linalg.norm(step / sigma) > AMPLIFIED * length:
+            return climb(field, ground, rows, follow_power=follow_power)
         before, change = change, float(np.abs(step / sigma)[field.used].max(initial=0.0))
         level = np.where(field.used, ground.level * np.exp(step), found.level)
         ground = Ground(level, power)

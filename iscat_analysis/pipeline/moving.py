@@ -30,6 +30,7 @@ from iscat_analysis.optics.blur import path_variance_nm2
 from iscat_analysis.pipeline.extension import extended
 from iscat_analysis.pipeline.heights import decide_heights
 from iscat_analysis.pipeline.identity import identified
+from iscat_analysis.pipeline.leaps import brought_back
 from iscat_analysis.pipeline.linking import (
     AS_FOUND,
     alone,
@@ -233,8 +234,8 @@ def follow(
         if scene.mode == "joint":
             rows = _in_their_fringes(scene, field, ground, rows)
         rows, ground, done = settle(
-            field, ground, rows, follow_power=follow_power, follow_level=follow_level,
-            turns=MOST_TURNS if stage else 1, coarse=not stage,
+            field, ground, brought_back(rows), follow_power=follow_power,
+            follow_level=follow_level, turns=MOST_TURNS if stage else 1, coarse=not stage,
         )  # fmt: skip
         progress("track", ROUNDS + 1 + stage, total)
         if stage == 0:

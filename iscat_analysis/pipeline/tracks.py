@@ -179,6 +179,7 @@ def track_setup(scene: Scene, windows: Windows) -> TrackSetup:
     config = scene.config
     rows, columns = windows.after_e.shape
     matter = material(config.particle, config.optics.wavelength_nm)
+    resolution_nm = config.optics.wavelength_nm / config.optics.na
     absorbs = abs(matter.permittivity.imag) > _ABSORBS or matter.permittivity.real <= 0
     return TrackSetup(
         frame_rate_hz=config.camera.frame_rate_hz,
@@ -193,6 +194,7 @@ def track_setup(scene: Scene, windows: Windows) -> TrackSetup:
         index=None if absorbs else float(np.sqrt(matter.permittivity.real)),
         density_kg_m3=matter.density_kg_m3,
         n_medium=config.optics.n_sample,
+        hidden_nm=resolution_nm if way_of(config) == "tracks" else 0.0,
     )
 
 

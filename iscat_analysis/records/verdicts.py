@@ -80,6 +80,7 @@ class TrackStatus(StrEnum):
     FEW_FRAMES = "few_frames"
     POOR_FITS = "poor_fits"
     MASS_VARIES = "mass_varies"
+    PARTLY_SEEN = "partly_seen"
     SHORT_WAY = "short_way"
     NOT_FREE = "not_free"
     STANDS_STILL = "stands_still"
@@ -100,6 +101,9 @@ _TRACK_ADVICE = {
     TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors, or those of "
     "all tracks do together: motion blurs the picture, particles met, the particle changed, or the "
     "focus drifts.",
+    TrackStatus.PARTLY_SEEN: "It is seen in some of the frames only, but moves too slowly to have "
+    "gone far in the others, in which the background learnt with it has it: its mass is too small; "
+    "record for longer, or give background frames without it.",
     TrackStatus.SHORT_WAY: "It went so short a way that it can hardly be told from the background "
     "learnt with it: mass and D are wrong together, D as the mass to the power of -2; record for "
     "longer, or give background frames without it.",

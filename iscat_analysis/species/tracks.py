@@ -66,6 +66,7 @@ _FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
 _DOUBT = 0.1
 _ENOUGH = 3  # of the first that are as surprising leave none
 _LITTLE_TOLD = 0.05  # of the information on a mass is left by the background
+_SEEN = 0.9  # of all frames, in which a particle that hardly moves is seen at least
 _VAGUE = 0.03  # of a mass, which the background makes too uncertain for the error to be trusted
 _FREE = ("p_confinement", "p_anomalous", "p_steady")
 _STEPS = 3.0  # standard deviations of a displacement within which it may end beyond the border
@@ -104,6 +105,9 @@ class TrackSetup:
         Refractive index of the liquid.
     change : float
         By how much, relative, the masses of all tracks change together; from `changes_together`.
+    hidden_nm : float
+        How far a particle must go not to be taken up by a background that was learnt with the
+        tracks; 0 where it was not [nm].
     """
 
     frame_rate_hz: float | None
@@ -119,6 +123,7 @@ class TrackSetup:
     density_kg_m3: float = 1350.0
     n_medium: float = 1.33
     change: float = 0.0
+    hidden_nm: float = 0.0
 
 
 Correlation = Callable[[FloatArray], FloatArray]
@@ -395,12 +400,22 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
         TrackStatus.POOR_FITS: record["n_mass_frames"] < record["n_frames"] / 2,
         TrackStatus.MASS_VARIES: record["p_mass"] < SURPRISING / 10
         or setup.change * abs(record["mass_kda"]) > record["sigma_mass_kda"],
+        TrackStatus.PARTLY_SEEN: _is_partly_seen(record, setup),
         TrackStatus.SHORT_WAY: record["short_way"],
         TrackStatus.NOT_FREE: min(record[name] for name in _FREE) <= SURPRISING,
         TrackStatus.STANDS_STILL: record["d_low_um2_s"] == 0,
         TrackStatus.NEAR_WALL: 9 / 32 * record["diameter_nm"] > SLOWED * record["z_nm"],
     }
     return [status for status in TrackStatus if seen.get(status, False)]
+
+
+def _is_partly_seen(record: Mapping[str, Any], setup: TrackSetup) -> bool:
+    """Whether a particle that stays where it is all the movie is seen in a part of it."""
+    frames = setup.frames[1] - setup.frames[0]
+    if setup.frame_rate_hz is None or record["n_frames"] > _SEEN * frames:
+        return False
+    way_nm = math.sqrt(2 * _UM2 * abs(record["d_um2_s"]) * frames / setup.frame_rate_hz)
+    return way_nm < setup.hidden_nm
 
 
 def _ends(rows: TrackRows, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:

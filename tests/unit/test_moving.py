@@ -21,6 +21,8 @@ from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.stamp import add_stamp
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.inference import settling
+from iscat_analysis.inference.climbing import climb, log_likelihood
 from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.newton import Response
@@ -113,6 +115,59 @@ def _square(theta: np.ndarray) -> tuple[slice, slice]:
         first = round(centre / PIXEL_NM - (ROI - 1) / 2)
         spans.append(slice(max(first, 0), min(first + ROI, size)))
     return spans[0], spans[1]
+
+
+def _multinomial(counts: np.ndarray, power: np.ndarray, rows: Rows) -> float:
+    """Log-likelihood of counts given their sums over the frames, from exact pictures."""
+    model = forward_model(_config(), 1e4)
+    grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
+    light = np.ones((FRAMES, *SHAPE))
+    for frame, (x, y, z, amplitude, _) in zip(rows.frame, rows.theta, strict=True):
+        light[frame] += model.amplitude_image(grid, x, y, z, amplitude)
+    share = power[:, None, None] * light
+    return float(np.sum(counts * np.log(share / share.sum(axis=0))))
+
+
+def _stretched(rows: Rows, by: float) -> Rows:
+    """Places farther from the middle of each track, and masses smaller, so that products stay."""
+    theta = rows.theta.copy()
+    for k in range(len(MASSES)):
+        mine = rows.track == k
+        middle = theta[mine, :2].mean(axis=0)
+        theta[mine, :2] = middle + by * (theta[mine, :2] - middle)
+        theta[mine, 3] /= by
+    return replace(rows, theta=theta)
+
+
+def test_log_likelihood_is_the_multinomial(pool: ThreadPoolExecutor) -> None:
+    counts, ground, truth = _movie(_paths(20.0), noise=True)
+    field = _field(counts, pool)
+    rows = [_stretched(truth, by) for by in (1.0, 1.02, 1.2)]
+    got = [log_likelihood(field, ground, some) for some in rows]
+    exact = [_multinomial(field.exposures.counts, ground.power, some) for some in rows]
+    assert np.ptp(exact) > 100
+    np.testing.assert_allclose(np.diff(got), np.diff(exact), rtol=2e-3, atol=0.5)
+
+
+def test_particles_that_hardly_move_end_at_the_maximum(
+    pool: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From wherever; the control is Newton's step without a look at the likelihood."""
+    counts, ground, truth = _movie(_paths(4.0), noise=True)
+    field = _field(counts, pool)
+
+    def height(by: float) -> float:
+        rows, found, _ = settle(field, ground, _stretched(truth, by), follow_power=True)
+        return log_likelihood(field, found, rows)
+
+    starts = (0.7, 1.0, 1.4)
+    ends = [height(by) for by in starts]
+    assert np.ptp(ends) < 2
+    assert min(ends) > log_likelihood(field, ground, truth)
+    rows, found, _ = climb(field, ground, truth, follow_power=True)
+    assert abs(log_likelihood(field, found, rows) - ends[1]) < 2
+    monkeypatch.setattr(settling, "AMPLIFIED", np.inf)
+    assert min(height(by) for by in starts) < min(ends) - 5
 
 
 @pytest.mark.parametrize(

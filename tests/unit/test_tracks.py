@@ -224,6 +224,20 @@ def test_what_does_not_move_is_flagged_and_has_no_size() -> None:
     assert np.isnan(found["diameter_nm"])
 
 
+def test_a_slow_particle_that_is_lost_is_flagged_where_the_background_may_have_it() -> None:
+    rng = np.random.default_rng(9)
+    slow, fast = walk(rng, 60, 0.01), walk(rng, 60, 0.8)
+
+    def statuses(**changes: float) -> list[str]:
+        both = describe_tracks(fits_of([slow, fast], rng, first=(100,)), setup(**changes))
+        return both["status"].tolist()
+
+    assert statuses(hidden_nm=370.0) == [TrackStatus.PARTLY_SEEN, TrackStatus.OK]
+    assert statuses() == [TrackStatus.OK] * 2
+    whole = describe_tracks(fits_of([walk(rng, 200, 0.01)], rng), setup(hidden_nm=370.0))
+    assert whole["status"].tolist() == [TrackStatus.OK]
+
+
 def test_a_track_of_few_frames_has_a_mass_and_no_d() -> None:
     rng = np.random.default_rng(8)
     found = describe_tracks(fits_of([walk(rng, 6, 0.3)], rng), SETUP).iloc[0]
