@@ -13,7 +13,7 @@ from iscat_analysis._kernels.vectors import LANES
 
 FloatArray = NDArray[np.float64]
 
-_STRIP = 256  # distances looked at together, as many as the first cache holds
+_NEAR = 0.9  # of the largest signal at the nodes, where the largest between them may be
 
 
 @njit(inline="always")
@@ -66,30 +66,47 @@ def largest_signal(
     """Parts of the signal of largest magnitude that are linear and quadratic in the amplitude.
 
     The largest on a radial grid of `per_step` points in each interval of the profile, then that of
-    a parabola through its neighbours.
+    a parabola through its neighbours.  An interval is looked at closely if it begins or ends near
+    the largest of all beginnings: within one the signal rises by a twentieth at most.
     """
-    count, ways = per_step * profile.shape[0], 1 if circular else 3 if analyzer else 2
-    sums, f = np.empty((ways, padded(count))), np.empty((DISTANCE + 1, _STRIP))
-    for first in range(0, sums.shape[1], _STRIP):
-        last = min(first + _STRIP, sums.shape[1])
-        for j in range(_STRIP):
-            f[DISTANCE, j] = min(first + j, count - 1) / per_step
+    intervals, ways = profile.shape[0], 1 if circular else 3 if analyzer else 2
+    rough, f = np.empty((ways, padded(intervals))), np.empty((DISTANCE + 1, padded(intervals)))
+    for j in range(f.shape[1]):
+        f[DISTANCE, j] = min(j, intervals - 1)
+    evaluate(profile, f)
+    top = 0.0
+    for way in range(ways):
+        _add_up(f, inv_step, amplitude, rho, circular, analyzer, way, rough[way])
+        for k in range(intervals):
+            top = max(top, abs(rough[way, k]))
+    fine, f = np.empty(padded(per_step)), np.empty((DISTANCE + 1, padded(per_step)))
+    at = best = 0
+    least, top = _NEAR * top, -1.0
+    for k in range(intervals):
+        near = False
+        for way in range(ways):
+            near |= max(abs(rough[way, k]), abs(rough[way, min(k + 1, intervals - 1)])) >= least
+        if not near:
+            continue
+        for i in range(f.shape[1]):
+            f[DISTANCE, i] = k + min(i, per_step - 1) / per_step
         evaluate(profile, f)
         for way in range(ways):
-            _add_up(f, inv_step, amplitude, rho, circular, analyzer, way, sums[way, first:last])
-    at = best = 0
-    top = -1.0
-    for way in range(ways):
-        for j in range(count):
-            if abs(sums[way, j]) > top:
-                top, at, best = abs(sums[way, j]), way, j
-    place = best / per_step
+            _add_up(f, inv_step, amplitude, rho, circular, analyzer, way, fine)
+            for i in range(per_step):
+                if abs(fine[i]) > top:
+                    top, at, best = abs(fine[i]), way, k * per_step + i
+    count, place = per_step * intervals, best / per_step
+    f, beside = np.empty((DISTANCE + 1, LANES)), np.empty(LANES)
     if 0 < best < count - 1:
-        low, mid, high = sums[at, best - 1], sums[at, best], sums[at, best + 1]
+        for i in range(LANES):
+            f[DISTANCE, i] = (best + min(i, 2) - 1) / per_step
+        evaluate(profile, f)
+        _add_up(f, inv_step, amplitude, rho, circular, analyzer, at, beside)
+        low, mid, high = beside[0], beside[1], beside[2]
         bend = low - 2 * mid + high
         if bend != 0.0:
             place += 0.5 * (low - high) / bend / per_step
-    f = np.empty((DISTANCE + 1, LANES))
     f[DISTANCE] = place
     evaluate(profile, f)
     square = (place / inv_step) ** 2

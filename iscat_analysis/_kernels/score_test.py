@@ -2,9 +2,9 @@
 
 A mode is a product H_i(x) H_j(y).  The information between two of them is therefore a sum over rows
 of pixels of H_j H_l Σ_x ω H_i H_k, ω the information of a pixel on the logarithm of its light: a
-few multiply-adds per pixel, whatever the number of modes.  With G the information of the fitted
-directions and the modes, G = L Lᵀ in this order and b the residual along them, the squares of L⁻¹b
-that belong to the modes add up to a χ².
+few multiply-adds per pixel and pair of functions of y, and sums over x in the end.  With G the
+information of the fitted directions and the modes, G = L Lᵀ in this order and b the residual along
+them, the squares of L⁻¹b that belong to the modes add up to a χ².
 
 `rows` are those of `iscat_analysis._kernels.image` or `iscat_analysis._kernels.hessian`: s and its
 derivatives in (x, y, z, a), each row of pixels; `terms` are those that
@@ -62,13 +62,13 @@ def _moments(lines: FloatArray, functions: FloatArray, out: FloatArray) -> None:
 
 
 @kernel(fastmath=FAST)
-def _add_outer(moments: FloatArray, line: FloatArray, out: FloatArray) -> None:
-    """Add the moments (m, n) times a line (k) to `out` (m, n, k)."""
-    for i in range(moments.shape[0]):
-        for k in range(moments.shape[1]):
-            t = moments[i, k]
-            for j in range(line.size):
-                out[i, k, j] += t * line[j]
+def _add_outer(factors: FloatArray, lines: FloatArray, out: FloatArray) -> None:
+    """Add factors (n) times lines (m, size) to `out` (m, n, size)."""
+    for i in range(lines.shape[0]):
+        for k in range(factors.size):
+            t = factors[k]
+            for j in range(lines.shape[1]):
+                out[i, k, j] += t * lines[i, j]
 
 
 @kernel()
@@ -147,37 +147,36 @@ def _mode_information(
     index = np.flatnonzero(free)
     fitted, count, nx = index.size, along.shape[0], along.shape[1]
     products, lines = _products(along), np.ascontiguousarray(_products(across).T)
-    turned = np.ascontiguousarray(across.T)
+    turned, pairs = np.ascontiguousarray(across.T), products.shape[0]
     directions, heavy = np.empty((fitted, nx)), np.empty((fitted + 1, nx))
-    moments = np.empty((1, products.shape[0]))
-    tensor = np.zeros((1, products.shape[0], products.shape[0]))
-    cross_moments = np.empty((fitted + 1, count))
-    cross = np.zeros((fitted + 1, count, count))
+    summed, crossed = np.zeros((1, pairs, nx)), np.zeros((fitted + 1, count, nx))
+    tensor, cross = np.empty((pairs, pairs)), np.empty((fitted + 1, count, count))
     matrix[:] = 0.0
     vector[:] = 0.0
     for row in range(rows.shape[0]):
         _directions(rows, row, index, terms[row, 2], directions)
         _add_fitted(directions, fitted, terms[row, 0], terms[row, 1], heavy, matrix, vector)
-        _moments(terms[row, :1], products, moments)
-        _add_outer(moments, lines[row], tensor)
-        _moments(heavy, along, cross_moments)
-        _add_outer(cross_moments, turned[row], cross)
+        _add_outer(lines[row], terms[row, :1], summed)
+        _add_outer(turned[row], heavy, crossed)
+    _moments(summed[0], products, tensor)
+    for f in range(fitted + 1):
+        _moments(crossed[f], along, cross[f])
     m = fitted
     for i in range(count):
         for j in range(count - i):
-            vector[m] = cross[fitted, i, j]
+            vector[m] = cross[fitted, j, i]
             for f in range(fitted):
-                matrix[m, f] = cross[f, i, j]
+                matrix[m, f] = cross[f, j, i]
             n = fitted
             for k in range(i + 1):
                 for other in range(count - k):
                     if n <= m:
-                        matrix[m, n] = tensor[0, _pair(i, k), _pair(j, other)]
+                        matrix[m, n] = tensor[_pair(j, other), _pair(i, k)]
                     n += 1
             m += 1
 
 
-@kernel()
+@kernel(fastmath=FAST)
 def _score_statistic(
     matrix: FloatArray, vector: FloatArray, fitted: int, dependent: float, used: BoolArray
 ) -> tuple[float, int]:
@@ -206,25 +205,20 @@ def _score_statistic(
     chi2, freedom = 0.0, 0
     used[:] = False
     for k in range(vector.size):
-        size = matrix[k, k]
+        size = left = matrix[k, k]
         for j in range(k):
-            if used[j]:
-                total = matrix[k, j]
-                for i in range(j):
-                    if used[i]:
-                        total -= matrix[k, i] * matrix[j, i]
-                matrix[k, j] = total / matrix[j, j]
-        left = size
-        for j in range(k):
-            if used[j]:
-                left -= matrix[k, j] ** 2
+            total = 0.0
+            for i in range(j):
+                total += matrix[k, i] * matrix[j, i]
+            # nothing along what is left out
+            matrix[k, j] = (matrix[k, j] - total) / matrix[j, j] if used[j] else 0.0
+            left -= matrix[k, j] ** 2
         if not (size > 0.0 and left > dependent * size):
             continue
         used[k] = True
         matrix[k, k] = np.sqrt(left)
         for j in range(k):
-            if used[j]:
-                vector[k] -= matrix[k, j] * vector[j]
+            vector[k] -= matrix[k, j] * (vector[j] if used[j] else 0.0)
         vector[k] /= matrix[k, k]
         if k >= fitted:
             chi2 += vector[k] ** 2
