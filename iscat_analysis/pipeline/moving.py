@@ -66,6 +66,7 @@ _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
 _FEW = 0.01  # of all rows: a search that adds no more is the last, and an extension
 _FEW_TRIED = 5e-3  # the same, of one with places that are only tried, which the next one judges
+_SEVERAL = 1.5  # rows in a frame, from which some will be linked by trackpy
 _FLOOD = 0.15  # rows in an area of (λ/NA)², beyond which they are no particles
 _FULL = 2  # searches of all frames, after which some of them tell whether to go on
 _FIRST_HEIGHTS = 1  # searches after which every row is put into its fringe
@@ -179,7 +180,7 @@ def follow(
         if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(scene, rows, found)
-        if len(np.unique(rows.frame)) < len(rows.frame):  # there may be a choice
+        if len(rows.frame) > _SEVERAL * len(np.unique(rows.frame)):  # there will be a choice
             beside(load_linker)
         rows, ground, done = settle(
             field,
