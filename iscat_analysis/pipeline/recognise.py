@@ -11,7 +11,7 @@ from scipy.special import bdtrc
 from iscat_analysis.config import Config
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.records import FrameSource
-from iscat_analysis.search.changes import Changes, find_changes, spot_of
+from iscat_analysis.search.changes import NO_CHANGES, Changes, find_changes, spot_of
 
 MOST_FRAMES = 2000
 """Of a movie that are looked at, from its first."""
@@ -19,9 +19,15 @@ MOST_FRAMES = 2000
 BLOCK = 20
 """Frames that are averaged: particles on a membrane, 0.15 µm²/s at 331 Hz, go 190 nm in them."""
 
-MOST_STAYING, MOST_UNDONE = 0.5, 0.05
-"""Shares of changes that may stay where particles move (some do stay for 40 frames), and that may
-be undone where they land (one lands where another just left)."""
+MOST_STAYING, MOST_MOVING = 0.1, 0.05
+"""Shares of changes that may stay with one picture where particles move (0.07 for 0.001 µm²/s, 0.03
+and less from 0.005 µm²/s on), and around which there may be three pictures where they land (0.002,
+more where they crowd)."""
+
+LEAST_MOVING = 0.4
+"""Share around which there are three pictures where particles move: 0.6 for 0.02 µm²/s, 0.9 and
+more from 0.1 to 1 µm²/s.  Where landings crowd, one and a leaving to 70 pixels in 400 frames, it
+is 0.14, and 0.36 at most."""
 
 DOUBT = 0.03
 """A movie is said to be of the other kind where so many changes have a smaller chance than this."""
@@ -58,7 +64,7 @@ def look_at_changes(
         if light.mean() > 0:
             images.append((light / light.mean()).astype(np.float32))
     if not images:
-        return Changes(0, float("nan"), float("nan"))
+        return NO_CHANGES
     level = np.mean(images, axis=0, dtype=np.float64)
     usable = (level > 0.1 * np.median(level)) & ~saturated
     for image in images:
@@ -107,12 +113,13 @@ def as_moving(changes: Changes, name: str) -> str:
     str
         One line; empty where it does not.
     """
-    if _chance(changes.number, changes.undone, MOST_UNDONE) > DOUBT:
+    clear = _chance(changes.number, changes.moving, MOST_MOVING) <= DOUBT
+    if not (clear and changes.moving >= LEAST_MOVING):
         return ""
     return (
-        f"{name}: its particles move rather than land: of {changes.number} clear changes from "
-        f"{BLOCK} frames to the next {100 * changes.undone:.0f} % are undone at once, as by one "
-        'that comes and goes on; use fit.mode = "track", which follows them'
+        f"{name}: its particles move rather than land: around {100 * changes.moving:.0f} % of "
+        f"{changes.number} clear changes the picture is another one every {BLOCK} frames, as of "
+        'what goes from place to place; use fit.mode = "track", which follows them'
     )
 
 
@@ -134,4 +141,4 @@ def changes_summary(changes: Changes) -> dict[str, Any]:
     dict
         Plain values.
     """
-    return {"number": changes.number, "staying": changes.staying, "undone": changes.undone}
+    return {"number": changes.number, "staying": changes.staying, "moving": changes.moving}

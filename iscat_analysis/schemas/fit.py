@@ -255,9 +255,9 @@ class Repeats(Closed):
 class Changes(Closed):
     """What becomes of clear changes between averages of 20 frames, in the first 2000 at most."""
 
-    number: Count = key("Changes above 12 standard deviations")
-    staying: Share = key("Share that stay: particles that land or leave")
-    undone: Share = key("Share that are undone at once: particles that move")
+    number: Count = key("Changes above 12 standard deviations, away from each other")
+    staying: Share = key("Share that stay, with one picture: particles that land or leave")
+    moving: Share = key("Share around which there are three pictures or more: particles that move")
 
 
 class Blocks(Closed):

@@ -3,9 +3,14 @@
 Averages A_j of successive blocks of frames change where something happens.  A change is seen as
 S_j = A_{j+1} − A_{j−1}, with the block in which it happens between.  Where a particle lands or
 leaves, the blocks before agree with each other, and so do those after: A_{j+2} − A_{j+1} and
-A_{j−1} − A_{j−2} are noise.  Where one came that moves, it is gone again after, or came just
-before, and one of these differences undoes the change: it is near −S_j.  A pattern that drifts
-steadily changes by S_j/2 each time, which is neither.
+A_{j−1} − A_{j−2} are noise.  Where one moves they seldom are.
+
+A particle that stays where it is, even one that lands for a moment or blinks, has one picture:
+around it five blocks, less their mean, are multiples of that picture, whatever it does in time.
+One that moves has another picture in every block.  How many pictures there are is the number of
+singular values of the matrix of blocks × pixels that exceed those of noise.  A second picture may
+be another particle that lands or leaves beside the first, or a pattern that drifts steadily; a
+third needs two such coincidences, or motion.
 """
 
 from __future__ import annotations
@@ -25,15 +30,18 @@ CLEAR = 12.0
 """Standard deviations of noise that a change must exceed: the ratios below then have errors of a
 tenth."""
 
-STAYS, UNDONE = 0.15, -0.5
-"""Bounds of what the neighbouring differences come to, as parts of a change: beyond the first, and
-beyond noise, it does not stay, for rings of others make less; below the second it is undone."""
+STAYS = 0.15
+"""What the neighbouring differences may come to, as a part of a change that stays, or noise: rings
+of others make less."""
 
+_PICTURE = 0.1  # singular value of a picture over the norm of the change
+_ABOVE = 1.5  # the same over noise's; of noise the second is 1.2, the third 0.9, 1.3 in a fiftieth
 _SHARED = 0.5  # of the picture's share beside its centre, which the pixels there have at least
 _QUIET = 4.0  # standard deviations of noise
 _SPOT = 0.21  # standard deviation of a spot, in wavelengths over NA
 _NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
-_BESIDE = 1, 2, 2  # blocks and pixels on either side within which a change is the largest
+_NEAR = 4.5  # standard deviations of a spot, within which a picture is looked at
+_AROUND = 2  # blocks on either side that are looked at
 _LEAST_BLOCKS = 5
 
 
@@ -44,16 +52,21 @@ class Changes:
     Attributes
     ----------
     number : int
-        How many there are.
+        How many there are, no two in each other's surroundings.
     staying : float
-        Share after which everything stays as it is, as before; NaN where there is none.
-    undone : float
-        Share that is undone at once, or undoes another.
+        Share after which everything stays as it is, as before, with one picture; NaN where there is
+        none.
+    moving : float
+        Share around which there are three pictures or more.
     """
 
     number: int
     staying: float
-    undone: float
+    moving: float
+
+
+NO_CHANGES = Changes(0, float("nan"), float("nan"))
+"""Of a movie that shows none, or is too short."""
 
 
 def find_changes(blocks: Sequence[NDArray[np.floating]], spot_px: float) -> Changes:
@@ -72,7 +85,7 @@ def find_changes(blocks: Sequence[NDArray[np.floating]], spot_px: float) -> Chan
         None in fewer than 5 blocks.
     """
     if len(blocks) < _LEAST_BLOCKS:
-        return Changes(0, float("nan"), float("nan"))
+        return NO_CHANGES
     smooth = np.empty((len(blocks), *blocks[0].shape), dtype=np.float32)
     for image, out in zip(blocks, smooth, strict=True):
         contrast = image - 1  # whose noise single precision holds
@@ -82,15 +95,34 @@ def find_changes(blocks: Sequence[NDArray[np.floating]], spot_px: float) -> Chan
     noise = _NORMAL * _median_deviation(lag)
     change = smooth[3:-1] - smooth[1:-3]
     size = np.abs(change)
-    peaks = maxima(size, max(CLEAR * noise, 0.0), _BESIDE)
-    found = tuple(peaks[_of_spots(blocks, peaks, spot_px)].T)
-    if not found[0].size:
-        return Changes(0, float("nan"), float("nan"))
+    apart = round(2 * _NEAR * spot_px)
+    peaks = maxima(size, max(CLEAR * noise, 0.0), (_AROUND, apart, apart))
+    peaks = peaks[_of_spots(blocks, peaks, spot_px)]
+    if not len(peaks):
+        return NO_CHANGES
+    found = tuple(peaks.T)
     before, after = (part[found] / change[found] for part in (lag[: len(change)], lag[3:]))
     quiet = np.maximum(_QUIET * noise / size[found], STAYS)
-    staying = np.maximum(np.abs(before), np.abs(after)) < quiet
-    undone = np.minimum(before, after) < UNDONE
-    return Changes(found[0].size, float(staying.mean()), float(undone.mean()))
+    pictures = _pictures(smooth, peaks, _NEAR * spot_px, noise)
+    staying = (np.maximum(np.abs(before), np.abs(after)) < quiet) & (pictures == 1)
+    return Changes(len(peaks), float(staying.mean()), float((pictures > 2).mean()))
+
+
+def _pictures(
+    smooth: NDArray[np.float32], peaks: NDArray[np.int64], reach_px: float, noise: float
+) -> NDArray[np.int64]:
+    """Count the pictures around each change; `noise` is that of the difference of two blocks."""
+    row, column = np.ogrid[: smooth.shape[1], : smooth.shape[2]]
+    count = np.empty(len(peaks), dtype=np.int64)
+    for number, (t, y, x) in enumerate(peaks.tolist()):
+        part = tuple(slice(max(c - int(reach_px), 0), c + int(reach_px) + 1) for c in (y, x))
+        near = (row[part[0]] - y) ** 2 + (column[:, part[1]] - x) ** 2 <= reach_px**2
+        seen = smooth[(slice(t, t + _LEAST_BLOCKS), *part)][:, near].astype(np.float64)
+        strength = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
+        change = np.linalg.norm(seen[_AROUND + 1] - seen[_AROUND - 1])
+        least = max(_PICTURE * change, _ABOVE * noise * math.sqrt(seen.shape[1] / 2))
+        count[number] = max(int((strength > least).sum()), 1)
+    return count
 
 
 def _of_spots(
