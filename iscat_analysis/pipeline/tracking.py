@@ -23,9 +23,10 @@ from iscat_analysis.pieces.regions import lines_from, numbered
 from iscat_analysis.pipeline.blank import FrameNoise
 from iscat_analysis.pipeline.block_store import Block, BlockStore, analyse_block
 from iscat_analysis.pipeline.blocks import Plan, plan_blocks
-from iscat_analysis.pipeline.diagnosis import pixel_warnings, shaking_warning
+from iscat_analysis.pipeline.diagnosis import pixel_warnings, plane_warning, shaking_warning
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.field import fit_field
+from iscat_analysis.pipeline.held_height import held_height_warning
 from iscat_analysis.pipeline.joining import join_blocks
 from iscat_analysis.pipeline.kept_frames import keep_frames
 from iscat_analysis.pipeline.moving_field import track_scene
@@ -110,7 +111,13 @@ def find_moving(ready: Prepared, run: Run) -> Found:
             scene, movie, camera, plan, shelf(config, run.partial),
             check=check, pool=pool, progress=run.progress, first=begun.block,
         )  # fmt: skip
-    joined = join_blocks(config, blocks, camera)
+        joined = join_blocks(config, blocks, camera)
+        if not interrupted and not plane_warning(config, joined.fits):  # which says it already
+            held = held_height_warning(
+                ready.config, movie, camera, plan.spans[0], joined.fits, check=check, pool=pool
+            )
+            if held:
+                run.tell(held)
     windows = joined.followed.windows
     for text in () if shaken else blocks[0].noise:
         run.tell(text)

@@ -232,6 +232,15 @@ def test_a_track_of_few_frames_has_a_mass_and_no_d() -> None:
     assert abs(found["mass_kda"] - 400) < SIGMAS * found["sigma_mass_kda"]
 
 
+def test_fits_that_ended_at_no_mass_have_no_contrast_for_it() -> None:
+    """Their ratio is not known, and is left out without a warning."""
+    rng = np.random.default_rng(8)
+    fits = fits_of([walk(rng, 30, 0.3)], rng)
+    fits.loc[:3, ["mass_kda", "contrast"]] = 0.0
+    found = describe_tracks(fits, SETUP).iloc[0]
+    assert found["contrast"] == pytest.approx(-3.1e-5 * found["mass_kda"])
+
+
 def test_confined_motion_is_remarked_on_with_the_size_of_the_well() -> None:
     rng = np.random.default_rng(9)
     found = describe_tracks(fits_of([walk(rng, 200, 0.8, side_nm=500.0)], rng), SETUP).iloc[0]
