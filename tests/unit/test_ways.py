@@ -82,6 +82,7 @@ def test_every_way_gives_the_same_record(analyses: dict[Way, Analysis], way: Way
     assert f'method = "{way}"' in found.config_toml
     assert found.ratio_image.shape == (SIDE, SIDE)
     assert found.power.shape == found.power_frames.shape
+    assert np.all(np.diff(found.power_frames) > 0)  # a line through them never runs back
     for flags, status in zip(table["flags"], table["status"], strict=True):
         own = [Status(flag) for flag in flags.split(";") if flag]
         assert own == sorted(own, key=SEVERITY.index)
