@@ -31,7 +31,8 @@ class BackgroundConfig(Section):
     frames: FramesOrAll | None = Field(
         None,
         description='pre-binding frames [start, stop); absent in landing movies | "all": in mode '
-        "track, the median of all analysed frames, particles included",
+        "track, all analysed frames, particles included: their median, or with method fixed their "
+        "mean",
     )
     window_frames: Annotated[int, Field(ge=4)] | None = Field(
         None,
@@ -56,10 +57,10 @@ class BackgroundConfig(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> BackgroundConfig:
-        if self.frames == ALL and self.method not in (None, "median"):
+        if self.frames == ALL and self.method not in (None, "median", "fixed"):
             raise ValueError(
-                f'frames = "all" is for method = "median", and method is "{self.method}": give the '
-                "frames before the particles, as in frames = [0, 200], or leave frames out"
+                'frames = "all" is for method = "median" or "fixed", the median or the mean of all '
+                f'frames, and method is "{self.method}": set one of these, or leave frames out'
             )
         if self.method == "known" and self.level_e is None:
             raise ValueError('method = "known" needs level_e, the known background level')

@@ -250,7 +250,8 @@ def _choose_method_again(values: dict[str, Any], changes: Iterable[Change]) -> N
         if named["method"] in _WITHOUT_FRAMES and "frames" not in named:
             background.pop("frames", None)
     elif background.get("method") in _WITHOUT_FRAMES or (
-        background.get("method") == "fixed" and background.get("frames") in (None, ALL)
+        background.get("method") == "fixed"
+        and (background.get("frames") is None or named.get("frames") == ALL)
     ):
         del background["method"]
 

@@ -30,7 +30,7 @@ from iscat_analysis.pipeline.injection import injected
 from iscat_analysis.pipeline.landing import find_landings
 from iscat_analysis.pipeline.prepare import Prepared, prepare
 from iscat_analysis.pipeline.results import Found
-from iscat_analysis.pipeline.resume import is_resumable, partial_folder
+from iscat_analysis.pipeline.resume import is_resumable, partial_folder, parts_kept
 from iscat_analysis.pipeline.run import Notify, Run, unheard
 from iscat_analysis.pipeline.tracking import find_moving
 from iscat_analysis.pipeline.ways import Way, way_of
@@ -108,7 +108,8 @@ def fit_stack(
     ConfigError
         The configuration does not suit the movie.
     KeyboardInterrupt
-        The user stopped it; what was finished is in the folder.
+        The user stopped it; what was finished is in the folder, or kept beside it where the report
+        was not yet begun or not done, as the interrupt says.
     """
 
     def told(stage: str, done: int, total: int) -> None:
@@ -119,7 +120,9 @@ def fit_stack(
     stack = path_in("`stack`", stack)
     folder = beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
-    figures = FEW_FIGURES if way_of(config) == "sliding" else EVENT_FIGURES
+    way = way_of(config)
+    figures = FEW_FIGURES if way == "sliding" else EVENT_FIGURES
+    partial = partial_folder(folder.resolve())
     with claim_output(folder, overwrite):
         with ExitStack() as writing:
             buildings: list[Path] = []
@@ -140,17 +143,19 @@ def fit_stack(
                     progress=told,
                     notify=notify,
                     command=command,
-                    partial=partial_folder(folder.resolve()),
+                    partial=partial,
                     inject=inject,
                     place=place,
                     begin_report=begin_report,
                 )
-            fill_report(analysis, buildings[0], event_figures=figures, draughtsman=draughtsman)
+            with parts_kept(None if way == "fixed" else partial):
+                fill_report(analysis, buildings[0], event_figures=figures, draughtsman=draughtsman)
         if not analysis.summary["interrupted"]:
-            shutil.rmtree(partial_folder(folder.resolve()), ignore_errors=True)
+            shutil.rmtree(partial, ignore_errors=True)
     if analysis.summary["interrupted"]:
         progress("report", 1, 1)
-        notify(f"interrupted; what was finished is in {folder}")
+        goes_on = ", and the same command goes on from there" if is_resumable(folder) else ""
+        notify(f"interrupted; what was finished is in {folder}{goes_on}")
         raise KeyboardInterrupt
     return analysis
 
@@ -208,8 +213,9 @@ def analyse(
         run = Run(notify, progress, compilation, partial, place or Here(), inject, begin_report)
         ready = prepare(movie, config, run)  # load, calibrate
         found = FIND[ready.way](ready, run)  # background, detect, fit, posterior, bounds
-        extra, stopped = injected(ready, run, found)
-        stopped = stopped or found.interrupted
-        return gather(
-            ready, run, found, extra, command=command, started=started, interrupted=stopped
-        )
+        with parts_kept(None if ready.way == "fixed" else partial):
+            extra, stopped = injected(ready, run, found)
+            stopped = stopped or found.interrupted
+            return gather(
+                ready, run, found, extra, command=command, started=started, interrupted=stopped
+            )

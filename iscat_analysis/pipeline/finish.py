@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from iscat_analysis.config import config_to_toml
 from iscat_analysis.movie.stack import printable
@@ -19,7 +20,7 @@ from iscat_analysis.pipeline.diagnosis import (
     sign_warning,
 )
 from iscat_analysis.pipeline.prepare import Prepared
-from iscat_analysis.pipeline.results import Found
+from iscat_analysis.pipeline.results import Compared, Found
 from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.summary import species_of, summary_of
@@ -136,6 +137,7 @@ def gather(
         "interrupted": interrupted,
         "warnings": run.warnings,
     }
+    frames, first = _each_once(compared)
     analysis = Analysis(
         config_toml=config_to_toml(config),
         mode=scene.mode,
@@ -144,10 +146,8 @@ def gather(
         table=table,
         views=found.views,
         ratio_image=found.image,
-        power=compared.power,
-        power_frames=np.concatenate(
-            [np.arange(*compared.frames_before), np.arange(*compared.frames_after)]
-        ),
+        power=compared.power[first],
+        power_frames=frames,
         summary=summary,
         provenance=provenance,
         warnings=tuple(run.warnings),
@@ -156,3 +156,14 @@ def gather(
     )
     run.begin_report(analysis)
     return replace(analysis, summary=summary | species_of(scene, table))
+
+
+def _each_once(compared: Compared) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """Give the frames of both ranges in their order, and where the light of each stands.
+
+    Where particles move, both ranges are the whole movie, and each frame stands there twice.
+    """
+    ranges = compared.frames_before, compared.frames_after
+    both = np.concatenate([np.arange(*span, dtype=np.int64) for span in ranges])
+    frames, first = np.unique(both, return_index=True)
+    return frames, first

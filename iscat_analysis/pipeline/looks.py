@@ -16,7 +16,6 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
-from iscat_analysis.inference.settling import first_ground
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.background import measure_windows, start_power
 from iscat_analysis.movie.camera import Camera
@@ -26,6 +25,7 @@ from iscat_analysis.pipeline.field import search_field
 from iscat_analysis.pipeline.moving_field import (
     LEAST_FRAMES,
     load_field,
+    opening_ground,
     search_frames,
     track_scene,
 )
@@ -324,8 +324,7 @@ class MovingSearch:
                 field = load_field(
                     self._scene, self._movie, camera, span, self._check, pool, silent
                 )
-                power = config.background.power_normalization
-                return field, first_ground(field, follow_power=power)
+                return field, opening_ground(config, field)
 
         self._background = background
 

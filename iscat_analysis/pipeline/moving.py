@@ -24,7 +24,7 @@ from iscat_analysis.inference.common import (
 )
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Judged, Rows
-from iscat_analysis.inference.settling import MOST_TURNS, first_ground, settle
+from iscat_analysis.inference.settling import MOST_TURNS, settle
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.blur import path_variance_nm2
 from iscat_analysis.pipeline.extension import extended
@@ -47,7 +47,12 @@ from iscat_analysis.pipeline.linking import (
     typical,
     typical_error,
 )
-from iscat_analysis.pipeline.moving_field import exposure_of, load_field, search_frames
+from iscat_analysis.pipeline.moving_field import (
+    exposure_of,
+    load_field,
+    opening_ground,
+    search_frames,
+)
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
 from iscat_analysis.search.moving import Sightings, load_linker
@@ -165,8 +170,8 @@ def follow(
     config = scene.config
     field = load_field(scene, movie, camera, span, check, pool, progress)
     follow_power = config.background.power_normalization
-    follow_level = config.background.method != "median"
-    ground = first_ground(field, follow_power=follow_power)
+    follow_level = config.background.method == "tracks"
+    ground = opening_ground(config, field)
     nothing = np.zeros(0, dtype=np.int64)
     rows = Rows.of(nothing, nothing, np.zeros((0, 5)))
     total = ROUNDS + 3

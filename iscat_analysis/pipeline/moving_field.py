@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.inference.settling import first_ground
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.scene import Scene, make_scene
@@ -77,6 +79,27 @@ def track_scene(config: Config, field_px: tuple[int, int], frames: int) -> Scene
     """
     fit = config.fit.model_copy(update={"mode": config.track.free})
     return make_scene(config.model_copy(update={"fit": fit}), field_px, searches=frames)
+
+
+def opening_ground(config: Config, field: MovingField) -> Ground:
+    """Give the background before there are tracks; of all frames together, it remains so.
+
+    Parameters
+    ----------
+    config : Config
+        ``background.method``: a mean where that is ``"fixed"``, else a median.
+    field : MovingField
+        The movie.
+
+    Returns
+    -------
+    Ground
+        Level and power.
+    """
+    ground = first_ground(field, follow_power=config.background.power_normalization)
+    if config.background.method == "fixed":
+        ground = replace(ground, level=np.maximum(field.total_e / ground.power.sum(), 1e-3))
+    return ground
 
 
 def load_field(

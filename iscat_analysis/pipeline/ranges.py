@@ -44,6 +44,7 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
         raise ConfigError(
             "which frames come before the particles? give them as "
             'background.frames = [0, 200], or a known level with background.method = "known"'
+            f"{_without_frames_before(config)}"
         )
     start = before[1] if before else 0
     after = fitted_frames(movie, config, before)
@@ -51,8 +52,22 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
         raise DataError(
             f"{movie.name}: has {count(movie.shape[0], 'frame')} and the background takes "
             f"{start} of them, so none is left to fit; change background.frames"
+            f"{_without_frames_before(config)}"
         )
     return before, after
+
+
+def _without_frames_before(config: Config) -> str:
+    """Name the backgrounds that need no frames before the particles, in the mode of a movie."""
+    if config.optics.scheme == "darkfield":
+        return ""
+    if config.fit.mode == "track":
+        return (
+            '; without such frames background.method = "tracks" learns the background with the '
+            'tracks, and background.frames = "all" takes the median of all frames, or with '
+            'background.method = "fixed" their mean'
+        )
+    return '; without such frames background.method = "sliding" takes those before each landing'
 
 
 def fitted_frames(

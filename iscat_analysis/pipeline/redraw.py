@@ -21,7 +21,6 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
-from iscat_analysis.inference.settling import first_ground
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.background import refine_power
 from iscat_analysis.movie.camera import Camera, camera_from_config
@@ -32,7 +31,12 @@ from iscat_analysis.pipeline.events import Fitted, PlaceAndMass
 from iscat_analysis.pipeline.field import add_signal
 from iscat_analysis.pipeline.light import judge_light
 from iscat_analysis.pipeline.moving import blurred_rows
-from iscat_analysis.pipeline.moving_field import exposure_of, load_field, track_scene
+from iscat_analysis.pipeline.moving_field import (
+    exposure_of,
+    load_field,
+    opening_ground,
+    track_scene,
+)
 from iscat_analysis.pipeline.neighbours import Neighbours, Step
 from iscat_analysis.pipeline.pattern import corrected
 from iscat_analysis.pipeline.ranges import (
@@ -251,10 +255,10 @@ def _moving(
             field = load_field(scene, movie, camera, (start, stop), check, pool, silent)
             field.set_blurs(variances)
             follows = config.background.power_normalization
-            ground = first_ground(field, follow_power=follows)
+            ground = opening_ground(config, field)
             for _ in range(_TURNS):
                 found = field.fit(ground, rows, sweeps=0)[1]
-                level = ground.level if config.background.method == "median" else found.level
+                level = found.level if config.background.method == "tracks" else ground.level
                 ground = Ground(level, found.power if follows else ground.power)
         return field, ground, rows, inside[order]
 

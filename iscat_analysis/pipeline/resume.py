@@ -7,6 +7,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,9 @@ from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.pipeline.merging import Done
 from iscat_analysis.records import Clip, EventView, FloatArray, Trace
 from iscat_analysis.search.empty import EmptySpread
+
+GOES_ON = "what was finished is kept, and the same command goes on from there"
+"""What an interrupt says where it is so."""
 
 _NO_TRACE = (0.0,) * 9
 _NO_CLIP = (0,) * 4
@@ -43,6 +47,11 @@ class Shelf:
         Frames analysed.
     camera : Camera
         Part of the key: a map may have changed under its name.
+
+    Attributes
+    ----------
+    kept : int
+        Parts that this object found there or put there.
     """
 
     def __init__(
@@ -55,6 +64,7 @@ class Shelf:
         camera: Camera,
     ) -> None:
         self._folder = folder if identity else None
+        self.kept = 0
         settings = config.model_copy(
             update={"compute": config.compute.model_copy(update={"workers": 1})}
         )
@@ -84,9 +94,11 @@ class Shelf:
         table_path, path = self._paths(number)
         try:
             with np.load(path, allow_pickle=False) as data:
-                return pd.read_parquet(table_path), dict(data)
+                found = pd.read_parquet(table_path), dict(data)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
             return None
+        self.kept += 1
+        return found
 
     def write(self, number: int, table: pd.DataFrame, arrays: Mapping[str, Any]) -> None:
         """Keep a finished part; a full disk costs the resumption, not the run.
@@ -108,6 +120,7 @@ class Shelf:
             table.to_parquet(table_path, index=False)
             with whole_file(path) as partial, partial.open("wb") as file:
                 np.savez(file, **arrays)
+            self.kept += 1
         except OSError:
             self._folder = None
 
@@ -285,6 +298,51 @@ def partial_folder(folder: Path) -> Path:
         It need not exist.
     """
     return folder.with_name(f".{folder.name}.partial")
+
+
+def saying(stop: KeyboardInterrupt, what: str) -> KeyboardInterrupt:
+    """Add to what an interrupt says.
+
+    Parameters
+    ----------
+    stop : KeyboardInterrupt
+        It may say by which signal it came.
+    what : str
+        What became of what was done.
+
+    Returns
+    -------
+    KeyboardInterrupt
+        To be raised in its place.
+    """
+    return KeyboardInterrupt("; ".join(filter(None, [str(stop), what])))
+
+
+@contextmanager
+def parts_kept(folder: Path | None) -> Iterator[None]:
+    """Say in an interrupt that finished parts are kept, when all of them are.
+
+    Parameters
+    ----------
+    folder : Path or None
+        Where they are; None, or a folder without any, says nothing.
+
+    Yields
+    ------
+    None
+        The block gathers or draws what was found in them.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        The block was interrupted.
+    """
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        if folder is None or not any(folder.glob("*.npz")):
+            raise
+        raise saying(stop, GOES_ON) from None
 
 
 def is_resumable(folder: Path) -> bool:

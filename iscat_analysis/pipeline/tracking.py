@@ -7,8 +7,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,9 +24,10 @@ from iscat_analysis.pieces.regions import lines_from, numbered
 from iscat_analysis.pipeline.blank import FrameNoise
 from iscat_analysis.pipeline.block_store import Block, BlockStore, analyse_block
 from iscat_analysis.pipeline.blocks import Plan, plan_blocks
-from iscat_analysis.pipeline.diagnosis import pixel_warnings, shaking_warning
+from iscat_analysis.pipeline.diagnosis import pixel_warnings, plane_warning, shaking_warning
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.field import fit_field
+from iscat_analysis.pipeline.held_height import held_height_warning
 from iscat_analysis.pipeline.joining import join_blocks
 from iscat_analysis.pipeline.kept_frames import keep_frames
 from iscat_analysis.pipeline.moving_field import track_scene
@@ -33,6 +35,7 @@ from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.ranges import checked, fitted_frames
 from iscat_analysis.pipeline.regions import contrast_image
 from iscat_analysis.pipeline.results import Compared, Followed, Found, lines_of, view_of
+from iscat_analysis.pipeline.resume import GOES_ON, saying
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.pipeline.tracked_optics import Begun, learn_from_tracks
@@ -90,11 +93,13 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         run.tell(f"{movie.name}: {shaken}")
     run.clock.lap("background")
     identity = ready.steady.identity if run.partial else ""
+    shelves: list[BlockStore] = []
 
     def shelf(config: Config, folder: Path | None) -> BlockStore:
-        return BlockStore(folder, config, identity, ready.shape, (first, last), camera)
+        shelves.append(BlockStore(folder, config, identity, ready.shape, (first, last), camera))
+        return shelves[-1]
 
-    with threads(config.compute.workers) as pool:
+    with _saying_what_is_kept(shelves, plan), threads(config.compute.workers) as pool:
 
         def begin(config: Config, *, cautious: bool = False) -> Begun:
             scene = track_scene(config, ready.shape, max(last - first, 1))
@@ -110,7 +115,13 @@ def find_moving(ready: Prepared, run: Run) -> Found:
             scene, movie, camera, plan, shelf(config, run.partial),
             check=check, pool=pool, progress=run.progress, first=begun.block,
         )  # fmt: skip
-    joined = join_blocks(config, blocks, camera)
+        joined = join_blocks(config, blocks, camera)
+        if not interrupted and not plane_warning(config, joined.fits):  # which says it already
+            held = held_height_warning(
+                ready.config, movie, camera, plan.spans[0], joined.fits, check=check, pool=pool
+            )
+            if held:
+                run.tell(held)
     windows = joined.followed.windows
     for text in () if shaken else blocks[0].noise:
         run.tell(text)
@@ -132,6 +143,24 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         interrupted=interrupted,
     )
     return kept.put_back(found)
+
+
+@contextmanager
+def _saying_what_is_kept(shelves: Sequence[BlockStore], plan: Plan) -> Iterator[None]:
+    """Say in an interrupt whether a block was finished, from which the same command goes on."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        if any(shelf.kept for shelf in shelves):
+            raise saying(stop, GOES_ON) from None
+        parts = f"in {len(plan.spans)} of them, of which the first is not"
+        if len(plan.spans) == 1:
+            parts = f"in one of {plan.frames} frames, which is not"
+        nothing = (
+            "nothing is kept, and the same command begins anew: tracks are kept when a block of "
+            f"frames is done, and this movie is analysed {parts}"
+        )
+        raise saying(stop, nothing) from None
 
 
 def _nothing_found(scene: Scene, block: Block) -> str:

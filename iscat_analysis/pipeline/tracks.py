@@ -93,7 +93,8 @@ def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
             f"camera.exposure_ms = {exposure:g} is longer than the {1e3 / rate:.4g} ms from frame "
             f"to frame at camera.frame_rate_hz = {rate:g}: correct one of them"
         )
-    if frames < SHORT_MOVIE and way_of(config) != "tracks":  # which refuses it altogether
+    # A movie without any is refused, as is one of few frames whose background is learnt.
+    if 0 < frames < SHORT_MOVIE and way_of(config) != "tracks":
         best = 100 / np.sqrt(max(frames - 1, 1))
         text = f"{name}: {frames} frames tell no diffusion coefficient better than to {best:.0f} %"
         if frames < config.track.min_frames:

@@ -6,7 +6,8 @@ way         frames                                                              
 "fixed"     those with particles, together or one by one, against a background    fixed, median,
             recorded before them, or against a known level                        known
 "sliding"   windows just after each frame against those just before it            sliding
-"tracks"    each frame against what all frames have in common without particles   tracks; median
+"tracks"    each frame against what all frames have in common without particles   tracks; median,
+                                                                                  or fixed (mean),
                                                                                   of all frames
 ==========  ====================================================================  ================
 """
@@ -27,8 +28,8 @@ def way_of(config: Config) -> Way:
     Parameters
     ----------
     config : Config
-        Its ``background.method`` decides; a median is that of ``background.frames``, which may be
-        ``"all"``.
+        Its ``background.method`` decides; a median, or a mean, is that of ``background.frames``,
+        which may be ``"all"``.
 
     Returns
     -------

@@ -95,7 +95,9 @@ class TrackStatus(StrEnum):
 
 _TRACK_ADVICE = {
     TrackStatus.OK: "The frames agree on one mass, and the particle diffuses freely.",
-    TrackStatus.FEW_FRAMES: "Fewer positions than track.min_frames: no diffusion coefficient.",
+    TrackStatus.FEW_FRAMES: "Fewer of its positions than track.min_frames tell how it moves (of "
+    "those at the border of the field, too close to another particle or not settled, none does): "
+    "no diffusion coefficient.",
     TrackStatus.POOR_FITS: "Fewer than half of its frames are ok, so that its mass is that of a "
     "selection: see the status of its rows in fits.csv.",
     TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors, or those of "

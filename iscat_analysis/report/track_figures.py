@@ -35,6 +35,7 @@ MSD_PART = 4
 _MOST_VERTICES = 20_000  # of paths in the page; more become an image
 _CELLS = 120  # of a density, along each axis
 _LEAST_WIDTH = 0.012  # of an axis, of a track whose error would not be seen
+_FAR = 3.0  # times the masses of tracks that are ok, up to where the scale of colours goes
 _UM2 = 1e6  # nm²
 _NO_MASS = (0.6, 0.6, 0.6, 1.0)
 
@@ -109,14 +110,35 @@ def mass_label(analysis: Analysis) -> str:
     return "mass [kDa]" if main.column == "mass_kda" else "mass, model scale [kDa]"
 
 
-def _colors(analysis: Analysis) -> tuple[Normalize, Colormap]:
+def _colors(analysis: Analysis) -> tuple[Normalize, Colormap, str]:
+    """Colours of masses, and at which ends of their scale some lie beyond it.
+
+    All tracks are drawn, and the scale covers them; but where one that is flagged lies far from
+    those that are ok, these would all have one colour.
+    """
     values, _ = masses(analysis)
     good = _ok(tracks_of(analysis)) & np.isfinite(values)
-    known = values[good if good.any() else np.isfinite(values)]
-    low, high = (float(v) for v in np.quantile(known, [0.02, 0.98])) if known.size else (0.0, 1.0)
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return Normalize(0.0, 1.0), mpl.colormaps["viridis"], "neither"
+    trusted = values[good] if good.any() else known
+    low = max(float(known.min()), float(trusted.min()) / _FAR)
+    high = min(float(known.max()), float(trusted.max()) * _FAR)
+    below, above = known.min() < low, known.max() > high
+    beyond = {(True, True): "both", (True, False): "min", (False, True): "max"}
     if high <= low:
         low, high = 0.9 * low, 1.1 * high or 1.0
-    return Normalize(low, high), mpl.colormaps["viridis"]
+    ends = beyond.get((bool(below), bool(above)), "neither")
+    return Normalize(low, high), mpl.colormaps["viridis"], ends
+
+
+def _scale_beside(figure: Figure, axes: Axes, analysis: Analysis) -> None:
+    """Draw the scale of masses, with an arrow at an end beyond which some lie."""
+    norm, colors, beyond = _colors(analysis)
+    figure.colorbar(
+        mpl.cm.ScalarMappable(norm, colors), ax=axes, label=mass_label(analysis),
+        fraction=0.05, pad=0.02, extend=beyond,
+    )  # fmt: skip
 
 
 def trajectories(analysis: Analysis, fits: pd.DataFrame) -> Figure:
@@ -142,7 +164,7 @@ def trajectories(analysis: Analysis, fits: pd.DataFrame) -> Figure:
     low, high = display_range([image], analysis.scheme)
     axes.imshow(image, cmap="gray", vmin=2 * low, vmax=2 * high, interpolation="antialiased")
     scale_bar(axes, columns, tall, analysis.pixel_size_nm)
-    norm, colors = _colors(analysis)
+    norm, colors, _ = _colors(analysis)
     values, _ = masses(analysis)
     numbers = track_numbers(fits)
     paths = dict(iter(fits.sort_values("frame").groupby(numbers)))
@@ -155,8 +177,7 @@ def trajectories(analysis: Analysis, fits: pd.DataFrame) -> Figure:
     axes.add_collection(drawn)
     starts = np.array([line[0] for line in lines]).reshape(-1, 2)
     _points(axes, starts[:, 0], starts[:, 1], np.arange(len(tracks)), mfc="none", mec="white", ms=5)
-    scale = mpl.cm.ScalarMappable(norm, colors)
-    figure.colorbar(scale, ax=axes, label=mass_label(analysis), fraction=0.05, pad=0.02)
+    _scale_beside(figure, axes, analysis)
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(tall - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
     return figure
 
@@ -303,7 +324,7 @@ def msd(analysis: Analysis, fits: pd.DataFrame) -> Figure | None:
         ["bad", "n_d_frames"], ascending=[True, False]
     )
     numbers = track_numbers(fits)
-    norm, colors = _colors(analysis)
+    norm, colors, _ = _colors(analysis)
     values, _ = masses(analysis)
     figure = new_figure(6.2, 3.6)
     axes = figure.add_subplot()
@@ -322,8 +343,7 @@ def msd(analysis: Analysis, fits: pd.DataFrame) -> Figure | None:
     axes.set(xscale="log", yscale="log", xlabel="lag [ms]", ylabel="MSD in x and y [µm²]")
     for which in ("x", "y"):
         _plain_log(axes, which)
-    scale = mpl.cm.ScalarMappable(norm, colors)
-    figure.colorbar(scale, ax=axes, label=mass_label(analysis), fraction=0.05, pad=0.02)
+    _scale_beside(figure, axes, analysis)
     return figure
 
 

@@ -248,7 +248,9 @@ def _record(
         record |= {name: value for name, value in exact.items() if name != "told"}
     scale = _scale_error(record, told)
     record["short_way"] = told < _LITTLE_TOLD and scale > 2 * _VAGUE
-    record["contrast"] = record["mass_kda"] * of_known(np.median, rows.contrast / rows.mass_kda)
+    massive = rows.only(rows.mass_kda != 0)  # a fit may end at nothing, and so is its contrast
+    each = of_known(np.median, massive.contrast / massive.mass_kda)
+    record["contrast"] = record["mass_kda"] * each
     if setup.frame_rate_hz is not None:
         record["n_d_frames"] = 0 if found is None else found.n_positions
     if found is not None:

@@ -17,7 +17,9 @@ from scipy.ndimage import gaussian_filter
 from wanderers import Wanderers, wander
 
 import iscat_analysis.pipeline.blocks as blocks_module
+import iscat_analysis.pipeline.finish as finish_module
 import iscat_analysis.pipeline.tracking as tracking_module
+from iscat_analysis import pipeline
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.rows import Rows
@@ -38,7 +40,7 @@ from iscat_analysis.pipeline.linking import unlike
 from iscat_analysis.pipeline.moving import follow
 from iscat_analysis.pipeline.moving_field import load_field, track_scene
 from iscat_analysis.pipeline.moving_table import common_masses, moving_table, table_of_tracks
-from iscat_analysis.pipeline.resume import partial_folder
+from iscat_analysis.pipeline.resume import GOES_ON, partial_folder
 from iscat_analysis.threads import threads
 
 pytestmark = pytest.mark.usefixtures("sketched")
@@ -435,8 +437,10 @@ def test_an_interrupted_run_resumes_to_the_same_result(
         stages.append(stage)
         stop(stage, done, total)
 
+    lines: list[str] = []
     with pytest.raises(KeyboardInterrupt):
-        fit_stack(movie, config, out=out, progress=told)
+        fit_stack(movie, config, out=out, progress=told, notify=lines.append)
+    assert lines[-1].endswith(f"is in {out}, and the same command goes on from there")
     after = stages[len(stages) - stages[::-1].index("track") :]
     assert set(after) == {"report"}  # the command line gives time for it, and for nothing else
     assert calls == [(0, 40), (40, 80), (80, 120)]
@@ -462,7 +466,31 @@ def test_an_interrupt_before_anything_is_finished_leaves_nothing(
     movie: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "cut.iscat"
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match=r"nothing is kept.* in one of 120 frames"):
         fit_stack(movie, _config(), out=out, progress=_stop_at(0.0))
     assert not out.exists()
+    assert not partial_folder(out).exists()
+    with pytest.raises(KeyboardInterrupt, match=r"nothing is kept.* in 3 of them"):
+        fit_stack(movie, _config(block_frames=40), out=out, progress=_stop_at(0.0))
+
+
+@pytest.mark.parametrize("late", ["tracks", "report"])
+def test_tracks_are_kept_where_their_report_is_interrupted(
+    movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, late: str
+) -> None:
+    """There is no folder yet, but a hidden one that the same command goes on from, as it says."""
+
+    def stop(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt("SIGTERM was received")
+
+    config, out = _config(), tmp_path / "cut.iscat"
+    with monkeypatch.context() as patch:
+        where = (finish_module, "summary_of") if late == "tracks" else (pipeline, "fill_report")
+        patch.setattr(*where, stop)
+        with pytest.raises(KeyboardInterrupt) as stopped:
+            fit_stack(movie, config, out=out)
+    assert str(stopped.value) == f"SIGTERM was received; {GOES_ON}"
+    assert not out.exists()
+    monkeypatch.setattr(tracking_module, "analyse_block", stop)  # which is not needed again
+    assert len(fit_stack(movie, config, out=out).table)
     assert not partial_folder(out).exists()

@@ -196,6 +196,15 @@ def test_a_median_of_all_frames_is_asked_for_by_name() -> None:
     assert configure(configure(TRACKED), settings={"background.frames": "all"}) == config
 
 
+def test_a_mean_of_all_frames_is_asked_for_by_both_names() -> None:
+    """And remains one where the mode, or anything else, is named again."""
+    config = configure({**TRACKED, "background": {"method": "fixed", "frames": "all"}})
+    assert (config.background.method, config.background.frames) == ("fixed", "all")
+    assert parse_config(tomllib.loads(config_to_toml(config))) == config
+    assert configure(config, settings={"fit.mode": "track"}) == config
+    assert configure(config, settings={"background.method": "tracks"}) == configure(TRACKED)
+
+
 def test_a_median_without_frames_means_all_for_one_release_more() -> None:
     old = {**TRACKED, "background": {"method": "median"}}
     with pytest.warns(FutureWarning, match=r'without background.frames.*frames = "all"'):
@@ -209,7 +218,10 @@ def test_a_median_without_frames_means_all_for_one_release_more() -> None:
     [
         ({"background": {"frames": "all"}}, 'fit.mode = "mass"'),
         ({**TRACKED, "background": {"frames": "all"}, "optics": {"scheme": "darkfield"}}, "dark"),
-        ({**TRACKED, "background": {"frames": "all", "method": "fixed"}}, 'for method = "median"'),
+        (
+            {**TRACKED, "background": {"frames": "all", "method": "known", "level_e": 1e4}},
+            'for method = "median" or "fixed"',
+        ),
         ({**TRACKED, "background": {"frames": "every"}}, "[start, stop)"),
         ({**TRACKED, "background": {"frames": [3, 2]}}, "0 <= start < stop"),
         ({**TRACKED, "background": {"frames": [0, "x"]}}, "background.frames"),

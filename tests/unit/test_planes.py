@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import pytest
-from scenes import make_config
+from scenes import Stack, make_config
 
+import iscat_analysis as ia
+from iscat_analysis.config import Config
+from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.pipeline.diagnosis import plane_warning
+from iscat_analysis.pipeline.held_height import held_height_warning
+from iscat_analysis.pipeline.ranges import checked
+from iscat_analysis.study.simulate import Movie
 
 STEP_NM, SIGMA_NM = 30.0, 5.0
 
@@ -48,3 +59,67 @@ def test_nothing_is_said_where_little_is_known() -> None:
     assert plane_warning(JOINT, _table(0.0).assign(frame=np.arange(120) * 2)) == ""
     held = make_config(fit={"mode": "track"}, track={"free": "mass"})
     assert plane_warning(held, _table(0.0)) == ""
+
+
+MOVIE = {
+    "background": {"frames": None},
+    "fit": {"mode": "track", "frames": None},
+    "track": {"free": "joint"},
+    "particle": {"mass_kda": 480.0},
+}
+SIMULATED = {"shape": [48, 48], "frames": 60, "photons_per_pixel": 4e5, "background": "speckle"}
+
+
+def _moving(seed: int = 1, *, exposure_ms: float = 0.2, **mover: Any) -> tuple[Config, Stack]:
+    """Simulate two particles that move."""
+    simulated = {**SIMULATED, "movers": [{"count": 2, "mass_kda": 400.0, **mover}]}
+    camera = {"frame_rate_hz": 331.0, "exposure_ms": exposure_ms, "gain_e_per_adu": 20.0}
+    config = make_config(**MOVIE, camera=camera, simulation=simulated)
+    return config, Stack(np.array(list(Movie(config, seed).frames())))
+
+
+def _said_of(config: Config, movie: Stack, flags: Sequence[str]) -> str:
+    """Ask what is said of free heights with such rows."""
+    fits = pd.DataFrame({"frame": np.arange(len(flags)) % len(movie.counts), "flags": flags})
+    camera = camera_from_config(config.camera, movie.shape[1:], movie.dtype)
+    with ThreadPoolExecutor(1) as pool:
+        return held_height_warning(
+            config, movie, camera, (0, len(movie.counts)), fits,
+            check=checked(movie, camera), pool=pool,
+        )  # fmt: skip
+
+
+def test_a_membrane_whose_heights_were_lost_is_recognised() -> None:
+    """Where free heights describe nothing, and one height does, it is no fault of the optics."""
+    config, movie = _moving(d_um2_s=0.3)
+    lost = _said_of(config, movie, ["poor_fit"] * 70 + [""] * 50)
+    assert 'set track.free = "mass"' in lost
+    assert "with heights that are free 70 of 120 fits are rejected" in lost
+    assert _said_of(config, movie, ["poor_fit"] * 50 + [""] * 70) == ""
+    assert _said_of(config, movie, []) == ""
+    track = config.track.model_copy(update={"free": "mass"})
+    assert _said_of(config.model_copy(update={"track": track}), movie, ["poor_fit"] * 120) == ""
+
+
+@pytest.mark.parametrize(
+    "mover",
+    [
+        {"d_um2_s": 4.0, "space": "volume", "ceiling_nm": 1000.0},
+        {"d_um2_s": 0.1, "space": "volume", "ceiling_nm": 100.0},
+    ],
+)
+def test_particles_at_many_heights_are_not_taken_for_a_membrane(mover: dict[str, Any]) -> None:
+    """Even where all their rows were rejected, as through wrong optics."""
+    config, movie = _moving(**mover)
+    assert _said_of(config, movie, ["poor_fit"] * 120) == ""
+
+
+@pytest.mark.usefixtures("sketched")
+def test_a_movie_of_a_membrane_says_so() -> None:
+    """Its heights were free: of all fits nearly none was described, and the optics were blamed."""
+    config, movie = _moving(seed=2, exposure_ms=2.5, d_um2_s=0.8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        result = ia.fit_movie(movie.counts, config=config)
+    assert (result.table["status"] == "ok").mean() < 0.5
+    assert sum('set track.free = "mass"' in line for line in result.warnings) == 1

@@ -80,6 +80,22 @@ def test_a_headline_of_tracks_that_are_flagged_has_no_median() -> None:
     assert "kDa" not in said[0]
 
 
+def test_the_colours_of_paths_cover_all_that_are_drawn() -> None:
+    """Beyond those that are ok too, but for what is so far from them that they had one colour."""
+    analysis = make_analysis(40, "track")
+    assert analysis.tracks is not None
+    tracks = analysis.tracks.assign(status="ok", mass_kda=[399.8, 400.3, 401.2, 196.0])
+    tracks.loc[3, "status"] = "not_free"
+    scale, _, beyond = track_figures._colors(replace(analysis, tracks=tracks))
+    assert (scale.vmin, scale.vmax, beyond) == (196.0, 401.2, "neither")
+    tracks.loc[3, "mass_kda"] = 9e3
+    scale, _, beyond = track_figures._colors(replace(analysis, tracks=tracks))
+    assert (scale.vmin, beyond) == (399.8, "max")
+    assert scale.vmax == pytest.approx(3 * 401.2)
+    drawn = track_figures.trajectories(replace(analysis, tracks=tracks), analysis.table)
+    assert drawn.axes[-1].get_ylabel().startswith("mass")
+
+
 def test_a_height_that_was_held_fixed_is_in_no_table_of_precision() -> None:
     analysis = make_analysis(40, "track")
     assert free_parameters("track", analysis.table) == FREE_PARAMETERS["joint"]

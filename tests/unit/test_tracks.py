@@ -246,6 +246,26 @@ def test_a_track_of_few_frames_has_a_mass_and_no_d() -> None:
     assert abs(found["mass_kda"] - 400) < SIGMAS * found["sigma_mass_kda"]
 
 
+def test_few_frames_are_those_that_tell_how_a_track_moves() -> None:
+    """Of 40 positions at the border none does, which is said: they are not fewer than ten."""
+    rng = np.random.default_rng(8)
+    path = walk(rng, 40, 0.8, start_nm=(0.0, 5000.0))
+    path[:, 0] = 30.0  # [nm] from the border, along which it goes 100 nm from frame to frame
+    found = describe_tracks(fits_of([path], rng), SETUP).iloc[0]
+    assert (found["n_frames"], found["n_d_frames"]) == (40, 0)
+    assert found["flags"] == TrackStatus.FEW_FRAMES
+    assert "border" in TrackStatus.FEW_FRAMES.advice
+
+
+def test_fits_that_ended_at_no_mass_have_no_contrast_for_it() -> None:
+    """Their ratio is not known, and is left out without a warning."""
+    rng = np.random.default_rng(8)
+    fits = fits_of([walk(rng, 30, 0.3)], rng)
+    fits.loc[:3, ["mass_kda", "contrast"]] = 0.0
+    found = describe_tracks(fits, SETUP).iloc[0]
+    assert found["contrast"] == pytest.approx(-3.1e-5 * found["mass_kda"])
+
+
 def test_confined_motion_is_remarked_on_with_the_size_of_the_well() -> None:
     rng = np.random.default_rng(9)
     found = describe_tracks(fits_of([walk(rng, 200, 0.8, side_nm=500.0)], rng), SETUP).iloc[0]

@@ -9,15 +9,17 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from scenes import PIXEL_NM
+from scenes import PIXEL_NM, Stack
 
 from iscat_analysis.config import Config, configure
-from iscat_analysis.errors import DataError
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
+from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline import FIND, analyse
 from iscat_analysis.pipeline.events import Event, remarks, standing_out
 from iscat_analysis.pipeline.field import fit_field
+from iscat_analysis.pipeline.moving_field import load_field, opening_ground, track_scene
 from iscat_analysis.pipeline.preview import Preview
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.pipeline.ways import Way, way_of, way_said
@@ -82,6 +84,7 @@ def test_every_way_gives_the_same_record(analyses: dict[Way, Analysis], way: Way
     assert f'method = "{way}"' in found.config_toml
     assert found.ratio_image.shape == (SIDE, SIDE)
     assert found.power.shape == found.power_frames.shape
+    assert np.all(np.diff(found.power_frames) > 0)  # a line through them never runs back
     for flags, status in zip(table["flags"], table["status"], strict=True):
         own = [Status(flag) for flag in flags.split(";") if flag]
         assert own == sorted(own, key=SEVERITY.index)
@@ -175,12 +178,62 @@ def test_the_sums_of_a_region_are_views() -> None:
         ),
         (["background.method=median", "background.frames=[0, 40]"], "the median of frames 0:40"),
         (["background.frames=all", "fit.mode=track"], '"median": frames are compared with the med'),
+        (
+            ["background.frames=all", "background.method=fixed", "fit.mode=track"],
+            '"fixed": frames are compared with the mean of all of them',
+        ),
         (["background.method=known", "background.level_e=2e4"], "background.level_e = 20000"),
         (["optics.scheme=darkfield"], "the mean of background.frames"),
     ],
 )
 def test_the_method_is_said_whether_it_was_written_or_not(settings: list[str], words: str) -> None:
     assert words in way_said(configure(settings=settings))
+
+
+@pytest.mark.parametrize("method", ["fixed", "median"])
+def test_a_background_of_all_frames_is_their_mean_or_their_median(method: str) -> None:
+    config = configure(
+        _config("tracks"), settings={"background.frames": "all", "background.method": method}
+    )
+    counts = np.array(list(Movie(config, 1).frames()))
+    with open_stack(counts) as movie:
+        found = analyse(movie, config)
+    assert 'frames = "all"' in found.config_toml
+    assert f'method = "{method}"' in found.config_toml
+    assert len(found.tracks) == len(PLACES)
+    assert (found.tracks["mass_kda"] < 480).all()  # of which a part is in the background
+    camera = camera_from_config(config.camera, counts.shape[1:], counts.dtype)
+    scene = track_scene(config, counts.shape[1:], len(counts))
+    with ThreadPoolExecutor(1) as pool:
+        span = (0, len(counts))
+        field = load_field(
+            scene, Stack(counts), camera, span, lambda *_: None, pool, lambda *_: None
+        )
+        ground = opening_ground(config, field)
+    light = counts * 8.0 / ground.power[:, None, None]
+    middle = {"fixed": np.mean, "median": np.median}[method](light, axis=0)
+    np.testing.assert_allclose(ground.level, middle, rtol=3e-4)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["fit.mode=track"], ['"tracks"', 'background.frames = "all"', '"fixed" their mean']),
+        (["fit.mode=mass"], ['"sliding"']),
+    ],
+)
+def test_what_needs_no_frames_before_the_particles_is_named(
+    settings: list[str], words: list[str]
+) -> None:
+    counts = np.random.default_rng(1).poisson(2e4, (60, SIDE, SIDE)).astype(np.uint16)
+    config = configure(settings=[*BASE, *settings, "background.method=fixed"])
+    whole = configure(settings=[*BASE, *settings, "background.frames=[0, 60]"])
+    for one, kind, begins in ((config, ConfigError, "which frames"), (whole, DataError, "array")):
+        told: list[str] = []
+        with open_stack(counts) as movie, pytest.raises(kind, match=begins) as refused:
+            analyse(movie, one, notify=told.append)
+        assert all(word in str(refused.value) for word in words)
+        assert not any("diffusion coefficient" in line for line in told)
 
 
 def test_a_run_says_its_method_first() -> None:
