@@ -50,6 +50,7 @@ import iscat_analysis as ia
 RESULTS = Path(__file__).resolve().parent / "results"
 SHAPE = (1500, 128, 128)
 MEGABYTES = 2e-6 * math.prod(SHAPE)
+MEGABYTES_PER_S = 10.0  # with ten particles in view
 MOVIES = 10
 NEAR_NM = 300.0
 LONG = 10  # frames of a false track that counts
@@ -329,6 +330,9 @@ def main() -> int:
         "D within 3 %": abs(diffusion["bias"]) < 0.03 + 2 * diffusion["bias_error"],
         f"{TIMES_MSPT:.1f} times the fits of MSPT": (
             numbers["fits_per_second_over_mspt"] >= TIMES_MSPT
+        ),
+        f"{MEGABYTES_PER_S:g} MB/s with ten particles in view": (
+            numbers["with_ten_in_view"]["megabytes_per_second"] >= MEGABYTES_PER_S
         ),
     }
     for name, each in (("mass", mass), ("D", diffusion)):
