@@ -225,14 +225,14 @@ def click(browser: Any, selector: str) -> None:
 
 
 def shown_rows(browser: Any, least: int = 0) -> int:
-    """Rows of the table that take room, once there are so many, or two seconds have gone by."""
+    """Rows of the table that take room, once there are so many, or twenty seconds have gone by."""
     script = """
     const [least, done] = arguments;
     const begun = performance.now();
     const look = () => {
       const rows = [...document.querySelectorAll("#table tbody tr[id]")];
       const shown = rows.filter((row) => row.getClientRects().length).length;
-      if (shown >= least || performance.now() - begun > 2000) return done(shown);
+      if (shown >= least || performance.now() - begun > 20000) return done(shown);
       setTimeout(look, 20);
     };
     look();
