@@ -574,7 +574,7 @@ def test_rows_beyond_the_first_200_are_laid_out_when_they_are_looked_for(
     }
     for look, rows in looks.items():
         show(browser, page)
-        assert shown_rows(browser) == 200, look
+        assert shown_rows(browser, 200) == 200, look
         browser.execute_script(look)
         assert shown_rows(browser, rows) >= rows, look
         assert browser.execute_script(
