@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.moving import BLOCK, MovingField
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.records import BoolArray, FloatArray
 
@@ -25,7 +25,6 @@ _NOISE = 0.5  # of the log-likelihood, by how the canvas is drawn
 _ENOUGH = 0.05  # expected gain of the step that is the last one
 _MOST_STEPS = 40
 _DARKEST = 0.99  # signal of a pixel that is taken to be none of a particle's
-_BLOCK = 32  # frames
 
 
 def climb(
@@ -49,7 +48,7 @@ def climb(
     rows, ground, converged
         As from `iscat_analysis.inference.settling.settle`.
     """
-    per_e = np.where(field.used, np.maximum(field.total_e, 1.0), 0.0)
+    counts = np.where(field.used, np.maximum(field.total_e, 1.0), 0.0)
     damping, best, kept = _DAMPING, -np.inf, (rows, ground)
     for _ in range(_MOST_STEPS):
         rows, found, done = field.fit(ground, rows)
@@ -62,7 +61,7 @@ def climb(
             continue
         best, kept = max(best, value), (rows, found)
         damping = max(_SOFTER * damping, _DAMPING)
-        step, gain = _uphill(field, move, per_e, damping)
+        step, gain = _uphill(field, move, counts, damping)
         ground = Ground(found.level * np.exp(step - move), found.power)
         if gain < _ENOUGH:
             return field.followed(rows, step), ground, done
@@ -70,13 +69,13 @@ def climb(
 
 
 def _uphill(
-    field: MovingField, move: FloatArray, per_e: FloatArray, damping: float
+    field: MovingField, move: FloatArray, counts: FloatArray, damping: float
 ) -> tuple[FloatArray, float]:
     """Give Newton's step, damped until it climbs, and by how much it should."""
     while True:
         step = field.where_turns_end(move, damping)
-        gain = 0.5 * float(np.sum(per_e * move * step))
-        if gain > 0 or not move.any():
+        gain = 0.5 * float(np.sum(counts * move * step))
+        if not gain <= 0 or not move.any():  # one that is no number climbs no better when damped
             return step, gain
         damping *= _STIFFER
 
@@ -99,15 +98,15 @@ def log_likelihood(field: MovingField, ground: Ground, rows: Rows) -> float:
         That of the multinomial in each pixel, but for what does not depend on particles; read noise
         counts as light.
     """
-    total, power = field.drawn(ground, rows), ground.power
+    total, power = field.draw(ground, rows, coarse=False), ground.power
 
     def block(first: int) -> FloatArray:
-        here = slice(first, first + _BLOCK)
+        here = slice(first, first + BLOCK)
         signal = np.maximum(total[here].astype(np.float64), -_DARKEST)
         bright = power[here, None, None] * (1 + signal)
         seen = np.einsum("tyx,tyx->yx", field.exposures.electrons(here), np.log1p(signal))
         return np.stack([seen, bright.sum(axis=0)])
 
-    seen, stretch = field.sum_of(block, _BLOCK)
+    seen, stretch = field.sum_of(block)
     each = seen - field.total_e * np.log(stretch)
     return float(each[field.used].sum() + field.frame_totals @ np.log(power))

@@ -333,17 +333,13 @@ class Likelihood:
         height = "exact" if free is None else "between" if free[2] else "fixed"
         return self.model.derivative_rows(self.grid, self._supported(theta), height)
 
-    def observed_information(
-        self, theta: FloatArray, derivatives: FloatArray | None = None
-    ) -> FloatArray:
+    def observed_information(self, theta: FloatArray) -> FloatArray:
         """Negative Hessian of the log-likelihood.
 
         Parameters
         ----------
         theta : ndarray, shape (5,)
             Parameters.
-        derivatives : ndarray, shape (ny, ROWS, nx), optional
-            Of the signal at θ, where they are known already.
 
         Returns
         -------
@@ -355,8 +351,7 @@ class Likelihood:
         ConfigError
             θ lies outside the support.
         """
-        rows = self.derivatives(theta) if derivatives is None else derivatives
-        info = np.empty((5, 5))
+        rows, info = self.derivatives(theta), np.empty((5, 5))
         observed_information(self.kind, self.data, math.exp(theta[LEVEL]), rows, info)
         return info
 

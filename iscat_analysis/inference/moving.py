@@ -53,8 +53,10 @@ DRAWN = 4
 COARSE = 2
 """Of the fitted square's side, by which it is cut while particles are still being looked for."""
 
-_BLOCK = 32  # frames that one thread takes at a time
-_SWEPT = 4  # the same, where every row is fitted several times
+BLOCK = 32
+"""Frames that one thread takes at a time."""
+
+_SWEPT = 4  # of them, where every row is fitted several times
 _TOLERANCE = 2e-4  # as in `Likelihood.maximize`
 _PASSING = 0.02  # the same, of a fit that the next turn goes on with
 _PASSES = 40
@@ -162,7 +164,7 @@ class MovingField:
         """Photoelectrons of all frames, shape (y, x) [e]."""
         counts = self.exposures.counts
         total = self.sum_of(
-            lambda first: np.sum(counts[first : first + _BLOCK], axis=0, dtype=np.float64)
+            lambda first: np.sum(counts[first : first + BLOCK], axis=0, dtype=np.float64)
         )
         return self.exposures.in_electrons(total, self.frames)
 
@@ -171,9 +173,9 @@ class MovingField:
         """Photoelectrons in the used pixels of each frame, shape (t,) [e]."""
         counts = self.exposures.counts
         unused = counts[:, ~self.used].sum(axis=1, dtype=np.float64)
-        blocks = range(0, self.frames, _BLOCK)
+        blocks = range(0, self.frames, BLOCK)
         parts = self._pool.map(
-            lambda first: counts[first : first + _BLOCK].sum(axis=(1, 2), dtype=np.float64), blocks
+            lambda first: counts[first : first + BLOCK].sum(axis=(1, 2), dtype=np.float64), blocks
         )
         total = np.concatenate(list(parts)) - unused
         return self.exposures.in_electrons(total, int(self.used.sum()))
@@ -238,7 +240,7 @@ class MovingField:
             sums = np.zeros(self.used.shape, dtype=np.float32)
             fit_frames(
                 light, field, near, far, search, starts, first,
-                min(first + _BLOCK, self.frames), sweeps, theta, rows.group, canvas, slopes,
+                min(first + BLOCK, self.frames), sweeps, theta, rows.group, canvas, slopes,
                 outcome, fisher, gain, expected, sums,
             )  # fmt: skip
             return sums
@@ -300,7 +302,7 @@ class MovingField:
         """Draw all rings where their particles are, at the next pass."""
         self._canvas = None
 
-    def draw(self, ground: Ground, rows: Rows) -> None:
+    def draw(self, ground: Ground, rows: Rows, *, coarse: bool = True) -> NDArray[np.float32]:
         """Draw the rows of all frames at once; `residual` of the same object then only subtracts.
 
         Parameters
@@ -309,9 +311,17 @@ class MovingField:
             Background.
         rows : Rows
             Particles.
+        coarse : bool
+            As in `fit`.
+
+        Returns
+        -------
+        ndarray of float32, shape (t, y, x)
+            Signal of all rows of each frame, until the next fit.
         """
         self.draw_anew()  # rings that stayed where rows were before are not good enough
-        self.fit(ground, rows, sweeps=0, coarse=True)
+        self.fit(ground, rows, sweeps=0, coarse=coarse)
+        return self._room
 
     def residual(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
         """Give the counts of some frames minus what is expected.
@@ -360,8 +370,7 @@ class MovingField:
             Counts minus what is expected, light without particles [e], and variance of the read
             noise [e²] are added to it; nothing in pixels that are not used.
         """
-        self.draw(ground, rows)
-        total, light = self._canvas_for(rows, coarse=True).total, self._light(ground)
+        total, light = self.draw(ground, rows), self._light(ground)
 
         def add(number: int) -> None:
             mine = np.flatnonzero(owner == number)
@@ -412,7 +421,7 @@ class MovingField:
         def block(first: int) -> FloatArray:
             judge_frames(
                 light, self._whole, near, far, self.free, starts, first,
-                min(first + _BLOCK, self.frames), rows.theta, rows.group, canvas, slopes, fisher,
+                min(first + BLOCK, self.frames), rows.theta, rows.group, canvas, slopes, fisher,
                 turned, ways, bias, numbers,
             )  # fmt: skip
             return np.zeros(1)
@@ -420,43 +429,20 @@ class MovingField:
         self.sum_of(block)
         return Judged.of(fisher, turned, ways, bias, numbers, slopes, free=self.free[:4])
 
-    def drawn(self, ground: Ground, rows: Rows) -> NDArray[np.float32]:
-        """Draw the whole squares of all rows anew.
-
-        Parameters
-        ----------
-        ground : Ground
-            Background.
-        rows : Rows
-            Particles.
-
-        Returns
-        -------
-        ndarray of float32, shape (t, y, x)
-            Signal of all rows of each frame, until the next fit.
-        """
-        self.draw_anew()
-        self.fit(ground, rows, sweeps=0)
-        return self._canvas_for(rows, coarse=False).total
-
-    def sum_of(
-        self, block: Callable[[int], NDArray[np.floating[Any]]], frames: int = _BLOCK
-    ) -> FloatArray:
+    def sum_of(self, block: Callable[[int], NDArray[np.floating[Any]]]) -> FloatArray:
         """Run blocks of frames and add what they give, in their order.
 
         Parameters
         ----------
         block : callable
-            Takes the first frame of a block.
-        frames : int
-            In a block.
+            Takes the first of `BLOCK` frames.
 
         Returns
         -------
         ndarray
             The sum, in double precision.
         """
-        parts = list(self._pool.map(block, range(0, self.frames, frames)))
+        parts = list(self._pool.map(block, range(0, self.frames, BLOCK)))
         total = parts[0].astype(np.float64)
         for part in parts[1:]:
             total += part
