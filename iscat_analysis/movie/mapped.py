@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import mmap
 import struct
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.records import InPlace
 
 WHAT_LIBRARIES_RAISE = (
     ValueError, RuntimeError, TypeError, LookupError, OSError, ArithmeticError, MemoryError,
@@ -35,6 +42,72 @@ def map_file(path: Path) -> mmap.mmap:
     """
     with path.open("rb") as file:
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+def unmap(data: mmap.mmap) -> None:
+    """Close a file, or have it closed when nobody uses frames where they lie in it any more.
+
+    Parameters
+    ----------
+    data : mmap
+        From `map_file`.
+    """
+    with suppress(BufferError):
+        data.close()
+
+
+def frames_in_place(
+    path: Path, data: mmap.mmap, offset: int, shape: tuple[int, int, int], stored: np.dtype[Any]
+) -> InPlace | None:
+    """Give frames that lie in a file one after the other.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    data : mmap
+        From `map_file`.
+    offset : int
+        Where the first one begins [bytes].
+    shape : tuple of int
+        Frames, rows, columns.
+    stored : dtype
+        Of the pixels, byte order included.
+
+    Returns
+    -------
+    InPlace or None
+        None where a processor could not use these numbers as they are.
+
+    Raises
+    ------
+    DataError
+        The file is gone, or shorter than it was.
+    """
+    if not stored.isnative or offset % stored.itemsize:
+        return None
+    refuse_changed(path, data)
+    counts = np.asarray(_Lying(np.frombuffer(data, dtype=np.uint8)[offset:], shape, stored))
+    return InPlace(
+        counts,
+        partial(refuse_changed, path, data),
+        partial(release, data, offset, offset + counts.nbytes),
+    )
+
+
+class _Lying:
+    """Bytes that NumPy shall take for an array which one may write to, though one may not.
+
+    Numba would compile all kernels anew for arrays that say that they cannot be written to.
+    """
+
+    def __init__(
+        self, data: NDArray[np.uint8], shape: tuple[int, int, int], stored: np.dtype[Any]
+    ) -> None:
+        self._data = data  # which keeps the file open
+        self.__array_interface__ = {
+            "version": 3, "shape": shape, "typestr": stored.str, "data": (data.ctypes.data, False),
+        }  # fmt: skip
 
 
 def refuse_changed(path: Path, data: mmap.mmap) -> None:

@@ -12,8 +12,15 @@ from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK, layout
-from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, map_file, refuse_changed, release
-from iscat_analysis.records import StackMetadata
+from iscat_analysis.movie.mapped import (
+    WHAT_LIBRARIES_RAISE,
+    frames_in_place,
+    map_file,
+    refuse_changed,
+    release,
+    unmap,
+)
+from iscat_analysis.records import InPlace, StackMetadata
 
 NPY_SIGNATURE = b"\x93NUMPY"
 
@@ -90,13 +97,22 @@ class MappedFrames:
         block = np.array(whole[start:stop], dtype=self.dtype, order="C")
         del whole
         if not self._last_first:
-            size = math.prod(self.shape[1:]) * self._stored.itemsize
-            release(self._data, self._offset + start * size, self._offset + stop * size)
+            release(self._data, self._begin(start), self._begin(stop))
         return block
+
+    def in_place(self, start: int, stop: int) -> InPlace | None:
+        """Frames ``[start, stop)`` where they lie in the file; None if they have to be read."""
+        if self._last_first:
+            return None
+        shape = (stop - start, *self.shape[1:])
+        return frames_in_place(self._path, self._data, self._begin(start), shape, self._stored)
+
+    def _begin(self, frame: int) -> int:
+        return self._offset + frame * math.prod(self.shape[1:]) * self._stored.itemsize
 
     def close(self) -> None:
         """Release the file."""
-        self._data.close()
+        unmap(self._data)
 
 
 def open_npy(path: Path) -> MappedFrames:

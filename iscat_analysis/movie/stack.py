@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK, fingerprint, split_address
-from iscat_analysis.records import BoolArray, StackMetadata
+from iscat_analysis.records import BoolArray, InPlace, PlacedSource, StackMetadata
 
 LeftOut = tuple[BoolArray, NDArray[Any]]
 """Pixels that are left out (y, x), and the counts of each in the dark."""
@@ -328,6 +328,33 @@ class Stack:
             pixels, dark = self._left_out
             counts[:, pixels] = dark
         return counts
+
+    def in_place(self, start: int, stop: int) -> InPlace | None:
+        """Give frames where they lie in the file, without a copy.
+
+        Parameters
+        ----------
+        start, stop : int
+            Half-open range ``[start, stop)``.
+
+        Returns
+        -------
+        InPlace or None
+            What `read` would give; None where the file does not hold it like that.
+
+        Raises
+        ------
+        DataError
+            The range leaves the movie, or the file has become shorter.
+        ValueError
+            The stack was closed.
+        """
+        if self._closed:
+            raise ValueError(f"{self.name} was closed; open it again to read from it")
+        self._check_range(start, stop)
+        if self._left_out is not None or not isinstance(self._frames, PlacedSource):
+            return None
+        return self._frames.in_place(start, stop)
 
     def chunks(
         self, start: int = 0, stop: int | None = None, memory_mb: float = 64.0

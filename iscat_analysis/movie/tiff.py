@@ -36,7 +36,14 @@ from iscat_analysis.movie.descriptions import (
     time_axis,
 )
 from iscat_analysis.movie.file_set import FileSet, open_set
-from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, map_file, refuse_changed, release
+from iscat_analysis.movie.mapped import (
+    WHAT_LIBRARIES_RAISE,
+    frames_in_place,
+    map_file,
+    refuse_changed,
+    release,
+    unmap,
+)
 from iscat_analysis.movie.ome import is_ome, read_ome, read_ome_set
 from iscat_analysis.movie.tiff_checks import (
     BOMB_RATIO,
@@ -54,7 +61,7 @@ from iscat_analysis.movie.tiff_checks import (
     refuse_unread_pixels,
 )
 from iscat_analysis.movie.tiff_headers import Repetition, repetition_of
-from iscat_analysis.records import StackMetadata
+from iscat_analysis.records import InPlace, StackMetadata
 
 _DESCRIPTION, _MICRO_MANAGER = 270, 51123
 _ESSENTIAL = {
@@ -148,9 +155,36 @@ class TiffFrames:
             release(self._data, int(self._starts[start]), int(self._starts[stop - 1]))
         return block
 
+    def in_place(self, start: int, stop: int) -> InPlace | None:
+        """Give frames where they lie in the file.
+
+        Parameters
+        ----------
+        start, stop : int
+            Half-open range inside the movie.
+
+        Returns
+        -------
+        InPlace or None
+            None where they are compressed, or do not lie one after the other.
+
+        Raises
+        ------
+        DataError
+            The file is gone, or shorter than it was.
+        """
+        if self._starts is None or start >= stop:
+            return None
+        shape = (stop - start, *self.shape[1:])
+        size = math.prod(self.shape[1:]) * self.dtype.itemsize
+        if np.any(np.diff(self._starts[start:stop]) != size):
+            return None
+        first = int(self._starts[start])
+        return frames_in_place(self._path, self._data, first, shape, self._stored_dtype)
+
     def close(self) -> None:
         """Release the file."""
-        self._data.close()
+        unmap(self._data)
 
     def _find_starts(self, n_frames: int) -> NDArray[np.int64] | None:
         """First byte of every frame, where all of them lie in the file as they are."""

@@ -14,7 +14,13 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera, check_counts
-from iscat_analysis.records import BoolArray, CountSource, FloatArray, Mapper
+from iscat_analysis.records import (
+    BoolArray,
+    CountSource,
+    FloatArray,
+    Mapper,
+    PlacedSource,
+)
 from iscat_analysis.search.sliding import Chunk, make_chunk, measure_frames
 
 NOISE_FRAMES = 800
@@ -28,7 +34,7 @@ _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is co
 
 
 class Reader:
-    """Frames in memory, from one chunk to the next without reading any twice.
+    """Frames of one chunk after the other: where they lie in the file, or read into memory once.
 
     Parameters
     ----------
@@ -50,8 +56,13 @@ class Reader:
         self.first, self.last = first, last
         self.shape = (movie.shape[1], movie.shape[2])
         self.frame_bytes = math.prod(self.shape) * movie.dtype.itemsize
+        self._placed = (
+            movie.in_place(first, last)
+            if isinstance(movie, PlacedSource) and first < last
+            else None
+        )
         # made at once, because growing copies; only what is written to takes memory
-        room = min(max(last - first, 0), room_bytes // self.frame_bytes)
+        room = 0 if self._placed else min(max(last - first, 0), room_bytes // self.frame_bytes)
         self._buffer = np.empty((room, *self.shape), dtype=movie.dtype)
         self._held = (first, first)
         self._light: FloatArray = np.empty(0)
@@ -65,46 +76,52 @@ class Reader:
 
     def forget(self) -> None:
         """Give the memory of the frames back."""
+        if self._placed:
+            self._placed.let_go()
         self._buffer = self._buffer[:0].copy()
         self._held = (self.first, self.first)
         self._summed = None
 
-    def _reserve(self, frames: int) -> None:
-        if frames > len(self._buffer):
-            kept = self._held[1] - self._held[0]
-            larger = np.empty((frames, *self.shape), dtype=self._movie.dtype)
-            larger[:kept] = self._buffer[:kept]
-            self._buffer = larger
+    def _keep(self, kept: slice, room: int) -> None:
+        """Leave only some of the frames in memory, with room for more behind them."""
+        if self._placed:
+            self._placed.let_go()
+            return
+        frames, old = self._buffer[kept], self._buffer
+        if room > len(old):
+            self._buffer = np.empty((room, *self.shape), dtype=self._movie.dtype)
+        if self._buffer is not old or kept.start:
+            self._buffer[: len(frames)] = frames
+
+    def _frames(self, start: int, stop: int) -> NDArray[Any]:
+        """Frames [start, stop) of those that are held."""
+        if self._placed:
+            self._placed.check()
+            return self._placed.counts[start - self.first : stop - self.first]
+        return self._buffer[start - self._held[0] : stop - self._held[0]]
 
     def counts(
         self, start: int, stop: int, mapper: Mapper = map
     ) -> tuple[NDArray[Any], BoolArray, FloatArray]:
         """Frames [start, stop), which of them are good, and their light [e per pixel]."""
         low, high = self._held
-        if low == start and stop <= high:  # a part of them stays with the others
-            light = self._light[: stop - start]
-            good = np.isfinite(light) & ~self._repeats[: stop - start]
-            return self._buffer[: stop - start], good, light
-        self._summed = None
-        kept = 0
-        if low <= start < high:
-            kept = min(high, stop) - start
-            if start > low:
-                self._buffer[:kept] = self._buffer[start - low : start - low + kept]
-            self._light = self._light[start - low : start - low + kept]
-            self._repeats = self._repeats[start - low : start - low + kept]
-        else:
-            self._light, self._repeats = np.empty(0), np.empty(0, dtype=np.bool_)
-        self._reserve(stop - start)
-        self._held = (start, start + kept)
-        self._append(start + kept, stop, mapper)
-        good = np.isfinite(self._light) & ~self._repeats
-        return self._buffer[: stop - start], good, self._light
+        if low != start or stop > high:  # a part of them stays with the others
+            self._summed = None
+            kept = min(high, stop) - start if low <= start < high else 0
+            known = slice(start - low, start - low + kept) if kept else slice(0, 0)
+            self._keep(known, stop - start)
+            self._light, self._repeats = self._light[known], self._repeats[known]
+            self._held = (start, start + kept)
+            self._append(stop, mapper)
+        light = self._light[: stop - start]
+        good = np.isfinite(light) & ~self._repeats[: stop - start]
+        return self._frames(start, stop), good, light
 
-    def _append(self, begin: int, end: int, mapper: Mapper) -> None:
+    def _append(self, end: int, mapper: Mapper) -> None:
+        """Go on from the last frame that is held."""
+        start, begin = self._held
         if begin >= end:
             return
-        start = self._held[0]
         step = max(1, _PIECE_BYTES // self.frame_bytes)
         pieces = [(a, min(a + step, end)) for a in range(begin, end, step)]
 
@@ -114,18 +131,19 @@ class Reader:
         def check(piece: tuple[int, int]) -> None:
             for run in _runs(lit[piece[0] - begin : piece[1] - begin]):
                 low, high = piece[0] + run.start, piece[0] + run.stop
-                frames = self._buffer[low - start : high - start]
+                frames = self._frames(low, high)
                 check_counts(frames, low, self.name, camera=self.camera)
 
-        for _ in mapper(read, pieces):
-            pass
+        if not self._placed:
+            for _ in mapper(read, pieces):
+                pass
         ahead = 1 if begin > start else 0  # the first new frame is compared with the last old one
-        part = self._buffer[begin - ahead - start : end - start]
+        part = self._frames(begin - ahead, end)
         light, repeats = measure_frames(part, self.camera, mapper=mapper)
         lit = np.isfinite(light[ahead:])
         for _ in mapper(check, pieces):
             pass
-        if not ahead and begin > self.first:  # the frame before is no longer in memory
+        if not ahead and begin > self.first:  # the frame before is not held
             (earlier,) = self._movie.read(begin - 1, begin)
             repeats[0] = np.array_equal(earlier, part[0])
         self._light = np.concatenate([self._light, light[ahead:]])
@@ -145,6 +163,7 @@ class Reader:
         chunk = make_chunk(
             span[0], counts, good, light, self.camera,
             stride=stride, defects=find_defects, mapper=pool.map,
+            check=self._placed.check if self._placed else lambda: None,
         )  # fmt: skip
         self._summed = span, stride, chunk
         return chunk

@@ -34,7 +34,14 @@ from iscat_analysis.records.fits import (
     FitResult,
     PosteriorResult,
 )
-from iscat_analysis.records.frames import CountSource, FrameSource, StackMetadata, Windows
+from iscat_analysis.records.frames import (
+    CountSource,
+    FrameSource,
+    InPlace,
+    PlacedSource,
+    StackMetadata,
+    Windows,
+)
 from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus, verdict
 
 __all__ = [
@@ -57,7 +64,9 @@ __all__ = [
     "FitResult",
     "FloatArray",
     "FrameSource",
+    "InPlace",
     "Mapper",
+    "PlacedSource",
     "PosteriorResult",
     "Progress",
     "Provenance",

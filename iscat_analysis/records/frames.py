@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,12 +49,40 @@ class FrameSource(Protocol):
         """Frames ``[start, stop)`` as stored, shape (stop − start, y, x) [counts]."""
 
 
+@dataclass(frozen=True)
+class InPlace:
+    """Frames where they lie in a file, which nobody may write to.
+
+    Attributes
+    ----------
+    counts : ndarray, shape (t, y, x)
+        The stored counts; they may be used while `check` is content.
+    check : callable
+        Raises DataError where the file has become shorter: touching what was beyond ends the
+        process.
+    let_go : callable
+        Gives back the memory of all of them, which comes from the file again where it is used.
+    """
+
+    counts: NDArray[Any]
+    check: Callable[[], None]
+    let_go: Callable[[], None]
+
+
 class CountSource(FrameSource, Protocol):
     """A movie and the type of its numbers."""
 
     @property
     def dtype(self) -> np.dtype[Any]:
         """Type of the stored counts."""
+
+
+@runtime_checkable
+class PlacedSource(Protocol):
+    """A movie whose frames may lie in a file as they are used."""
+
+    def in_place(self, start: int, stop: int) -> InPlace | None:
+        """Frames ``[start, stop)`` without a copy; None where they have to be read."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from tiff_files import write_ome_set
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import beside, open_stack
 from iscat_analysis.movie.addresses import split_address
+from iscat_analysis.movie.mapped_frames import MappedFrames
 
 SHAPE = (7, 6, 5)
 COUNTS = np.random.default_rng(1).integers(0, 60000, SHAPE).astype(np.uint16)
@@ -113,6 +114,51 @@ def test_a_mapped_file_that_shrinks_is_refused(tmp_path: Path) -> None:
         path.write_bytes(path.read_bytes()[:200])
         with pytest.raises(DataError, match="shrank"):
             stack.read(0, 7)
+
+
+def test_frames_lie_in_place_where_a_processor_can_use_them(tmp_path: Path) -> None:
+    for name, stored, placed in (("little", "<u2", True), ("big", ">u2", False)):
+        path = tmp_path / f"{name}.npy"
+        np.save(path, COUNTS.astype(stored))
+        with open_stack(path) as stack:
+            found = stack.in_place(2, 5)
+            assert (found is not None) == placed
+            assert stack.without(COUNTS[0] < 0, np.empty(0, "u2")).in_place(2, 5) is None
+            with pytest.raises(DataError, match="frame"):
+                stack.in_place(2, 99)
+        if found is not None:  # until nobody holds them, whether the stack is closed or not
+            found.let_go()
+            np.testing.assert_array_equal(found.counts, COUNTS[2:5])
+        with pytest.raises(ValueError, match="closed"):
+            stack.in_place(2, 5)
+    np.save(tmp_path / "columns.npy", np.asfortranarray(COUNTS))
+    (tmp_path / "odd.bin").write_bytes(b"0" + COUNTS.tobytes())
+    odd = MappedFrames(tmp_path / "odd.bin", COUNTS.shape, COUNTS.dtype, offset=1)
+    assert odd.in_place(0, 2) is None
+    np.testing.assert_array_equal(odd.read(0, 7), COUNTS)
+    odd.close()
+    with open_stack(tmp_path / "columns.npy") as stack:
+        assert stack.in_place(0, 2) is None
+
+
+def test_frames_of_a_tiff_lie_in_place_unless_something_is_between_them(tmp_path: Path) -> None:
+    for name, options, placed in (
+        ("together", {}, True),
+        ("packed", {"compression": "zlib"}, False),
+        ("apart", {"contiguous": False}, False),
+    ):
+        path = tmp_path / f"{name}.tif"
+        with tifffile.TiffWriter(path) as file:
+            if options:
+                for frame in COUNTS:
+                    file.write(frame, photometric="minisblack", **options)
+            else:
+                file.write(COUNTS, photometric="minisblack")
+        with open_stack(path) as stack:
+            found = stack.in_place(1, 6)
+            assert (found is not None) == placed
+            if found is not None:
+                np.testing.assert_array_equal(found.counts, stack.read(1, 6))
 
 
 # ---- HDF5 ------------------------------------------------------------------------------------

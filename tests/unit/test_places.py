@@ -12,6 +12,7 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.config import with_absolute_paths
+from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.chunks import Reader
@@ -124,11 +125,12 @@ def test_files_of_a_configuration_are_found_from_everywhere(tmp_path: Path, monk
     assert with_absolute_paths(ia.configure()) == ia.configure()
 
 
-def test_a_chunk_knows_the_frame_before_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stored", ["<u2", ">u2"], ids=["in place", "read"])
+def test_a_chunk_knows_the_frame_before_it(tmp_path: Path, stored: str) -> None:
     """Its first frame may repeat that one, whether or not the reader has held it."""
     counts = np.random.default_rng(1).poisson(100, (30, 8, 8)).astype("u2")
     counts[12] = counts[11]
-    np.save(tmp_path / "movie.npy", counts)
+    np.save(tmp_path / "movie.npy", counts.astype(stored))
     with open_stack(tmp_path / "movie.npy") as stack:
         goods = []
         for spans in ([(12, 20)], [(5, 15), (12, 20)]):
@@ -139,6 +141,37 @@ def test_a_chunk_knows_the_frame_before_it(tmp_path: Path) -> None:
         first = Reader(stack, Camera(), 12, 30, 10_000)
         assert first.counts(12, 20)[1].all()  # nothing before it is looked at
     assert goods[0] == goods[1] == [False] + 7 * [True]
+
+
+@pytest.mark.parametrize("stored", ["<u2", ">u2"], ids=["in place", "read"])
+def test_frames_of_one_chunk_after_the_other_are_those_of_the_file(
+    tmp_path: Path, stored: str
+) -> None:
+    counts = np.random.default_rng(2).poisson(100, (40, 6, 8)).astype(stored)
+    np.save(tmp_path / "movie.npy", counts)
+    with open_stack(tmp_path / "movie.npy") as stack:
+        reader = Reader(stack, Camera(), 3, 40, 12 * 6 * 8 * 2)
+        for span in [(3, 9), (3, 15), (5, 13), (10, 25), (30, 40), (3, 15), (20, 40)]:
+            found, good, light = reader.counts(*span)
+            np.testing.assert_array_equal(found, counts[slice(*span)])
+            assert good.all()
+            np.testing.assert_allclose(light, counts[slice(*span)].mean(axis=(1, 2)), rtol=1e-12)
+            if span == (30, 40):
+                reader.forget()
+
+
+def test_a_region_of_a_file_that_has_shrunk_is_not_looked_at(tmp_path: Path) -> None:
+    counts = np.random.default_rng(3).poisson(100, (40, 32, 32)).astype("<u2")
+    path = tmp_path / "movie.npy"
+    np.save(path, counts)
+    with open_stack(path) as stack, threads(1) as pool:
+        chunk = Reader(stack, Camera(), 0, 40, 10**6).chunk((0, 40), 10, pool)
+        np.testing.assert_array_equal(
+            chunk.patch(3, 9, (1, 4), (2, 7)).counts, counts[3:9, 1:4, 2:7]
+        )
+        path.write_bytes(path.read_bytes()[:2000])
+        with pytest.raises(DataError, match="shrank"):
+            chunk.patch(3, 9, (1, 4), (2, 7))
 
 
 # ---- threads of a worker ---------------------------------------------------------------------

@@ -41,6 +41,8 @@ class Chunk:
         Blocks, relative to `first`.
     blocks_e : ndarray, shape (k, y, x)
         Photoelectrons summed over each block.
+    check : callable
+        Raises DataError where `counts` may no longer be looked at.
     """
 
     first: int
@@ -53,6 +55,7 @@ class Chunk:
     saturated: BoolArray
     edges: NDArray[np.int64]
     blocks_e: FloatArray
+    check: Callable[[], None]
 
     @property
     def stop(self) -> int:
@@ -85,6 +88,7 @@ class Chunk:
         Patch
             Counts and light of these frames and pixels.
         """
+        self.check()
         here, pixels = self.cut(start, stop), (slice(*rows), slice(*columns))
         camera = self.camera
         return Patch(
@@ -250,6 +254,7 @@ def make_chunk(
     *,
     stride: int,
     defects: Callable[[FloatArray, FloatArray], BoolArray],
+    check: Callable[[], None] = lambda: None,
     mapper: Mapper = map,
 ) -> Chunk:
     """Sum consecutive frames in blocks.
@@ -270,6 +275,8 @@ def make_chunk(
         Frames per block; the last may be shorter.
     defects : callable
         Summed photoelectrons and their read-noise variance → dead and hot pixels.
+    check : callable
+        Raises DataError where `counts` may no longer be looked at.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -307,8 +314,9 @@ def make_chunk(
     variance = camera.read_variance_e2((rows, columns))
     usable = ~(saturated | defects(total, n.sum() * variance)) & (total > 0)
     return Chunk(
-        first, counts, good, power, camera, total / power.sum(), usable, saturated, edges, blocks
-    )
+        first, counts, good, power, camera, total / power.sum(), usable, saturated, edges, blocks,
+        check,
+    )  # fmt: skip
 
 
 def _at(value: float | FloatArray, here: tuple[slice, slice]) -> Any:
