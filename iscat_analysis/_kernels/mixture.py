@@ -1,7 +1,6 @@
 """Mixture of normal distributions with an error of its own for each event: EM and likelihood.
 
 x_i ~ Σ_k w_k N(μ_k, τ_k² + σ_i²), seen where an estimate of it exceeds a threshold.
-Loops, because the arrays are a few hundred by a few.
 """
 
 from __future__ import annotations
@@ -9,15 +8,170 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
+from iscat_analysis._kernels.lattice import FAST
 
 FloatArray = NDArray[np.float64]
 
 _LOG_2PI = math.log(2.0 * math.pi)
 _SURE = 9.0  # standard deviations above the threshold: a chance of 1 to the last digit
 _TINY = 1e-250  # a density below it is added up by logarithms
+_BLOCK = 128  # events whose numbers stay in the cache
+_LN2_HIGH, _LN2_LOW = (
+    0.6931471803691238,
+    1.90821492927058770002e-10,
+)  # ln 2; the first has few digits
+_HALVES = np.exp2(-np.arange(1024.0))
+
+
+@njit(inline="always")
+def _exp_falling(x: float) -> float:
+    """Give exp x for −700 ≤ x ≤ 0, in a form of which processors do several at a time; to 2e-16."""
+    halvings = np.int32(0.5 - x / _LN2_HIGH)
+    r = (x + halvings * _LN2_HIGH) + halvings * _LN2_LOW
+    value: float = 1.0 / 6227020800.0
+    value = value * r + 1.0 / 479001600.0
+    value = value * r + 1.0 / 39916800.0
+    value = value * r + 1.0 / 3628800.0
+    value = value * r + 1.0 / 362880.0
+    value = value * r + 1.0 / 40320.0
+    value = value * r + 1.0 / 5040.0
+    value = value * r + 1.0 / 720.0
+    value = value * r + 1.0 / 120.0
+    value = value * r + 1.0 / 24.0
+    value = value * r + 1.0 / 6.0
+    value = value * r + 0.5
+    value = value * r + 1.0
+    value = value * r + 1.0
+    value *= _HALVES[np.uint32(halvings)]
+    return value
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def _densities(
+    x: FloatArray,
+    noise: FloatArray,
+    weight: float,
+    mean: float,
+    variance: float,
+    share: FloatArray,
+    slope: FloatArray,
+    inverse: FloatArray,
+    norm: FloatArray,
+) -> None:
+    """Fill √(2π) times the density of a species at some events, and add it to `norm`.
+
+    `slope` and `inverse` become (x − μ)/(τ² + σ²) and 1/(τ² + σ²).
+    """
+    for i in range(x.size):
+        over = 1.0 / (variance + noise[i])
+        d = x[i] - mean
+        slope[i], inverse[i] = d * over, over
+        share[i] = weight * math.sqrt(over) * _exp_falling(max(-0.5 * d * d * over, -700.0))
+        norm[i] += share[i]
+
+
+@kernel()
+def _by_logarithms(
+    weight: FloatArray, share: FloatArray, slope: FloatArray, inverse: FloatArray, norm: FloatArray
+) -> float:
+    """Do events that are far from every species anew; by how much their logarithms are larger."""
+    added = 0.0
+    for i in range(norm.size):
+        if norm[i] > _TINY:
+            continue
+        top = -1e300
+        for j in range(weight.size):
+            share[j, i] = math.log(weight[j] + 1e-300) + 0.5 * math.log(inverse[j, i])
+            share[j, i] -= 0.5 * slope[j, i] * slope[j, i] / inverse[j, i]
+            top = max(top, share[j, i])
+        norm[i] = 0.0
+        for j in range(weight.size):
+            share[j, i] = math.exp(share[j, i] - top)
+            norm[i] += share[j, i]
+        added += top
+    return added
+
+
+@kernel()
+def _expect(
+    x: FloatArray,
+    noise: FloatArray,
+    weight: FloatArray,
+    mean: FloatArray,
+    variance: FloatArray,
+    share: FloatArray,
+    slope: FloatArray,
+    inverse: FloatArray,
+    norm: FloatArray,
+) -> float:
+    """Fill what each event may be, the reciprocal of the norm too; Σ log of √(2π) the density."""
+    norm[:] = 0.0
+    for j in range(weight.size):
+        _densities(x, noise, weight[j], mean[j], variance[j], share[j], slope[j], inverse[j], norm)
+    value: float = _by_logarithms(weight, share, slope, inverse, norm)
+    for i in range(norm.size):
+        value += math.log(norm[i])
+        norm[i] = 1.0 / norm[i]
+    return value
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def _moments(
+    share: FloatArray, over: FloatArray, slope: FloatArray, inverse: FloatArray, noise: FloatArray
+) -> tuple[float, float, float, float, float]:
+    """Sum the shares r of a species, r·slope, r·slope², r·inverse and r·inverse·σ²."""
+    size = first = second = spread = noisy = 0.0
+    for i in range(over.size):
+        r = share[i] * over[i]
+        size += r
+        first += r * slope[i]
+        second += r * slope[i] * slope[i]
+        spread += r * inverse[i]
+        noisy += r * inverse[i] * noise[i]
+    return size, first, second, spread, noisy
+
+
+@kernel()
+def mixture_sums(
+    x: FloatArray, noise: FloatArray, weight: FloatArray, mean: FloatArray, variance: FloatArray
+) -> tuple[float, FloatArray]:
+    """Sum over events what steps and slopes are made of.
+
+    Parameters
+    ----------
+    x, noise : ndarray, shape (n,)
+        Measured values and σ_i².
+    weight, mean, variance : ndarray, shape (k,)
+        w, μ and τ².
+
+    Returns
+    -------
+    value : float
+        Σ_i log Σ_k w_k N(x_i; μ_k, τ_k² + σ_i²).
+    sums : ndarray, shape (k, 5)
+        With r the chance that an event is of a species and u = 1/(τ² + σ²): Σ r, Σ r u (x − μ),
+        Σ r u² (x − μ)², Σ r u and Σ r u σ².
+    """
+    n, k = x.size, weight.size
+    sums = np.zeros((k, 5))
+    share, slope, inverse = np.empty((k, _BLOCK)), np.empty((k, _BLOCK)), np.empty((k, _BLOCK))
+    norm = np.empty(_BLOCK)
+    value = -0.5 * n * _LOG_2PI
+    for start in range(0, n, _BLOCK):
+        stop = min(start + _BLOCK, n)
+        here = norm[: stop - start]
+        value += _expect(
+            x[start:stop], noise[start:stop], weight, mean, variance, share, slope, inverse, here
+        )
+        for j in range(k):
+            found = _moments(share[j], here, slope[j], inverse[j], noise[start:stop])
+            for m in range(5):
+                sums[j, m] += found[m]
+    return value, sums
 
 
 @kernel()
@@ -40,36 +194,15 @@ def mixture_em(
     steps : int
         How many.
     """
-    n, k = x.size, weight.size
-    share = np.empty(k)
-    size, first, second = np.empty(k), np.empty(k), np.empty(k)
     for _ in range(steps):
-        size[:] = 1e-12
-        first[:] = 0.0
-        second[:] = 0.0
-        for i in range(n):
-            top = -1e300
-            for j in range(k):
-                total = variance[j] + noise[i]
-                d = x[i] - mean[j]
-                share[j] = math.log(weight[j] + 1e-300) - 0.5 * (d * d / total + math.log(total))
-                top = max(top, share[j])
-            norm = 0.0
-            for j in range(k):
-                share[j] = math.exp(share[j] - top)
-                norm += share[j]
-            for j in range(k):
-                r = share[j] / norm
-                gain = variance[j] / (variance[j] + noise[i])
-                true = gain * (x[i] - mean[j])  # from the old mean, against cancellation
-                size[j] += r
-                first[j] += r * true
-                second[j] += r * (true * true + gain * noise[i])
-        for j in range(k):
-            shift = first[j] / size[j]
+        _, sums = mixture_sums(x, noise, weight, mean, variance)
+        for j in range(weight.size):
+            size = sums[j, 0] + 1e-12
+            shift = variance[j] * sums[j, 1] / size  # from the old mean, against cancellation
+            second = variance[j] * (variance[j] * sums[j, 2] + sums[j, 4])
             mean[j] += shift
-            variance[j] = max(second[j] / size[j] - shift * shift, 0.0)
-            weight[j] = size[j] / n
+            variance[j] = max(second / size - shift * shift, 0.0)
+            weight[j] = size / x.size
 
 
 @kernel()
@@ -92,36 +225,12 @@ def mixture_score(
     gradient : ndarray, shape (3, k)
         With respect to log w (each by itself), μ and τ².
     """
-    n, k = x.size, weight.size
-    gradient = np.zeros((3, k))
-    share, slope, inverse = np.empty(k), np.empty(k), np.empty(k)
-    value = 0.0
-    for i in range(n):
-        norm = 0.0
-        for j in range(k):
-            inverse[j] = 1.0 / (variance[j] + noise[i])
-            d = x[i] - mean[j]
-            slope[j] = d * inverse[j]
-            share[j] = weight[j] * math.sqrt(inverse[j]) * math.exp(-0.5 * d * slope[j])
-            norm += share[j]
-        if norm > _TINY:
-            value += math.log(norm) - 0.5 * _LOG_2PI
-        else:  # far from every species: by logarithms
-            top = -1e300
-            for j in range(k):
-                share[j] = math.log(weight[j] + 1e-300) + 0.5 * math.log(inverse[j])
-                share[j] -= 0.5 * slope[j] * slope[j] / inverse[j]
-                top = max(top, share[j])
-            norm = 0.0
-            for j in range(k):
-                share[j] = math.exp(share[j] - top)
-                norm += share[j]
-            value += top + math.log(norm) - 0.5 * _LOG_2PI
-        for j in range(k):
-            r = share[j] / norm
-            gradient[0, j] += r
-            gradient[1, j] += r * slope[j]
-            gradient[2, j] += 0.5 * r * (slope[j] * slope[j] - inverse[j])
+    value, sums = mixture_sums(x, noise, weight, mean, variance)
+    gradient = np.empty((3, weight.size))
+    for j in range(weight.size):
+        gradient[0, j] = sums[j, 0]
+        gradient[1, j] = sums[j, 1]
+        gradient[2, j] = 0.5 * (sums[j, 2] - sums[j, 3])
     return value, gradient
 
 

@@ -97,6 +97,28 @@ def test_far_from_every_species_the_likelihood_goes_on() -> None:
     assert np.allclose(slope[1], numerical, rtol=1e-3, atol=1e-6)
 
 
+def test_a_step_of_em_is_what_its_definition_says_for_any_number_of_events() -> None:
+    """The kernel takes events by blocks, and exponentials by a series of its own."""
+    rng = np.random.default_rng(4)
+    w, m, v = np.array([0.2, 0.5, 0.3]), np.array([60.0, 90.0, 300.0]), np.array([0.0, 9.0, 1e4])
+    for n in (1, 127, 128, 129, 300):
+        x, noise = rng.uniform(0, 700, n), rng.uniform(2, 90, n)
+        x[0] = 1e4  # where densities vanish
+        density = np.log(w) + norm.logpdf(x[:, None], m, np.sqrt(v + noise[:, None]))
+        share = np.exp(density - logsumexp(density, axis=1, keepdims=True))
+        true = m + v / (v + noise[:, None]) * (x[:, None] - m)
+        size = share.sum(axis=0) + 1e-12
+        mean = m + (share * (true - m)).sum(axis=0) / size
+        square = (share * ((true - m) ** 2 + (v / (v + noise[:, None])) * noise[:, None])).sum(0)
+        found = w.copy(), m.copy(), v.copy()
+        mixture_em(x, noise, *found, 1)
+        assert found[0] == pytest.approx(size / n, rel=1e-11)
+        assert found[1] == pytest.approx(mean, rel=1e-11)
+        assert found[2] == pytest.approx(square / size - (mean - m) ** 2, rel=1e-9, abs=1e-9)
+        value, _ = mixture_score(x, noise, w, m, v)
+        assert value == pytest.approx(logsumexp(density, axis=1).sum(), rel=1e-12)
+
+
 def test_em_never_goes_down() -> None:
     x, sigma = np.abs(sample()[0]), sample()[1]
     weight, mean, variance = np.array([0.5, 0.5]), np.array([20.0, 300.0]), np.array([900.0, 900.0])
