@@ -164,7 +164,7 @@ def log_likelihood(
     for events, structure in samples:
         value, slopes = score(events, structure.mixture(theta))
         total += value
-        slope += np.tensordot(slopes, structure.design, 2)
+        slope += slopes.ravel() @ structure.design.reshape(slopes.size, -1)
     return total, slope
 
 

@@ -93,7 +93,7 @@ class Chunk:
         camera = self.camera
         return Patch(
             first=self.first + here.start,
-            counts=np.ascontiguousarray(self.counts[(here, *pixels)]),
+            counts=_region(self.counts, here, rows, columns),
             good=self.good[here],
             power=self.power[here],
             gain=_at(camera.gain_e_per_adu, pixels),
@@ -317,6 +317,21 @@ def make_chunk(
         first, counts, good, power, camera, total / power.sum(), usable, saturated, edges, blocks,
         check,
     )  # fmt: skip
+
+
+def _region(
+    counts: NDArray[Any], frames: slice, rows: tuple[int, int], columns: tuple[int, int]
+) -> NDArray[Any]:
+    """Copy a region of frames, a row at a time: NumPy's copy of a slice takes pixel by pixel."""
+    stored, (by_frame, by_row, by_pixel) = counts.dtype, counts.strides
+    shape = max(frames.stop - frames.start, 0), rows[1] - rows[0], columns[1] - columns[0]
+    if not shape[0]:
+        return np.empty(shape, dtype=stored)
+    strips = np.ndarray(
+        shape[:2], dtype=f"V{shape[2] * by_pixel}", buffer=counts, strides=(by_frame, by_row),
+        offset=frames.start * by_frame + rows[0] * by_row + columns[0] * by_pixel,
+    )  # fmt: skip
+    return strips.copy().view(stored).reshape(shape)
 
 
 def _at(value: float | FloatArray, here: tuple[slice, slice]) -> Any:
