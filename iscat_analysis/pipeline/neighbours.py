@@ -216,14 +216,20 @@ class Neighbours:
         factor: FloatArray = self.factor(step, before, after, inside) / model**step.sign
         return factor
 
-    def add_change(self, total: FloatArray, step: Step, before: slice, after: slice) -> None:
-        """Add to a field the contrast that a step's particle makes between ranges of frames."""
+    def change(self, step: Step, before: slice, after: slice) -> tuple[FloatArray, float]:
+        """Contrast that a step's particle makes between ranges of frames: a multiple of an image.
+
+        A weak one has the same image, its own, at all times.
+        """
         strong = abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK
         if strong or self._pattern is not None:
-            total[self.box(step)] += self.factor(step, before, after) - 1
-            return
-        share = self.presence(step, after) - self.presence(step, before)
-        add_image(total, step.corner, step.image, share)
+            return self.factor(step, before, after) - 1, 1.0
+        return step.image, self.presence(step, after) - self.presence(step, before)
+
+    def add_change(self, total: FloatArray, step: Step, before: slice, after: slice) -> None:
+        """Add to a field the contrast that a step's particle makes between ranges of frames."""
+        image, share = self.change(step, before, after)
+        add_image(total, step.corner, image, share)
 
     def _present(self, step: Step, frames: slice) -> slice:
         """Give those of the frames in which the particle is there; all if it is there in none."""

@@ -28,21 +28,19 @@ from iscat_analysis.pipeline.pattern import MovingPattern
 from iscat_analysis.pipeline.repeats import step_controls, step_repeats
 from iscat_analysis.pipeline.scene import Scene, reported_steps
 from iscat_analysis.pipeline.sidelobes import Sieve
+from iscat_analysis.pipeline.step_maps import StepMaps
 from iscat_analysis.pipeline.tasks import Task, TaskBuilder
 from iscat_analysis.pipeline.traces import clip_of, patch_of, trace_of
 from iscat_analysis.records import FREE_PARAMETERS, Candidate, Clip, FloatArray, Trace
 from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.residue import chi2_excess
 from iscat_analysis.search.sliding import (
-    STRIDES,
     Chunk,
     Filter,
-    MapArray,
     Peak,
     StepFrame,
     find_steps,
     make_filter,
-    sliding_maps,
 )
 from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, refuse_flood
 
@@ -130,15 +128,12 @@ class ChunkFitter:
         self._pattern = pattern
         self._window = window
         self._pool = pool
-        self._strides = STRIDES
         self._roi_px = scene.roi_px
         self._neighbours = Neighbours(scene, chunk, window, pattern)
         self._tasks = TaskBuilder(scene, chunk, window, self._neighbours, pattern)
         self._stride = int(chunk.edges[1] - chunk.edges[0])
         self._sieve = Sieve(chunk.first, self._stride, window, scene.roi_px)
-        self._maps: tuple[MapArray, FloatArray] | None = None
         self._doubtful: list[Peak] = []
-        self._near: list[list[Step]] = []  # for each map, the steps that were taken off it
         self.strongest = np.zeros((2, *chunk.shape))
         self.rounds = 0
         self.empty: EmptySpread | None = None  # noise where nothing lands or leaves
@@ -158,12 +153,13 @@ class ChunkFitter:
         """
         templates = self._scene.templates
         matched = make_filter(self._chunk, templates.images[0], templates.noise)
+        maps = StepMaps(self._scene, self._chunk, matched, self._neighbours, self._pattern)
         steps: list[Step] = []
         rejected: list[Step] = []
         for self.rounds in range(1, ROUNDS + 1):
             fresh = [
                 s
-                for s in self._search(matched, steps)
+                for s in self._search(maps, matched, steps)
                 if not any(
                     distance_px(s, r) < _SAME_PX and _apart(s, r) <= self._stride for r in rejected
                 )
@@ -187,7 +183,7 @@ class ChunkFitter:
             kept = {id(s) for s in credible}
             rejected += [s for s in steps if id(s) not in kept]
             steps = credible
-        self._maps = None  # fits need their memory
+        del maps  # fits need their memory
         if not steps:
             return []
         lobes = [self._begin(peak) for peak in self._doubtful]
@@ -244,35 +240,9 @@ class ChunkFitter:
 
     # ---- search ----------------------------------------------------------------------------
 
-    def _search(self, matched: Filter, steps: Sequence[Step]) -> list[Step]:
+    def _search(self, maps: StepMaps, matched: Filter, steps: Sequence[Step]) -> list[Step]:
         scene, chunk = self._scene, self._chunk
-        moving, edges, count = self._pattern, chunk.edges, chunk.edges.size - 2
-        near = []
-        for j in range(count):
-            low, high = max(j + 1 - self._strides, 0), min(j + 1 + self._strides, count + 1)
-            span = slice(int(edges[low]), int(edges[high]))
-            if moving:
-                middle = int(edges[j + 1])
-                span = moving.span(slice(span.start, middle), slice(middle, span.stop))
-            near.append([s for s in steps if self._neighbours.overlaps(s, span.start, span.stop)])
-
-        def explained(j: int, before: slice, after: slice) -> FloatArray | None:
-            if not near[j]:
-                return moving.contrast[j] if moving else None
-            total = np.zeros(chunk.shape)
-            for step in near[j]:
-                self._neighbours.add_change(total, step, before, after)
-            total = scene.left(total)
-            return total + moving.contrast[j] * (1 + total) if moving else total
-
-        self._maps = snr, effective = sliding_maps(
-            chunk, matched, self._strides,
-            explained=explained if steps or moving else None,
-            earlier=self._maps,
-            changed=[j for j, old in enumerate(self._near) if _ids(old) != _ids(near[j])],
-            mapper=self._pool.map,
-        )  # fmt: skip
-        self._near = near
+        snr, effective = maps.without(steps, self._pool.map)
         if not steps and len(snr):
             where = np.argmax(np.abs(snr), axis=0)
             best = np.take_along_axis(snr, where[None], axis=0)[0].astype(np.float64)
@@ -432,11 +402,6 @@ class ChunkFitter:
             ):
                 kept.append(step)
         return kept
-
-
-def _ids(steps: Sequence[Step]) -> set[int]:
-    """Tell apart the very same steps from those that were fitted anew."""
-    return {id(step) for step in steps}
 
 
 def _has_moved(old: Step, new: Step) -> bool:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +85,8 @@ class Filter:
         Information about the amplitude, per frame.
     noise : NoiseSpectrum or None
         What the noise is where it is not white and of the expected size.
+    template : ndarray, shape (k, k)
+        Contrast per unit amplitude, k odd.
     """
 
     spectrum: NDArray[np.complex64]
@@ -92,6 +95,53 @@ class Filter:
     weight: MapArray
     norm: MapArray
     noise: NoiseSpectrum | None
+    template: FloatArray
+
+    def response(
+        self, corner: tuple[int, int], contrast: FloatArray
+    ) -> tuple[tuple[slice, slice], MapArray]:
+        """Filter a small image alone, on a field without contrast and with white noise.
+
+        Parameters
+        ----------
+        corner : (int, int)
+            Row and column of its first pixel, all of which lie in the field.
+        contrast : ndarray, shape (ny, nx)
+            Its values.
+
+        Returns
+        -------
+        box : (slice, slice)
+            Pixels of the field that it reaches.
+        snr : ndarray of float32
+            There, what a map of `sliding_maps` gains where one frame before and infinitely many
+            after are compared; in others times the root of the effective frames.
+        """
+        half, field = self.half, self.weight.shape
+        inside = tuple(slice(c, c + n) for c, n in zip(corner, contrast.shape, strict=True))
+        weighted = self.weight[inside] * contrast.astype(np.float32)
+        reach = contrast.shape[0] + 2 * half, contrast.shape[1] + 2 * half
+        size = fft.next_fast_len(reach[0], real=True), fft.next_fast_len(reach[1], real=True)
+        spectrum = fft.rfft2(weighted, s=size) * self._spectrum_of(size)
+        whole = fft.irfft2(spectrum, s=size)[: reach[0], : reach[1]]
+        box, seen = [], []
+        for c, n, end in zip(corner, contrast.shape, field, strict=True):
+            low, high = max(c - half, 0), min(c + n + half, end)
+            box.append(slice(low, high))
+            seen.append(slice(low - c + half, high - c + half))
+        there = box[0], box[1]
+        return there, whole[seen[0], seen[1]] / np.sqrt(self.norm[there])
+
+    def _spectrum_of(self, size: tuple[int, int]) -> NDArray[np.complex64]:
+        """Give the spectrum of the reversed template, its first pixel at the origin."""
+        if size not in self._spectra:
+            reversed_ = self.template[::-1, ::-1].astype(np.float32)
+            self._spectra[size] = fft.rfft2(reversed_, s=size)
+        return self._spectra[size]
+
+    @cached_property
+    def _spectra(self) -> dict[tuple[int, int], NDArray[np.complex64]]:
+        return {}
 
 
 def make_filter(chunk: Chunk, template: FloatArray, noise: NoiseSpectrum | None = None) -> Filter:
@@ -139,6 +189,7 @@ def make_filter(chunk: Chunk, template: FloatArray, noise: NoiseSpectrum | None 
         weight[:rows, :columns].astype(np.float32),
         norm.astype(np.float32),
         noise,
+        template,
     )
 
 
