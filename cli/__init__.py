@@ -74,6 +74,11 @@ def _start(program: str, arguments: Sequence[str] | None) -> int:
             signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
         try:
             from iscat_cli import app
+
+            if arguments is None:
+                from iscat_cli.shrunk import explain_bus_errors
+
+                explain_bus_errors(program)
         finally:
             if ours:
                 signal.signal(signal.SIGINT, signal.default_int_handler)

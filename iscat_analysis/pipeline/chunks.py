@@ -169,10 +169,10 @@ class Reader:
         return chunk
 
     def opening(self, mapper: Mapper = map) -> NDArray[Any]:
-        """Good frames among the first, on which the noise is judged."""
+        """Good frames among the first, on which the noise is judged; a copy of a file's."""
         stop = min(self.last, self.first + NOISE_FRAMES)
         counts, good, _ = self.counts(self.first, stop, mapper)
-        used = counts if good.all() else counts[good]
+        used = counts[good] if self._placed or not good.all() else counts
         if len(used) < 2:
             raise DataError(f"{self.name}: has no two frames that differ; export it again")
         return used

@@ -294,6 +294,7 @@ def make_chunk(
     highest = np.empty((edges.size - 1, rows, columns), dtype=counts.dtype)
 
     def one(k: int) -> None:
+        check()
         part = slice(edges[k], edges[k + 1])
         start = int(np.argmax(good[part])) + int(edges[k])
         highest[k] = counts[start]
