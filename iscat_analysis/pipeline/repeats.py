@@ -32,8 +32,8 @@ from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Windows
 from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.sliding import Chunk
 
-PLACES = 20_000
-"""Places times windows at which the noise of a chunk is looked at."""
+PLACES, MOVIE_PLACES = 20_000, 100_000
+"""Places times windows at which the noise of a chunk is looked at, and of a whole movie."""
 
 MOST_WINDOWS, FEWEST_WINDOWS = 8, 2
 """Windows of a chunk that are looked at."""
@@ -192,7 +192,7 @@ def step_controls(
         scene, chunk.mean_e, chunk.camera.read_variance_e2(chunk.shape), chunk.usable,
         [event.fit for event in events], level=True,
     )  # fmt: skip
-    most = int(np.clip(PLACES // max(field.places, 1), FEWEST_WINDOWS, MOST_WINDOWS))
+    most = _most_windows(field.places, (chunk.edges.size - 2) / scene.searches)
     apart: list[int] = []
     for t in times:
         if not apart or t >= apart[-1] + window:
@@ -224,6 +224,12 @@ def step_controls(
         found = field.spread(sides[0], sides[1], (powers[0], powers[1]), taken)
         total = found if total is None else total + found
     return total
+
+
+def _most_windows(places: int, share: float) -> int:
+    """Windows to look at in a chunk with so many places, which is a share of its movie."""
+    enough = min(PLACES, MOVIE_PLACES * share) / max(places, 1)
+    return int(np.clip(enough, FEWEST_WINDOWS, MOST_WINDOWS))
 
 
 def _cuts(chunk: Chunk, start: int, stop: int) -> Iterator[slice]:

@@ -43,6 +43,8 @@ class Scene:
         Matched filter.
     mode : str
         Key of `FREE_PARAMETERS`.
+    searches : int
+        Images, or boundaries between windows, that are searched in all of the movie.
     lines : Lines or None
         Rows and columns whose flicker is divided out of the frames.
     """
@@ -52,6 +54,7 @@ class Scene:
     wide: ForwardModel
     templates: Templates
     mode: str
+    searches: int = 1
     lines: Lines | None = None
 
     @property
@@ -178,6 +181,7 @@ def make_scene(
             correlation=CORRELATION if sliding and searches > 1 else 0.0,
         ),
         mode=mode,
+        searches=searches,
         lines=lines,
     )
 

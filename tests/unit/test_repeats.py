@@ -25,6 +25,7 @@ from iscat_analysis.inference.repeats import (
 )
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline.achieved import likely_noise, measured_scale, spread_verdict
+from iscat_analysis.pipeline.repeats import _most_windows
 from iscat_analysis.pipeline.summary import _across
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
 from iscat_analysis.report import render_report
@@ -396,3 +397,11 @@ def test_species_of_poor_fits_are_judged_where_the_model_is_rejected() -> None:
     assert one["spread_over_sigma"] == pytest.approx(np.hypot(1, 7.5 / 2), rel=0.2)
     fine = table.assign(status="ok", flags="", p_value=rng.uniform(size=120))
     assert _across(scene, fine, {"species": []}) == []  # type: ignore[arg-type]
+
+
+def test_a_long_movie_is_looked_at_in_as_many_windows_as_tell_its_noise() -> None:
+    assert _most_windows(4000, 1.0) == 5  # of one chunk
+    assert _most_windows(4000, 0.25) == 5
+    assert _most_windows(100, 1.0) == 8
+    for chunks in (20, 100):  # every chunk has two all the same
+        assert _most_windows(4000, 1 / chunks) == 2
