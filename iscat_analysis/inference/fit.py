@@ -46,6 +46,9 @@ POOR_FIT_P = 1e-3
 FOLLOWED = 30.0
 """Log-likelihood below the best optimum down to which others are followed to their ends."""
 
+PLAIN = 2 * FOLLOWED
+"""Log-likelihood of a particle against none from which the scan of heights is believed alone."""
+
 OUTWARD = 3.0
 """Standard deviations by which the data pull a height beyond the end of its range, or a mass beyond
 the end of a calibration's line, before the fit is said to be at a bound: fewer are chance."""
@@ -58,6 +61,7 @@ AMPLITUDE = 3
 
 _STARTS = 8  # local maxima of the scan that are followed
 _WINDOW_NM = 350.0  # how far x and y may move from the start
+_NOTHING_KNOWN = np.zeros((5, 5))  # information where nothing was looked at
 
 
 def window_nm(pixel_nm: float) -> float:
@@ -272,24 +276,36 @@ def start_theta(likelihood: Likelihood, start: Candidate) -> FloatArray:
 def _optima(likelihood: Likelihood, start: Candidate, box: Box) -> list[Optimum]:
     """Every optimum that was reached, best first.
 
-    Starts are followed in the order of their likelihood, the given one last, and no farther than
-    shows that the optimum cannot be within `FOLLOWED` of the best.
+    Starts are followed in the order of their likelihood, and no farther than shows that the optimum
+    cannot be within `FOLLOWED` of the best.  The given height is one of the scan.  Where it is none
+    of its maxima, it is followed only if what was found is fainter than `PLAIN`, when each start may
+    end elsewhere, or if there is no reference, when there are no fringes that a scan could follow.
     """
     theta = start_theta(likelihood, start)
     theta = np.minimum(np.maximum(theta, box.lower), box.upper)  # what is not free has no room
     if not box.free[2]:
         return [likelihood.maximize(theta, box.free, box.lower, box.upper)]
     optima: list[Optimum] = []
-    best = -math.inf
-    for begin, value in [*_heights(likelihood, theta, box), (theta, 0.0)]:
+    best, plain = -math.inf, False
+    for begin, value in _heights(likelihood, theta, box):
         if box.free[3] and begin[3] == 0.0 and best > 0.0:
-            optima.append(Optimum(begin, value, 0, False, np.zeros((5, 5))))  # no particle there
+            optima.append(Optimum(begin, value, 0, False, _NOTHING_KNOWN))  # no particle there
             continue
         found = likelihood.maximize(begin, box.free, box.lower, box.upper, least=best - FOLLOWED)
         optima.append(found)
         if found.converged and found.log_likelihood > best:
-            best = found.log_likelihood
+            best, plain = found.log_likelihood, _is_plain(found)
+    if not plain or likelihood.model.rho == 0:
+        optima.append(
+            likelihood.maximize(theta, box.free, box.lower, box.upper, least=best - FOLLOWED)
+        )
     return sorted(optima, key=lambda o: (not o.converged, -o.log_likelihood))
+
+
+def _is_plain(found: Optimum) -> bool:
+    """Whether a particle is told from none, and not only a level of the light from another."""
+    alone = 0.5 * found.theta[AMPLITUDE] ** 2 * found.fisher[AMPLITUDE, AMPLITUDE]
+    return bool(min(found.log_likelihood, alone) > PLAIN)
 
 
 def _heights(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[tuple[FloatArray, float]]:
