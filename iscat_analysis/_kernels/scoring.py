@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.dense import factorise, solve
 from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
-from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lattice import FAST, TAPS
 from iscat_analysis._kernels.lattice_rows import lattice_span
 from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, Lens
 from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_at
 from iscat_analysis._kernels.radial_rows import intervals_needed, radial_strip, strip_scratch
+from iscat_analysis._kernels.stamp import STRIP, begin_stamp, stamp_strip
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -205,13 +206,9 @@ def image_value(kind: int, data: FloatArray, level: float, rows: FloatArray) -> 
 
 @kernel()
 def image_score(
-    kind: int,
-    data: FloatArray,
-    level: float,
-    rows: FloatArray,
-    score: FloatArray,
+    kind: int, data: FloatArray, level: float, rows: FloatArray, score: FloatArray,
     fisher: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Fill score (5) and Fisher matrix (5, 5) of an image; `rows` as in `image_value`."""
     ny, nx = rows.shape[0], rows.shape[2]
     flat, sums = data.reshape(4, ny * nx), np.zeros(20)
@@ -255,6 +252,17 @@ def score_pass(
             total += _some_value(kind, flat, row * nx, end * nx, level, here[0])
         _unpack(sums, score, fisher)
         return total
+    if len(lens) == STAMP:
+        flat, sums, total = data.reshape(4, ny * nx), np.zeros(20), 0.0
+        scratch = begin_stamp(profile, lens, pixels, theta[0], theta[1], theta[3])
+        at, lines = np.empty(TAPS, dtype=np.int64), np.zeros((5, STRIP * nx))
+        for row in range(0, ny, STRIP):
+            end = min(row + STRIP, ny)
+            stamp_strip(profile, lens, theta[3], row, end - row, nx, at, scratch, lines)
+            _add_score(kind, flat, row * nx, end * nx, level, lines, sums)
+            total += _some_value(kind, flat, row * nx, end * nx, level, lines[0])
+        _unpack(sums, score, fisher)
+        return total
     g = np.empty((ny, 5, nx))
     signal_gradient(profile, lens, pixels, theta[0], theta[1], theta[3], g)
     image_score(kind, data, level, g, score, fisher)
@@ -264,12 +272,7 @@ def score_pass(
 
 @kernel()
 def value_pass(
-    profile: FloatArray,
-    lens: Lens,
-    pixels: Pixels,
-    kind: int,
-    data: FloatArray,
-    theta: FloatArray,
+    profile: FloatArray, lens: Lens, pixels: Pixels, kind: int, data: FloatArray, theta: FloatArray
 ) -> float:
     """Log-likelihood at θ, without derivatives."""
     level = np.exp(theta[4])
