@@ -318,6 +318,7 @@ def test_a_bad_start_costs_no_optimum(seed: int) -> None:
     fit = fit_particle(which, start, "joint", (0.0, 600.0), level=True)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("iscat_analysis.inference.fit.FOLLOWED", math.inf)
+        patched.setattr("iscat_analysis.inference.fit.PLAIN", math.inf)
         slow = fit_particle(which, start, "joint", (0.0, 600.0), level=True)
     assert fit.log_likelihood == pytest.approx(slow.log_likelihood, abs=0.1)
     assert fit.status == slow.status
