@@ -15,6 +15,8 @@ four entries zero.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -24,7 +26,7 @@ from iscat_analysis._kernels.dense import factorise, solve
 from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.lattice import FAST, TAPS
 from iscat_analysis._kernels.lattice_rows import lattice_span
-from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, Lens
+from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, Lens, named_lens
 from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_at
 from iscat_analysis._kernels.radial_rows import intervals_needed, radial_strip, strip_scratch
 from iscat_analysis._kernels.stamp import STRIP, begin_stamp, stamp_strip
@@ -379,9 +381,9 @@ def scoring_step(
 
 @kernel()
 def maximize(
-    axial: AxialTable,
-    lens: Lens,
-    pixels: Pixels,
+    table: tuple[Any, ...],
+    optics: tuple[Any, ...],
+    grid: tuple[Any, ...],
     kind: int,
     data: FloatArray,
     free: BoolArray,
@@ -391,7 +393,6 @@ def maximize(
     tolerance: float,
     iterations: int,
     theta: FloatArray,
-    score: FloatArray,
     fisher: FloatArray,
     least: float,
 ) -> tuple[float, int, int]:
@@ -399,8 +400,9 @@ def maximize(
 
     Parameters
     ----------
-    axial, lens, pixels
-        The model; see `profile_at` and `signal_gradient`.
+    table, optics, grid : tuple
+        Fields of the `AxialTable`, the `Lens` and the `Pixels` of the model; without their names,
+        which it takes longer to hand over.
     kind : int
         CONDITIONAL or POISSON.
     data : ndarray, shape (4, ny, nx)
@@ -417,8 +419,8 @@ def maximize(
         Passes over the data at most.
     theta : ndarray, shape (5,)
         Start; overwritten.
-    score, fisher : ndarray, shape (5,), (5, 5)
-        Filled with those at the last pass.
+    fisher : ndarray, shape (5, 5)
+        Filled with that of the last pass.
     least : float
         Log-likelihood below which the maximum is of no interest: where `HOPE` times the expected
         gain would not reach it, the search ends after that step, HOPELESS.
@@ -432,9 +434,10 @@ def maximize(
     outcome : int
         CONVERGED, STALLED, EXHAUSTED or HOPELESS.
     """
+    axial, lens, pixels = AxialTable(*table), named_lens(optics), Pixels(*grid)
     profile = blank_profile(axial, lens, 2)
     width = axial.heights.shape[3]
-    step, trial = np.empty(5), np.empty(5)
+    step, trial, score = np.empty(5), np.empty(5), np.empty(5)
     trial_score, trial_fisher = np.empty(5), np.empty((5, 5))
     active = np.empty(5, dtype=np.bool_)
     damping = 0.0
