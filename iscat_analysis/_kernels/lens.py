@@ -7,10 +7,12 @@ take half of the time of a first run.
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from iscat_analysis._kernels import kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -94,3 +96,16 @@ LATTICE: Final = 5
 
 STAMP: Final = 4
 """Fields of the lens of a sampled picture."""
+
+
+@kernel()
+def named_lens(fields: tuple[Any, ...]) -> Lens:
+    """Make a lens of its fields.
+
+    A plain tuple reaches a kernel in half of the time that one with names takes.
+    """
+    if len(fields) == ROUND:
+        return RoundLens(*fields)
+    if len(fields) == LATTICE:
+        return LatticeLens(*fields)
+    return StampLens(*fields)

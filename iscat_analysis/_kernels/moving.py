@@ -228,7 +228,7 @@ def _climb(
     value, _, outcome = maximize(
         table_of(near, group), lens_of(near, group), pixels, np.int64(POISSON),
         data.astype(np.float64), search.free, lower, upper, search.max_step, search.tolerance,
-        search.passes, p, score, fisher, -np.inf,
+        search.passes, p, fisher, -np.inf,
     )  # fmt: skip  # np.int64: a constant would be compiled for by itself
     draw_gradient(near, group, p, pixels, profile, both[0])
     place_score(data, both[0], near.lens, score, fisher)

@@ -6,13 +6,15 @@ and the amplitude is fitted with them.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.image import Pixels, signal_parts
 from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.lens import Lens
+from iscat_analysis._kernels.lens import named_lens
 from iscat_analysis._kernels.radial import AxialTable, profile_at
 from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, blank_profile, signal_value, span
 
@@ -21,9 +23,9 @@ FloatArray = NDArray[np.float64]
 
 @kernel()
 def scan_heights(
-    axial: AxialTable,
-    lens: Lens,
-    pixels: Pixels,
+    table: tuple[Any, ...],
+    optics: tuple[Any, ...],
+    grid: tuple[Any, ...],
     kind: int,
     data: FloatArray,
     heights: FloatArray,
@@ -35,8 +37,9 @@ def scan_heights(
     """Profile log-likelihood along z at fixed (x, y): the amplitude takes two scoring steps.
 
     Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the rest and the start.  An
-    empty amplitude range holds the amplitude fixed.
+    empty amplitude range holds the amplitude fixed.  The first three are as of `maximize`.
     """
+    axial, lens, pixels = AxialTable(*table), named_lens(optics), Pixels(*grid)
     profile = blank_profile(axial, lens, 1)
     here, size = theta.copy(), pixels.y.size * pixels.x.size
     flat, parts, s = data.reshape(4, size), np.empty((2, size)), np.empty(size)

@@ -15,6 +15,8 @@ four entries zero.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -22,11 +24,12 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.dense import factorise, solve
 from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
-from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lattice import FAST, TAPS
 from iscat_analysis._kernels.lattice_rows import lattice_span
-from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, Lens
+from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, Lens, named_lens
 from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_at
 from iscat_analysis._kernels.radial_rows import intervals_needed, radial_strip, strip_scratch
+from iscat_analysis._kernels.stamp import STRIP, begin_stamp, stamp_strip
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -205,13 +208,9 @@ def image_value(kind: int, data: FloatArray, level: float, rows: FloatArray) -> 
 
 @kernel()
 def image_score(
-    kind: int,
-    data: FloatArray,
-    level: float,
-    rows: FloatArray,
-    score: FloatArray,
+    kind: int, data: FloatArray, level: float, rows: FloatArray, score: FloatArray,
     fisher: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Fill score (5) and Fisher matrix (5, 5) of an image; `rows` as in `image_value`."""
     ny, nx = rows.shape[0], rows.shape[2]
     flat, sums = data.reshape(4, ny * nx), np.zeros(20)
@@ -255,6 +254,17 @@ def score_pass(
             total += _some_value(kind, flat, row * nx, end * nx, level, here[0])
         _unpack(sums, score, fisher)
         return total
+    if len(lens) == STAMP:
+        flat, sums, total = data.reshape(4, ny * nx), np.zeros(20), 0.0
+        scratch = begin_stamp(profile, lens, pixels, theta[0], theta[1], theta[3])
+        at, lines = np.empty(TAPS, dtype=np.int64), np.zeros((5, STRIP * nx))
+        for row in range(0, ny, STRIP):
+            end = min(row + STRIP, ny)
+            stamp_strip(profile, lens, theta[3], row, end - row, nx, at, scratch, lines)
+            _add_score(kind, flat, row * nx, end * nx, level, lines, sums)
+            total += _some_value(kind, flat, row * nx, end * nx, level, lines[0])
+        _unpack(sums, score, fisher)
+        return total
     g = np.empty((ny, 5, nx))
     signal_gradient(profile, lens, pixels, theta[0], theta[1], theta[3], g)
     image_score(kind, data, level, g, score, fisher)
@@ -264,12 +274,7 @@ def score_pass(
 
 @kernel()
 def value_pass(
-    profile: FloatArray,
-    lens: Lens,
-    pixels: Pixels,
-    kind: int,
-    data: FloatArray,
-    theta: FloatArray,
+    profile: FloatArray, lens: Lens, pixels: Pixels, kind: int, data: FloatArray, theta: FloatArray
 ) -> float:
     """Log-likelihood at θ, without derivatives."""
     level = np.exp(theta[4])
@@ -376,9 +381,9 @@ def scoring_step(
 
 @kernel()
 def maximize(
-    axial: AxialTable,
-    lens: Lens,
-    pixels: Pixels,
+    table: tuple[Any, ...],
+    optics: tuple[Any, ...],
+    grid: tuple[Any, ...],
     kind: int,
     data: FloatArray,
     free: BoolArray,
@@ -388,7 +393,6 @@ def maximize(
     tolerance: float,
     iterations: int,
     theta: FloatArray,
-    score: FloatArray,
     fisher: FloatArray,
     least: float,
 ) -> tuple[float, int, int]:
@@ -396,8 +400,9 @@ def maximize(
 
     Parameters
     ----------
-    axial, lens, pixels
-        The model; see `profile_at` and `signal_gradient`.
+    table, optics, grid : tuple
+        Fields of the `AxialTable`, the `Lens` and the `Pixels` of the model; without their names,
+        which it takes longer to hand over.
     kind : int
         CONDITIONAL or POISSON.
     data : ndarray, shape (4, ny, nx)
@@ -414,8 +419,8 @@ def maximize(
         Passes over the data at most.
     theta : ndarray, shape (5,)
         Start; overwritten.
-    score, fisher : ndarray, shape (5,), (5, 5)
-        Filled with those at the last pass.
+    fisher : ndarray, shape (5, 5)
+        Filled with that of the last pass.
     least : float
         Log-likelihood below which the maximum is of no interest: where `HOPE` times the expected
         gain would not reach it, the search ends after that step, HOPELESS.
@@ -429,9 +434,10 @@ def maximize(
     outcome : int
         CONVERGED, STALLED, EXHAUSTED or HOPELESS.
     """
+    axial, lens, pixels = AxialTable(*table), named_lens(optics), Pixels(*grid)
     profile = blank_profile(axial, lens, 2)
     width = axial.heights.shape[3]
-    step, trial = np.empty(5), np.empty(5)
+    step, trial, score = np.empty(5), np.empty(5), np.empty(5)
     trial_score, trial_fisher = np.empty(5), np.empty((5, 5))
     active = np.empty(5, dtype=np.bool_)
     damping = 0.0

@@ -53,7 +53,7 @@ def sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
 
 
 @kernel()
-def _begin(
+def begin_stamp(
     profile: AnyFloatArray,
     lens: StampLens,
     pixels: Pixels,
@@ -182,7 +182,7 @@ def stamp_gradient(
     amplitude: float, out: AnyFloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (ny, 5, nx) with signal and gradient of an image; ∂s/∂z is 0."""
-    f = _begin(profile, lens, pixels, x_p, y_p, amplitude)
+    f = begin_stamp(profile, lens, pixels, x_p, y_p, amplitude)
     _fill_gradient(profile, lens, amplitude, np.empty(TAPS, dtype=np.int64), f, out)
 
 
@@ -209,13 +209,36 @@ def _fill_gradient(
         begin += line
 
 
+@kernel(fastmath=FAST, _nrt=False)
+def stamp_strip(
+    profile: AnyFloatArray, lens: StampLens, amplitude: float, row: int, rows: int, columns: int,
+    at: IntArray, f: AnyFloatArray, out: AnyFloatArray,
+) -> None:  # fmt: skip
+    """Fill `out` (5, rows·columns or more) with signal and gradient of a strip of rows.
+
+    All of its pixels follow one another; ∂s/∂z, which is 0, is left alone.  `f` comes from
+    `begin_stamp`, `at` (TAPS) is work space.
+    """
+    line, _, _, strip = sizes(lens, columns)
+    begin = _make_strip(profile, lens, row, rows, columns, True, at, f)
+    for k in range(4):
+        there = out[4 if k == 3 else k]
+        factor = out.dtype.type(amplitude if k == 0 else 1.0 if k == 3 else -amplitude)
+        for i in range(rows):
+            made = f[begin + i * line : begin + i * line + columns]
+            image = there[i * columns : (i + 1) * columns]
+            for j in range(columns):
+                image[j] = factor * made[j]
+        begin += strip
+
+
 @kernel()
 def stamp_signal(
     profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
     amplitude: float, out: FloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (ny, nx) with the signal of an image."""
-    f = _begin(profile, lens, pixels, x_p, y_p, amplitude)
+    f = begin_stamp(profile, lens, pixels, x_p, y_p, amplitude)
     _put_signal(profile, lens, amplitude, False, np.empty(TAPS, dtype=np.int64), f, out)
 
 
@@ -225,7 +248,7 @@ def add_stamp(
     amplitude: float, sign: float, out: AnyFloatArray,
 ) -> None:  # fmt: skip
     """Add the signal of an image, times a sign, to `out` (ny, nx), in the latter's precision."""
-    f = _begin(profile, lens, pixels, x_p, y_p, amplitude)
+    f = begin_stamp(profile, lens, pixels, x_p, y_p, amplitude)
     _put_signal(profile, lens, sign * amplitude, True, np.empty(TAPS, dtype=np.int64), f, out)
 
 

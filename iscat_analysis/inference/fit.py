@@ -17,6 +17,7 @@ the level is a nuisance, and bounds count it as one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import compress
 
 import numpy as np
@@ -28,7 +29,6 @@ from iscat_analysis.records import (
     FREE_PARAMETERS,
     PARAMETERS,
     Alternative,
-    BoolArray,
     Box,
     Candidate,
     FitResult,
@@ -46,6 +46,10 @@ POOR_FIT_P = 1e-3
 FOLLOWED = 30.0
 """Log-likelihood below the best optimum down to which others are followed to their ends."""
 
+PLAIN = 2 * FOLLOWED
+"""Log-likelihood of a particle against none from which a scan of heights finds it by itself, unless
+what was found does not describe the data."""
+
 OUTWARD = 3.0
 """Standard deviations by which the data pull a height beyond the end of its range, or a mass beyond
 the end of a calibration's line, before the fit is said to be at a bound: fewer are chance."""
@@ -58,6 +62,7 @@ AMPLITUDE = 3
 
 _STARTS = 8  # local maxima of the scan that are followed
 _WINDOW_NM = 350.0  # how far x and y may move from the start
+_NOTHING_KNOWN = np.zeros((5, 5))  # information where nothing was looked at
 
 
 def window_nm(pixel_nm: float) -> float:
@@ -105,29 +110,38 @@ def search_box(
         Where z is free the amplitude keeps one sign: a change of sign is half a fringe.  What is
         not free has no width, wherever it lies.
     """
+    return _box_around(likelihood, start_theta(likelihood, start), mode, z_range_nm, level)
+
+
+def _box_around(
+    likelihood: Likelihood,
+    theta: FloatArray,
+    mode: str,
+    z_range_nm: tuple[float, float],
+    level: bool,
+) -> Box:
+    """Bounds of the search around θ; see `search_box`."""
     names = FREE_PARAMETERS[mode]
     grid = likelihood.grid
-    reach = window_nm(grid.pixel_nm)
-    x, y, _, amplitude, _ = fixed = start_theta(likelihood, start).tolist()
+    reach, half = window_nm(grid.pixel_nm), grid.pixel_nm / 2
+    x, y, _, amplitude, _ = fixed = theta.tolist()
     largest = 100 * max(abs(amplitude), abs(likelihood.model.nominal_amplitude))
     signed = "z_nm" not in names and likelihood.model.rho > 0
-    half = grid.pixel_nm / 2
     free = [name in names for name in PARAMETERS] + [level]
+    left, right = grid.x_nm.item(0) - half, grid.x_nm.item(-1) + half
+    top, bottom = grid.y_nm.item(0) - half, grid.y_nm.item(-1) + half
     lower = (
-        max(x - reach, grid.x_nm[0] - half), max(y - reach, grid.y_nm[0] - half), z_range_nm[0],
-        -largest if signed else 0.0, -1.0,
+        max(x - reach, left), max(y - reach, top), z_range_nm[0], -largest if signed else 0.0, -1.0,
     )  # fmt: skip
-    upper = (
-        min(x + reach, grid.x_nm[-1] + half), min(y + reach, grid.y_nm[-1] + half), z_range_nm[1],
-        largest, 1.0,
-    )  # fmt: skip
-    low, high = (
-        np.array(
-            [end if moves else value for moves, end, value in zip(free, ends, fixed, strict=True)]
-        )
-        for ends in (lower, upper)
+    upper = min(x + reach, right), min(y + reach, bottom), z_range_nm[1], largest, 1.0
+    return Box(np.array(free), _where(free, lower, fixed), _where(free, upper, fixed))
+
+
+def _where(free: list[bool], ends: Sequence[float], fixed: Sequence[float]) -> FloatArray:
+    """Take one end of each parameter that is free, and the value of each that is not."""
+    return np.array(
+        [end if moves else value for moves, end, value in zip(free, ends, fixed, strict=True)]
     )
-    return Box(np.array(free), low, high)
 
 
 def fit_particle(
@@ -163,18 +177,25 @@ def fit_particle(
     FitResult
         Estimate, uncertainty, goodness of fit and verdict.
     """
-    box = search_box(likelihood, start, mode, z_range_nm, level=level)
-    optima = _optima(likelihood, start, box)
+    begin = start_theta(likelihood, start)
+    box = _box_around(likelihood, begin, mode, z_range_nm, level)
+    optima, all_followed = _optima(likelihood, begin, box)
     best = optima[0]
+    derivatives, chi2_reduced, p_value = _judged(likelihood, best, box)
+    if not all_followed and not p_value >= POOR_FIT_P:
+        last = _follow(likelihood, _inside(begin, box), box, best.log_likelihood)
+        optima = _ranked([*optima, last])
+        if optima[0] is not best:
+            best = optima[0]
+            derivatives, chi2_reduced, p_value = _judged(likelihood, best, box)
     model = likelihood.model
     alternatives = _alternatives(optima, model.fringe_nm)
-    derivatives = likelihood.derivatives(best.theta, box.free)
     walls = _walls(best.theta, box)
     slope = abs(model.scale.slope(float(best.theta[AMPLITUDE])))
     known, sigma, covariance, bias = precision(
-        likelihood, best.theta, best.fisher, box.free, derivatives, walls=walls, slope=slope
-    )
-    chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free, derivatives)
+        likelihood, best.theta, best.fisher, box.free, derivatives, walls=np.array(walls),
+        slope=slope,
+    )  # fmt: skip
     flags = []
     if not best.converged or not known:
         flags.append(Status.NOT_CONVERGED)
@@ -185,12 +206,8 @@ def fit_particle(
     if p_value < POOR_FIT_P:
         flags.append(Status.POOR_FIT)
     estimate = best.theta
-    if correct_bias and known:
-        size = np.abs(bias[:4])
-        size[AMPLITUDE] *= slope
-        # an expansion whose first term exceeds the error has lost its meaning
-        if (size <= sigma)[box.free[:4]].all():
-            estimate = np.minimum(np.maximum(estimate - bias, box.lower), box.upper)
+    if correct_bias and known and _is_small(bias, sigma, box, slope):
+        estimate = np.minimum(np.maximum(estimate - bias, box.lower), box.upper)
     x, y, z, amplitude = (float(value) for value in estimate[:4])
     if box.free[AMPLITUDE] and model.scale.off_line(estimate[AMPLITUDE], sigma[AMPLITUDE], OUTWARD):
         flags.append(Status.AT_BOUND)
@@ -269,27 +286,57 @@ def start_theta(likelihood: Likelihood, start: Candidate) -> FloatArray:
     return np.array([start.x_px * pixel, start.y_px * pixel, start.z_nm, amplitude, 0.0])
 
 
-def _optima(likelihood: Likelihood, start: Candidate, box: Box) -> list[Optimum]:
-    """Every optimum that was reached, best first.
+def _optima(likelihood: Likelihood, theta: FloatArray, box: Box) -> tuple[list[Optimum], bool]:
+    """Every optimum that was reached, best first, and whether all starts were followed.
 
-    Starts are followed in the order of their likelihood, the given one last, and no farther than
-    shows that the optimum cannot be within `FOLLOWED` of the best.
+    Starts are followed in the order of their likelihood, θ itself last.  The height of θ is one of
+    the scan, and where it is none of its maxima, a plain particle is found without it; it is left
+    out then, unless there is no reference and so no fringes that a scan could follow.
     """
-    theta = start_theta(likelihood, start)
-    theta = np.minimum(np.maximum(theta, box.lower), box.upper)  # what is not free has no room
+    theta = _inside(theta, box)
     if not box.free[2]:
-        return [likelihood.maximize(theta, box.free, box.lower, box.upper)]
+        return [likelihood.maximize(theta, box.free, box.lower, box.upper)], True
     optima: list[Optimum] = []
-    best = -math.inf
-    for begin, value in [*_heights(likelihood, theta, box), (theta, 0.0)]:
+    best, plain = -math.inf, False
+    for begin, value in _heights(likelihood, theta, box):
         if box.free[3] and begin[3] == 0.0 and best > 0.0:
-            optima.append(Optimum(begin, value, 0, False, np.zeros((5, 5))))  # no particle there
+            optima.append(Optimum(begin, value, 0, False, _NOTHING_KNOWN))  # no particle there
             continue
-        found = likelihood.maximize(begin, box.free, box.lower, box.upper, least=best - FOLLOWED)
+        found = _follow(likelihood, begin, box, best)
         optima.append(found)
         if found.converged and found.log_likelihood > best:
-            best = found.log_likelihood
+            best, plain = found.log_likelihood, _is_plain(found)
+    enough = plain and likelihood.model.rho > 0
+    if not enough:
+        optima.append(_follow(likelihood, theta, box, best))
+    return _ranked(optima), not enough
+
+
+def _inside(theta: FloatArray, box: Box) -> FloatArray:
+    """Move θ into a box; what is not free has no room there."""
+    return np.minimum(np.maximum(theta, box.lower), box.upper)
+
+
+def _follow(likelihood: Likelihood, theta: FloatArray, box: Box, best: float) -> Optimum:
+    """Follow a start, no farther than shows that it cannot end within `FOLLOWED` of the best."""
+    return likelihood.maximize(theta, box.free, box.lower, box.upper, least=best - FOLLOWED)
+
+
+def _ranked(optima: list[Optimum]) -> list[Optimum]:
+    """Put optima in order, the best first and those that were not followed to their ends last."""
     return sorted(optima, key=lambda o: (not o.converged, -o.log_likelihood))
+
+
+def _judged(likelihood: Likelihood, best: Optimum, box: Box) -> tuple[FloatArray, float, float]:
+    """Give the derivatives of the signal at an optimum, and reduced χ² and p-value there."""
+    derivatives = likelihood.derivatives(best.theta, box.free)
+    return derivatives, *goodness_of_fit(likelihood, best.theta, box.free, derivatives)
+
+
+def _is_plain(found: Optimum) -> bool:
+    """Whether a particle is told from none, and not only a level of the light from another."""
+    alone = 0.5 * found.theta[AMPLITUDE] ** 2 * found.fisher[AMPLITUDE, AMPLITUDE]
+    return bool(min(found.log_likelihood, alone) > PLAIN)
 
 
 def _heights(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[tuple[FloatArray, float]]:
@@ -325,16 +372,29 @@ def _alternatives(optima: list[Optimum], fringe_nm: float) -> tuple[Alternative,
     )
 
 
-def _walls(theta: FloatArray, box: Box) -> BoolArray:
+def _walls(theta: FloatArray, box: Box) -> list[bool]:
     """Which free parameters lie on an end of the box."""
-    width = box.upper - box.lower
-    near = (theta - box.lower < 1e-6 * width) | (box.upper - theta < 1e-6 * width)
-    walls: BoolArray = near & box.free
-    return walls
+    places = zip(
+        box.free.tolist(), theta.tolist(), box.lower.tolist(), box.upper.tolist(), strict=True
+    )
+    return [
+        free and min(value - low, high - value) < 1e-6 * (high - low)
+        for free, value, low, high in places
+    ]
+
+
+def _is_small(bias: FloatArray, sigma: FloatArray, box: Box, slope: float) -> bool:
+    """Whether no bias exceeds its error: an expansion has lost its meaning if its first term does.
+
+    The amplitude's error is in units of `slope` per unit of the amplitude.
+    """
+    x, y, z, amplitude, _ = bias.tolist()
+    each = zip((x, y, z, slope * amplitude), sigma.tolist(), box.free.tolist()[:4], strict=True)
+    return all(abs(size) <= error for size, error, free in each if free)
 
 
 def _at_bound(
-    likelihood: Likelihood, theta: FloatArray, walls: BoolArray, sigma_z_nm: float
+    likelihood: Likelihood, theta: FloatArray, walls: list[bool], sigma_z_nm: float
 ) -> bool:
     """Whether the search ended where the data do not want it to end.
 

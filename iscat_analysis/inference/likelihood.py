@@ -252,7 +252,7 @@ class Likelihood:
         if free.shape != (5,):
             raise DataError(f"free: has shape {free.shape} where (5,) is needed")
         self._require_box(theta, free, lower, upper)
-        score, fisher = np.empty(5), np.empty((5, 5))
+        fisher = np.empty((5, 5))
         lens, pixels, kind, data = self._arguments
         if free[2]:
             table = self.model.axial_table
@@ -263,8 +263,8 @@ class Likelihood:
         else:
             table = self.model.height_table(theta[2])
         value, used, outcome = maximize(
-            table, lens, pixels, kind, data, free, lower, upper, self._farthest, tolerance, passes,
-            theta, score, fisher, least,
+            tuple(table), tuple(lens), tuple(pixels), kind, data, free, lower, upper,
+            self._farthest, tolerance, passes, theta, fisher, least,
         )  # fmt: skip
         return Optimum(theta, value, used, outcome == CONVERGED, fisher)
 
@@ -299,9 +299,10 @@ class Likelihood:
         inside = self.supports(points)
         known = heights if inside.all() else heights[inside]
         found, refitted = np.empty((2, known.size))
+        lens, pixels, kind, data = self._arguments
         scan_heights(
-            self.model.axial_table, *self._arguments, known, amplitude_range or (0.0, 0.0), point,
-            found, refitted,
+            tuple(self.model.axial_table), tuple(lens), tuple(pixels), kind, data, known,
+            amplitude_range or (0.0, 0.0), point, found, refitted,
         )  # fmt: skip
         if known is heights:
             return found, refitted

@@ -12,11 +12,17 @@ from scenes import PIXEL_NM, gold, make_config
 
 from iscat_analysis._kernels.curvature import first_order_bias
 from iscat_analysis._kernels.hessian import PAIRS
-from iscat_analysis._kernels.image import signal_image
-from iscat_analysis._kernels.scoring import CONDITIONAL
+from iscat_analysis._kernels.image import signal_gradient, signal_image
+from iscat_analysis._kernels.scoring import (
+    CONDITIONAL,
+    image_score,
+    image_value,
+    picture_at,
+    score_pass,
+)
 from iscat_analysis.config import Calibration
 from iscat_analysis.inference import noise
-from iscat_analysis.inference.fit import FOLLOWED, fit_particle, search_box
+from iscat_analysis.inference.fit import FOLLOWED, PLAIN, fit_particle, search_box
 from iscat_analysis.inference.goodness import ORDER, WAIST, _gamma_above, three_tests
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
 from iscat_analysis.inference.precision import precision
@@ -318,9 +324,33 @@ def test_a_bad_start_costs_no_optimum(seed: int) -> None:
     fit = fit_particle(which, start, "joint", (0.0, 600.0), level=True)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("iscat_analysis.inference.fit.FOLLOWED", math.inf)
+        patched.setattr("iscat_analysis.inference.fit.PLAIN", math.inf)
         slow = fit_particle(which, start, "joint", (0.0, 600.0), level=True)
     assert fit.log_likelihood == pytest.approx(slow.log_likelihood, abs=0.1)
     assert fit.status == slow.status
+
+
+@pytest.mark.parametrize("pupil", ["round", "gold", "coma"])
+@pytest.mark.parametrize("level", [False, True])
+def test_a_plain_particle_is_found_without_the_given_height(pupil: str, level: bool) -> None:
+    """The given start, wherever it is, would lead to no other maximum."""
+    rng = np.random.default_rng(9)
+    for seed in range(4):
+        case = _case("conditional", light=1e5, pupil=pupil, seed=seed)
+        x, y, _, amplitude, _ = case.theta
+        place = np.array([x, y]) / PIXEL_NM + rng.uniform(-0.5, 0.5, 2)
+        mass = amplitude * rng.uniform(0.5, 1.5)
+        start = Candidate(*place, float(rng.uniform(0, 600)), float(mass), 10.0)
+        fit = fit_particle(case.likelihood, start, "joint", (0.0, 600.0), level=level)
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr("iscat_analysis.inference.fit.PLAIN", math.inf)
+            slow = fit_particle(case.likelihood, start, "joint", (0.0, 600.0), level=level)
+        assert fit.log_likelihood > PLAIN
+        known = np.isfinite(fit.sigma)
+        names = ("x_nm", "y_nm", "z_nm", "mass_kda")
+        moved = np.array([getattr(fit, name) - getattr(slow, name) for name in names])
+        assert np.all(np.abs(moved[known]) < SETTLED * fit.sigma[known])
+        assert (fit.status, fit.flags) == (slow.status, slow.flags)
 
 
 # ---- the picture at a fixed height ---------------------------------------------------------------
@@ -378,6 +408,36 @@ def test_what_has_no_picture_takes_the_field() -> None:
     askew = PixelGrid(np.sort(np.append(grid.x_nm[:-1], 10.0)), grid.y_nm, PIXEL_NM)
     other = noise.poisson(model, askew, np.full(grid.shape, 1e4), 1e4, 1e4)
     assert not other._is_pictured(model.height_nm, low, high)
+
+
+@pytest.mark.parametrize("rows", [5, 16, 35])
+@pytest.mark.parametrize("kind", ["conditional", "poisson"])
+def test_strips_of_a_picture_are_scored_as_its_rows(kind: str, rows: int) -> None:
+    """Less than a strip, one, and more than two."""
+    model = forward_model(make_config(calibrated=False), 4000.0)
+    grid = PixelGrid.region((0, rows), (0, 13), PIXEL_NM)
+    theta = np.array([6.3 * PIXEL_NM, 0.4 * rows * PIXEL_NM, model.height_nm, 900.0, 0.02])
+    counts = np.random.default_rng(rows).poisson(1e3, (2, *grid.shape)).astype(float)
+    which = (
+        noise.conditional(model, grid, *counts, 1.0)
+        if kind == "conditional"
+        else noise.poisson(model, grid, counts[1], 1e3, 1e3)
+    )
+    lens, table = model.picture_table(PIXEL_NM, max(grid.shape))
+    pixels, out = model.pixels(grid), np.empty((rows, 5, 13))
+    profile = picture_at(
+        table, lens, model.height_nm, 0, table.heights.shape[3], np.empty((0, 0, 0))
+    )
+    got, score, wanted = np.empty((5, 5)), np.empty((2, 5)), np.empty((5, 5))
+    value = score_pass(profile, lens, pixels, which.kind, which.data, theta, score[0], got)
+    signal_gradient(profile, lens, pixels, theta[0], theta[1], theta[3], out)
+    image_score(which.kind, which.data, math.exp(theta[LEVEL]), out, score[1], wanted)
+    assert value == pytest.approx(
+        image_value(which.kind, which.data, math.exp(theta[LEVEL]), out), rel=1e-10
+    )
+    unit = np.sqrt(np.diag(wanted) + 1e-300)
+    np.testing.assert_allclose(score[0] / unit, score[1] / unit, atol=1e-9)
+    np.testing.assert_allclose(got, wanted, atol=1e-12 * np.outer(unit, unit).max(), rtol=1e-10)
 
 
 # ---- the largest contrast ------------------------------------------------------------------------
