@@ -134,7 +134,7 @@ def fit(
 
         with closing(Draughtsman()) as pen:
             if resolved.background.method != "sliding" or not _is_large(stack):
-                pen.start()  # first, because it has as much to load
+                pen.start()  # early, because it has as much to load
             from iscat_analysis.movie.addresses import MARK, beside
             from iscat_analysis.pipeline import fit_stack
             from iscat_analysis.places import open_place

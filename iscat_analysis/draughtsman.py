@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 _DRAWING = "iscat_analysis.report.drawing"
 
+_SHARED = ("pandas", "scipy.special")
+"""What both processes need, and what is loaded once if the copy is made after it."""
+
 Order: TypeAlias = "tuple[Analysis, Path, int] | Mapping[str, Any] | None"
 """What to begin with, the summary to end with, or nothing yet: get ready."""
 
@@ -119,6 +122,8 @@ def _started() -> _Other | None:
         return None
     try:
         if sys.platform == "linux":
+            for name in _SHARED:
+                importlib.import_module(name)
             return Copy(_Copied())
         if sys.executable and not getattr(sys, "frozen", False):
             return _Program()
