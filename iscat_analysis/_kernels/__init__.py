@@ -18,6 +18,7 @@ from numba import config, njit
 from numba.core.caching import FunctionCache
 from numba.core.runtime import rtsys
 
+from iscat_analysis._kernels.compiler import Kernel, KernelStore
 from iscat_analysis.errors import ConfigError
 
 
@@ -88,6 +89,8 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba is not typed
     all kernels of a small run.
     """
 
+    _impl_class = KernelStore
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         with self._guard_against_spurious_io_errors():
             rtsys.initialize(target_context)
@@ -105,6 +108,7 @@ def kernel(
 ) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function by Numba when it is first called, and keep what was compiled.
 
+    What only other kernels call is compiled as a part of them (`iscat_analysis._kernels.compiler`).
     It runs without the interpreter's lock, and divides by zero as NumPy does.
 
     Parameters
@@ -121,9 +125,13 @@ def kernel(
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(
-            nogil=True, error_model="numpy", fastmath=fastmath, forceinline=forceinline, _nrt=_nrt
-        )(function)
+        if config.DISABLE_JIT:
+            return function
+        options = {
+            "nogil": True, "error_model": "numpy", "fastmath": fastmath,
+            "forceinline": forceinline, "_nrt": _nrt,
+        }  # fmt: skip
+        dispatcher = Kernel(function, options)
         dispatcher._cache = _KernelCache(function)
         return dispatcher
 
