@@ -18,8 +18,12 @@ from numba import config, njit
 from numba.core.caching import FunctionCache
 from numba.core.runtime import rtsys
 
-from iscat_analysis._kernels.compiler import Kernel, KernelStore
 from iscat_analysis.errors import ConfigError
+
+try:
+    from iscat_analysis._kernels import compiler as _compiler
+except ImportError:  # of a Numba that is another one inside: it compiles everything as a whole
+    _compiler = None  # type: ignore[assignment]
 
 
 def _probe() -> None:
@@ -89,7 +93,8 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba is not typed
     all kernels of a small run.
     """
 
-    _impl_class = KernelStore
+    if _compiler is not None:
+        _impl_class = _compiler.KernelStore
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         with self._guard_against_spurious_io_errors():
@@ -131,7 +136,10 @@ def kernel(
             "nogil": True, "error_model": "numpy", "fastmath": fastmath,
             "forceinline": forceinline, "_nrt": _nrt,
         }  # fmt: skip
-        dispatcher = Kernel(function, options)
+        if _compiler is None:
+            dispatcher = njit(**options)(function)
+        else:
+            dispatcher = _compiler.Kernel(function, options)
         dispatcher._cache = _KernelCache(function)
         return dispatcher
 

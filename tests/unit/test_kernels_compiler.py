@@ -52,7 +52,9 @@ print(json.dumps(found))
 
 def _asked(folder: Path, *names: str) -> dict[str, tuple[object, int]]:
     """Values of kernels in a process of its own, and how many it compiled of each."""
-    (folder / "kernels.py").write_text(KERNELS, encoding="utf-8")
+    written = folder / "kernels.py"
+    if not written.exists():  # a Numba that goes by dates would compile them anew
+        written.write_text(KERNELS, encoding="utf-8")
     done = subprocess.run(
         [sys.executable, "-c", ASK, *names],
         cwd=folder, env=os.environ | {"NUMBA_CACHE_DIR": str(folder / "kept")},
