@@ -20,6 +20,11 @@ from numba.core.runtime import rtsys
 
 from iscat_analysis.errors import ConfigError
 
+try:
+    from iscat_analysis._kernels import compiler as _compiler
+except ImportError:  # of a Numba that is another one inside: it compiles everything as a whole
+    _compiler = None  # type: ignore[assignment]
+
 
 def _probe() -> None:
     """Be something to compile."""
@@ -88,6 +93,9 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba is not typed
     all kernels of a small run.
     """
 
+    if _compiler is not None:
+        _impl_class = _compiler.KernelStore
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         with self._guard_against_spurious_io_errors():
             rtsys.initialize(target_context)
@@ -105,6 +113,7 @@ def kernel(
 ) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function by Numba when it is first called, and keep what was compiled.
 
+    What only other kernels call is compiled as a part of them (`iscat_analysis._kernels.compiler`).
     It runs without the interpreter's lock, and divides by zero as NumPy does.
 
     Parameters
@@ -121,9 +130,16 @@ def kernel(
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(
-            nogil=True, error_model="numpy", fastmath=fastmath, forceinline=forceinline, _nrt=_nrt
-        )(function)
+        if config.DISABLE_JIT:
+            return function
+        options = {
+            "nogil": True, "error_model": "numpy", "fastmath": fastmath,
+            "forceinline": forceinline, "_nrt": _nrt,
+        }  # fmt: skip
+        if _compiler is None:
+            dispatcher = njit(**options)(function)
+        else:
+            dispatcher = _compiler.Kernel(function, options)
         dispatcher._cache = _KernelCache(function)
         return dispatcher
 

@@ -1,0 +1,281 @@
+"""How kernels are compiled: as a whole where Python calls them, as a body for other kernels.
+
+Numba finishes every function it meets: what only other functions call is optimised with all that it
+calls in turn, and written out as machine code with ways in from Python and C, though its callers
+take nothing but its intermediate code, which they optimise again.  Of a hundred kernels of a run
+Python calls ten, so that most of that is for nothing.
+
+Here a kernel is compiled to intermediate code first, its *body*.  When Python calls it, or a
+function that is no kernel does, a *whole* is made of the body: with a way in from Python,
+optimised together with the bodies that it contains, and as machine code.  Both are kept on disk
+under the same name, the whole in place of the body; it brings its body for those who link it.
+What a kernel computes does therefore not depend on who called it first.
+"""
+
+from __future__ import annotations
+
+import copy
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from llvmlite import binding
+from numba.core import event, sigutils
+from numba.core.caching import CompileResultCacheImpl
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, Flags, compile_result
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.environment import Environment, lookup_environment
+from numba.core.registry import CPUDispatcher
+from numba.core.targetconfig import ConfigStack
+
+_ENVIRONMENT = "_ZN08NumbaEnv"  # how the names of variables begin that hold an environment
+
+_depth = 0  # of kernels that are being compiled, one within the other, under the compiler's lock
+
+
+class _Body(JITCodeLibrary):  # type: ignore[misc]  # Numba is not typed
+    """Intermediate code of a kernel and of all it calls, of which each function is simplified.
+
+    One that calls no other kernel is optimised by itself as well: a loop over its arguments, which
+    LLVM does in registers there, may stay scalar where it has become part of another function.
+    """
+
+    def _optimize_final_module(self) -> None:
+        if not any(isinstance(library, _Body | _Whole) for library in self._linking_libraries):
+            super()._optimize_final_module()
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._verify_declare_only_symbols()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        del name
+        return 0
+
+    @classmethod
+    def restored(cls, codegen: Any, name: str, bitcode: bytes) -> _Body:
+        self = cls(codegen, name)
+        self._final_module = binding.parse_bitcode(bitcode)
+        self._finalize_final_module()
+        return self
+
+
+class _Whole(JITCodeLibrary):  # type: ignore[misc]
+    """Machine code of a kernel, and its body as intermediate code for those who link it."""
+
+    _body: bytes | None = None
+    _shared_module: Any
+
+    def _finalize_specific(self) -> None:
+        super()._finalize_specific()
+        for variable in self._final_module.global_variables:
+            if variable.name.startswith(_ENVIRONMENT):
+                environment = lookup_environment(variable.name)
+                if environment is not None:
+                    self._codegen.set_env(variable.name, environment)
+
+    def _get_module_for_linking(self) -> Any:
+        self._ensure_finalized()
+        if self._shared_module is None:
+            if self._body is None:
+                (body,) = self._linking_libraries
+                return body._get_module_for_linking()
+            self._shared_module = binding.parse_bitcode(self._body)
+        return self._shared_module
+
+    def get_pointer_to_function(self, name: str) -> int:
+        self._ensure_finalized()
+        address: int = self._codegen._engine.get_function_address(name)
+        return address
+
+    @classmethod
+    def restored(cls, codegen: Any, name: str, code: bytes, body: bytes) -> _Whole:
+        self = cls(codegen, name)
+        self.enable_object_caching()
+        self._set_compiled_object(code)
+        self._body = body
+        self._finalize_final_module()
+        return self
+
+
+class _Compiler(Compiler):  # type: ignore[misc]
+    """Numba's, that makes bodies."""
+
+    def compile_extra(self, func: Any) -> Any:
+        global _depth
+        state = self.state
+        state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = True
+        state.flags.no_compile = True
+        context = state.targetctx
+        state.library = _Body(context.codegen(), func.__qualname__)
+        _depth += 1
+        try:
+            compiled = super().compile_extra(func)
+        finally:
+            _depth -= 1
+        # that by which callers find it, in place of something that Python could call
+        compiled = compiled._replace(entry_point=object())
+        context.insert_user_function(compiled.entry_point, compiled.fndesc, [compiled.library])
+        return compiled
+
+
+@contextmanager
+def _no_search_for_cycles() -> Iterator[None]:
+    """Let the interpreter not search for cycles among the very many objects of a compilation."""
+    searching = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if searching:
+            gc.enable()
+
+
+class Kernel(CPUDispatcher):  # type: ignore[misc]
+    """A function that Numba compiles when it is called.
+
+    Parameters
+    ----------
+    function : callable
+        In Python.
+    options : dict
+        Of `numba.njit`.
+    """
+
+    def __init__(self, function: Any, options: dict[str, Any]) -> None:
+        super().__init__(function, {}, {"nopython": True, **options}, _Compiler)
+
+    def compile(self, sig: Any) -> Any:
+        """Compile it, or load what was compiled.
+
+        Parameters
+        ----------
+        sig : numba signature or tuple of types
+            Of its arguments.
+
+        Returns
+        -------
+        object
+            What Python calls; where another kernel is what needs it, something by which that one
+            finds it.
+        """
+        with global_compiler_lock:
+            if _depth > 0:
+                return super().compile(sig)
+            with _no_search_for_cycles():
+                super().compile(sig)
+                arguments, result = sigutils.normalize_signature(sig)
+                known = self.overloads[tuple(arguments)]
+                if isinstance(known.library, _Body):
+                    details = {"dispatcher": self, "args": arguments, "return_type": result}
+                    with event.trigger_event("numba:compile", data=details):
+                        known = self._whole(known)
+                    self.targetctx.insert_user_function(
+                        known.entry_point, known.fndesc, [known.library]
+                    )
+                    self.add_overload(known)
+                    self._cache.save_overload(sig, known)
+                return known.entry_point
+
+    def _whole(self, compiled: Any) -> Any:
+        """Make of a body what Python can call."""
+        flags = Flags()
+        self.targetdescr.options.parse_as_flags(flags, self.targetoptions)
+        # Ways in keep constants of their own in the environment, which is therefore another one
+        # than that of the body.
+        function = copy.copy(compiled.fndesc)
+        function.env_name += "_whole"
+        environment = Environment.from_fndesc(function)
+        context = self.targetctx.subtarget(
+            environment=environment, fndesc=function, enable_nrt=bool(flags.nrt)
+        )
+        library = _Whole(context.codegen(), compiled.library.name)
+        library.enable_object_caching()
+        library.add_linking_library(compiled.library)
+        with ConfigStack().enter(flags):
+            context.create_cpython_wrapper(
+                library, function, environment, compiled.call_helper, flags.release_gil
+            )
+            entry = context.get_executable(library, function, environment)
+        return compiled._replace(
+            library=library, fndesc=function, environment=environment, entry_point=entry
+        )
+
+    def add_overload(self, cres: Any) -> None:
+        """Note what was compiled; to Python only wholes are shown.
+
+        Parameters
+        ----------
+        cres : numba.core.compiler.CompileResult
+            A body or a whole.
+        """
+        if isinstance(cres.library, _Body):
+            self.overloads[tuple(cres.signature.args)] = cres
+        else:
+            super().add_overload(cres)
+
+
+class KernelStore(CompileResultCacheImpl):  # type: ignore[misc]
+    """How bodies and wholes are written to disk and read again."""
+
+    def reduce(self, cres: Any) -> tuple[Any, ...]:
+        """Give what is written.
+
+        Parameters
+        ----------
+        cres : numba.core.compiler.CompileResult
+            A body or a whole.
+
+        Returns
+        -------
+        tuple
+            For `rebuild`.
+        """
+        library = cres.library
+        bitcode = library._get_module_for_linking().as_bitcode()
+        code = None if isinstance(library, _Body) else library._get_compiled_object()
+        function = copy.copy(cres.fndesc)
+        function.typemap = function.calltypes = None  # not needed, and perhaps not to be written
+        environments = tuple(cres._find_referenced_environments())
+        return (
+            library.name, code, bitcode, function, cres.environment, cres.signature,
+            cres.reload_init, environments,
+        )  # fmt: skip
+
+    def rebuild(self, target_context: Any, payload: tuple[Any, ...]) -> Any:
+        """Make of what was written what it had been.
+
+        Parameters
+        ----------
+        target_context : numba.core.cpu.CPUContext
+            Into which it is loaded.
+        payload : tuple
+            As from `reduce`.
+
+        Returns
+        -------
+        numba.core.compiler.CompileResult
+            A body or a whole.
+        """
+        name, code, bitcode, function, environment, signature, reload, environments = payload
+        for again in reload:
+            again()
+        codegen = target_context.codegen()
+        library: _Body | _Whole
+        entry: Any
+        if code is None:
+            library, entry = _Body.restored(codegen, name, bitcode), object()
+        else:
+            library = _Whole.restored(codegen, name, code, bitcode)
+            entry = target_context.get_executable(library, function, environment)
+            for other in environments:
+                codegen.set_env(other.env_name, other)
+        return compile_result(
+            target_context=target_context, typing_context=target_context.typing_context,
+            library=library, environment=environment, entry_point=entry, fndesc=function,
+            type_annotation="", signature=signature, objectmode=False, lifted=(),
+            reload_init=reload, referenced_envs=environments,
+        )  # fmt: skip

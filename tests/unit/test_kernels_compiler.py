@@ -1,0 +1,130 @@
+"""Kernels as bodies for others and as wholes for Python."""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba import njit
+
+from iscat_analysis._kernels import kernel
+from iscat_analysis._kernels.compiler import _Body, _Whole
+
+KERNELS = """
+import sys
+import numpy as np
+from iscat_analysis._kernels import kernel
+
+@kernel()
+def doubled(x):
+    if x.size == 0:
+        raise ValueError("no numbers")
+    return 2.0 * x
+
+@kernel()
+def total(x):
+    return doubled(x).sum()
+
+@kernel()
+def more(x):
+    return total(x) + 1.0
+"""
+ASK = """
+import json
+import sys
+import numpy as np
+sys.path.insert(0, "")
+import kernels
+
+found = {}
+for name in sys.argv[1:]:
+    one = getattr(kernels, name)
+    found[name] = np.asarray(one(np.arange(4.0))).tolist(), sum(one.stats.cache_misses.values())
+print(json.dumps(found))
+"""
+
+
+def _asked(folder: Path, *names: str) -> dict[str, tuple[object, int]]:
+    """Values of kernels in a process of its own, and how many it compiled of each."""
+    written = folder / "kernels.py"
+    if not written.exists():  # a Numba that goes by dates would compile them anew
+        written.write_text(KERNELS, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-c", ASK, *names],
+        cwd=folder, env=os.environ | {"NUMBA_CACHE_DIR": str(folder / "kept")},
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    found: dict[str, tuple[object, int]] = json.loads(done.stdout)
+    return found
+
+
+@kernel()
+def _halves(x: np.ndarray) -> np.ndarray:
+    if x.size == 0:
+        raise ValueError("no numbers")
+    return x / 2.0
+
+
+@kernel()
+def _sum_of_halves(x: np.ndarray) -> float:
+    return float(_halves(x).sum())
+
+
+for _one in (_halves, _sum_of_halves):
+    _one._cache.disable()  # what an earlier run of the tests kept
+
+
+def test_kernel_that_kernels_call_answers_python_as_well() -> None:
+    x = np.arange(5.0)
+    assert _sum_of_halves(x) == 5.0
+    (compiled,) = _halves.overloads.values()
+    assert isinstance(compiled.library, _Body)
+    np.testing.assert_array_equal(_halves(x), x / 2)
+    (compiled,) = _halves.overloads.values()
+    assert isinstance(compiled.library, _Whole)
+    for called in (_halves, _sum_of_halves):
+        with pytest.raises(ValueError, match="no numbers"):
+            called(x[:0])
+    assert _sum_of_halves(x) == 5.0
+
+
+def test_function_that_is_no_kernel_calls_one() -> None:
+    @njit  # type: ignore[untyped-decorator]
+    def outside(x: np.ndarray) -> float:
+        return _sum_of_halves(x) + 1.0
+
+    assert outside(np.arange(5.0)) == 6.0
+    with pytest.raises(ValueError, match="no numbers"):
+        outside(np.zeros(0))
+
+
+def test_cycles_are_searched_for_after_compilation() -> None:
+    @kernel()
+    def plain(x: float) -> float:
+        return x + 1.0
+
+    assert gc.isenabled()
+    assert plain(1.0) == 2.0
+    assert gc.isenabled()
+
+
+@pytest.mark.parametrize("first", [["more"], ["doubled", "more"], ["total"]])
+def test_what_one_process_compiled_serves_another(tmp_path: Path, first: list[str]) -> None:
+    values = {"doubled": [0.0, 2.0, 4.0, 6.0], "total": 12.0, "more": 13.0}
+    assert {name: value for name, (value, _) in _asked(tmp_path, *first).items()} == {
+        name: values[name] for name in first
+    }
+    again = _asked(tmp_path, *first)
+    assert again == {name: [values[name], 0] for name in first}
+    # a body of the first process is made a whole here, and kept
+    every = _asked(tmp_path, "more", "total", "doubled")
+    assert {name: value for name, (value, _) in every.items()} == values
+    assert every["doubled"][1] == 0
+    last = _asked(tmp_path, "doubled", "more", "total")
+    assert last == {name: [values[name], 0] for name in values}
