@@ -14,15 +14,20 @@ from collections.abc import Callable, Iterable, Iterator, Set
 from contextlib import contextmanager
 from typing import Any
 
+import numba
 from numba import config, njit
 from numba.core.caching import FunctionCache
 from numba.core.runtime import rtsys
 
 from iscat_analysis.errors import ConfigError
 
-try:
+_INSIDE = range(60, 69)
+"""Minor versions of Numba 0 whose insides are known: others compile every kernel as a whole."""
+
+_major, _minor, *_ = numba.__version__.split(".")
+if _major == "0" and _minor.isdecimal() and int(_minor) in _INSIDE:
     from iscat_analysis._kernels import compiler as _compiler
-except ImportError:  # of a Numba that is another one inside: it compiles everything as a whole
+else:
     _compiler = None  # type: ignore[assignment]
 
 

@@ -68,16 +68,15 @@ class StepMaps:
             As from `iscat_analysis.search.sliding.sliding_maps`; the next call overwrites them.
         """
         if self._is_local:
-            if self._maps is None:
-                self._maps = sliding_maps(self._chunk, self._matched, STRIDES, mapper=mapper)
+            maps = self._maps or sliding_maps(self._chunk, self._matched, STRIDES, mapper=mapper)
             for step in _missing(self._known, steps):
-                self._add(step, 1.0)
+                self._add(maps, step, 1.0)
             for step in _missing(steps, self._known):
-                self._add(step, -1.0)
+                self._add(maps, step, -1.0)
         else:
-            self._maps = self._anew(steps, mapper)
-        self._known = list(steps)
-        return self._maps
+            maps = self._anew(steps, mapper)
+        self._maps, self._known = maps, list(steps)
+        return maps
 
     def _windows(self, boundary: int) -> tuple[slice, slice]:
         """Frames before and after a boundary that are compared there, relative to the chunk."""
@@ -86,10 +85,9 @@ class StepMaps:
         middle = int(edges[boundary + 1])
         return slice(int(edges[low]), middle), slice(middle, int(edges[high]))
 
-    def _add(self, step: Step, share: float) -> None:
+    def _add(self, maps: tuple[MapArray, FloatArray], step: Step, share: float) -> None:
         """Add a multiple of what a step makes of the contrast to the maps around it."""
-        assert self._maps is not None
-        snr, effective = self._maps
+        snr, effective = maps
         here = int(np.searchsorted(self._chunk.edges, step.at.frame - self._chunk.first))
         filtered = None
         for boundary in range(max(here - STRIDES - 1, 0), min(here + STRIDES, len(snr))):

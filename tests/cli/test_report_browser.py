@@ -199,6 +199,15 @@ DOCUMENT = {
 }  # fmt: skip
 
 
+READY = """
+const [address, done] = arguments;
+const look = () =>
+  location.href.startsWith(address) && document.readyState === "complete" ? done() : setTimeout(look, 20);
+look();
+"""
+"""Waits for all of a page: a busy browser may still have the one before, or a part of it."""
+
+
 def show(browser: Any, page: Path, *, width: int = 1440, scheme: str = "light") -> None:
     feature = {"name": "prefers-color-scheme", "value": scheme}
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
@@ -206,6 +215,7 @@ def show(browser: Any, page: Path, *, width: int = 1440, scheme: str = "light") 
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
     browser.get_log("browser")
     browser.get(page.as_uri())
+    browser.execute_async_script(READY, page.as_uri())
 
 
 def errors(browser: Any) -> list[str]:

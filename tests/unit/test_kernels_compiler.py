@@ -50,13 +50,21 @@ print(json.dumps(found))
 """
 
 
-def _asked(folder: Path, *names: str) -> dict[str, tuple[object, int]]:
+OTHER = """
+import numba
+numba.__version__ = "0.999.0"
+from iscat_analysis import _kernels
+assert _kernels._compiler is None
+"""
+
+
+def _asked(folder: Path, *names: str, before: str = "") -> dict[str, tuple[object, int]]:
     """Values of kernels in a process of its own, and how many it compiled of each."""
     written = folder / "kernels.py"
     if not written.exists():  # a Numba that goes by dates would compile them anew
         written.write_text(KERNELS, encoding="utf-8")
     done = subprocess.run(
-        [sys.executable, "-c", ASK, *names],
+        [sys.executable, "-c", before + ASK, *names],
         cwd=folder, env=os.environ | {"NUMBA_CACHE_DIR": str(folder / "kept")},
         check=True, capture_output=True, text=True,
     )  # fmt: skip
@@ -128,3 +136,11 @@ def test_what_one_process_compiled_serves_another(tmp_path: Path, first: list[st
     assert every["doubled"][1] == 0
     last = _asked(tmp_path, "doubled", "more", "total")
     assert last == {name: [values[name], 0] for name in values}
+
+
+def test_numba_of_unknown_insides_compiles_everything_as_a_whole(tmp_path: Path) -> None:
+    expected = {"more": 13.0, "doubled": [0.0, 2.0, 4.0, 6.0]}
+    for compiled in (1, 0):
+        found = _asked(tmp_path, "more", "doubled", before=OTHER)
+        assert {name: value for name, (value, _) in found.items()} == expected
+        assert found["more"][1] == compiled
