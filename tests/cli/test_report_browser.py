@@ -201,8 +201,10 @@ DOCUMENT = {
 
 READY = """
 const [address, done] = arguments;
-const look = () =>
-  location.href.startsWith(address) && document.readyState === "complete" ? done() : setTimeout(look, 20);
+const look = () => {
+  const there = location.href.startsWith(address) && document.readyState === "complete";
+  return there ? done() : setTimeout(look, 20);
+};
 look();
 """
 """Waits for all of a page: a busy browser may still have the one before, or a part of it."""
