@@ -278,7 +278,6 @@ def compile_values(model: ForwardModel, parts: Collection[str] = PARTS) -> None:
         Which of `PARTS` will be needed.
     """
     likelihood, theta = _small(model)
-    likelihood.signal(theta)
     if "posteriors" in parts:
         likelihood.values(theta[None])
     if "heights" in parts:

@@ -19,7 +19,6 @@ from iscat_analysis.records import FREE_PARAMETERS
 _PATIENCE_S = 1.0  # of compilation, before it is announced
 _BETWEEN_S = 4.0  # from one line to the next
 _ROOM = f"{_kernels.__name__}."
-_SHARED = ("radial", "image", "scoring")  # whose kernels the other process compiles half of
 # All of whose kernels it compiles.
 _THEIRS = ("curvature", "goodness", "hessian", "residuals", "score_test")
 _ABOUT = {
@@ -90,7 +89,7 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
             return
         kind = module.removeprefix(_ROOM)
         self._about = _ABOUT.get(kind, _PICTURES)
-        if self._together and self._other is None and kind in _SHARED:
+        if self._together and self._other is None:
             self._other = _started(self.parts)
         if self._timer is None:
             self._timer = threading.Timer(_PATIENCE_S, self._announce)

@@ -87,16 +87,13 @@ def test_nothing_is_said_of_a_kernel_that_is_quick(monkeypatch):
     assert not said
 
 
-def test_a_second_process_is_started_for_the_kernels_of_fits_alone(started):
+def test_a_second_process_is_started_once_for_the_first_kernel(started):
     with compiling(print, 2) as compilation:
-        for name in ("sliding", "drift"):
+        with event.trigger_event("numba:compile", data=kernel("numpy")):
+            assert not started
+        for name in ("sliding", "drift", "image"):
             with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.{name}")):
-                pass
-        assert not started
-        for _ in range(2):
-            with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.image")):
-                pass
-        assert len(started) == 1
+                assert len(started) == 1
         compilation.wait()
         assert started[0].returncode == 0
 
