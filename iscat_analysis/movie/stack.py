@@ -320,9 +320,7 @@ class Stack:
         ValueError
             The stack was closed.
         """
-        if self._closed:
-            raise ValueError(f"{self.name} was closed; open it again to read from it")
-        self._check_range(start, stop)
+        self._require(start, stop)
         counts = self._frames.read(start, stop)
         if self._left_out is not None:
             pixels, dark = self._left_out
@@ -349,9 +347,7 @@ class Stack:
         ValueError
             The stack was closed.
         """
-        if self._closed:
-            raise ValueError(f"{self.name} was closed; open it again to read from it")
-        self._check_range(start, stop)
+        self._require(start, stop)
         if self._left_out is not None or not isinstance(self._frames, PlacedSource):
             return None
         return self._frames.in_place(start, stop)
@@ -387,7 +383,7 @@ class Stack:
         if not memory_mb > 0:
             raise ValueError(f"memory_mb = {memory_mb} must be positive")
         end = self.shape[0] if stop is None else stop
-        self._check_range(start, end)
+        self._require(start, end)
         _, y, x = self.shape
         step = max(1, int(memory_mb * _MB // (y * x * self.dtype.itemsize)))
         for first in range(start, end, step):
@@ -424,7 +420,10 @@ class Stack:
         digest.update(self._part.encode("utf-8", "backslashreplace"))
         return digest.hexdigest()
 
-    def _check_range(self, start: int, stop: int) -> None:
+    def _require(self, start: int, stop: int) -> None:
+        """Refuse to read from a closed stack, or frames that it does not hold."""
+        if self._closed:
+            raise ValueError(f"{self.name} was closed; open it again to read from it")
         total = self.shape[0]
         if not 0 <= start <= stop <= total:
             raise DataError(

@@ -35,6 +35,11 @@ class StepMaps:
         Of the same chunk.
     pattern : MovingPattern, optional
         Of the same chunk, where its motion is divided out.
+
+    Attributes
+    ----------
+    matched : Filter
+        As given.
     """
 
     def __init__(
@@ -45,7 +50,7 @@ class StepMaps:
         neighbours: Neighbours,
         pattern: MovingPattern | None = None,
     ) -> None:
-        self._scene, self._chunk, self._matched = scene, chunk, matched
+        self._scene, self._chunk, self.matched = scene, chunk, matched
         self._neighbours, self._pattern = neighbours, pattern
         self._is_local = pattern is None and scene.lines is None and matched.noise is None
         self._maps: tuple[MapArray, FloatArray] | None = None
@@ -68,7 +73,7 @@ class StepMaps:
             As from `iscat_analysis.search.sliding.sliding_maps`; the next call overwrites them.
         """
         if self._is_local:
-            maps = self._maps or sliding_maps(self._chunk, self._matched, STRIDES, mapper=mapper)
+            maps = self._maps or sliding_maps(self._chunk, self.matched, STRIDES, mapper=mapper)
             for step in _missing(self._known, steps):
                 self._add(maps, step, 1.0)
             for step in _missing(steps, self._known):
@@ -96,7 +101,7 @@ class StepMaps:
                 continue
             image, part = self._neighbours.change(step, before, after)
             if filtered is None or image is not filtered[0]:
-                filtered = image, *self._matched.response(step.corner, image)
+                filtered = image, *self.matched.response(step.corner, image)
             _, box, response = filtered
             scale = share * part * math.sqrt(effective[boundary])
             snr[boundary][box] += np.float32(scale) * response
@@ -126,7 +131,7 @@ class StepMaps:
         ]
         self._near = near
         return sliding_maps(
-            chunk, self._matched, STRIDES,
+            chunk, self.matched, STRIDES,
             explained=explained if steps or moving else None,
             earlier=self._maps, changed=changed, mapper=mapper,
         )  # fmt: skip

@@ -36,7 +36,6 @@ from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.residue import chi2_excess
 from iscat_analysis.search.sliding import (
     Chunk,
-    Filter,
     Peak,
     StepFrame,
     find_steps,
@@ -159,7 +158,7 @@ class ChunkFitter:
         for self.rounds in range(1, ROUNDS + 1):
             fresh = [
                 s
-                for s in self._search(maps, matched, steps)
+                for s in self._search(maps, steps)
                 if not any(
                     distance_px(s, r) < _SAME_PX and _apart(s, r) <= self._stride for r in rejected
                 )
@@ -240,8 +239,8 @@ class ChunkFitter:
 
     # ---- search ----------------------------------------------------------------------------
 
-    def _search(self, maps: StepMaps, matched: Filter, steps: Sequence[Step]) -> list[Step]:
-        scene, chunk = self._scene, self._chunk
+    def _search(self, maps: StepMaps, steps: Sequence[Step]) -> list[Step]:
+        scene, chunk, matched = self._scene, self._chunk, maps.matched
         snr, effective = maps.without(steps, self._pool.map)
         if not steps and len(snr):
             where = np.argmax(np.abs(snr), axis=0)

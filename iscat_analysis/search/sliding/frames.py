@@ -187,7 +187,12 @@ class Patch:
         here = rows, columns
         return replace(
             self,
-            counts=np.ascontiguousarray(self.counts[(slice(None), *here)]),
+            counts=_region(
+                self.counts,
+                slice(0, len(self.counts)),
+                (rows.start, rows.stop),
+                (columns.start, columns.stop),
+            ),
             gain=_at(self.gain, here),
             offset=_at(self.offset, here),
             read_noise_e=_at(self.read_noise_e, here),
