@@ -80,14 +80,32 @@ class Copy:
         LostError
             The copy has ended.
         """
+        self.ask(asked)
         try:
-            _send(self._asking, asked)
             failed, result = _received(self._telling)
         except (OSError, EOFError):
             raise LostError from None
         if failed:
             raise result
         return result
+
+    def ask(self, asked: Any) -> None:
+        """Have it do something, and do not wait for that; nothing can be had from it afterwards.
+
+        Parameters
+        ----------
+        asked : Any
+            As in `do`.
+
+        Raises
+        ------
+        LostError
+            The copy has ended.
+        """
+        try:
+            _send(self._asking, asked)
+        except OSError:
+            raise LostError from None
 
     def end(self) -> None:
         """End it and its group, whatever they are at; once, as its number may then be another's."""

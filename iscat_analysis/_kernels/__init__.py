@@ -10,8 +10,7 @@ import atexit
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Set
-from contextlib import contextmanager
+from collections.abc import Callable, Set
 from typing import Any
 
 import numba
@@ -19,6 +18,7 @@ from numba import config, njit
 from numba.core.caching import FunctionCache
 from numba.core.runtime import rtsys
 
+from iscat_analysis._kernels.claims import claimed
 from iscat_analysis.errors import ConfigError
 
 _INSIDE = range(60, 69)
@@ -68,29 +68,6 @@ def environment() -> dict[str, str]:
     return os.environ | ({"NUMBA_CACHE_DIR": config.CACHE_DIR} if TEMPORARY else {})
 
 
-_elsewhere: dict[str, Callable[[], None]] = {}
-
-
-@contextmanager
-def awaited(modules: Iterable[str], wait: Callable[[], None]) -> Iterator[None]:
-    """Wait for kernels that another process compiles, instead of compiling them here as well.
-
-    Parameters
-    ----------
-    modules : iterable of str
-        Names of the modules in this package that hold these kernels.
-    wait : callable
-        Returns when the other process has ended, at once where there is none.
-    """
-    names = [f"{__name__}.{module}" for module in modules]
-    _elsewhere.update(dict.fromkeys(names, wait))
-    try:
-        yield
-    finally:
-        for name in names:
-            _elsewhere.pop(name, None)
-
-
 class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba is not typed
     """Numba's compiled functions on disk, of which one is loaded without what only compiling needs.
 
@@ -105,12 +82,14 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba is not typed
         with self._guard_against_spurious_io_errors():
             rtsys.initialize(target_context)
             loaded = self._load_overload(sig, target_context)
-            if loaded is None and (wait := _elsewhere.get(self._py_func.__module__)) is not None:
-                wait()
-                loaded = self._load_overload(sig, target_context)
             if loaded is not None:
                 return loaded
         return super().load_overload(sig, target_context)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        function = self._py_func  # whose list of signatures is written anew
+        with claimed(self.cache_path, f"{function.__module__}.{function.__qualname__}"):
+            super().save_overload(sig, data)
 
 
 def kernel(

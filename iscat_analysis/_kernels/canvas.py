@@ -18,6 +18,7 @@ from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens, StampLens
+from iscat_analysis._kernels.lines import copy_line
 from iscat_analysis._kernels.radial import AxialTable
 from iscat_analysis._kernels.scoring import picture_at, span
 from iscat_analysis._kernels.stamp import add_stamp, stamp_gradient
@@ -304,7 +305,8 @@ def ready_frame(
             add_row(near, field, k, square, -1.0, inner, near_profile, image, total)
             _add_rings(far, field, k, rings, -1.0, inner, outer, far_profile, image, total)
         if aside or anew:
-            rings[:] = square[:] = now
+            copy_line(now, rings)
+            copy_line(now, square)
             outer = square_of(field, now, field.drawn, rows, columns)
             if field.alike:
                 add_row(far, field, k, now, 1.0, outer, far_profile, image, total)
@@ -319,10 +321,10 @@ def ready_frame(
             rings[3] += now[3]
             _add_rings(far, field, k, rings, share, inner, outer, far_profile, image, total)
             rings[3] = now[3]
-        if np.any(now != square):
+        if _differ(now, square):
             add_row(near, field, k, square, -1.0, inner, near_profile, image, total)
             add_row(near, field, k, now, 1.0, inner, near_profile, image, total)
-            square[:] = now
+            copy_line(now, square)
 
 
 @kernel()
@@ -332,6 +334,15 @@ def _is_aside(field: Field, theta: FloatArray, rings: FloatArray) -> bool:
     for k in range(3):
         aside |= abs(theta[k] - rings[k]) > field.slack[k]
     return bool(aside or (theta[3] != rings[3] and theta[3] == -rings[3]))
+
+
+@kernel(_nrt=False)
+def _differ(one: FloatArray, other: FloatArray) -> bool:
+    """Tell whether any number of a row differs from another's."""
+    count = 0
+    for i in range(one.size):
+        count += one[i] != other[i]
+    return count > 0
 
 
 @kernel()

@@ -18,7 +18,7 @@ import copy
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 from llvmlite import binding
 from numba.core import event, sigutils
@@ -29,6 +29,11 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import Environment, lookup_environment
 from numba.core.registry import CPUDispatcher
 from numba.core.targetconfig import ConfigStack
+from numba.core.types import SliceLiteral
+from numba.core.types.functions import BaseFunction
+from numba.core.typing import Context as TypingContext
+
+from iscat_analysis._kernels.claims import claimed
 
 _ENVIRONMENT = "_ZN08NumbaEnv"  # how the names of variables begin that hold an environment
 
@@ -101,15 +106,55 @@ class _Whole(JITCodeLibrary):  # type: ignore[misc]
         return self
 
 
+class _Types(TypingContext):  # type: ignore[misc]
+    """Numba's knowledge of types, that remembers what a function of given arguments returns.
+
+    Numba tries its definitions of a function one after another each time that it meets it: of `+`
+    between two numbers alone some dozen, a thousand times.
+    """
+
+    _known: ClassVar[dict[Any, Any]] = {}
+
+    @classmethod
+    def of(cls, context: TypingContext) -> _Types:
+        self = cls.__new__(cls)
+        self.__dict__ = context.__dict__
+        return self
+
+    def resolve_function_type(self, function: Any, arguments: Any, named: Any) -> Any:
+        find = super().resolve_function_type
+        constants = any(isinstance(argument, SliceLiteral) for argument in arguments)
+        if named or constants or not isinstance(function, BaseFunction):
+            return find(function, arguments, named)
+        key = function, tuple(arguments)
+        if key not in self._known:
+            self._known[key] = find(function, arguments, named)
+        return self._known[key]
+
+
+class _Options(Flags):  # type: ignore[misc]
+    """Numba's, compared by what is set, and not each time by all that could be."""
+
+    _HASH = hash(Flags())  # of all of them
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Flags) and self._values == other._values
+
+    def __hash__(self) -> int:
+        return self._HASH
+
+
 class _Compiler(Compiler):  # type: ignore[misc]
     """Numba's, that makes bodies."""
 
     def compile_extra(self, func: Any) -> Any:
         global _depth
         state = self.state
+        state.flags = _Options(state.flags)
         state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = True
         state.flags.no_compile = True
         context = state.targetctx
+        state.typingctx = _Types.of(state.typingctx)
         state.library = _Body(context.codegen(), func.__qualname__)
         _depth += 1
         try:
@@ -131,6 +176,7 @@ def _no_search_for_cycles() -> Iterator[None]:
         yield
     finally:
         if searching:
+            gc.freeze()
             gc.enable()
 
 
@@ -162,12 +208,16 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
             What Python calls; where another kernel is what needs it, something by which that one
             finds it.
         """
+        arguments, result = sigutils.normalize_signature(sig)
+        function = self.py_func
+        subject = f"{function.__module__}.{function.__qualname__}{arguments}"
         with global_compiler_lock:
-            if _depth > 0:
-                return super().compile(sig)
-            with _no_search_for_cycles():
+            if _depth > 0 and tuple(arguments) in self.overloads:
+                return self.overloads[tuple(arguments)].entry_point
+            with claimed(self._cache.cache_path, subject), _no_search_for_cycles():
+                if _depth > 0:
+                    return super().compile(sig)
                 super().compile(sig)
-                arguments, result = sigutils.normalize_signature(sig)
                 known = self.overloads[tuple(arguments)]
                 if isinstance(known.library, _Body):
                     details = {"dispatcher": self, "args": arguments, "return_type": result}

@@ -16,6 +16,7 @@ from iscat_analysis._kernels.hessian import signal_hessian
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import Lens
+from iscat_analysis._kernels.lines import marked
 from iscat_analysis._kernels.radial import AxialTable, profile_at
 from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, blank_profile, image_score, span
 
@@ -138,7 +139,7 @@ def invert(matrix: FloatArray, like: FloatArray, active: BoolArray, out: FloatAr
     The diagonal of `like` (5, 5) is about that of the matrix.  False, and NaN, if it is not
     positive.
     """
-    index = np.flatnonzero(active)
+    index = marked(active)
     n = index.size
     lower, inverse, scale = np.zeros((n, n)), np.zeros((n, n)), np.empty(5)
     for i in range(5):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lines import largest
 
 FloatArray = NDArray[np.float64]
 
@@ -181,7 +182,7 @@ def most_likely_diffusion(
         ladder[k + 1] = top * _SPAN ** (1.0 - k / (_RUNGS - 1.0))
     for _ in range(_LADDERS):
         values = displacement_likelihoods(steps, error, error_next, rate, rate_next, ladder)
-        highest = int(np.argmax(values))
+        highest = largest(values)
         best = ladder[highest]
         low, high = ladder[max(highest - 1, 0)], ladder[min(highest + 1, ladder.size - 1)]
         for _ in range(_NEWTON):
@@ -194,5 +195,8 @@ def most_likely_diffusion(
             best += step
             if abs(step) < _FINE * scale:
                 return float(best)
-        ladder = np.linspace(low, high, _RUNGS)
+        ladder = np.empty(_RUNGS)
+        for k in range(_RUNGS):
+            ladder[k] = low + (high - low) / (_RUNGS - 1) * k
+        ladder[_RUNGS - 1] = high
     return float(best)

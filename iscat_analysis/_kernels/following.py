@@ -16,6 +16,7 @@ from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.canvas import Light
 from iscat_analysis._kernels.dense import factorise, solve
 from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lines import copy_line
 
 FloatArray = NDArray[np.float64]
 AnyArray = NDArray[Any]
@@ -209,31 +210,35 @@ def join_rows(
     for c in range(first, last):
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
         n, t = k * rows.size, clusters.frame[c]
-        joint, scale, step = np.zeros((n, n)), np.ones(n), np.zeros(n)
+        joint, scale, step = np.zeros((n, n)), np.empty(n), np.zeros(n)
+        order = np.empty(n, dtype=np.int64)
         for a in range(rows.size):
-            joint[k * a : k * (a + 1), k * a : k * (a + 1)] = information[rows[a]]
+            for i in range(k):
+                copy_line(information[rows[a], i], joint[k * a + i, k * a : k * (a + 1)])
             for b in range(a):
                 if _overlap(slopes, light, t, totals[t], rows[a], rows[b], work, block):
-                    joint[k * a : k * (a + 1), k * b : k * (b + 1)] = block
                     for i in range(k):
+                        copy_line(block[i], joint[k * a + i, k * b : k * (b + 1)])
                         for j in range(k):
                             step[k * b + j] -= block[i, j] * slopes.moves[rows[a], i]
         for i in range(n):
-            if joint[i, i] > 0.0:
-                scale[i] = 1.0 / np.sqrt(joint[i, i])
-            else:  # what it changes is not seen
+            order[i] = i
+            if not joint[i, i] > 0.0:  # what it changes is not seen
                 joint[i, i] = 1.0
+            scale[i] = 1.0 / np.sqrt(joint[i, i])
         low = clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n)
         stiffer = _STIFFER
-        while not factorise(joint, np.arange(n), scale, stiffer, low) and stiffer < _STIFFEST:
+        while not factorise(joint, order, scale, stiffer, low) and stiffer < _STIFFEST:
             stiffer *= 10.0
         if rows.size > 1 and clusters.steps.size:
             shy = np.empty((n, n))
-            factorise(joint, np.arange(n), scale, max(stiffer, _SHY), shy)
-            step *= scale
+            factorise(joint, order, scale, max(stiffer, _SHY), shy)
+            for i in range(n):
+                step[i] *= scale[i]
             solve(shy, step)
-            step *= scale
-            clusters.steps[rows] = step.reshape(rows.size, k)
+            for a in range(rows.size):
+                for i in range(k):
+                    clusters.steps[rows[a], i] = step[k * a + i] * scale[k * a + i]
         for i in range(n):
             for j in range(i + 1):
                 low[i, j] /= scale[i]

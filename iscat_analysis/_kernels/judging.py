@@ -26,6 +26,7 @@ from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import STAMP, Lens
+from iscat_analysis._kernels.lines import copy_line, largest, marked
 from iscat_analysis._kernels.place_score import LEAST, place_score
 from iscat_analysis._kernels.scoring import FLOOR, blank_profile
 from iscat_analysis._kernels.stamp_bends import BENDS, stamp_bends
@@ -98,7 +99,7 @@ def _left_over(
     least, a = data.dtype.type(LEAST), data.dtype.type(amplitude)
     chi2 = used = light = known = more = zero
     # of each column: one for all would keep the loop from vectors
-    worst = np.zeros_like(data[0, 0])
+    worst = np.zeros(data.shape[2], data.dtype)
     inverse = one / a if a != zero else zero
     for i in range(data.shape[1]):
         d0, d1, d2, d3 = data[0, i], data[1, i], data[2, i], data[3, i]
@@ -116,7 +117,7 @@ def _left_over(
             known += change * slope
             bend = four * d2[j] * (ga[j] - inverse * s[j])
             more += change * (bend - a * change * slope)
-    numbers[0], numbers[1], numbers[2] = chi2, used, np.sqrt(worst.max())
+    numbers[0], numbers[1], numbers[2] = chi2, used, np.sqrt(worst[largest(worst)])
     numbers[3] = light / max(used, one)
     numbers[4] = more / known if known > zero else zero
 
@@ -166,7 +167,7 @@ def judge_frames(
     near_profile = blank_profile(table_of(near, 0), near.lens, 1)
     far_profile = blank_profile(table_of(far, 0), far.lens, 1)
     profile = blank_profile(table_of(near, 0), near.lens, 2)
-    index = np.flatnonzero(free[:4])
+    index = marked(free[:4])
     image = np.empty(max(field.drawn, field.side) ** 2)
     square = np.empty(4 * field.side**2, near.nodes.dtype)
     g = np.empty(BENDS * field.side**2, near.nodes.dtype)
@@ -189,7 +190,8 @@ def judge_frames(
             here = _draw(near, lens_of(near, group[r]), group[r], p, pixels, profile, g)
             data = square[: 4 * ny * nx].reshape(4, ny, nx)
             stage(light, t, canvas.total[t], here, r0, c0, data)
-            slopes.squares[r] = r0, r1, c0, c1
+            inside = slopes.squares[r]
+            inside[0], inside[1], inside[2], inside[3] = r0, r1, c0, c1
             keep_slopes(data[2], here, index, slopes, r, room)
             value = place_score(data, here, near.lens, pull, known)
             for i in range(4):
@@ -199,7 +201,11 @@ def judge_frames(
             _left_over(data, here, p[3], numbers[r, 1:])
             if not _directions(f, index, ways_here):
                 continue
-            if PART * np.abs(ways_here[:2]).max() > field.pixel_nm:  # as good as singular
+            farthest = 0.0
+            for k in range(index.size):
+                for a in range(2):
+                    farthest = max(farthest, abs(ways_here[a, k]))
+            if PART * farthest > field.pixel_nm:  # as good as singular
                 continue
             for k in range(index.size):
                 for a in range(4):
@@ -250,7 +256,7 @@ def _curve(
     for k in range(ways.shape[1]):
         for sign in range(2):
             step = PART if sign == 0 else -PART
-            trial[:] = p
+            copy_line(p, trial)
             for a in range(4):
                 trial[a] += step * ways[a, k]
             if free[2]:

@@ -33,6 +33,7 @@ from iscat_analysis._kernels.canvas import (
 from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lines import copy_line, marked
 from iscat_analysis._kernels.place_score import place_score
 from iscat_analysis._kernels.scoring import (
     CONVERGED,
@@ -137,10 +138,14 @@ def fit_frames(
     change = np.empty(field.side**2, near.nodes.dtype)
     gradients = np.empty(10 * field.side**2, near.nodes.dtype)
     room = np.empty(field.side**2, dtype=np.float32)
-    step, before, index = np.empty(5), np.empty(5), np.flatnonzero(search.free[:4])
+    step, before, index = np.empty(5), np.empty(5), marked(search.free[:4])
     slope_profile = blank_profile(table_of(near, 0), near.lens, 2)
     fisher = np.empty((5, 5))
-    background, amount = light.background.astype(np.float32), light.background.sum()
+    background, amount = np.empty((rows, columns), dtype=np.float32), 0.0
+    for i in range(rows):
+        for j in range(columns):
+            background[i, j] = light.background[i, j]
+            amount += light.background[i, j]
     for t in range(first, last):
         if sweeps:
             expected[t] = _look_over(light.counts[t])  # kept for a moment, or nothing would be read
@@ -165,16 +170,18 @@ def fit_frames(
                 for i in range(ny):
                     for j in range(nx):
                         signal[i, j] = both[0, i, 0, j]
-                before[:] = p
+                copy_line(p, before)
                 outcome[r], last_one, gain[r] = _climb(
                     near, group[r], pixels, data, search, p, both, slope_profile, fisher, step
                 )
                 here = both[last_one]
                 _add_signal(here, step, signal, total[r0:r1, c0:c1])
-                canvas.squares[r] = p
-                information[r] = fisher[:4, :4]
+                copy_line(p, canvas.squares[r])
+                for i in range(4):
+                    copy_line(fisher[i, :4], information[r, i])
                 if slopes.values.size:
-                    slopes.squares[r] = r0, r1, c0, c1
+                    inside = slopes.squares[r]
+                    inside[0], inside[1], inside[2], inside[3] = r0, r1, c0, c1
                     for k in range(index.size):
                         slopes.moves[r, k] = p[index[k]] - before[index[k]]
                     keep_slopes(data[2], here, index, slopes, r, room)
@@ -215,13 +222,14 @@ def _climb(
         if gain == np.inf:
             break
         if gain < search.tolerance:
-            p[:] = trial
+            copy_line(trial, p)
             return CONVERGED, at, value + gain
         draw_gradient(near, group, trial, pixels, profile, both[1 - at])
         there = place_score(data, both[1 - at], near.lens, score, fisher)
         if not there > value:
             break
-        p[:], value, at = trial, there, 1 - at
+        copy_line(trial, p)
+        value, at = there, 1 - at
     for i in range(5):
         if search.free[i]:
             p[i] = min(max(p[i], lower[i]), upper[i])

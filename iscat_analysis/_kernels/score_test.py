@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lines import marked
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -144,7 +145,7 @@ def _mode_information(
     vector : ndarray, shape (k + m,)
         Filled.
     """
-    index = np.flatnonzero(free)
+    index = marked(free)
     fitted, count, nx = index.size, along.shape[0], along.shape[1]
     products, lines = _products(along), np.ascontiguousarray(_products(across).T)
     turned, pairs = np.ascontiguousarray(across.T), products.shape[0]
@@ -257,7 +258,7 @@ def _leverages(
 
     It is the sum of the squares of the pixel's components of the orthonormal modes.
     """
-    index = np.flatnonzero(free)
+    index = marked(free)
     fitted, count = index.size, along.shape[0]
     w = np.empty((used.size, along.shape[1]))
     for row in range(rows.shape[0]):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.diffusion import LOG_2PI, TOGETHER
 from iscat_analysis._kernels.lattice import FAST
+from iscat_analysis._kernels.lines import copy_line, largest
 
 FloatArray = NDArray[np.float64]
 
@@ -78,7 +79,8 @@ def harmonic_likelihoods(
                 var_mean[i] = 2.0 * width[i] * curved / (u * u)
     out = np.full(m, -0.5 * axes * (n - 1) * LOG_2PI)
     for c in range(axes):
-        place[:], unit[:], spread[:], product[:] = 0.0, 0.0, width, 1.0
+        place[:], unit[:], product[:] = 0.0, 0.0, 1.0
+        copy_line(width, spread)
         q11[:], q12[:], q22[:], log_determinant[:] = 0.0, 0.0, 0.0, 0.0
         for k in range(n):
             if k < 2 or gaps[k - 1] != gaps[k - 2]:
@@ -148,7 +150,8 @@ def most_likely_well(
         points[2 * k : 2 * k + 2, 1] = low[1] + (high[1] - low[1]) * k / (_RUNGS - 1.0)
         points[2 * k, 0], points[2 * k + 1, 0] = 0.0, 0.5
     values = _logarithmic(positions, variance, gaps, exposure, scale, points)
-    best, value = points[np.argmax(values)].copy(), values.max()
+    at = largest(values)
+    best, value = points[at].copy(), values[at]
     apart, square = _FIRST, np.empty((9, 2))
     for _ in range(_MOST):
         for k in range(9):
@@ -157,8 +160,9 @@ def most_likely_well(
             for a in range(2):
                 square[k, a] = min(max(square[k, a], low[a]), high[a])
         values = _logarithmic(positions, variance, gaps, exposure, scale, square)
-        if values.max() > value:
-            best, value = square[np.argmax(values)].copy(), values.max()
+        at = largest(values)
+        if values[at] > value:
+            best, value = square[at].copy(), values[at]
             continue
         g0, g1 = 0.5 * (values[7] - values[1]), 0.5 * (values[5] - values[3])
         h0, h1 = values[7] + values[1] - 2.0 * value, values[5] + values[3] - 2.0 * value

@@ -97,7 +97,7 @@ class Coupling:
         back : ndarray, shape (b, pixels)
             N⁻½ Σ Gᵀ covariance G N⁻½ v.
         """
-        seen = images.reshape(-1, *self._weight.shape) * self._sigma
+        seen = np.multiply(images.reshape(-1, *self._weight.shape), self._sigma, order="C")
         felt = np.zeros((len(self._rows), len(images), covariance.shape[1]))
         out = np.zeros_like(seen)
         follow(self._slopes, self._rows, self._squares, covariance, seen, felt, out)

@@ -249,7 +249,7 @@ class MovingField:
         fitted = rows.fitted(theta, fisher, gain) if sweeps else rows
         self._canvas = Sheet(fitted, canvas, coarse)
         if sweeps:
-            own = fisher[:, self.free[:4]][:, :, self.free[:4]]
+            own = np.ascontiguousarray(fisher[:, self.free[:4]][:, :, self.free[:4]])
             self._response = Response(
                 slopes, starts, light, canvas.total, own, self._pool, joint=not coarse
             )

@@ -14,11 +14,12 @@ What to use when
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from iscat_analysis._kernels.hessian import ROWS
 from iscat_analysis._kernels.scoring import CONDITIONAL, POISSON
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.checks import mask_of, pixels_of
@@ -26,6 +27,7 @@ from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.precision import precision
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+from iscat_analysis.records import BoolArray
 
 FloatArray = NDArray[np.float64]
 
@@ -236,20 +238,8 @@ def asimov_poisson(
     return poisson(model, grid, counts, background_e, scale_e, extra_variance_e2=extra_variance_e2)
 
 
-def compile_kernels(model: ForwardModel) -> None:
-    """Run every kernel once on a few pixels, so that later calls find them compiled.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        Any.
-    """
-    compile_maximisation(model)
-    compile_values(model)
-
-
-def compile_maximisation(model: ForwardModel, parts: Collection[str] = PARTS) -> None:
-    """Run the kernels of a maximisation once on a few pixels: half of `compile_kernels`.
+def compile_kernels(model: ForwardModel, parts: Collection[str] = PARTS) -> None:
+    """Run every kernel of fits once on a few pixels, so that later calls find them compiled.
 
     Parameters
     ----------
@@ -258,17 +248,14 @@ def compile_maximisation(model: ForwardModel, parts: Collection[str] = PARTS) ->
     parts : collection of str
         Which of `PARTS` will be needed.
     """
-    likelihood, theta = _small(model)
-    margin = np.array([1.0, 1.0, 0.0, 1.0, 0.0])
-    for free_height in (False, True) if "heights" in parts else (False,):
-        free = np.array([True, True, free_height, True, False])
-        likelihood.maximize(theta, free, theta - margin, theta + margin, passes=2)
-    if parts:
-        likelihood.score_fisher(theta)
+    for kernel in kernels_of_fits(model, parts):
+        kernel()
 
 
-def compile_values(model: ForwardModel, parts: Collection[str] = PARTS) -> None:
-    """Run the kernels of values and curvatures once: the other half of `compile_kernels`.
+def kernels_of_fits(model: ForwardModel, parts: Collection[str]) -> list[Callable[[], object]]:
+    """List the kernels of fits as calls on a few pixels, nearly as an analysis comes to them.
+
+    Two processes that begin at the two ends meet when all is compiled.
 
     Parameters
     ----------
@@ -276,22 +263,37 @@ def compile_values(model: ForwardModel, parts: Collection[str] = PARTS) -> None:
         Any.
     parts : collection of str
         Which of `PARTS` will be needed.
+
+    Returns
+    -------
+    list of callable
+        The calls.
     """
-    likelihood, theta = _small(model)
-    if "posteriors" in parts:
-        likelihood.values(theta[None])
-    if "heights" in parts:
-        likelihood.derivatives(theta, np.ones(5, dtype=np.bool_))
-        likelihood.scan_heights(theta[2:3], theta, (0.0, 2.0))
-    free = np.array([True, True, False, True, False])
-    derivatives = likelihood.derivatives(theta, free)
-    precision(likelihood, theta, np.eye(5), free, derivatives)
-    goodness_of_fit(likelihood, theta, free, derivatives)
-
-
-def _small(model: ForwardModel) -> tuple[Likelihood, FloatArray]:
-    """Likelihood of nine pixels, and parameters inside them."""
     grid = PixelGrid.region((0, 3), (0, 3), 10.0)
     counts = np.full(grid.shape, 100.0)
+    likelihood = poisson(model, grid, counts, counts, counts)
     theta = np.array([10.0, 10.0, model.height_nm, 1.0, 0.0])
-    return poisson(model, grid, counts, counts, counts), theta
+    margin = np.array([1.0, 1.0, 0.0, 1.0, 0.0])
+    flat, deep = (np.array([True, True, free_z, True, False]) for free_z in (False, True))
+    every = np.ones(5, dtype=np.bool_)
+    lines = np.random.default_rng(1).normal(size=(grid.shape[0], ROWS, grid.shape[1]))
+
+    def maximise(free: BoolArray) -> object:
+        return likelihood.maximize(theta, free, theta - margin, theta + margin, passes=2)
+
+    calls: list[Callable[[], object]] = [
+        lambda: likelihood.derivatives(theta, flat),
+        lambda: goodness_of_fit(likelihood, theta, flat, lines),
+        lambda: precision(likelihood, theta, np.eye(5), flat, lines),
+    ]
+    if "heights" in parts:  # which are held fixed in some fits, but later
+        calls.insert(0, lambda: maximise(deep))
+        calls.insert(0, lambda: likelihood.scan_heights(theta[2:3], theta, (0.0, 2.0)))
+        calls.append(lambda: maximise(flat))
+        calls.append(lambda: likelihood.derivatives(theta, every))
+    else:
+        calls.insert(0, lambda: maximise(flat))
+    calls.append(lambda: likelihood.score_fisher(theta))
+    if "posteriors" in parts:
+        calls.append(lambda: likelihood.values(theta[None]))
+    return calls

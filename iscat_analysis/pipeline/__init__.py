@@ -24,7 +24,7 @@ from iscat_analysis.inference.checks import path_in
 from iscat_analysis.memory import freed_memory_kept
 from iscat_analysis.movie import Stack, beside, open_stack
 from iscat_analysis.pipeline.bound import find_bound
-from iscat_analysis.pipeline.compilation import compiling, needed_parts
+from iscat_analysis.pipeline.compilation import compiling, needs_of
 from iscat_analysis.pipeline.finish import gather
 from iscat_analysis.pipeline.injection import injected
 from iscat_analysis.pipeline.landing import find_landings
@@ -205,11 +205,8 @@ def analyse(
             "numpy.save, and give its path; or leave `scheduler` out"
         )
     started = datetime.now(UTC).isoformat(timespec="seconds")
-    # particles that move are fitted by kernels of their own, which call those of others
-    tracked = way_of(config) == "tracks"
-    workers = 1 if tracked else config.compute.workers
-    kept = freed_memory_kept() if tracked else nullcontext()
-    with kept, compiling(notify, workers, needed_parts(config)) as compilation:
+    kept = freed_memory_kept() if way_of(config) == "tracks" else nullcontext()
+    with kept, compiling(notify, config.compute.workers, needs_of(config)) as compilation:
         run = Run(notify, progress, compilation, partial, place or Here(), inject, begin_report)
         ready = prepare(movie, config, run)  # load, calibrate
         found = FIND[ready.way](ready, run)  # background, detect, fit, posterior, bounds

@@ -13,14 +13,15 @@ from numba.core import event
 
 from iscat_analysis import _kernels
 from iscat_analysis.config import Config
+from iscat_analysis.copies import Copy, LostError
 from iscat_analysis.inference.noise import PARTS
+from iscat_analysis.pipeline import rehearsal
+from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import FREE_PARAMETERS
 
 _PATIENCE_S = 1.0  # of compilation, before it is announced
 _BETWEEN_S = 4.0  # from one line to the next
 _ROOM = f"{_kernels.__name__}."
-# All of whose kernels it compiles.
-_THEIRS = ("curvature", "goodness", "hessian", "residuals", "score_test")
 _ABOUT = {
     "curvature": "the precision of fits",
     "diffusion": "diffusion",
@@ -53,22 +54,22 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
         Told one line at a time.
     together : bool
         Whether a second process may be started.
-    parts : sequence of str
+    needs : sequence of str
         As in `compiling`.
 
     Attributes
     ----------
-    parts : sequence of str
+    needs : sequence of str
         As given.
     """
 
     def __init__(
-        self, notify: Callable[[str], None], *, together: bool, parts: Sequence[str]
+        self, notify: Callable[[str], None], *, together: bool, needs: Sequence[str]
     ) -> None:
-        self.parts = parts
+        self.needs = needs
         self._notify = notify
         self._together = together
-        self._other: subprocess.Popen[bytes] | None = None
+        self._other: Copy | subprocess.Popen[bytes] | None = None
         self._lock = threading.Lock()
         self._depth = 0
         self._about = ""
@@ -90,7 +91,7 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
         kind = module.removeprefix(_ROOM)
         self._about = _ABOUT.get(kind, _PICTURES)
         if self._together and self._other is None:
-            self._other = _started(self.parts)
+            self._other = self._started()
         if self._timer is None:
             self._timer = threading.Timer(_PATIENCE_S, self._announce)
             self._timer.daemon = True
@@ -120,22 +121,43 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
             self._said = self._about, time.monotonic()
         self._notify(f"{text}: {self._about}…")
 
-    def wait(self) -> None:
-        """Wait for the other process, where there is one."""
-        if self._other is not None:
-            self._other.wait()
+    def _started(self) -> Copy | subprocess.Popen[bytes] | None:
+        """Start the other process; what it does not compile is compiled in this one."""
+        try:
+            if sys.platform == "linux":
+                copied = Copy(self._rehearsed)
+                copied.ask(None)
+                return copied
+            if not sys.executable or getattr(sys, "frozen", False):  # inside another program
+                return None
+            nowhere = subprocess.DEVNULL
+            command = [sys.executable, "-P", "-m", rehearsal.__name__, *self.needs]
+            return subprocess.Popen(
+                command, stdin=nowhere, stdout=nowhere, stderr=nowhere, env=_kernels.environment()
+            )
+        except (OSError, LostError):
+            return None
+
+    def _rehearsed(self, asked: None) -> None:
+        """Be the other process, a copy, which says nothing and starts no third one."""
+        del asked
+        event.unregister("numba:compile", self)
+        rehearsal.rehearse(self.needs)
 
     def close(self) -> None:
         """Say nothing any more, and end the other process."""
         if self._timer is not None:
             self._timer.cancel()
-        if self._other is not None and self._other.poll() is None:
+        if isinstance(self._other, subprocess.Popen):
             self._other.kill()
             self._other.wait()
+        elif self._other is not None:
+            self._other.end()
+            self._other.close()
 
 
-def needed_parts(config: Config) -> tuple[str, ...]:
-    """Name the kernels of `iscat_analysis.inference.noise.PARTS` that an analysis needs.
+def needs_of(config: Config) -> tuple[str, ...]:
+    """Name the kernels that an analysis needs and not every other one does.
 
     Parameters
     ----------
@@ -145,32 +167,20 @@ def needed_parts(config: Config) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        Some of them, or none.
+        Some of `iscat_analysis.inference.noise.PARTS`, and ``"tracks"`` where particles move.
     """
+    tracks = way_of(config) == "tracks"
     needed = {
-        "heights": "z_nm" in FREE_PARAMETERS[config.fit.mode],
+        "heights": "z_nm" in FREE_PARAMETERS[config.track.free if tracks else config.fit.mode],
         "posteriors": config.samples_posterior,
+        "tracks": tracks,
     }
-    return tuple(part for part in PARTS if needed[part])
-
-
-def _started(parts: Sequence[str]) -> subprocess.Popen[bytes] | None:
-    """Start the other process; what it does not compile is compiled in this one."""
-    if not sys.executable or getattr(sys, "frozen", False):  # inside another program
-        return None
-    nowhere = subprocess.DEVNULL
-    command = [sys.executable, "-P", "-m", "iscat_analysis.inference.ahead", *parts]
-    try:
-        return subprocess.Popen(
-            command, stdin=nowhere, stdout=nowhere, stderr=nowhere, env=_kernels.environment()
-        )
-    except OSError:
-        return None
+    return tuple(part for part, is_needed in needed.items() if is_needed)
 
 
 @contextmanager
 def compiling(
-    notify: Callable[[str], None], workers: int, parts: Sequence[str] = PARTS
+    notify: Callable[[str], None], workers: int, needs: Sequence[str] = PARTS
 ) -> Iterator[Compilation]:
     """Say what is compiled until the block ends.
 
@@ -179,14 +189,14 @@ def compiling(
     notify : callable
         Told one line at a time, after a second of compilation.
     workers : int
-        From two on, a second process compiles half of what fits need.
-    parts : sequence of str
-        Which of `iscat_analysis.inference.noise.PARTS` it compiles as well.
+        From two on, a second process compiles half of them.
+    needs : sequence of str
+        As from `needs_of`.
 
     Yields
     ------
     Compilation
-        Whose `wait` waits for that process.
+        That knows what is needed.
     """
     if _kernels.TEMPORARY:
         notify(
@@ -194,12 +204,9 @@ def compiling(
             "folder can be written: every run compiles them anew; set NUMBA_CACHE_DIR to a folder "
             "that can be written"
         )
-    listener = Compilation(notify, together=workers > 1, parts=parts)
+    listener = Compilation(notify, together=workers > 1, needs=needs)
     try:
-        with (
-            event.install_listener("numba:compile", listener),
-            _kernels.awaited(_THEIRS, listener.wait),
-        ):
+        with event.install_listener("numba:compile", listener):
             yield listener
     finally:
         listener.close()

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from iscat_analysis.inference.noise import compile_maximisation, compile_values
+from iscat_analysis.inference.noise import compile_kernels
 from iscat_analysis.pipeline.compilation import Compilation
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.places import Place
@@ -83,6 +83,4 @@ class Run:
 
     def warm_up(self, scene: Scene) -> None:
         """Load the compiled kernels of fits, or compile them."""
-        compile_maximisation(scene.model, self.compilation.parts)
-        self.compilation.wait()
-        compile_values(scene.model, self.compilation.parts)
+        compile_kernels(scene.model, self.compilation.needs)

@@ -1,0 +1,50 @@
+"""Claims: one process compiles a kernel, and others that need it wait for what it keeps."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+
+try:
+    import fcntl
+except ImportError:  # Windows, where each process compiles what it needs
+    fcntl = None  # type: ignore[assignment]
+
+_NAME = "claims"
+
+
+@contextmanager
+def claimed(folder: str, subject: str) -> Iterator[None]:
+    """Claim something for this process as long as the block lasts.
+
+    The system takes back the claims of a process that ends.  Where it keeps none, as on some file
+    servers, or where two processes wait for each other, the block goes on without.
+
+    Parameters
+    ----------
+    folder : str
+        Where compiled kernels are kept.
+    subject : str
+        What only one process at a time may do there.
+    """
+    place = zlib.crc32(subject.encode())
+    try:
+        file = _opened(folder)
+        fcntl.lockf(file, fcntl.LOCK_EX, 1, place)
+    except (OSError, AttributeError):
+        yield
+        return
+    try:
+        yield
+    finally:
+        fcntl.lockf(file, fcntl.LOCK_UN, 1, place)
+
+
+@cache
+def _opened(folder: str) -> int:
+    """Open the file whose bytes are claimed; as long as this process lives, for closing frees them."""
+    os.makedirs(folder, exist_ok=True)
+    return os.open(os.path.join(folder, _NAME), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)

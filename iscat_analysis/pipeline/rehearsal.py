@@ -1,0 +1,90 @@
+"""The kernels of an analysis, run on next to nothing, and those first that it needs last.
+
+While an analysis compiles its kernels from the first one on, another process compiles them from the
+other end.  Each finds what the other has made, where Numba keeps compiled kernels, and waits for
+what the other is at (`iscat_analysis._kernels.claims`).  That process is a copy of the first one,
+or on other systems than Linux ``python -m iscat_analysis.pipeline.rehearsal NEED…``.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+from collections.abc import Collection
+
+import numpy as np
+
+from iscat_analysis._kernels.canvas import Light
+from iscat_analysis.config import Config
+from iscat_analysis.inference.coupling import Coupling
+from iscat_analysis.inference.exposures import Exposures
+from iscat_analysis.inference.moving import MovingField
+from iscat_analysis.inference.newton import Response
+from iscat_analysis.inference.noise import kernels_of_fits
+from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.optics.forward import ForwardModel, forward_model
+from iscat_analysis.species.motion import confinement_test
+from iscat_analysis.threads import threads
+
+_REACH_NM = 2000.0
+_SIDE, _SQUARE, _FRAMES = 8, 4, 4
+_PIXEL_NM = 50.0
+
+
+def rehearse(needs: Collection[str]) -> None:
+    """Run what an analysis runs, from its end.
+
+    Parameters
+    ----------
+    needs : collection of str
+        As from `iscat_analysis.pipeline.compilation.needs_of`.
+    """
+    model = forward_model(Config(), _REACH_NM)
+    if "tracks" in needs:
+        _track(model, free_z="heights" in needs)
+        return
+    for kernel in reversed(kernels_of_fits(model, needs)):
+        kernel()
+
+
+def _track(model: ForwardModel, *, free_z: bool) -> None:
+    """Run what is done with tracks, with judged rows, with rows that follow, and with frames."""
+    walk = np.cumsum(np.random.default_rng(1).normal(0, 100, (12, 2)), axis=0)
+    confinement_test(np.arange(12), walk, 1.0, frame_rate_hz=100, resamples=1)
+    shape = (_FRAMES, _SIDE, _SIDE)
+    counts = np.full(shape, 100, dtype=np.uint16)
+    theta = np.zeros((_FRAMES, 2, 5))
+    theta[:, :, :2] = _PIXEL_NM * _SIDE / 2
+    theta[:, :, 2] = model.height_nm
+    theta[:, :, 3] = 0.1
+    frame, track = np.divmod(np.arange(2 * _FRAMES), 2)
+    rows = Rows.of(frame, track, theta.reshape(-1, 5))
+    ground = Ground(np.full(shape[1:], 100.0), np.ones(_FRAMES))
+    used = np.ones(shape[1:], dtype=np.bool_)
+    with threads(1) as pool:
+        field = MovingField(
+            Exposures(counts), np.ones(shape[1:]), used, model, model, pixel_nm=_PIXEL_NM,
+            roi_px=_SQUARE, z_range_nm=(0.0, 100.0) if free_z else None, largest=1.0, pool=pool,
+        )  # fmt: skip
+        judged = field.judge(ground, rows)
+        coupling = Coupling(field, ground, judged, np.arange(2))
+        own = coupling.own()
+        coupling.followed(own, coupling.sent(np.zeros((2, 1, own.shape[1]))))
+        response = Response(
+            judged.slopes, rows.starts(_FRAMES),
+            Light(counts, 1.0, 0.0, ground.power, ground.level, np.ones(shape[1:])),
+            np.zeros(shape, dtype=np.float32), np.ones((len(theta) * 2, *own.shape[1:])), pool,
+            joint=True,
+        )  # fmt: skip
+        walls = np.full(5, -1e9), np.full(5, 1e9)
+        still = np.zeros(shape[1:])
+        response.together(rows.theta, field.free, walls)
+        response.followed(rows.theta, still, field.free, walls)
+        response.step(still, field.total_e, used, 0.0)
+        field.residual(ground, rows, 0, 1)
+        field.fit(ground, rows)
+
+
+if __name__ == "__main__":
+    gc.disable()  # the process is short, and what it makes stays
+    rehearse(sys.argv[1:])
