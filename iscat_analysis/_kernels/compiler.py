@@ -18,7 +18,8 @@ import copy
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar
+from functools import cache
+from typing import Any
 
 from llvmlite import binding
 from numba.core import event, sigutils
@@ -46,6 +47,14 @@ class _Body(JITCodeLibrary):  # type: ignore[misc]  # Numba is not typed
     One that calls no other kernel is optimised by itself as well: a loop over its arguments, which
     LLVM does in registers there, may stay scalar where it has become part of another function.
     """
+
+    def _optimize_functions(self, module: Any) -> None:
+        # as Numba does, but for functions that are only named, most of all
+        module.data_layout = self._codegen._data_layout
+        passes, builder = self._codegen._function_pass_manager()
+        for function in module.functions:
+            if not function.is_declaration:
+                passes.run(function, builder)
 
     def _optimize_final_module(self) -> None:
         if not any(isinstance(library, _Body | _Whole) for library in self._linking_libraries):
@@ -113,23 +122,22 @@ class _Types(TypingContext):  # type: ignore[misc]
     between two numbers alone some dozen, a thousand times.
     """
 
-    _known: ClassVar[dict[Any, Any]] = {}
-
-    @classmethod
-    def of(cls, context: TypingContext) -> _Types:
-        self = cls.__new__(cls)
-        self.__dict__ = context.__dict__
-        return self
+    def __init__(self, context: TypingContext) -> None:
+        self.__dict__ = context.__dict__  # one and the same knowledge
+        self._known: dict[Any, Any] = {}
 
     def resolve_function_type(self, function: Any, arguments: Any, named: Any) -> Any:
         find = super().resolve_function_type
         constants = any(isinstance(argument, SliceLiteral) for argument in arguments)
         if named or constants or not isinstance(function, BaseFunction):
             return find(function, arguments, named)
-        key = function, tuple(arguments)
+        key = function, tuple(arguments), ConfigStack.top_or_none()
         if key not in self._known:
             self._known[key] = find(function, arguments, named)
         return self._known[key]
+
+
+_types = cache(_Types)  # one for Numba's: it keeps by context what it makes of its functions
 
 
 class _Options(Flags):  # type: ignore[misc]
@@ -154,7 +162,7 @@ class _Compiler(Compiler):  # type: ignore[misc]
         state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = True
         state.flags.no_compile = True
         context = state.targetctx
-        state.typingctx = _Types.of(state.typingctx)
+        state.typingctx = _types(state.typingctx)
         state.library = _Body(context.codegen(), func.__qualname__)
         _depth += 1
         try:

@@ -15,6 +15,7 @@ What to use when
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +28,6 @@ from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.precision import precision
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
-from iscat_analysis.records import BoolArray
 
 FloatArray = NDArray[np.float64]
 
@@ -238,8 +238,10 @@ def asimov_poisson(
     return poisson(model, grid, counts, background_e, scale_e, extra_variance_e2=extra_variance_e2)
 
 
-def compile_kernels(model: ForwardModel, parts: Collection[str] = PARTS) -> None:
-    """Run every kernel of fits once on a few pixels, so that later calls find them compiled.
+def compile_kernels(
+    model: ForwardModel, parts: Collection[str] = PARTS, *, backwards: bool = False
+) -> None:
+    """Run the kernels of fits once on a few pixels, so that later calls find them compiled.
 
     Parameters
     ----------
@@ -247,53 +249,34 @@ def compile_kernels(model: ForwardModel, parts: Collection[str] = PARTS) -> None
         Any.
     parts : collection of str
         Which of `PARTS` will be needed.
-    """
-    for kernel in kernels_of_fits(model, parts):
-        kernel()
-
-
-def kernels_of_fits(model: ForwardModel, parts: Collection[str]) -> list[Callable[[], object]]:
-    """List the kernels of fits as calls on a few pixels, nearly as an analysis comes to them.
-
-    Two processes that begin at the two ends meet when all is compiled.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        Any.
-    parts : collection of str
-        Which of `PARTS` will be needed.
-
-    Returns
-    -------
-    list of callable
-        The calls.
+    backwards : bool
+        In the other order: two processes that begin at the two ends take half of it off each other.
     """
     grid = PixelGrid.region((0, 3), (0, 3), 10.0)
     counts = np.full(grid.shape, 100.0)
     likelihood = poisson(model, grid, counts, counts, counts)
     theta = np.array([10.0, 10.0, model.height_nm, 1.0, 0.0])
     margin = np.array([1.0, 1.0, 0.0, 1.0, 0.0])
-    flat, deep = (np.array([True, True, free_z, True, False]) for free_z in (False, True))
-    every = np.ones(5, dtype=np.bool_)
-    lines = np.random.default_rng(1).normal(size=(grid.shape[0], ROWS, grid.shape[1]))
+    free = np.array([True, True, "heights" in parts, True, False])
+    derivatives = np.random.default_rng(1).normal(size=(grid.shape[0], ROWS, grid.shape[1]))
 
-    def maximise(free: BoolArray) -> object:
-        return likelihood.maximize(theta, free, theta - margin, theta + margin, passes=2)
+    def maximise() -> None:
+        likelihood.maximize(theta, free, theta - margin, theta + margin, passes=2)
+
+    def differentiate() -> None:
+        likelihood.derivatives(theta, free)
 
     calls: list[Callable[[], object]] = [
-        lambda: likelihood.derivatives(theta, flat),
-        lambda: goodness_of_fit(likelihood, theta, flat, lines),
-        lambda: precision(likelihood, theta, np.eye(5), flat, lines),
+        lambda: likelihood.score_fisher(theta),
+        lambda: precision(likelihood, theta, np.eye(5), free, derivatives),
+        lambda: goodness_of_fit(likelihood, theta, free, derivatives),
     ]
-    if "heights" in parts:  # which are held fixed in some fits, but later
-        calls.insert(0, lambda: maximise(deep))
-        calls.insert(0, lambda: likelihood.scan_heights(theta[2:3], theta, (0.0, 2.0)))
-        calls.append(lambda: maximise(flat))
-        calls.append(lambda: likelihood.derivatives(theta, every))
+    if "heights" in parts:
+        scan = partial(likelihood.scan_heights, theta[2:3], theta, (0.0, 2.0))
+        calls = [scan, maximise, *calls, differentiate]
     else:
-        calls.insert(0, lambda: maximise(flat))
-    calls.append(lambda: likelihood.score_fisher(theta))
+        calls = [maximise, differentiate, *calls]
     if "posteriors" in parts:
         calls.append(lambda: likelihood.values(theta[None]))
-    return calls
+    for call in reversed(calls) if backwards else calls:
+        call()

@@ -20,7 +20,7 @@ from iscat_analysis.inference.coupling import Coupling
 from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.newton import Response
-from iscat_analysis.inference.noise import kernels_of_fits
+from iscat_analysis.inference.noise import compile_kernels
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.species.motion import confinement_test
@@ -43,8 +43,7 @@ def rehearse(needs: Collection[str]) -> None:
     if "tracks" in needs:
         _track(model, free_z="heights" in needs)
         return
-    for kernel in reversed(kernels_of_fits(model, needs)):
-        kernel()
+    compile_kernels(model, needs, backwards=True)
 
 
 def _track(model: ForwardModel, *, free_z: bool) -> None:
