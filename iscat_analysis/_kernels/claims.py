@@ -45,6 +45,6 @@ def claimed(folder: str, subject: str) -> Iterator[None]:
 
 @cache
 def _opened(folder: str) -> int:
-    """Open the file whose bytes are claimed; as long as this process lives, for closing frees them."""
-    os.makedirs(folder, exist_ok=True)
-    return os.open(os.path.join(folder, _NAME), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    """Open the file whose bytes are claimed, for good: to close it would free them all."""
+    os.makedirs(folder, exist_ok=True)  # noqa: PTH103  # kernels know no paths
+    return os.open(f"{folder}/{_NAME}", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)

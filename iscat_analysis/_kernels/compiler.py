@@ -30,8 +30,8 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import Environment, lookup_environment
 from numba.core.registry import CPUDispatcher
 from numba.core.targetconfig import ConfigStack
-from numba.core.types import SliceLiteral
 from numba.core.types.functions import BaseFunction
+from numba.core.types.misc import SliceLiteral
 from numba.core.typing import Context as TypingContext
 
 from iscat_analysis._kernels.claims import claimed

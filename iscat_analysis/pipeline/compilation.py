@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 import threading
@@ -15,12 +16,12 @@ from iscat_analysis import _kernels
 from iscat_analysis.config import Config
 from iscat_analysis.copies import Copy, LostError
 from iscat_analysis.inference.noise import PARTS
-from iscat_analysis.pipeline import rehearsal
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import FREE_PARAMETERS
 
 _PATIENCE_S = 1.0  # of compilation, before it is announced
 _BETWEEN_S = 4.0  # from one line to the next
+_REHEARSAL = "iscat_analysis.pipeline.rehearsal"
 _ROOM = f"{_kernels.__name__}."
 _ABOUT = {
     "curvature": "the precision of fits",
@@ -131,7 +132,7 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
             if not sys.executable or getattr(sys, "frozen", False):  # inside another program
                 return None
             nowhere = subprocess.DEVNULL
-            command = [sys.executable, "-P", "-m", rehearsal.__name__, *self.needs]
+            command = [sys.executable, "-P", "-m", _REHEARSAL, *self.needs]
             return subprocess.Popen(
                 command, stdin=nowhere, stdout=nowhere, stderr=nowhere, env=_kernels.environment()
             )
@@ -142,7 +143,7 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
         """Be the other process, a copy, which says nothing and starts no third one."""
         del asked
         event.unregister("numba:compile", self)
-        rehearsal.rehearse(self.needs)
+        importlib.import_module(_REHEARSAL).rehearse(self.needs)
 
     def close(self) -> None:
         """Say nothing any more, and end the other process."""

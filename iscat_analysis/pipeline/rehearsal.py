@@ -76,10 +76,10 @@ def _track(model: ForwardModel, *, free_z: bool) -> None:
             joint=True,
         )  # fmt: skip
         walls = np.full(5, -1e9), np.full(5, 1e9)
-        still = np.zeros(shape[1:])
+        change = np.full(shape[1:], 1e-3)
         response.together(rows.theta, field.free, walls)
-        response.followed(rows.theta, still, field.free, walls)
-        response.step(still, field.total_e, used, 0.0)
+        response.followed(rows.theta, change, field.free, walls)
+        response.step(change, field.total_e, used, 0.0)
         field.residual(ground, rows, 0, 1)
         field.fit(ground, rows)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import shutil
 import subprocess
@@ -17,22 +16,12 @@ from numba.core import event
 
 import iscat_analysis
 from iscat_analysis import _kernels
-from iscat_analysis._kernels.goodness import look
-from iscat_analysis._kernels.hessian import signal_hessian
-from iscat_analysis._kernels.scan import scan_heights
-from iscat_analysis._kernels.scoring import maximize, value_batch
 from iscat_analysis.config import load_config
-from iscat_analysis.inference import ahead
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise import (
-    PARTS,
-    compile_kernels,
-    compile_maximisation,
-    compile_values,
-)
+from iscat_analysis.inference.noise import compile_kernels
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.pipeline import compilation as module
-from iscat_analysis.pipeline.compilation import compiling, needed_parts
+from iscat_analysis.pipeline.compilation import Compilation, compiling, needs_of
 
 ROOM = "iscat_analysis._kernels"
 
@@ -47,11 +36,11 @@ def started(monkeypatch):
     """Start processes that do nothing, and list them."""
     begun = []
 
-    def start(parts):
-        begun.append(subprocess.Popen([sys.executable, "-c", "", *parts]))
+    def start(self):
+        begun.append(subprocess.Popen([sys.executable, "-c", "", *self.needs]))
         return begun[-1]
 
-    monkeypatch.setattr(module, "_started", start)
+    monkeypatch.setattr(Compilation, "_started", start)
     return begun
 
 
@@ -88,31 +77,31 @@ def test_nothing_is_said_of_a_kernel_that_is_quick(monkeypatch):
 
 
 def test_a_second_process_is_started_once_for_the_first_kernel(started):
-    with compiling(print, 2) as compilation:
+    with compiling(print, 2):
         with event.trigger_event("numba:compile", data=kernel("numpy")):
             assert not started
         for name in ("sliding", "drift", "image"):
             with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.{name}")):
                 assert len(started) == 1
-        compilation.wait()
-        assert started[0].returncode == 0
+    assert started[0].returncode is not None  # it ends with the first
 
 
-def test_the_second_process_runs_nothing_of_the_folder_it_is_in(monkeypatch, tmp_path):
+def test_a_program_for_the_second_process_runs_nothing_of_the_folder_it_is_in(
+    monkeypatch, tmp_path
+):
+    monkeypatch.setattr(sys, "platform", "another")
     ran = tmp_path / "ran"
     for name in ("numba.py", "iscat_analysis.py"):
         (tmp_path / name).write_text("open('ran', 'w').close()\n", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    other = module._started(())
+    other = Compilation(print, together=True, needs=())._started()
     with suppress(subprocess.TimeoutExpired):
         other.wait(timeout=5)  # long after its imports begin
     other.kill()
     other.wait()
     assert not ran.exists()
     subprocess.run(
-        [sys.executable, "-m", "iscat_analysis.inference.ahead"],
-        stderr=subprocess.DEVNULL,
-        check=False,
+        [sys.executable, "-m", module._REHEARSAL], stderr=subprocess.DEVNULL, check=False
     )
     assert ran.exists()
 
@@ -120,7 +109,7 @@ def test_the_second_process_runs_nothing_of_the_folder_it_is_in(monkeypatch, tmp
 def test_the_second_process_ends_with_the_first(monkeypatch):
     command = [sys.executable, "-c", "import time; time.sleep(600)"]
     other = subprocess.Popen(command)
-    monkeypatch.setattr(module, "_started", lambda _: other)
+    monkeypatch.setattr(Compilation, "_started", lambda _: other)
     with (
         pytest.raises(KeyboardInterrupt),
         compiling(print, 2),
@@ -130,40 +119,66 @@ def test_the_second_process_ends_with_the_first(monkeypatch):
     assert other.returncode not in (None, 0)
 
 
-def test_the_second_process_compiles_what_the_first_needs():
-    shared = (value_batch, signal_hessian, scan_heights, look)
-    others = set(maximize.signatures)  # of other tests
-    ahead.main(PARTS)
-    assert gc.isenabled()  # only a process that is short does without
-    made = [set(kernel.signatures) for kernel in shared]
-    assert all(made)
-    config = load_config(Path("sample_configs/joint.toml"), [])
-    compile_kernels(forward_model(config, 2000.0))
-    assert [set(kernel.signatures) for kernel in shared] == made
-    assert len(set(maximize.signatures) - others) <= 2  # of the field, and of a picture
+SHARED = """
+import contextlib
+import sys
+import tempfile
+from pathlib import Path
+
+from iscat_analysis.config import load_config
+from iscat_analysis._kernels import (
+    curvature, diffusion, following, goodness, hessian, judging, moving, scan, scoring, sharing,
+    well,
+)
+from iscat_analysis.pipeline.compilation import needs_of
+from iscat_analysis.pipeline.rehearsal import rehearse
+from iscat_cli import main
+
+names = (
+    scoring.maximize, scan.scan_heights, hessian.signal_hessian, curvature.errors_and_bias,
+    goodness.look, judging.judge_frames, moving.fit_frames, following.find_clusters,
+    following.join_rows, following.follow_rows, following.shift_rows, following.move_together,
+    sharing.own_shares, sharing.send, sharing.follow, diffusion.most_likely_diffusion,
+    well.most_likely_well,
+)
+sample, *changes = sys.argv[1:]
+rehearse(needs_of(load_config(Path(sample), changes)))
+known = [set(kernel.signatures) for kernel in names]
+print(sum(map(bool, known)))
+with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(sys.stderr):
+    options = ["--config", sample, *(f"--set={change}" for change in changes), "--quiet"]
+    assert not main(["simulate", *options, "--out", f"{folder}/movie.tif"])
+    assert not main(["fit", f"{folder}/movie.tif", *options])
+for kernel, before in zip(names, known):
+    if set(kernel.signatures) - before:
+        print(kernel.py_func.__name__)
+"""
+FEW = ["simulation.shape=[64, 64]", "compute.workers=1", "posterior.enabled=false"]
+ONE = "simulation.events=[{frame=200, x_px=31.2, y_px=30.8, mass_kda=900.0}]"
+MOVING = [
+    "simulation.count=0", "simulation.leavings=0", "simulation.frames=60",
+    "simulation.movers=[{count=2, mass_kda=900.0, d_um2_s=0.15}]", "camera.frame_rate_hz=331.0",
+    "fit.mode=track",
+]  # fmt: skip
 
 
-def test_a_kernel_of_the_second_process_is_awaited_and_not_compiled_twice(monkeypatch, tmp_path):
-    monkeypatch.setattr(_kernels.config, "CACHE_DIR", str(tmp_path))
-
-    def third(x):
-        return x / 3
-
-    third.__module__ = f"{ROOM}.residuals"
-    here, there = _kernels.kernel()(third), _kernels.kernel()(third)
-    with _kernels.awaited(["residuals"], lambda: None):
-        assert here(3.0) == 1.0
-    assert sum(here.stats.cache_misses.values()) == 1  # the other one has ended without it
-
-    def wait():
-        with monkeypatch.context() as own:
-            own.setattr(_kernels, "_elsewhere", {})
-            there(1)
-
-    with _kernels.awaited(["residuals"], wait):
-        assert here(6) == 2.0
-    assert list(here.stats.cache_hits.values()) == [1]
-    assert sum(here.stats.cache_misses.values()) == 1
+@pytest.mark.parametrize(
+    ("sample", "changes", "kernels", "more"),
+    [
+        ("mass", [ONE], 4, set()),
+        ("joint", [ONE], 4, {"signal_hessian"}),  # at heights that are held fixed
+        ("landing", [*MOVING, "track.free=mass"], 12, set()),
+    ],
+)
+def test_a_rehearsal_compiles_what_an_analysis_needs(sample, changes, kernels, more):
+    done = subprocess.run(
+        [sys.executable, "-c", SHARED, f"sample_configs/{sample}.toml", *FEW, *changes],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    known, *unknown = done.stdout.split()
+    assert int(known) == kernels
+    assert set(unknown) <= more
 
 
 def test_a_picture_is_compiled_without_those_of_other_kinds(tmp_path):
@@ -192,20 +207,22 @@ print(*(len(kernel.signatures) for kernel in (radial_signal, lattice_signal, sta
         ("landing", [], ()),
         ("joint", [], ("heights",)),
         ("joint", ["posterior.enabled=true"], ("heights", "posteriors")),
+        ("landing", ["fit.mode=track", "track.free=mass"], ("tracks",)),
+        ("landing", ["fit.mode=track", "track.free=joint"], ("heights", "tracks")),
     ],
 )
 def test_an_analysis_compiles_what_it_needs(monkeypatch, sample, changes, parts):
     config = load_config(Path(f"sample_configs/{sample}.toml"), changes)
-    assert needed_parts(config) == parts
+    assert needs_of(config) == parts
     run = set()
     for name, part in (("scan_heights", "heights"), ("values", "posteriors")):
         monkeypatch.setattr(Likelihood, name, lambda *_, part=part: run.add(part))
-    compile_values(forward_model(config, 2000.0), parts)
-    assert run == set(parts)
     free = []
     monkeypatch.setattr(Likelihood, "maximize", lambda *given, **_: free.append(given[2][2]))
-    compile_maximisation(forward_model(config, 2000.0), parts)
-    assert any(free) == ("heights" in parts)
+    for backwards in (False, True):
+        compile_kernels(forward_model(config, 2000.0), parts, backwards=backwards)
+    assert run == set(parts) - {"tracks"}
+    assert free == 2 * ["heights" in parts]
 
 
 def test_a_kept_kernel_is_loaded_without_what_compiling_needs(tmp_path):
@@ -261,7 +278,7 @@ print(_kernels.TEMPORARY, folder, sum(len(files) for _, _, files in os.walk(fold
     temporary, folder, files = done.stdout.split()
     assert temporary == "True"
     assert Path(folder).parent == tmp_path
-    assert int(files) == 2
+    assert int(files) == 3  # an index, what it names, and the claims
     assert not Path(folder).exists()
 
 

@@ -14,6 +14,7 @@ import pytest
 from numba import njit
 
 from iscat_analysis._kernels import kernel
+from iscat_analysis._kernels.claims import claimed
 from iscat_analysis._kernels.compiler import _Body, _Whole
 
 KERNELS = """
@@ -144,3 +145,93 @@ def test_numba_of_unknown_insides_compiles_everything_as_a_whole(tmp_path: Path)
         found = _asked(tmp_path, "more", "doubled", before=OTHER)
         assert {name: value for name, (value, _) in found.items()} == expected
         assert found["more"][1] == compiled
+
+
+SUMS = """
+import numpy as np
+from iscat_analysis._kernels import kernel
+
+@kernel(fastmath=True)
+def quickly(x):
+    return np.sum(x)
+
+@kernel()
+def exactly(x):
+    return np.sum(x)
+
+x = np.random.default_rng(1).lognormal(0.0, 5.0, 1000)
+for one in ORDER:
+    one(x)
+total = 0.0
+for number in x:
+    total += number
+print(exactly(x) == total, quickly(x) == total)
+"""
+
+
+@pytest.mark.parametrize("order", ["quickly, exactly", "exactly, quickly"])
+def test_what_numpy_does_for_one_kernel_is_not_taken_for_another_of_other_options(
+    tmp_path: Path, order: str
+) -> None:
+    script = tmp_path / "sums.py"
+    script.write_text(SUMS.replace("ORDER", f"({order})"), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kept")},
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.stdout.split() == ["True", "False"]
+
+
+def test_two_processes_compile_a_kernel_once(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(KERNELS, encoding="utf-8")
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", ASK, "more"],
+            cwd=tmp_path, env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kept")},
+            stdout=subprocess.PIPE, text=True,
+        )
+        for _ in range(2)
+    ]  # fmt: skip
+    found = [json.loads(one.communicate()[0])["more"] for one in both]
+    assert [value for value, _ in found] == [13.0, 13.0]
+    assert sum(compiled for _, compiled in found) == 1
+
+
+CLAIM = """
+import sys
+from iscat_analysis._kernels.claims import claimed
+with claimed(*sys.argv[1:]):
+    print("mine", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_claim_holds_until_it_is_given_back_or_its_process_ends(tmp_path: Path) -> None:
+    def claimant(subject: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-c", CLAIM, str(tmp_path), subject],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+
+    with claimant("one") as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "mine\n"
+        with claimant("another") as other:
+            assert other.communicate()[0] == "mine\n"
+        with claimant("one") as second:
+            with pytest.raises(subprocess.TimeoutExpired):
+                second.wait(timeout=2)
+            holder.kill()
+            assert second.communicate()[0] == "mine\n"
+    with claimed(str(tmp_path), "one"), claimant("one") as third:
+        with pytest.raises(subprocess.TimeoutExpired):
+            third.wait(timeout=2)
+        third.kill()
+
+
+def test_nothing_is_claimed_where_nothing_can_be_written(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("a file is no folder", encoding="utf-8")
+    with claimed(str(blocked / "kernels"), "one"):
+        pass
