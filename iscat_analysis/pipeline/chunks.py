@@ -70,6 +70,15 @@ class Reader:
         self._summed: tuple[tuple[int, int], int, Chunk] | None = None  # span, stride, and that
 
     @property
+    def held_bytes(self) -> int:
+        """What a frame of a chunk counts for.
+
+        Where frames stay in the file, the system can take its pages back, but would have to read
+        them again.
+        """
+        return self.frame_bytes // 2 if self._placed else self.frame_bytes
+
+    @property
     def name(self) -> str:
         """What messages call the movie."""
         return self._movie.name
@@ -227,7 +236,7 @@ def plan_chunks(
     # out, that and a spectrum as well), and the field some images in doubles
     pixels = math.prod(reader.shape)
     per_block = 32 if config.background.drift_correction else 20
-    per_frame = reader.frame_bytes + per_block * pixels // stride
+    per_frame = reader.held_bytes + per_block * pixels // stride
     room = (budget - 40 * pixels) // per_frame
     if room >= last - first:
         return [((first, last), (first, last))]
