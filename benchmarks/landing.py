@@ -76,22 +76,22 @@ def whole_job(folder: Path, settings: list[str], seed: int) -> dict[str, float]:
     command = [sys.executable, "-c", PROGRAM, "fit", str(movie), "--config", str(CONFIG)]
     command += ["--quiet", "--json", "--out", str(folder / "movie.iscat"), "--overwrite"]
     size = movie.stat().st_size / 1e6
-    seconds, processor = [], []
-    memory = 0.0
     answer = folder / "answer.json"
-    for _ in range(3):
+
+    def run(*, watched: bool) -> tuple[float, float, float]:
         start = time.perf_counter()
         with answer.open("w", encoding="utf-8") as out:
             job = subprocess.Popen(command, stdout=out)
-            watch = _Memory(job.pid)
-            watch.start()
+            watch = _Memory(job.pid, movie)
+            if watched:
+                watch.start()
             _, status, usage = os.wait4(job.pid, 0)
-            watch.join()
-        seconds.append(time.perf_counter() - start)
-        processor.append(usage.ru_utime + usage.ru_stime)
         if status:
             raise SystemExit(f"{' '.join(command)} did not finish")
-        memory = max(memory, watch.peak_mb)
+        return time.perf_counter() - start, usage.ru_utime + usage.ru_stime, watch.peak_mb
+
+    seconds, processor, _ = zip(*(run(watched=False) for _ in range(3)), strict=True)
+    memory = run(watched=True)[2]  # to look takes time
     summary: dict[str, Any] = json.loads(answer.read_text(encoding="utf-8"))
     movie.unlink()
     return {
@@ -109,18 +109,22 @@ def whole_job(folder: Path, settings: list[str], seed: int) -> dict[str, float]:
 class _Memory(threading.Thread):
     """Looks at the memory of a process and of those it has made, until it ends.
 
-    What several of them share is divided among them.
+    What several of them share is divided among them.  Pages of the movie are left out: they are the
+    system's, which keeps them for whoever reads the file, and does not charge for them a group of
+    processes that finds them there.
     """
 
-    def __init__(self, pid: int) -> None:
+    def __init__(self, pid: int, movie: Path) -> None:
         super().__init__(daemon=True)
         self._pid = pid
+        self._movie = str(movie)
         self.peak_mb = 0.0
 
     def run(self) -> None:
         """Keep the largest sum."""
         while Path(f"/proc/{self._pid}/status").exists():
-            self.peak_mb = max(self.peak_mb, sum(map(_memory_mb, _family(self._pid))))
+            held = sum(_memory_mb(pid, self._movie) for pid in _family(self._pid))
+            self.peak_mb = max(self.peak_mb, held)
             time.sleep(LOOK_S)
 
 
@@ -133,12 +137,16 @@ def _family(pid: int) -> list[int]:
     return found
 
 
-def _memory_mb(pid: int) -> float:
+def _memory_mb(pid: int, movie: str) -> float:
+    total, counted = 0.0, True
     with suppress(OSError):
-        for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
-            if line.startswith("Pss:"):
-                return float(line.split()[1]) * 1024 / 1e6
-    return 0.0
+        for line in Path(f"/proc/{pid}/smaps").read_text().splitlines():
+            name, *rest = line.split()
+            if not name.endswith(":"):  # of the next mapping, which ends with its file
+                counted = not line.endswith(movie)
+            elif name == "Pss:" and counted:
+                total += float(rest[0]) * 1024 / 1e6
+    return total
 
 
 def growth(whole: dict[str, float], half: dict[str, float]) -> dict[str, float]:

@@ -71,10 +71,9 @@ class Reader:
 
     @property
     def held_bytes(self) -> int:
-        """What a frame of a chunk counts for.
+        """What a frame of a chunk counts for: half where it stays in the file.
 
-        Where frames stay in the file, the system can take its pages back, but would have to read
-        them again.
+        The system can take such pages back, but would have to read them again.
         """
         return self.frame_bytes // 2 if self._placed else self.frame_bytes
 
@@ -236,10 +235,11 @@ def plan_chunks(
     # out, that and a spectrum as well), and the field some images in doubles
     pixels = math.prod(reader.shape)
     per_block = 32 if config.background.drift_correction else 20
-    per_frame = reader.held_bytes + per_block * pixels // stride
-    room = (budget - 40 * pixels) // per_frame
-    if room >= last - first:
+    beside = per_block * pixels // stride
+    if (last - first) * (reader.frame_bytes + beside) <= budget - 40 * pixels:
         return [((first, last), (first, last))]
+    per_frame = reader.held_bytes + beside
+    room = (budget - 40 * pixels) // per_frame
     core = (room - 2 * halo) // stride * stride
     if core < stride:
         least = math.ceil((40 * pixels + per_frame * (2 * halo + stride)) / _MEMORY_SHARE / 1e6)
@@ -248,7 +248,7 @@ def plan_chunks(
             f"pixels need compute.memory_limit_mb = {least}; raise it, or lower "
             "background.window_frames"
         )
-    count = math.ceil((last - first) / core)
+    count = 2 * math.ceil((last - first) / core / 2)  # which two processes share evenly
     core = math.ceil((last - first) / count / stride) * stride  # of equal length
     return [
         (

@@ -35,7 +35,7 @@ pytestmark = [
 
 DEADLINE_S = 120.0
 
-FRAMES = 800
+FRAMES = 1300
 LANDING = {
     "camera.pixel_size_nm": 84.0,
     "camera.gain_e_per_adu": 4.0,
