@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+import scipy
 from scipy.special import chdtrc
 
 from iscat_analysis.records import FloatArray
@@ -88,7 +88,7 @@ def combine_masses(
     CommonMass
         Mass, error, bound, and whether the frames agree.
     """
-    factor = None if correlation is None else cho_factor(correlation)
+    factor = None if correlation is None else scipy.linalg.cho_factor(correlation)
     mass = float(np.median(mass_kda))
     for _ in range(_ROUNDS):
         before, there = mass, _at(mass, mass_kda, power)
@@ -151,4 +151,4 @@ def _least_squares(
 
 def _without_correlation(values: FloatArray, factor: _Factor | None) -> FloatArray:
     """Solve correlation · x = values; without a factor the values are independent."""
-    return values if factor is None else np.asarray(cho_solve(factor, values))
+    return values if factor is None else np.asarray(scipy.linalg.cho_solve(factor, values))
