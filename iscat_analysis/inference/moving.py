@@ -15,6 +15,7 @@ informations, so that Newton's method sees where the turns would end (`settle`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -120,7 +121,10 @@ class MovingField:
         wavelength = near.optics.wavelength_nm
         slack = _SLACK * np.array([pixel_nm, pixel_nm, wavelength, 1.0])
         along_z = z_range_nm is not None
-        self._whole = Field(pixels, pixel_nm, roi_px, DRAWN * roi_px, slack, along_z)
+        drawn = DRAWN * roi_px
+        if along_z:  # no farther than the tables reach, into the corners of the square
+            drawn = min(drawn, 2 * int(far.reach_nm / (math.sqrt(2) * pixel_nm) - 1))
+        self._whole = Field(pixels, pixel_nm, roi_px, drawn, slack, along_z)
         self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, roi_px, slack, True)
         if along_z:  # the rings tell one fringe from the next, and reach far
             self._coarse = self._whole

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -123,3 +126,27 @@ def test_a_movie_of_a_membrane_says_so() -> None:
         result = ia.fit_movie(movie.counts, config=config)
     assert (result.table["status"] == "ok").mean() < 0.5
     assert sum('set track.free = "mass"' in line for line in result.warnings) == 1
+
+
+MEMBRANE = """
+import sys
+sys.path[:0] = ["tests", "tests/unit"]
+import iscat_analysis as ia
+from test_planes import _moving
+config, movie = _moving(seed=2, exposure_ms=2.5, d_um2_s=0.8)
+print(len(ia.fit_movie(movie.counts, config=config).table))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is filled by its C library")
+@pytest.mark.parametrize("filled", ["0", "255"])
+def test_pixels_far_from_a_particle_outside_the_field_are_not_drawn_from_beyond_its_tables(
+    filled: str,
+) -> None:
+    """What memory held there was at times no number, and then no particle was found."""
+    done = subprocess.run(
+        [sys.executable, "-c", MEMBRANE],
+        env=os.environ | {"MALLOC_PERTURB_": filled},
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    assert int(done.stdout) == 119
