@@ -39,6 +39,7 @@ from iscat_analysis._kernels.claims import claimed
 _ENVIRONMENT = "_ZN08NumbaEnv"  # how the names of variables begin that hold an environment
 
 _depth = 0  # of kernels that are being compiled, one within the other, under the compiler's lock
+_made = 0  # bodies that this process has compiled
 
 
 class _Body(JITCodeLibrary):  # type: ignore[misc]  # Numba is not typed
@@ -156,7 +157,7 @@ class _Compiler(Compiler):  # type: ignore[misc]
     """Numba's, that makes bodies."""
 
     def compile_extra(self, func: Any) -> Any:
-        global _depth
+        global _depth, _made
         state = self.state
         state.flags = _Options(state.flags)
         state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = True
@@ -165,6 +166,7 @@ class _Compiler(Compiler):  # type: ignore[misc]
         state.typingctx = _types(state.typingctx)
         state.library = _Body(context.codegen(), func.__qualname__)
         _depth += 1
+        _made += 1
         try:
             compiled = super().compile_extra(func)
         finally:
@@ -177,14 +179,18 @@ class _Compiler(Compiler):  # type: ignore[misc]
 
 @contextmanager
 def _no_search_for_cycles() -> Iterator[None]:
-    """Let the interpreter not search for cycles among the very many objects of a compilation."""
-    searching = gc.isenabled()
+    """Let the interpreter not search for cycles among the very many objects of a compilation.
+
+    Those that it leaves are not searched afterwards either.
+    """
+    searching, made = gc.isenabled(), _made
     gc.disable()
     try:
         yield
     finally:
-        if searching:
+        if _made > made:
             gc.freeze()
+        if searching:
             gc.enable()
 
 
