@@ -30,7 +30,7 @@ from _peer import peer_python  # noqa: E402
 from iscat_analysis.config import parse_config  # noqa: E402
 from iscat_analysis.inference.fit import fit_particle, search_box, start_theta  # noqa: E402
 from iscat_analysis.inference.likelihood import Likelihood  # noqa: E402
-from iscat_analysis.inference.noise import compile_kernels  # noqa: E402
+from iscat_analysis.inference.noise import compile_kernels, parts_of  # noqa: E402
 from iscat_analysis.records import Box, Candidate, FloatArray  # noqa: E402
 from iscat_analysis.study import Setting, make_setting, trial_generator  # noqa: E402
 
@@ -109,7 +109,7 @@ class Batch:
 
     def __init__(self, side: int, count: int) -> None:
         self.setting = experiment(side)
-        compile_kernels(self.setting.scene.model)
+        compile_kernels(self.setting.scene.model, parts_of(self.setting.free, posteriors=False))
         pixel, truth = self.setting.scene.pixel_nm, self.setting.truth
         self.sets: list[tuple[Likelihood, FloatArray, Box]] = []
         for i in range(count):

@@ -11,6 +11,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Set
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numba
@@ -87,9 +88,13 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba is not typed
         return super().load_overload(sig, target_context)
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        function = self._py_func  # whose list of signatures is written anew
-        with claimed(self.cache_path, f"{function.__module__}.{function.__qualname__}"):
+        with self.claimed():  # its list of signatures is written anew
             super().save_overload(sig, data)
+
+    def claimed(self, arguments: object = "") -> AbstractContextManager[None]:
+        """Claim the function, or what is compiled of it for some arguments."""
+        function = self._py_func
+        return claimed(self.cache_path, f"{function.__module__}.{function.__qualname__}{arguments}")
 
 
 def kernel(

@@ -31,16 +31,24 @@ def claimed(folder: str, subject: str) -> Iterator[None]:
         What only one process at a time may do there.
     """
     place = zlib.crc32(subject.encode())
-    try:
-        file = _opened(folder)
-        fcntl.lockf(file, fcntl.LOCK_EX, 1, place)
-    except (OSError, AttributeError):
-        yield
-        return
+    file = _claimed(folder, place)
     try:
         yield
     finally:
-        fcntl.lockf(file, fcntl.LOCK_UN, 1, place)
+        if file is not None:
+            fcntl.lockf(file, fcntl.LOCK_UN, 1, place)
+
+
+def _claimed(folder: str, place: int) -> int | None:
+    """Claim a byte; the file that holds it, or none where there are no claims."""
+    if fcntl is None:
+        return None
+    try:
+        file = _opened(folder)
+        fcntl.lockf(file, fcntl.LOCK_EX, 1, place)
+    except OSError:
+        return None
+    return file
 
 
 @cache

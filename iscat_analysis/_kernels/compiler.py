@@ -19,7 +19,7 @@ import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 from llvmlite import binding
 from numba.core import event, sigutils
@@ -33,8 +33,6 @@ from numba.core.targetconfig import ConfigStack
 from numba.core.types.functions import BaseFunction
 from numba.core.types.misc import SliceLiteral
 from numba.core.typing import Context as TypingContext
-
-from iscat_analysis._kernels.claims import claimed
 
 _ENVIRONMENT = "_ZN08NumbaEnv"  # how the names of variables begin that hold an environment
 
@@ -123,9 +121,10 @@ class _Types(TypingContext):  # type: ignore[misc]
     between two numbers alone some dozen, a thousand times.
     """
 
+    _known: ClassVar[dict[Any, Any]] = {}
+
     def __init__(self, context: TypingContext) -> None:
         self.__dict__ = context.__dict__  # one and the same knowledge
-        self._known: dict[Any, Any] = {}
 
     def resolve_function_type(self, function: Any, arguments: Any, named: Any) -> Any:
         find = super().resolve_function_type
@@ -223,15 +222,14 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
             finds it.
         """
         arguments, result = sigutils.normalize_signature(sig)
-        function = self.py_func
-        subject = f"{function.__module__}.{function.__qualname__}{arguments}"
         with global_compiler_lock:
-            if _depth > 0 and tuple(arguments) in self.overloads:
-                return self.overloads[tuple(arguments)].entry_point
-            with claimed(self._cache.cache_path, subject), _no_search_for_cycles():
+            known = self.overloads.get(tuple(arguments))
+            if _depth > 0 and known is not None:
+                return known.entry_point
+            with self._cache.claimed(arguments), _no_search_for_cycles():
+                compiled = super().compile(sig)
                 if _depth > 0:
-                    return super().compile(sig)
-                super().compile(sig)
+                    return compiled
                 known = self.overloads[tuple(arguments)]
                 if isinstance(known.library, _Body):
                     details = {"dispatcher": self, "args": arguments, "return_type": result}

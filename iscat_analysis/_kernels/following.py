@@ -86,9 +86,11 @@ class Clusters(NamedTuple):
 @kernel(fastmath=FAST, _nrt=False)
 def keep_slopes(
     level: FloatArray, gradient: AnyFloatArray, index: IntArray, slopes: Slopes, row: int,
-    room: NDArray[np.float32],
+    square: tuple[int, int, int, int], room: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Keep level × gradient of the free parameters of a row; `room` is for a square."""
+    """Keep level × gradient of the free parameters of a row in its square; `room` is for one."""
+    for i in range(4):
+        slopes.squares[row, i] = square[i]
     ny, nx = level.shape
     for k in range(index.size):
         for i in range(ny):  # lines by themselves are what the compiler makes vectors of

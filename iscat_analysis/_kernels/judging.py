@@ -190,13 +190,10 @@ def judge_frames(
             here = _draw(near, lens_of(near, group[r]), group[r], p, pixels, profile, g)
             data = square[: 4 * ny * nx].reshape(4, ny, nx)
             stage(light, t, canvas.total[t], here, r0, c0, data)
-            inside = slopes.squares[r]
-            inside[0], inside[1], inside[2], inside[3] = r0, r1, c0, c1
-            keep_slopes(data[2], here, index, slopes, r, room)
+            keep_slopes(data[2], here, index, slopes, r, (r0, r1, c0, c1), room)
             value = place_score(data, here, near.lens, pull, known)
             for i in range(4):
-                for j in range(4):
-                    f[i, j] = known[i, j]
+                copy_line(known[i, :4], f[i])
             numbers[r, 0] = value
             _left_over(data, here, p[3], numbers[r, 1:])
             if not _directions(f, index, ways_here):

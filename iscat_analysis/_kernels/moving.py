@@ -180,11 +180,9 @@ def fit_frames(
                 for i in range(4):
                     copy_line(fisher[i, :4], information[r, i])
                 if slopes.values.size:
-                    inside = slopes.squares[r]
-                    inside[0], inside[1], inside[2], inside[3] = r0, r1, c0, c1
                     for k in range(index.size):
                         slopes.moves[r, k] = p[index[k]] - before[index[k]]
-                    keep_slopes(data[2], here, index, slopes, r, room)
+                    keep_slopes(data[2], here, index, slopes, r, (r0, r1, c0, c1), room)
         expected[t] = amount + _add_signals(total, background, light.power[t], sums)
 
 

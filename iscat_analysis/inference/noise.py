@@ -31,9 +31,6 @@ from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 
 FloatArray = NDArray[np.float64]
 
-PARTS = ("heights", "posteriors")
-"""Kernels that not every run needs: of a height that is fitted, and of posteriors."""
-
 
 def conditional(
     model: ForwardModel,
@@ -238,8 +235,27 @@ def asimov_poisson(
     return poisson(model, grid, counts, background_e, scale_e, extra_variance_e2=extra_variance_e2)
 
 
+def parts_of(free: Collection[str], *, posteriors: bool) -> tuple[str, ...]:
+    """Name the kernels that some fits need and others do not.
+
+    Parameters
+    ----------
+    free : collection of str
+        What is fitted, of `iscat_analysis.records.PARAMETERS`.
+    posteriors : bool
+        Whether posteriors are sampled.
+
+    Returns
+    -------
+    tuple of str
+        Some of ``"heights"``, ``"posteriors"``.
+    """
+    needed = {"heights": "z_nm" in free, "posteriors": posteriors}
+    return tuple(part for part, is_needed in needed.items() if is_needed)
+
+
 def compile_kernels(
-    model: ForwardModel, parts: Collection[str] = PARTS, *, backwards: bool = False
+    model: ForwardModel, parts: Collection[str], *, backwards: bool = False
 ) -> None:
     """Run the kernels of fits once on a few pixels, so that later calls find them compiled.
 
@@ -248,7 +264,7 @@ def compile_kernels(
     model : ForwardModel
         Any.
     parts : collection of str
-        Which of `PARTS` will be needed.
+        As from `parts_of`; others are left out.
     backwards : bool
         In the other order: two processes that begin at the two ends take half of it off each other.
     """

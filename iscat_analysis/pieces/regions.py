@@ -18,7 +18,7 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, real_array
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
-from iscat_analysis.inference.noise import compile_kernels
+from iscat_analysis.inference.noise import compile_kernels, parts_of
 from iscat_analysis.pieces.counts import Counts, gather
 from iscat_analysis.pieces.setups import config_of
 from iscat_analysis.records import (
@@ -150,7 +150,7 @@ def fit_rois(
         z_range_nm=config.fit.z_range_nm if "z_nm" in FREE_PARAMETERS[mode] else None,
         field_px=counts.grid.shape,
     )  # fmt: skip
-    compile_kernels(counts.model)
+    compile_kernels(counts.model, parts_of(FREE_PARAMETERS[mode], posteriors=False))
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
     return numbered(lines_from(rows), range(count))

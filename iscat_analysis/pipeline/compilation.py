@@ -15,7 +15,7 @@ from numba.core import event
 from iscat_analysis import _kernels
 from iscat_analysis.config import Config
 from iscat_analysis.copies import Copy, LostError
-from iscat_analysis.inference.noise import PARTS
+from iscat_analysis.inference.noise import parts_of
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import FREE_PARAMETERS
 
@@ -127,7 +127,7 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
         try:
             if sys.platform == "linux":
                 copied = Copy(self._rehearsed)
-                copied.ask(None)
+                copied.ask(self.needs)
                 return copied
             if not sys.executable or getattr(sys, "frozen", False):  # inside another program
                 return None
@@ -139,11 +139,10 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
         except (OSError, LostError):
             return None
 
-    def _rehearsed(self, asked: None) -> None:
+    def _rehearsed(self, needs: Sequence[str]) -> None:
         """Be the other process, a copy, which says nothing and starts no third one."""
-        del asked
         event.unregister("numba:compile", self)
-        importlib.import_module(_REHEARSAL).rehearse(self.needs)
+        importlib.import_module(_REHEARSAL).rehearse(needs)
 
     def close(self) -> None:
         """Say nothing any more, and end the other process."""
@@ -168,20 +167,17 @@ def needs_of(config: Config) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        Some of `iscat_analysis.inference.noise.PARTS`, and ``"tracks"`` where particles move.
+        As from `iscat_analysis.inference.noise.parts_of`, and ``"tracks"`` where particles move.
     """
     tracks = way_of(config) == "tracks"
-    needed = {
-        "heights": "z_nm" in FREE_PARAMETERS[config.track.free if tracks else config.fit.mode],
-        "posteriors": config.samples_posterior,
-        "tracks": tracks,
-    }
-    return tuple(part for part, is_needed in needed.items() if is_needed)
+    free = FREE_PARAMETERS[config.track.free if tracks else config.fit.mode]
+    parts = parts_of(free, posteriors=config.samples_posterior)
+    return (*parts, "tracks") if tracks else parts
 
 
 @contextmanager
 def compiling(
-    notify: Callable[[str], None], workers: int, needs: Sequence[str] = PARTS
+    notify: Callable[[str], None], workers: int, needs: Sequence[str] = ()
 ) -> Iterator[Compilation]:
     """Say what is compiled until the block ends.
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.noise import compile_kernels
+from iscat_analysis.inference.noise import compile_kernels, parts_of
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.records import PARAMETERS, BoolArray, Box, FloatArray
 from iscat_analysis.study.scores import rank_test
@@ -108,7 +108,7 @@ def calibrate_posterior(
     widths = np.full((draws, k), np.nan)
     inside = np.zeros((2, draws, k), dtype=bool)
     model = setting.scene.model
-    compile_kernels(model)
+    compile_kernels(model, parts_of(setting.free, posteriors=True))
     amplitudes = [model.scale.amplitude(float(m)) for m in (lower[3], upper[3])]
 
     def one(i: int) -> bool:

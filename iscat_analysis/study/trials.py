@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.noise import compile_kernels
+from iscat_analysis.inference.noise import compile_kernels, parts_of
 from iscat_analysis.records import BoolArray, FitResult, FloatArray, Status
 from iscat_analysis.study.baselines import Baselines
 from iscat_analysis.study.setting import Setting
@@ -148,7 +148,7 @@ def run_trials(
     gauss, peak = np.full((count, 4), np.nan), np.full((count, 4), np.nan)
     p_value, chi2, gap = (np.full(count, np.nan) for _ in range(3))
     fits: list[FitResult | None] = [None] * count
-    compile_kernels(setting.scene.model)
+    compile_kernels(setting.scene.model, parts_of(setting.free, posteriors=False))
 
     def work(first: int) -> float:
         spent = 0.0

@@ -378,7 +378,8 @@ def test_slopes_are_kept_in_half_the_memory() -> None:
         np.zeros((1, 4), dtype=np.int64), np.zeros((1, 3, side**2), dtype=np.int16),
         np.zeros((1, 3)), np.zeros((1, 3)),
     )  # fmt: skip
-    keep_slopes(level, gradient, index, slopes, 0, np.zeros(side**2, dtype=np.float32))
+    room = np.zeros(side**2, dtype=np.float32)
+    keep_slopes(level, gradient, index, slopes, 0, (0, ny, 0, nx), room)
     kept = (slopes.values[0, :, : ny * nx] * slopes.units[0][:, None]).reshape(3, ny, nx)
     exact = level * np.moveaxis(gradient, 1, 0)[1 + index]
     assert np.all(kept[1] == 0.0)
