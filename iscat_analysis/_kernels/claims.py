@@ -13,7 +13,7 @@ try:
 except ImportError:  # Windows, where each process compiles what it needs
     fcntl = None  # type: ignore[assignment]
 
-_NAME = "claims"
+_NAME = "claims.nbi"  # as Numba names what it keeps, so that who packs or tidies knows it
 
 
 @contextmanager
