@@ -165,6 +165,31 @@ def contrast_map(before: FloatArray, after: FloatArray, weight: MapArray, out: M
 
 
 @kernel()
+def strongest_maps(maps: MapArray, index: NDArray[np.int64]) -> None:
+    """Find the map of a stack that is farthest from 0, at each pixel.
+
+    Parameters
+    ----------
+    maps : ndarray, shape (k, y, x)
+        Signal-to-noise ratios, k at least 1.
+    index : ndarray of int, shape (y, x)
+        Filled; the first of several that are as far.
+    """
+    depth, rows, columns = maps.shape
+    highest = np.empty(columns, dtype=np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            highest[j] = abs(maps[0, i, j])
+            index[i, j] = 0
+        for k in range(1, depth):
+            for j in range(columns):
+                height = abs(maps[k, i, j])
+                if height > highest[j]:
+                    highest[j] = height
+                    index[i, j] = k
+
+
+@kernel()
 def step_peaks(maps: MapArray, threshold: float) -> NDArray[np.int64]:
     """Local extremes of a stack of maps.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,7 @@ class PixelGrid:
             raise DataError(f"pixel_nm = {self.pixel_nm}: give the side of a pixel, above 0 nm")
 
     @classmethod
+    @lru_cache(maxsize=1024)  # fits that follow each other share it
     def region(cls, rows: tuple[int, int], columns: tuple[int, int], pixel_nm: float) -> PixelGrid:
         """Half-open ranges of full-frame pixels; pixel (0, 0) has its centre at (0, 0) nm."""
         x, y = (np.arange(*span, dtype=np.float64) * pixel_nm for span in (columns, rows))

@@ -30,7 +30,7 @@ from iscat_analysis.pipeline.regions import Region, photons_scale
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Windows
 from iscat_analysis.search.empty import EmptySpread
-from iscat_analysis.search.sliding import Chunk
+from iscat_analysis.search.sliding import Chunk, Patch
 
 PLACES, MOVIE_PLACES = 20_000, 100_000
 """Places times windows at which the noise of a chunk is looked at, and of a whole movie."""
@@ -64,6 +64,7 @@ def nothing_repeated(mode: str) -> FloatArray:
 
 def step_repeats(
     chunk: Chunk,
+    patch: Patch,
     event: Event,
     step: Step,
     others: Sequence[Step],
@@ -76,6 +77,8 @@ def step_repeats(
     ----------
     chunk : Chunk
         The frames.
+    patch : Patch
+        Those of the particle's region.
     event : Event
         The particle.
     step : Step
@@ -97,20 +100,20 @@ def step_repeats(
     if response is None:
         return nothing_repeated("mass")[:, : len(event.fit.free) + 1]
     local = pattern.local(region, step.at.frame) if pattern else None
+    light = patch.mean_e
+    read = np.square(patch.read_noise_e) * np.ones(region.shape)
     series = []
     for span, weights in (
         (windows.frames_before, response.before),
         (windows.frames_after, response.after),
     ):
-        patch = chunk.patch(*span, region.rows, region.columns)
-        read = np.square(patch.read_noise_e) * np.ones(region.shape)
+        part = patch.frames(*span)
         one = series_of(
-            patch.counts, weights, patch.power,
-            gain=patch.gain, offset=patch.offset, mean_e=patch.mean_e, read_variance_e2=read,
+            part.counts, weights, part.power,
+            gain=part.gain, offset=part.offset, mean_e=light, read_variance_e2=read,
         )  # fmt: skip
         known = np.zeros(one.values.shape)
-        light = patch.mean_e
-        frames = np.arange(patch.first, patch.first + len(patch.power))[patch.power > 0]
+        frames = np.arange(part.first, part.first + len(part.power))[part.power > 0]
         for other in others:
             if not span[0] < other.at.frame < span[1]:
                 continue

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from iscat_analysis._kernels.stepping import add_image
 from iscat_analysis.pipeline.neighbours import Neighbours, Step
 from iscat_analysis.pipeline.pattern import MovingPattern
 from iscat_analysis.pipeline.scene import Scene
@@ -104,7 +105,8 @@ class StepMaps:
                 filtered = image, *self.matched.response(step.corner, image)
             _, box, response = filtered
             scale = share * part * math.sqrt(effective[boundary])
-            snr[boundary][box] += np.float32(scale) * response
+            corner = box[0].start, box[1].start
+            add_image(snr[boundary], corner, response, np.float32(scale))
 
     def _anew(self, steps: Sequence[Step], mapper: Mapper) -> tuple[MapArray, FloatArray]:
         """Make the maps again in which what is known has changed."""

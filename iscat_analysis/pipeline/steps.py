@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.inference.fit import (
     POOR_FIT_P,
     detection_snr,
@@ -22,7 +23,7 @@ from iscat_analysis.inference.fit import (
     search_box,
     start_theta,
 )
-from iscat_analysis.pipeline.events import Event, Fitted, remarks, standing_out
+from iscat_analysis.pipeline.events import Event, remarks, standing_out
 from iscat_analysis.pipeline.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.pipeline.pattern import MovingPattern
 from iscat_analysis.pipeline.repeats import step_controls, step_repeats
@@ -77,10 +78,8 @@ class StepEvent:
 class _Finished:
     """A step after its last fit, before it is judged."""
 
-    fitted: Fitted
-    step: Step
-    others: tuple[Step, ...]
-    task: Task
+    fitted: StepEvent
+    crowded: bool  # as of its `Task`
     lobe: bool  # found where the fit of a known step may have left a residual
 
 
@@ -243,7 +242,8 @@ class ChunkFitter:
         scene, chunk, matched = self._scene, self._chunk, maps.matched
         snr, effective = maps.without(steps, self._pool.map)
         if not steps and len(snr):
-            where = np.argmax(np.abs(snr), axis=0)
+            where = np.empty(chunk.shape, dtype=np.int64)
+            strongest_maps(snr, where)
             best = np.take_along_axis(snr, where[None], axis=0)[0].astype(np.float64)
             frames = np.maximum(effective[where], 1e-9)
             self.strongest = np.stack([np.abs(best), best / np.sqrt(frames * matched.norm)])
@@ -354,40 +354,41 @@ class ChunkFitter:
         if fit.mass_kda <= 0 and "mass_kda" in fit.free:
             return None
         pixel = scene.pixel_nm
-        fitted = Fitted(task.region, fit.shifted(-x_px * pixel, -y_px * pixel), likelihood)
-        if fitted.snr < _EXPLAINED * scene.templates.threshold:
+        event = Event(
+            task.region, fit.shifted(-x_px * pixel, -y_px * pixel), likelihood, task.windows, (),
+            task.at.frame, task.n_before, task.n_after, step.sign, task.at.half_width,
+        )  # fmt: skip
+        if event.snr < _EXPLAINED * scene.templates.threshold:
             return None
+        step = replace(step, at=task.at)
         seen = near[index] if scene.lines is None else [i for i in range(len(steps)) if i != index]
         others = tuple(steps[i] for i in seen)
-        return _Finished(fitted, replace(step, at=task.at), others, task, lobe)
+        repeats = step_repeats(
+            self._chunk, task.patch, event, step, others, self._neighbours, self._pattern
+        )
+        return _Finished(StepEvent(event, step, others, repeats), task.crowded, lobe)
 
     def _judged(self, finished: Sequence[_Finished]) -> list[StepEvent]:
         """Judge all steps, those that may be side lobes, or explain less than they leave, too."""
-
-        def one(own: _Finished) -> StepEvent:
-            fitted, task, step = own.fitted, own.task, own.step
-            near = (
-                other.fitted.described
-                for other in finished
-                if _apart(other.step, step) < self._window
-                and distance_px(other.step, step) < LARGEST_IMAGE * self._roi_px
-            )
+        steps = [own.fitted.step for own in finished]
+        described = [own.fitted.event.described for own in finished]
+        frame = np.array([step.at.frame for step in steps])
+        x_px = np.array([step.start.x_px for step in steps])
+        y_px = np.array([step.start.y_px for step in steps])
+        judged = []
+        for number, own in enumerate(finished):
+            away = np.hypot(x_px - x_px[number], y_px - y_px[number])
+            at_once = np.abs(frame - frame[number]) < self._window
+            near = np.flatnonzero(at_once & (away < LARGEST_IMAGE * self._roi_px)).tolist()
+            event = own.fitted.event
             flags = remarks(
-                self._scene, fitted, task.windows,
-                sidelobe=own.lobe or fitted.described.is_dwarfed(near),
-                too_close=task.crowded,
-                poor_fit=task.at.p_constant < POOR_FIT_P,
+                self._scene, event, event.windows,
+                sidelobe=own.lobe or described[number].is_dwarfed(described[i] for i in near),
+                too_close=own.crowded,
+                poor_fit=steps[number].at.p_constant < POOR_FIT_P,
             )  # fmt: skip
-            event = Event(
-                fitted.region, fitted.fit, fitted.likelihood, task.windows, flags, task.at.frame,
-                task.n_before, task.n_after, step.sign, task.at.half_width,
-            )  # fmt: skip
-            repeats = step_repeats(
-                self._chunk, event, step, own.others, self._neighbours, self._pattern
-            )
-            return StepEvent(event, step, own.others, repeats)
-
-        return list(self._pool.map(one, finished))
+            judged.append(replace(own.fitted, event=replace(event, flags=flags)))
+        return judged
 
     def _credible(self, steps: Sequence[Step]) -> list[Step]:
         """Leave out what the others explain, and the weaker of two steps that describe one."""

@@ -35,6 +35,8 @@ class Task:
         Of the counts before and after.
     region : Region
         Its pixels, in the full frame.
+    patch : Patch
+        Of these pixels, the frames that are used and some around them.
     windows : Windows
         The sums, those with the particle as "after".
     at : StepFrame
@@ -49,6 +51,7 @@ class Task:
 
     likelihood: Likelihood
     region: Region
+    patch: Patch
     windows: Windows
     at: StepFrame
     n_before: int
@@ -169,7 +172,7 @@ class TaskBuilder:
             frames_after=ranges[1],
             power=np.empty(0),
         )
-        return Task(likelihood, region, windows, at, n_before, n_after, crowded, offset)
+        return Task(likelihood, region, patch, windows, at, n_before, n_after, crowded, offset)
 
     def _present(self, steps: Sequence[Step], span: tuple[int, int], cut: slice) -> FloatArray:
         """Contrast over the field, in some frames, of what lands or leaves in a span of them."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.region import copy_region
 from iscat_analysis._kernels.sliding import block_sums, frame_totals, region_sum
 from iscat_analysis._kernels.stepping import part_sums
 from iscat_analysis.movie.camera import Camera
@@ -131,6 +132,25 @@ class Patch:
     read_noise_e: float | FloatArray
     mean_e: FloatArray
     usable: BoolArray
+
+    def frames(self, start: int, stop: int) -> Patch:
+        """Give some of the frames, where they lie.
+
+        Parameters
+        ----------
+        start, stop : int
+            Half-open range, clipped to those held.
+
+        Returns
+        -------
+        Patch
+            Of the same pixels.
+        """
+        here = slice(max(start - self.first, 0), max(stop - self.first, 0))
+        return replace(
+            self, first=self.first + here.start, counts=self.counts[here], good=self.good[here],
+            power=self.power[here],
+        )  # fmt: skip
 
     def window(self, start: int, stop: int) -> tuple[FloatArray, int, float]:
         """Sum frames.
@@ -328,16 +348,22 @@ def make_chunk(
 def _region(
     counts: NDArray[Any], frames: slice, rows: tuple[int, int], columns: tuple[int, int]
 ) -> NDArray[Any]:
-    """Copy a region of frames, a row at a time: NumPy's copy of a slice takes pixel by pixel."""
-    stored, (by_frame, by_row, by_pixel) = counts.dtype, counts.strides
+    """Copy a region of some frames."""
+    ends = zip((rows, columns), counts.shape[1:], strict=True)
+    if not all(0 <= low <= high <= size for (low, high), size in ends):
+        raise IndexError(f"rows {rows} and columns {columns} of frames of shape {counts.shape[1:]}")
+    counts = np.ascontiguousarray(counts)
+    by_frame, by_row, by_pixel = counts.strides
     shape = max(frames.stop - frames.start, 0), rows[1] - rows[0], columns[1] - columns[0]
-    if not shape[0]:
-        return np.empty(shape, dtype=stored)
-    strips = np.ndarray(
-        shape[:2], dtype=f"V{shape[2] * by_pixel}", buffer=counts, strides=(by_frame, by_row),
-        offset=frames.start * by_frame + rows[0] * by_row + columns[0] * by_pixel,
-    )  # fmt: skip
-    return strips.copy().view(stored).reshape(shape)
+    region = np.empty(shape, dtype=counts.dtype)
+    copy_region(
+        counts.reshape(-1).view(np.uint8),
+        frames.start * by_frame + rows[0] * by_row + columns[0] * by_pixel,
+        (by_frame, by_row),
+        (shape[0], shape[1], shape[2] * by_pixel),
+        region.reshape(-1).view(np.uint8),
+    )
+    return region
 
 
 def _at(value: float | FloatArray, here: tuple[slice, slice]) -> Any:
