@@ -31,7 +31,7 @@ def block_sums(
         Stored counts.
     good : ndarray of bool, shape (t,)
         Frames to take.
-    total : ndarray, shape (y, x)
+    total : ndarray, shape (x,)
         Scratch in a type that holds a block's sum exactly.
     sums : ndarray, shape (y, x)
         Filled with the sum of the good frames.
@@ -39,18 +39,18 @@ def block_sums(
         Updated with the highest count of every pixel in the good frames.
     """
     frames, rows, columns = counts.shape
-    total[:] = 0
-    for t in range(frames):
-        if not good[t]:
-            continue
-        for i in range(rows):
-            for j in range(columns):
-                c = counts[t, i, j]
-                total[i, j] += c
-                highest[i, j] = max(highest[i, j], c)
     for i in range(rows):
         for j in range(columns):
-            sums[i, j] = total[i, j]
+            total[j] = 0
+        for t in range(frames):
+            if not good[t]:
+                continue
+            for j in range(columns):
+                c = counts[t, i, j]
+                total[j] += c
+                highest[i, j] = max(highest[i, j], c)
+        for j in range(columns):
+            sums[i, j] = total[j]
 
 
 @kernel()
@@ -93,18 +93,17 @@ def region_sum(counts: NDArray[Any], good: BoolArray, out: FloatArray) -> None:
 
     Parameters
     ----------
-    counts : ndarray, shape (t, y, x)
-        Stored counts.
+    counts : ndarray, shape (t, n)
+        Stored counts of n pixels.
     good : ndarray of bool, shape (t,)
         Frames to take.
-    out : ndarray, shape (y, x)
+    out : ndarray, shape (n,)
         Added to.
     """
     for t in range(counts.shape[0]):
         if good[t]:
-            for i in range(out.shape[0]):
-                for j in range(out.shape[1]):
-                    out[i, j] += counts[t, i, j]
+            for i in range(out.size):
+                out[i] += counts[t, i]
 
 
 @kernel(fastmath=True)
@@ -113,29 +112,28 @@ def region_scores(counts: NDArray[Any], weights: FloatArray, out: FloatArray) ->
 
     Parameters
     ----------
-    counts : ndarray, shape (t, y, x)
-        Stored counts.
-    weights : ndarray, shape (y, x)
+    counts : ndarray, shape (t, n)
+        Stored counts of n pixels.
+    weights : ndarray, shape (n,)
         Of the pixels.
     out : ndarray, shape (t,)
         Filled.
     """
     for t in range(counts.shape[0]):
         total = 0.0
-        for i in range(weights.shape[0]):
-            for j in range(weights.shape[1]):
-                total += weights[i, j] * counts[t, i, j]
+        for i in range(weights.size):
+            total += weights[i] * counts[t, i]
         out[t] = total
 
 
-@kernel()
-def contrast_map(before: FloatArray, after: FloatArray, weight: MapArray, out: MapArray) -> float:
+@kernel(fastmath={"reassoc", "nsz"})
+def contrast_map(earlier: FloatArray, later: FloatArray, weight: MapArray, out: MapArray) -> float:
     """Weighted contrast of two sums over the field, with its weighted mean taken off.
 
     Parameters
     ----------
-    before, after : ndarray, shape (y, x)
-        Photoelectrons.
+    earlier, later : ndarray, shape (k, y, x)
+        Photoelectrons of the blocks before and after; any number of each.
     weight : ndarray, shape (y, x)
         Information of a pixel; 0 where it is not used.
     out : ndarray, shape (y, x) or larger
@@ -146,14 +144,20 @@ def contrast_map(before: FloatArray, after: FloatArray, weight: MapArray, out: M
     float
         Power after over power before.
     """
-    rows, columns = before.shape
+    rows, columns = weight.shape
+    before, after = np.zeros((rows, columns)), np.zeros((rows, columns))
     total_before = 0.0
     total_after = 0.0
     for i in range(rows):
+        for k in range(earlier.shape[0]):
+            for j in range(columns):
+                before[i, j] += earlier[k, i, j]
+        for k in range(later.shape[0]):
+            for j in range(columns):
+                after[i, j] += later[k, i, j]
         for j in range(columns):
-            if weight[i, j] > 0:
-                total_before += before[i, j]
-                total_after += after[i, j]
+            total_before += before[i, j] if weight[i, j] > 0 else 0.0
+            total_after += after[i, j] if weight[i, j] > 0 else 0.0
     ratio = total_after / total_before
     for i in range(rows):
         for j in range(columns):
@@ -209,6 +213,11 @@ def step_peaks(maps: MapArray, threshold: float) -> NDArray[np.int64]:
     depth, rows, columns = maps.shape
     for k in range(depth):
         for i in range(rows):
+            above = False  # in most rows nothing is, which several numbers at a time tell
+            for j in range(columns):
+                above |= abs(maps[k, i, j]) > threshold
+            if not above:
+                continue
             for j in range(columns):
                 value = maps[k, i, j]
                 if abs(value) <= threshold:

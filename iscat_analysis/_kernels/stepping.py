@@ -182,11 +182,11 @@ def frame_scores(
 
     Parameters
     ----------
-    counts : ndarray, shape (t, y, x)
-        Stored counts.
+    counts : ndarray, shape (t, p)
+        Stored counts of p pixels.
     lit : ndarray of bool, shape (t,)
         Frames to take.
-    weights : ndarray, shape (n, y, x)
+    weights : ndarray, shape (n, p)
         Of the pixels.
     out : ndarray, shape (n, m)
         Filled, one column for each frame that is taken.
@@ -198,8 +198,7 @@ def frame_scores(
         for n in range(weights.shape[0]):
             total = 0.0
             for i in range(weights.shape[1]):
-                for j in range(weights.shape[2]):
-                    total += weights[n, i, j] * counts[t, i, j]
+                total += weights[n, i] * counts[t, i]
             out[n, m] = total
         m += 1
 

@@ -96,7 +96,8 @@ def conditional(
     read = (1 - p) ** 2 * read_after + p**2 * read_before
     data[0], data[1], data[2] = after, total, ratio
     data[3] = shot / np.where(usable, shot + read, 1.0)
-    data[:, ~usable] = 0.0
+    if not usable.all():
+        data[:, ~usable] = 0.0
     return Likelihood(model, grid, CONDITIONAL, data)
 
 

@@ -174,7 +174,7 @@ def series_of(
     flat = weights.reshape(len(weights), -1)
     seen = weights * gain
     values = np.empty((len(weights), np.count_nonzero(lit)))
-    frame_scores(counts, lit, seen, values)
+    frame_scores(counts.reshape(len(counts), mean_e.size), lit, seen.reshape(flat.shape), values)
     values -= np.sum(seen * offset, axis=(1, 2))[:, None]
     squared = flat**2
     return Series(

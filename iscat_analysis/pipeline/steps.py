@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
@@ -159,7 +160,7 @@ class ChunkFitter:
                 s
                 for s in self._search(maps, steps)
                 if not any(
-                    distance_px(s, r) < _SAME_PX and _apart(s, r) <= self._stride for r in rejected
+                    _apart(s, r) <= self._stride and distance_px(s, r) < _SAME_PX for r in rejected
                 )
             ]
             if not fresh:
@@ -373,8 +374,7 @@ class ChunkFitter:
         steps = [own.fitted.step for own in finished]
         described = [own.fitted.event.described for own in finished]
         frame = np.array([step.at.frame for step in steps])
-        x_px = np.array([step.start.x_px for step in steps])
-        y_px = np.array([step.start.y_px for step in steps])
+        x_px, y_px = _places(steps)
         judged = []
         for number, own in enumerate(finished):
             away = np.hypot(x_px - x_px[number], y_px - y_px[number])
@@ -392,16 +392,20 @@ class ChunkFitter:
 
     def _credible(self, steps: Sequence[Step]) -> list[Step]:
         """Leave out what the others explain, and the weaker of two steps that describe one."""
-        kept: list[Step] = []
-        for step in sorted(steps, key=lambda s: -s.start.snr):
-            if step.snr > _EXPLAINED * self._scene.templates.threshold and not any(
-                s.sign == step.sign
-                and distance_px(s, step) < _SAME_PX
-                and abs(s.at.frame - step.at.frame) <= max(2, s.at.half_width + step.at.half_width)
-                for s in kept
-            ):
-                kept.append(step)
-        return kept
+        steps = sorted(steps, key=lambda s: -s.start.snr)
+        sign = np.array([s.sign for s in steps])
+        frame = np.array([s.at.frame for s in steps])
+        width = np.array([s.at.half_width for s in steps])
+        x_px, y_px = _places(steps)
+        kept = np.array([s.snr for s in steps]) > _EXPLAINED * self._scene.templates.threshold
+        for number in np.flatnonzero(kept).tolist():
+            same = kept[:number] & (sign[:number] == sign[number])
+            same &= np.abs(frame[:number] - frame[number]) <= np.maximum(
+                2, width[:number] + width[number]
+            )
+            away = np.hypot(x_px[:number] - x_px[number], y_px[:number] - y_px[number])
+            kept[number] = not np.any(same & (away < _SAME_PX))
+        return list(compress(steps, kept))
 
 
 def _has_moved(old: Step, new: Step) -> bool:
@@ -410,6 +414,12 @@ def _has_moved(old: Step, new: Step) -> bool:
         return True
     tolerance = max(old.start.mass_kda, new.start.mass_kda) / max(new.snr, 1.0)
     return abs(new.start.mass_kda - old.start.mass_kda) > tolerance
+
+
+def _places(steps: Sequence[Step]) -> tuple[FloatArray, FloatArray]:
+    """Give x and y of all [pixels]."""
+    x_px, y_px = (np.array([getattr(s.start, axis) for s in steps]) for axis in ("x_px", "y_px"))
+    return x_px, y_px
 
 
 def _displaced(start: Candidate, y_px: float, x_px: float) -> Candidate:

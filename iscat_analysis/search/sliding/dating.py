@@ -153,7 +153,7 @@ def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArr
     """
     weights, scale = _projector(patch, image)
     scores = np.empty(len(patch.counts))
-    region_scores(patch.counts, weights * patch.gain, scores)
+    region_scores(patch.pixels, (weights * patch.gain).reshape(-1), scores)
     power = patch.power
     lit = power > 0
     zero = float(np.sum(weights * patch.gain * patch.offset))

@@ -133,6 +133,11 @@ class Patch:
     mean_e: FloatArray
     usable: BoolArray
 
+    @property
+    def pixels(self) -> NDArray[Any]:
+        """Stored counts, shape (t, ny·nx): longer loops than those along a row."""
+        return self.counts.reshape(len(self.counts), self.mean_e.size)
+
     def frames(self, start: int, stop: int) -> Patch:
         """Give some of the frames, where they lie.
 
@@ -171,7 +176,7 @@ class Patch:
         """
         here = slice(max(start - self.first, 0), max(stop - self.first, 0))
         out = np.zeros(self.mean_e.shape)
-        region_sum(self.counts[here], self.good[here], out)
+        region_sum(self.pixels[here], self.good[here], out.reshape(-1))
         frames = int(np.count_nonzero(self.good[here]))
         return self.gain * (out - frames * self.offset), frames, float(self.power[here].sum())
 
@@ -324,9 +329,8 @@ def make_chunk(
         start = int(np.argmax(good[part])) + int(edges[k])
         highest[k] = counts[start]
         block_sums(
-            counts[part], good[part], np.empty((rows, columns), dtype=scratch),
-            blocks[k], highest[k],
-        )  # fmt: skip
+            counts[part], good[part], np.empty(columns, dtype=scratch), blocks[k], highest[k]
+        )
 
     for _ in mapper(one, range(edges.size - 1)):
         pass

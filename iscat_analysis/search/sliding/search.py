@@ -244,10 +244,9 @@ def sliding_maps(
         if min(powers) <= 0:
             snr[j] = 0.0
             return
-        before = chunk.blocks_e[low:middle].sum(axis=0)
-        after = chunk.blocks_e[middle:high].sum(axis=0)
+        blocks = chunk.blocks_e
         image = np.zeros(matched.size, dtype=np.float32)
-        contrast_map(before, after, matched.weight, image)
+        contrast_map(blocks[low:middle], blocks[middle:high], matched.weight, image)
         if explained is not None:
             known = explained(
                 j,
