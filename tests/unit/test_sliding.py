@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.search.sliding import (
@@ -94,6 +96,57 @@ def test_maps_of_the_camera_enter_pixel_by_pixel() -> None:
     np.testing.assert_allclose(summed, electrons[4:8, 5:15, 7:20].sum(axis=0))
     assert frames == 4
     assert power == pytest.approx(chunk.power[4:8].sum())
+
+
+@pytest.mark.parametrize("stored", ["u1", ">u2", "u2", "i4", "f4", "f8"])
+@pytest.mark.parametrize(
+    ("rows", "columns"),
+    [((5, 15), (7, 20)), ((0, 40), (0, 44)), ((39, 40), (43, 44)), ((3, 3), (0, 9))],
+)
+def test_a_patch_holds_the_counts_of_its_region(
+    stored: str, rows: tuple[int, int], columns: tuple[int, int]
+) -> None:
+    counts = np.random.default_rng(8).integers(0, 200, (20, *SHAPE)).astype(stored)
+    chunk = replace(_chunk(_movie(20, 3)), counts=counts)
+    for start, stop in ((0, 20), (3, 5), (4, 4), (19, 30), (-7, 2), (30, 40)):
+        patch = chunk.patch(start, stop, rows, columns)
+        held = slice(max(start, 0), max(stop, 0))
+        wanted = counts[held, slice(*rows), slice(*columns)]
+        assert patch.counts.dtype == counts.dtype
+        np.testing.assert_array_equal(patch.counts, wanted)
+        some = patch.frames(start + 1, stop)
+        np.testing.assert_array_equal(some.counts, wanted[some.first - patch.first :])
+        assert some.first == max(start + 1, patch.first)
+
+
+def test_a_patch_of_frames_that_are_a_part_of_others() -> None:
+    """Their rows do not follow each other in memory."""
+    counts = (
+        np.random.default_rng(8).integers(0, 200, (20, 2 * SHAPE[0], 3 * SHAPE[1])).astype("u2")
+    )
+    part = counts[::2, 1::2, 2::3]
+    chunk = replace(_chunk(_movie(10, 3)), counts=part)
+    patch = chunk.patch(2, 9, (5, 15), (7, 20))
+    np.testing.assert_array_equal(patch.counts, part[2:9, 5:15, 7:20])
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns"),
+    [((-1, 4), (0, 4)), ((0, 41), (0, 4)), ((0, 4), (40, 45)), ((5, 4), (0, 4))],
+)
+def test_a_patch_beyond_the_frames_is_refused(
+    rows: tuple[int, int], columns: tuple[int, int]
+) -> None:
+    with pytest.raises(IndexError, match="frames of shape"):
+        _chunk(_movie(20, 3)).patch(0, 20, rows, columns)
+
+
+def test_the_strongest_map_of_each_pixel() -> None:
+    maps = np.random.default_rng(4).standard_normal((9, *SHAPE)).astype("f4")
+    maps[6] = -maps[2]  # of two that are as far from 0, the first
+    found = np.empty(SHAPE, dtype=np.int64)
+    strongest_maps(maps, found)
+    np.testing.assert_array_equal(found, np.abs(maps).argmax(axis=0))
 
 
 def test_stuck_and_dark_frames_do_not_exist() -> None:
