@@ -22,7 +22,7 @@ from numba.core.runtime import rtsys
 from iscat_analysis._kernels.claims import claimed
 from iscat_analysis.errors import ConfigError
 
-_INSIDE = range(60, 69)
+_INSIDE = range(62, 69)
 """Minor versions of Numba 0 whose insides are known: others compile every kernel as a whole."""
 
 _major, _minor, *_ = numba.__version__.split(".")
