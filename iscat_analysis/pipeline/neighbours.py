@@ -165,8 +165,8 @@ class Neighbours:
 
     def box(self, step: Step) -> tuple[slice, slice]:
         """Pixels of the field that a step's image covers."""
-        rows, columns = spans(step.corner, step.image.shape)
-        return slice(*rows), slice(*columns)
+        (y, x), (height, width) = step.corner, step.image.shape
+        return slice(y, y + height), slice(x, x + width)
 
     def factor(
         self, step: Step, before: slice, after: slice, inside: tuple[slice, slice] = WHOLE
@@ -285,36 +285,14 @@ class Neighbours:
         self, step: Step, region: Region
     ) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:
         """Where a step's image and a region overlap: in the region, and in the image."""
-        rows, columns = spans(step.corner, step.image.shape)
-        top, bottom = max(rows[0], region.rows[0]), min(rows[1], region.rows[1])
-        left, right = max(columns[0], region.columns[0]), min(columns[1], region.columns[1])
+        (y, x), (height, width) = step.corner, step.image.shape
+        (first, last), (begin, end) = region.rows, region.columns
+        top, bottom = max(y, first), min(y + height, last)
+        left, right = max(x, begin), min(x + width, end)
         if top >= bottom or left >= right:
             return None
-        here, inside = (
-            (slice(top - y, bottom - y), slice(left - x, right - x))
-            for y, x in ((region.rows[0], region.columns[0]), (rows[0], columns[0]))
-        )
-        return here, inside
-
-
-def spans(
-    corner: tuple[int, int], shape: tuple[int, ...]
-) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Rows and columns that an image covers.
-
-    Parameters
-    ----------
-    corner : (int, int)
-        Row and column of its first pixel.
-    shape : tuple of int
-        Its rows and columns.
-
-    Returns
-    -------
-    rows, columns : (int, int)
-        Half-open.
-    """
-    return (corner[0], corner[0] + shape[0]), (corner[1], corner[1] + shape[1])
+        here = slice(top - first, bottom - first), slice(left - begin, right - begin)
+        return here, (slice(top - y, bottom - y), slice(left - x, right - x))
 
 
 def _ends(part: tuple[slice, slice]) -> tuple[int, int, int, int]:

@@ -424,6 +424,8 @@ def _places(steps: Sequence[Step]) -> tuple[FloatArray, FloatArray]:
 
 def _displaced(start: Candidate, y_px: float, x_px: float) -> Candidate:
     """Move a candidate."""
+    if y_px == x_px == 0:  # where nothing drifts
+        return start
     return replace(start, x_px=start.x_px + x_px, y_px=start.y_px + y_px)
 
 
