@@ -20,7 +20,7 @@ from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens, StampLens
 from iscat_analysis._kernels.lines import copy_line
 from iscat_analysis._kernels.radial import AxialTable
-from iscat_analysis._kernels.scoring import picture_at, span
+from iscat_analysis._kernels.scoring import blank_profile, picture_at, span
 from iscat_analysis._kernels.stamp import add_stamp, stamp_gradient
 
 FloatArray = NDArray[np.float64]
@@ -272,7 +272,38 @@ def stage(
 
 
 @kernel()
-def ready_frame(
+def draw_frames(
+    field: Field, near: Pictures, far: Pictures, starts: IntArray, first: int, last: int,
+    theta: FloatArray, group: IntArray, canvas: Canvas,
+) -> None:  # fmt: skip
+    """Bring frames first…last − 1 of the canvas to the rows as they are.
+
+    Parameters
+    ----------
+    field, near, far
+        Pixels, and pictures of the fitted squares and of what is drawn around them.
+    starts : ndarray of int, shape (t + 1,)
+        First row of each frame.
+    first, last : int
+        Frames.
+    theta : ndarray, shape (rows, 5)
+        The rows.
+    group : ndarray of int, shape (rows,)
+        Number of each row's picture.
+    canvas : Canvas
+        Drawn on.
+    """
+    near_profile = blank_profile(table_of(near, 0), near.lens, 1)
+    far_profile = blank_profile(table_of(far, 0), far.lens, 1)
+    image = np.empty(max(field.drawn, field.side) ** 2)
+    for t in range(first, last):
+        _ready_frame(
+            field, near, far, starts, t, theta, group, canvas, near_profile, far_profile, image
+        )
+
+
+@kernel()
+def _ready_frame(
     field: Field, near: Pictures, far: Pictures, starts: IntArray, t: int, theta: FloatArray,
     group: IntArray, canvas: Canvas, near_profile: FloatArray,
     far_profile: FloatArray, image: FloatArray,

@@ -16,7 +16,6 @@ from iscat_analysis._kernels.canvas import (
     cut,
     draw_gradient,
     lens_of,
-    ready_frame,
     square_of,
     stage,
     table_of,
@@ -127,7 +126,6 @@ def judge_frames(
     light: Light,
     field: Field,
     near: Pictures,
-    far: Pictures,
     free: BoolArray,
     starts: IntArray,
     first: int,
@@ -146,8 +144,8 @@ def judge_frames(
 
     Parameters
     ----------
-    light, field, near, far, free, starts, first, last, theta, group, canvas
-        As in `fit_frames`.
+    light, field, near, free, starts, theta, group, canvas, first, last
+        As in `fit_frames`; frames first…last − 1.
     slopes : Slopes
         Filled.
     fisher : ndarray, shape (rows, 4, 4)
@@ -164,20 +162,14 @@ def judge_frames(
         information F on the amplitude a.
     """
     rows, columns = light.background.shape
-    near_profile = blank_profile(table_of(near, 0), near.lens, 1)
-    far_profile = blank_profile(table_of(far, 0), far.lens, 1)
     profile = blank_profile(table_of(near, 0), near.lens, 2)
     index = marked(free[:4])
-    image = np.empty(max(field.drawn, field.side) ** 2)
     square = np.empty(4 * field.side**2, near.nodes.dtype)
     g = np.empty(BENDS * field.side**2, near.nodes.dtype)
     room, work = np.empty(field.side**2, np.float32), np.empty(10 * field.side**2)
     pull, known = np.empty(5), np.empty((5, 5))
     ways_here = np.empty((4, index.size))
     for t in range(first, last):
-        ready_frame(
-            field, near, far, starts, t, theta, group, canvas, near_profile, far_profile, image
-        )
         for r in range(starts[t], starts[t + 1]):
             p, f = theta[r], fisher[r]
             f[:], turned[r], ways[r] = 0.0, np.nan, np.nan

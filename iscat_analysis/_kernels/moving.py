@@ -24,8 +24,6 @@ from iscat_analysis._kernels.canvas import (
     Pictures,
     cut,
     draw_gradient,
-    lens_of,
-    ready_frame,
     square_of,
     stage,
     table_of,
@@ -37,10 +35,8 @@ from iscat_analysis._kernels.lines import copy_line, marked
 from iscat_analysis._kernels.place_score import place_score
 from iscat_analysis._kernels.scoring import (
     CONVERGED,
-    POISSON,
     STALLED,
     blank_profile,
-    maximize,
     scoring_step,
 )
 
@@ -48,6 +44,10 @@ FloatArray = NDArray[np.float64]
 AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+
+ASTRAY = 4
+"""How a fit ended, besides the ways of `iscat_analysis._kernels.scoring`: its steps lead nowhere."""
 
 
 class Search(NamedTuple):
@@ -78,15 +78,35 @@ class Search(NamedTuple):
     passes: int
 
 
+class Stand(NamedTuple):
+    """Where the fits of some frames stand, between one call of `fit_frames` and the next.
+
+    Attributes
+    ----------
+    place : ndarray of int, shape (7,)
+        Frame, sweep and row, and the row's square: first and last row and column, half-open, all 0
+        where it is yet to be found.
+    data : ndarray, shape (4 side²,)
+        Begins with the constants of its likelihood, shape (4, ny, nx).
+    signal : ndarray, shape (side²,)
+        Begins with its signal at its start, shape (ny, nx).
+    start : ndarray, shape (5,)
+        That θ.
+    """
+
+    place: IntArray
+    data: AnyFloatArray
+    signal: AnyFloatArray
+    start: FloatArray
+
+
 @kernel()
 def fit_frames(
     light: Light,
     field: Field,
     near: Pictures,
-    far: Pictures,
     search: Search,
     starts: IntArray,
-    first: int,
     last: int,
     sweeps: int,
     theta: FloatArray,
@@ -98,25 +118,29 @@ def fit_frames(
     gain: FloatArray,
     expected: FloatArray,
     sums: NDArray[np.float32],
-) -> None:
-    """Fit the rows of frames first…last − 1, each `sweeps` times.
+    stand: Stand,
+) -> bool:
+    """Fit the rows of frames up to last − 1, each `sweeps` times, as far as plain steps lead.
+
+    A row that needs more care is left to the caller, with its place, its constants and a start in
+    its box; with its maximum in `theta`, `outcome` and `gain` the next call goes on.
 
     Parameters
     ----------
-    light, field, near, far, search
-        Movie, pixels, pictures to fit and to draw, and what is fitted.
+    light, field, near, search
+        Movie, pixels, pictures to fit, and what is fitted.
     starts : ndarray of int, shape (t + 1,)
         First row of each frame.
-    first, last : int
-        Frames.
+    last : int
+        The frame after those that are fitted.
     sweeps : int
-        How often; 0 draws only.
+        How often; 0 sums only.
     theta : ndarray, shape (rows, 5)
         Starts; overwritten with the estimates.
     group : ndarray of int, shape (rows,)
         Number of each row's picture.
     canvas : Canvas
-        Brought to the estimates.
+        From `draw_frames`; the rows' own squares follow the estimates.
     slopes : Slopes
         Filled by the last fit of each row.
     outcome : ndarray of int, shape (rows,)
@@ -126,54 +150,63 @@ def fit_frames(
     gain : ndarray, shape (rows,)
         Filled with its log-likelihood over that without the particle, the others in place.
     expected : ndarray, shape (t,)
-        Filled with the photoelectrons expected in the used pixels at power 1.
+        Filled with what particles add to the photoelectrons of the used pixels at power 1.
     sums : ndarray of float32, shape (y, x)
         Added to: Σ w C over the frames.
+    stand : Stand
+        Where to begin; left where the caller has to help.
+
+    Returns
+    -------
+    bool
+        Whether all frames are done.
     """
     rows, columns = light.background.shape
-    near_profile = blank_profile(table_of(near, 0), near.lens, 1)
-    far_profile = blank_profile(table_of(far, 0), far.lens, 1)
-    image = np.empty(max(field.drawn, field.side) ** 2)
-    square = np.empty(4 * field.side**2, near.nodes.dtype)
-    change = np.empty(field.side**2, near.nodes.dtype)
+    place = stand.place
     gradients = np.empty(10 * field.side**2, near.nodes.dtype)
     room = np.empty(field.side**2, dtype=np.float32)
-    step, before, index = np.empty(5), np.empty(5), marked(search.free[:4])
-    slope_profile = blank_profile(table_of(near, 0), near.lens, 2)
+    step, score, index = np.empty(5), np.empty(5), marked(search.free[:4])
+    profile = blank_profile(table_of(near, 0), near.lens, 2)
     fisher = np.empty((5, 5))
-    background, amount = np.empty((rows, columns), dtype=np.float32), 0.0
-    for i in range(rows):
-        for j in range(columns):
-            background[i, j] = light.background[i, j]
-            amount += light.background[i, j]
-    for t in range(first, last):
-        if sweeps:
-            expected[t] = _look_over(light.counts[t])  # kept for a moment, or nothing would be read
-        ready_frame(
-            field, near, far, starts, t, theta, group, canvas, near_profile, far_profile, image
-        )
+    while place[0] < last:
+        t = place[0]
         total = canvas.total[t]
-        for _ in range(sweeps):
-            for r in range(starts[t], starts[t + 1]):
-                p = theta[r]
-                r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
+        if sweeps and place[4] == 0:
+            expected[t] = _look_over(light.counts[t])  # kept for a moment, or nothing would be read
+        while place[1] < sweeps:
+            for r in range(place[2], starts[t + 1]):
+                p, helped = theta[r], place[4] > 0
+                r0, r1, c0, c1 = place[3], place[4], place[5], place[6]
+                if not helped:
+                    r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
                 if r1 <= r0:
                     outcome[r], information[r], gain[r] = STALLED, 0.0, 0.0
                     continue
                 ny, nx = r1 - r0, c1 - c0
                 pixels = cut(field.pixels, r0, r1, c0, c1)
                 both = gradients[: 10 * ny * nx].reshape(2, ny, 5, nx)
-                draw_gradient(near, group[r], p, pixels, slope_profile, both[0])
-                data = square[: 4 * ny * nx].reshape(4, ny, nx)
-                stage(light, t, total, both[0], r0, c0, data)
-                signal = change[: ny * nx].reshape(ny, nx)
-                for i in range(ny):
-                    for j in range(nx):
-                        signal[i, j] = both[0, i, 0, j]
-                copy_line(p, before)
-                outcome[r], last_one, gain[r] = _climb(
-                    near, group[r], pixels, data, search, p, both, slope_profile, fisher, step
-                )
+                draw_gradient(near, group[r], p, pixels, profile, both[0])
+                data = stand.data[: 4 * ny * nx].reshape(4, ny, nx)
+                signal = stand.signal[: ny * nx].reshape(ny, nx)
+                if not helped:
+                    stage(light, t, total, both[0], r0, c0, data)
+                    for i in range(ny):
+                        for j in range(nx):
+                            signal[i, j] = both[0, i, 0, j]
+                    copy_line(p, stand.start)
+                value, last_one = place_score(data, both[0], near.lens, score, fisher), 0
+                if helped:
+                    place[4] = 0
+                    for i in range(5):
+                        step[i] = 0.0
+                else:
+                    outcome[r], last_one, gain[r] = _climb(
+                        near, group[r], pixels, data, search, p, both, profile, value, score,
+                        fisher, step,
+                    )  # fmt: skip
+                    if outcome[r] == ASTRAY:
+                        place[2], place[3], place[4], place[5], place[6] = r, r0, r1, c0, c1
+                        return False
                 here = both[last_one]
                 _add_signal(here, step, signal, total[r0:r1, c0:c1])
                 copy_line(p, canvas.squares[r])
@@ -181,9 +214,13 @@ def fit_frames(
                     copy_line(fisher[i, :4], information[r, i])
                 if slopes.values.size:
                     for k in range(index.size):
-                        slopes.moves[r, k] = p[index[k]] - before[index[k]]
+                        slopes.moves[r, k] = p[index[k]] - stand.start[index[k]]
                     keep_slopes(data[2], here, index, slopes, r, (r0, r1, c0, c1), room)
-        expected[t] = amount + _add_signals(total, background, light.power[t], sums)
+            place[1] += 1
+            place[2] = starts[t]
+        expected[t] = _add_signals(total, light.background, light.power[t], sums)
+        place[0], place[1], place[2] = t + 1, 0, starts[t + 1]
+    return True
 
 
 @kernel(fastmath=FAST, _nrt=False)
@@ -199,22 +236,23 @@ def _look_over(frame: Counts) -> float:
 @kernel()
 def _climb(
     near: Pictures, group: int, pixels: Pixels, data: AnyFloatArray, search: Search, p: FloatArray,
-    both: AnyFloatArray, profile: FloatArray, fisher: FloatArray, step: FloatArray,
+    both: AnyFloatArray, profile: FloatArray, value: float, score: FloatArray, fisher: FloatArray,
+    step: FloatArray,
 ) -> tuple[int, int, float]:  # fmt: skip
-    """Fit one row from p, at which both[0] is drawn.
+    """Fit one row from p, at which both[0] is drawn and its value, score and information known.
 
     As long as they lie inside the box and improve, the steps of Fisher scoring are taken as they
-    are: every picture is drawn once.  `maximize` takes over where they do not.
+    are: every picture is drawn once.  Where they do not, the fit is `ASTRAY`.
 
     Returns how the fit ended, which of `both` holds the picture at the estimate minus `step`, which
     the last step leaves so small that the gradient tells the rest, and the log-likelihood over that
     without the particle.
     """
-    lower, upper, trial, score = np.empty(5), np.empty(5), np.empty(5), np.empty(5)
+    lower, upper, trial = np.empty(5), np.empty(5), np.empty(5)
     for i in range(5):
         lower[i] = max(search.lower[i], p[i] - search.reach[i])
         upper[i] = min(search.upper[i], p[i] + search.reach[i])
-    at, value = 0, place_score(data, both[0], near.lens, score, fisher)
+    at = 0
     for _ in range(search.passes):
         gain = _step(search, p, lower, upper, score, fisher, step, trial)
         if gain == np.inf:
@@ -231,15 +269,7 @@ def _climb(
     for i in range(5):
         if search.free[i]:
             p[i] = min(max(p[i], lower[i]), upper[i])
-    value, _, outcome = maximize(
-        table_of(near, group), lens_of(near, group), pixels, np.int64(POISSON),
-        data.astype(np.float64), search.free, lower, upper, search.max_step, search.tolerance,
-        search.passes, p, fisher, -np.inf,
-    )  # fmt: skip  # np.int64: a constant would be compiled for by itself
-    draw_gradient(near, group, p, pixels, profile, both[0])
-    place_score(data, both[0], near.lens, score, fisher)
-    step[:] = 0.0
-    return outcome, 0, value
+    return ASTRAY, at, value
 
 
 @kernel()
@@ -280,7 +310,7 @@ def _add_signal(
 
 @kernel(fastmath=FAST, _nrt=False)
 def _add_signals(
-    total: NDArray[np.float32], background: NDArray[np.float32], power: float,
+    total: NDArray[np.float32], background: FloatArray, power: float,
     sums: NDArray[np.float32],
 ) -> float:  # fmt: skip
     """Add w C of a frame to `sums`; return Σ B C.  Single precision does, as both are small."""
@@ -289,5 +319,5 @@ def _add_signals(
         signal, light, out = total[i], background[i], sums[i]
         for j in range(signal.size):
             out[j] += w * signal[j]
-            amount += light[j] * signal[j]
+            amount += np.float32(light[j]) * signal[j]
     return float(amount)
