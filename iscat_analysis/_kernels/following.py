@@ -295,29 +295,11 @@ def _look_at_part(
 
 
 @kernel(fastmath=FAST)
-def _shift(
-    slopes: Slopes, clusters: Clusters, c: int, move: FloatArray, seen: NDArray[np.float32]
-) -> FloatArray:
-    """F⁻¹ G move of a cluster, shape (its rows × k,); `seen` is room for a square."""
-    rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
-    k = slopes.values.shape[1]
-    n = k * rows.size
-    step = np.empty(n)
-    for q in range(rows.size):
-        size = look(move, slopes.squares[rows[q]], seen)
-        for a in range(k):
-            step[k * q + a] = slopes.units[rows[q], a] * product(
-                slopes.values[rows[q], a], seen, size
-            )
-    solve(clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n), step)
-    return step
-
-
-@kernel(fastmath=FAST)
 def follow_rows(
-    slopes: Slopes, clusters: Clusters, first: int, last: int, move: FloatArray, out: FloatArray
-) -> None:
-    """Add what the rows of some clusters take up of a change of the logarithm of the background.
+    slopes: Slopes, clusters: Clusters, first: int, last: int, move: FloatArray,
+    steps: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Tell by what the rows of some clusters follow a change of the logarithm of the background.
 
     Parameters
     ----------
@@ -327,93 +309,28 @@ def follow_rows(
         Clusters first…last − 1.
     move : ndarray, shape (y, x)
         Change.
+    steps : ndarray, shape (rows, k)
+        Filled with F⁻¹ G move.
     out : ndarray, shape (y, x)
-        Σ Gᵀ F⁻¹ G move is added to it [e].
+        Σ Gᵀ F⁻¹ G move, what they take up of it, is added to it [e]; without room, left alone.
     """
     k = slopes.values.shape[1]
     seen = np.empty(slopes.values.shape[2], dtype=np.float32)
     for c in range(first, last):
-        step = _shift(slopes, clusters, c, move, seen)
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
+        n = k * rows.size
+        step = np.empty(n)
         for q in range(rows.size):
             r = rows[q]
-            square = slopes.squares[r]
-            size = (square[1] - square[0]) * (square[3] - square[2])
-            mix(slopes.values[r], slopes.units[r], step[k * q : k * (q + 1)], size, seen)
-            put(seen, square, out)
-
-
-@kernel()
-def shift_rows(
-    slopes: Slopes, clusters: Clusters, first: int, last: int, move: FloatArray, index: IntArray,
-    lower: FloatArray, upper: FloatArray, theta: FloatArray,
-) -> None:  # fmt: skip
-    """Let the rows of some clusters follow a change of the logarithm of the background.
-
-    Parameters
-    ----------
-    slopes, clusters
-        As `join_rows` left them.
-    first, last : int
-        Clusters first…last − 1.
-    move : ndarray, shape (y, x)
-        Change.
-    index : ndarray of int, shape (k,)
-        Free parameters.
-    lower, upper : ndarray, shape (5,)
-        Bounds of the parameters.
-    theta : ndarray, shape (rows, 5)
-        Moved.
-    """
-    k = index.size
-    seen = np.empty(slopes.values.shape[2], dtype=np.float32)
-    for c in range(first, last):
-        step = _shift(slopes, clusters, c, move, seen)
-        rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
+            size = look(move, slopes.squares[r], seen)
+            for a in range(k):
+                step[k * q + a] = slopes.units[r, a] * product(slopes.values[r, a], seen, size)
+        solve(clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n), step)
         for q in range(rows.size):
-            for a in range(k):
-                i = index[a]
-                moved = theta[rows[q], i] - step[k * q + a]
-                theta[rows[q], i] = min(max(moved, lower[i]), upper[i])
-
-
-@kernel()
-def move_together(
-    clusters: Clusters, first: int, last: int, index: IntArray, longest: FloatArray,
-    lower: FloatArray, upper: FloatArray, theta: FloatArray,
-) -> None:  # fmt: skip
-    """Let rows that overlap follow one another, to the maximum of all, to first order.
-
-    Parameters
-    ----------
-    clusters : Clusters
-        As `join_rows` left them.
-    first, last : int
-        Clusters first…last − 1.
-    index : ndarray of int, shape (k,)
-        Free parameters.
-    longest : ndarray, shape (5,)
-        Step of a parameter at most, of the amplitude relative; longer ones are shortened with their
-        cluster.
-    lower, upper : ndarray, shape (5,)
-        Bounds of the parameters.
-    theta : ndarray, shape (rows, 5)
-        Moved.
-    """
-    k = index.size
-    for c in range(first, last):
-        rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
-        if rows.size == 1:
-            continue
-        share = 1.0
-        for r in rows:
-            for a in range(k):
-                i, step = index[a], abs(clusters.steps[r, a])
-                most = longest[i] * (abs(theta[r, 3]) if i == 3 else 1.0)
-                if step > most:
-                    share = min(share, most / step)
-        for r in rows:
-            for a in range(k):
-                i = index[a]
-                moved = theta[r, i] + share * clusters.steps[r, a]
-                theta[r, i] = min(max(moved, lower[i]), upper[i])
+            r = rows[q]
+            here, square = steps[r], slopes.squares[r]
+            copy_line(step[k * q : k * (q + 1)], here)
+            if out.size:
+                size = (square[1] - square[0]) * (square[3] - square[2])
+                mix(slopes.values[r], slopes.units[r], here, size, seen)
+                put(seen, square, out)

@@ -149,10 +149,11 @@ def judge_frames(
     slopes : Slopes
         Filled.
     fisher : ndarray, shape (rows, 4, 4)
-        Filled with the expected information in (x, y, z, a).
+        Filled with the expected information in (x, y, z, a).  Of rows without a square this and what
+        follows stay as they are.
     turned, ways : ndarray, shape (rows, 4, 4)
         Filled with O V and V, the columns of V directions of one standard deviation in the free
-        parameters, and O the observed information; NaN where the information is singular.
+        parameters, and O the observed information; left alone where the information is singular.
     bias : ndarray, shape (rows, 4)
         Filled with what the score is expected to be off by through curvature, −½ Σ V tr(F⁻¹∂²η) ∂η:
         F⁻¹ times it is the bias of order 1/N (see `iscat_analysis.inference.precision`).
@@ -172,8 +173,6 @@ def judge_frames(
     for t in range(first, last):
         for r in range(starts[t], starts[t + 1]):
             p, f = theta[r], fisher[r]
-            f[:], turned[r], ways[r] = 0.0, np.nan, np.nan
-            bias[r], numbers[r] = 0.0, 0.0
             r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
             if r1 <= r0:
                 continue

@@ -415,8 +415,8 @@ class MovingField:
         light = self._light(ground)
         near, far = self._pictures_for(coarse=False)
         starts = rows.starts(self.frames)
-        fisher, turned, ways = np.empty((3, n, 4, 4))
-        bias, numbers = np.empty((n, 4)), np.empty((n, 6))
+        fisher, (turned, ways) = np.zeros((n, 4, 4)), np.full((2, n, 4, 4), np.nan)
+        bias, numbers = np.zeros((n, 4)), np.zeros((n, 6))
         canvas = self._canvas_for(rows, coarse=False)
         slopes = self._slopes_of(n, self._whole.side)
 
