@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.following import Slopes
 from iscat_analysis._kernels.sharing import follow, own_shares, send
 from iscat_analysis.inference.moving import MovingField
-from iscat_analysis.inference.rows import Ground, Judged
+from iscat_analysis.inference.rows import Ground
 from iscat_analysis.records import FloatArray
 
 
@@ -25,17 +26,17 @@ class Coupling:
         The movie.
     ground : Ground
         Background.
-    judged : Judged
-        Of all rows; the field has fitted nothing since.
+    slopes : Slopes
+        Of all rows, as judged; the field has fitted nothing since.
     rows : ndarray of int, shape (n,)
         Numbers of those that belong together.
     """
 
     def __init__(
-        self, field: MovingField, ground: Ground, judged: Judged, rows: NDArray[np.int64]
+        self, field: MovingField, ground: Ground, slopes: Slopes, rows: NDArray[np.int64]
     ) -> None:
-        self._slopes, self._rows = judged.slopes, rows
-        squares = judged.slopes.squares[rows]
+        self._slopes, self._rows = slopes, rows
+        squares = slopes.squares[rows]
         top, left = squares[:, 0].min(), squares[:, 2].min()
         bottom, right = squares[:, 1].max(), squares[:, 3].max()
         self._squares = squares - np.array([top, top, left, left])
