@@ -152,7 +152,7 @@ def mix(
             out[j] += factor * out.dtype.type(slope[j])
 
 
-@kernel()
+@kernel(_nrt=False)
 def find_clusters(squares: IntArray, starts: IntArray, owner: IntArray) -> None:
     """Say which rows overlap by half their squares, directly or through others.
 
@@ -246,7 +246,7 @@ def join_rows(
                 low[i, j] /= scale[i]
 
 
-@kernel(fastmath=FAST)
+@kernel(fastmath=FAST, _nrt=False)
 def _overlap(
     slopes: Slopes, light: Light, t: int, total: NDArray[np.float32], r: int, s: int,
     work: NDArray[np.float32], out: FloatArray,
@@ -294,10 +294,10 @@ def _look_at_part(
             line[j] = unit * np.float32(there[j])
 
 
-@kernel(fastmath=FAST)
+@kernel(fastmath=FAST, _nrt=False)
 def follow_rows(
     slopes: Slopes, clusters: Clusters, first: int, last: int, move: FloatArray,
-    steps: FloatArray, out: FloatArray,
+    steps: FloatArray, out: FloatArray, seen: NDArray[np.float32], step: FloatArray,
 ) -> None:  # fmt: skip
     """Tell by what the rows of some clusters follow a change of the logarithm of the background.
 
@@ -313,19 +313,21 @@ def follow_rows(
         Filled with F⁻¹ G move.
     out : ndarray, shape (y, x)
         Σ Gᵀ F⁻¹ G move, what they take up of it, is added to it [e]; without room, left alone.
+    seen : ndarray of float32, shape (side²,)
+        Room for a square.
+    step : ndarray
+        Room for the steps of a cluster.
     """
     k = slopes.values.shape[1]
-    seen = np.empty(slopes.values.shape[2], dtype=np.float32)
     for c in range(first, last):
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
         n = k * rows.size
-        step = np.empty(n)
         for q in range(rows.size):
             r = rows[q]
             size = look(move, slopes.squares[r], seen)
             for a in range(k):
                 step[k * q + a] = slopes.units[r, a] * product(slopes.values[r, a], seen, size)
-        solve(clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n), step)
+        solve(clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n), step[:n])
         for q in range(rows.size):
             r = rows[q]
             here, square = steps[r], slopes.squares[r]

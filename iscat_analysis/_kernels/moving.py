@@ -26,17 +26,15 @@ from iscat_analysis._kernels.canvas import (
     draw_gradient,
     square_of,
     stage,
-    table_of,
 )
 from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.lines import copy_line, marked
+from iscat_analysis._kernels.lines import copy_line
 from iscat_analysis._kernels.place_score import place_score
 from iscat_analysis._kernels.scoring import (
     CONVERGED,
     STALLED,
-    blank_profile,
     scoring_step,
 )
 
@@ -78,29 +76,37 @@ class Search(NamedTuple):
     passes: int
 
 
-class Stand(NamedTuple):
-    """Where the fits of some frames stand, between one call of `fit_frames` and the next.
+class Room(NamedTuple):
+    """Where the kernels of rows keep what they need for a moment; none of them asks for memory.
 
     Attributes
     ----------
-    place : ndarray of int, shape (7,)
-        Frame, sweep and row, and the row's square: first and last row and column, half-open, all 0
-        where it is yet to be found.
-    data : ndarray, shape (4 side²,)
-        Begins with the constants of its likelihood, shape (4, ny, nx).
-    signal : ndarray, shape (side²,)
-        Begins with its signal at its start, shape (ny, nx).
-    start : ndarray, shape (5,)
-        That θ.
+    pixels : ndarray, shape (15 side²,)
+        In the precision of gradients: first the constants of a likelihood, (4, ny, nx).
+    line : ndarray of float32, shape (side²,)
+        For the slopes of a row.
+    profile : ndarray
+        For a picture and its ∂/∂z, as `iscat_analysis._kernels.scoring.blank_profile` makes it.
+    index : ndarray of int, shape (k,)
+        Free parameters.
+    small : ndarray, shape (11, 5)
+        For numbers of a row; a fit leaves its start in the last line.
+    ways : ndarray, shape (4, k)
+        For directions.
+    work : ndarray, shape (10 side²,)
+        For two pictures in double precision; empty at one height.
     """
 
-    place: IntArray
-    data: AnyFloatArray
-    signal: AnyFloatArray
-    start: FloatArray
+    pixels: AnyFloatArray
+    line: NDArray[np.float32]
+    profile: FloatArray
+    index: IntArray
+    small: FloatArray
+    ways: FloatArray
+    work: FloatArray
 
 
-@kernel()
+@kernel(_nrt=False)
 def fit_frames(
     light: Light,
     field: Field,
@@ -118,7 +124,8 @@ def fit_frames(
     gain: FloatArray,
     expected: FloatArray,
     sums: NDArray[np.float32],
-    stand: Stand,
+    place: IntArray,
+    room: Room,
 ) -> bool:
     """Fit the rows of frames up to last − 1, each `sweeps` times, as far as plain steps lead.
 
@@ -146,15 +153,19 @@ def fit_frames(
     outcome : ndarray of int, shape (rows,)
         Filled with how the last fit ended.
     information : ndarray, shape (rows, 4, 4)
-        Filled with the expected information in (x, y, z, a) of the last fit.
+        Filled with the expected information in (x, y, z, a) of the last fit; left alone where a row
+        has no square.
     gain : ndarray, shape (rows,)
         Filled with its log-likelihood over that without the particle, the others in place.
     expected : ndarray, shape (t,)
         Filled with what particles add to the photoelectrons of the used pixels at power 1.
     sums : ndarray of float32, shape (y, x)
         Added to: Σ w C over the frames.
-    stand : Stand
-        Where to begin; left where the caller has to help.
+    place : ndarray of int, shape (7,)
+        Where to begin, and left where the caller has to help: frame, sweep and row, and the row's
+        square, first and last row and column, half-open; all 0 where it is yet to be found.
+    room : Room
+        The same one until all frames are done.
 
     Returns
     -------
@@ -162,12 +173,9 @@ def fit_frames(
         Whether all frames are done.
     """
     rows, columns = light.background.shape
-    place = stand.place
-    gradients = np.empty(10 * field.side**2, near.nodes.dtype)
-    room = np.empty(field.side**2, dtype=np.float32)
-    step, score, index = np.empty(5), np.empty(5), marked(search.free[:4])
-    profile = blank_profile(table_of(near, 0), near.lens, 2)
-    fisher = np.empty((5, 5))
+    area = field.side**2
+    fisher, step, score, start = room.small[:5], room.small[5], room.small[6], room.small[10]
+    index = room.index
     while place[0] < last:
         t = place[0]
         total = canvas.total[t]
@@ -180,20 +188,20 @@ def fit_frames(
                 if not helped:
                     r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
                 if r1 <= r0:
-                    outcome[r], information[r], gain[r] = STALLED, 0.0, 0.0
+                    outcome[r], gain[r] = STALLED, 0.0
                     continue
                 ny, nx = r1 - r0, c1 - c0
                 pixels = cut(field.pixels, r0, r1, c0, c1)
-                both = gradients[: 10 * ny * nx].reshape(2, ny, 5, nx)
-                draw_gradient(near, group[r], p, pixels, profile, both[0])
-                data = stand.data[: 4 * ny * nx].reshape(4, ny, nx)
-                signal = stand.signal[: ny * nx].reshape(ny, nx)
+                both = room.pixels[5 * area : 5 * area + 10 * ny * nx].reshape(2, ny, 5, nx)
+                draw_gradient(near, group[r], p, pixels, room.profile, both[0])
+                data = room.pixels[: 4 * ny * nx].reshape(4, ny, nx)
+                signal = room.pixels[4 * area : 4 * area + ny * nx].reshape(ny, nx)
                 if not helped:
                     stage(light, t, total, both[0], r0, c0, data)
                     for i in range(ny):
                         for j in range(nx):
                             signal[i, j] = both[0, i, 0, j]
-                    copy_line(p, stand.start)
+                    copy_line(p, start)
                 value, last_one = place_score(data, both[0], near.lens, score, fisher), 0
                 if helped:
                     place[4] = 0
@@ -201,9 +209,8 @@ def fit_frames(
                         step[i] = 0.0
                 else:
                     outcome[r], last_one, gain[r] = _climb(
-                        near, group[r], pixels, data, search, p, both, profile, value, score,
-                        fisher, step,
-                    )  # fmt: skip
+                        near, group[r], pixels, data, search, p, both, value, room
+                    )
                     if outcome[r] == ASTRAY:
                         place[2], place[3], place[4], place[5], place[6] = r, r0, r1, c0, c1
                         return False
@@ -211,11 +218,12 @@ def fit_frames(
                 _add_signal(here, step, signal, total[r0:r1, c0:c1])
                 copy_line(p, canvas.squares[r])
                 for i in range(4):
-                    copy_line(fisher[i, :4], information[r, i])
+                    for j in range(4):
+                        information[r, i, j] = fisher[i, j]
                 if slopes.values.size:
                     for k in range(index.size):
-                        slopes.moves[r, k] = p[index[k]] - stand.start[index[k]]
-                    keep_slopes(data[2], here, index, slopes, r, (r0, r1, c0, c1), room)
+                        slopes.moves[r, k] = p[index[k]] - start[index[k]]
+                    keep_slopes(data[2], here, index, slopes, r, (r0, r1, c0, c1), room.line)
             place[1] += 1
             place[2] = starts[t]
         expected[t] = _add_signals(total, light.background, light.power[t], sums)
@@ -233,22 +241,22 @@ def _look_over(frame: Counts) -> float:
     return float(total)
 
 
-@kernel()
+@kernel(_nrt=False)
 def _climb(
     near: Pictures, group: int, pixels: Pixels, data: AnyFloatArray, search: Search, p: FloatArray,
-    both: AnyFloatArray, profile: FloatArray, value: float, score: FloatArray, fisher: FloatArray,
-    step: FloatArray,
+    both: AnyFloatArray, value: float, room: Room,
 ) -> tuple[int, int, float]:  # fmt: skip
     """Fit one row from p, at which both[0] is drawn and its value, score and information known.
 
     As long as they lie inside the box and improve, the steps of Fisher scoring are taken as they
     are: every picture is drawn once.  Where they do not, the fit is `ASTRAY`.
 
-    Returns how the fit ended, which of `both` holds the picture at the estimate minus `step`, which
-    the last step leaves so small that the gradient tells the rest, and the log-likelihood over that
+    Returns how the fit ended, which of `both` holds the picture at the estimate minus the step,
+    which the last one leaves so small that the gradient tells the rest, and the log-likelihood over that
     without the particle.
     """
-    lower, upper, trial = np.empty(5), np.empty(5), np.empty(5)
+    fisher, step, score, trial = room.small[:5], room.small[5], room.small[6], room.small[7]
+    lower, upper = room.small[8], room.small[9]
     for i in range(5):
         lower[i] = max(search.lower[i], p[i] - search.reach[i])
         upper[i] = min(search.upper[i], p[i] + search.reach[i])
@@ -260,7 +268,7 @@ def _climb(
         if gain < search.tolerance:
             copy_line(trial, p)
             return CONVERGED, at, value + gain
-        draw_gradient(near, group, trial, pixels, profile, both[1 - at])
+        draw_gradient(near, group, trial, pixels, room.profile, both[1 - at])
         there = place_score(data, both[1 - at], near.lens, score, fisher)
         if not there > value:
             break
@@ -272,7 +280,7 @@ def _climb(
     return ASTRAY, at, value
 
 
-@kernel()
+@kernel(_nrt=False)
 def _step(
     search: Search, p: FloatArray, lower: FloatArray, upper: FloatArray, score: FloatArray,
     fisher: FloatArray, step: FloatArray, trial: FloatArray,

@@ -39,7 +39,7 @@ LEAST = 1e-15
 """Least expected count, as `FLOOR` of `scoring`, but its square is a number in single precision."""
 
 
-@kernel()
+@kernel(_nrt=False)
 def place_score(
     data: AnyFloatArray, here: AnyFloatArray, lens: Lens, score: FloatArray, fisher: FloatArray
 ) -> float:

@@ -45,6 +45,7 @@ class Coupling:
         share = np.where(field.used[cut], level / (level + field.read_e2[cut]), 0.0)
         self._weight = share / np.maximum(field.total_e[cut], 1.0)
         self._sigma = np.sqrt(self._weight)
+        self._room = slopes.values.shape[2]
 
     @property
     def pixels(self) -> int:
@@ -61,7 +62,10 @@ class Coupling:
         """
         free = self._slopes.values.shape[1]
         out = np.zeros((len(self._rows), free, free))
-        own_shares(self._slopes, self._rows, self._squares, self._weight, out)
+        own_shares(
+            self._slopes, self._rows, self._squares, self._weight, out,
+            *np.empty((2, self._room)),
+        )  # fmt: skip
         return out
 
     def sent(self, by: FloatArray) -> FloatArray:
@@ -78,7 +82,7 @@ class Coupling:
             Images.
         """
         out = np.zeros((by.shape[1], *self._weight.shape))
-        send(self._slopes, self._rows, self._squares, by, out)
+        send(self._slopes, self._rows, self._squares, by, out, np.empty(self._room))
         return (out * self._sigma).reshape(len(out), -1)
 
     def followed(self, covariance: FloatArray, images: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -101,5 +105,8 @@ class Coupling:
         seen = np.multiply(images.reshape(-1, *self._weight.shape), self._sigma, order="C")
         felt = np.zeros((len(self._rows), len(images), covariance.shape[1]))
         out = np.zeros_like(seen)
-        follow(self._slopes, self._rows, self._squares, covariance, seen, felt, out)
+        follow(
+            self._slopes, self._rows, self._squares, covariance, seen, felt, out,
+            np.empty(self._room), np.empty(covariance.shape[1]),
+        )  # fmt: skip
         return felt, (out * self._sigma).reshape(images.shape)

@@ -11,13 +11,67 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.canvas import Canvas, Field, Light, Pictures
+from iscat_analysis._kernels.canvas import Canvas, Field, Light, Pictures, draw_frames
 from iscat_analysis._kernels.following import Slopes
-from iscat_analysis._kernels.moving import Search, Stand, fit_frames
+from iscat_analysis._kernels.lens import LATTICE, STAMP
+from iscat_analysis._kernels.moving import Room, Search, fit_frames
+from iscat_analysis._kernels.radial import POWERS
 from iscat_analysis._kernels.scoring import POISSON, maximize
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
+
+
+def room_for(field: Field, near: Pictures, free: BoolArray) -> Room:
+    """Make room for the kernels of rows.
+
+    Parameters
+    ----------
+    field : Field
+        Sides of squares.
+    near : Pictures
+        What is fitted.
+    free : ndarray of bool, shape (5,)
+        Free parameters.
+
+    Returns
+    -------
+    Room
+        For one thread.
+    """
+    index, area = np.flatnonzero(free[:4]), field.side**2
+    return Room(
+        np.empty(15 * area, near.nodes.dtype), np.empty(area, np.float32), _profile(near, 2), index,
+        np.empty((11, 5)), np.empty((4, index.size)),
+        np.empty(0 if len(near.lens) == STAMP else 10 * area),
+    )  # fmt: skip
+
+
+def _profile(pictures: Pictures, orders: int) -> FloatArray:
+    """Make room for a profile, as `iscat_analysis._kernels.scoring.blank_profile` does."""
+    lens, (channels, width) = pictures.lens, pictures.heights.shape[3:]
+    if len(lens) == STAMP:
+        return np.empty((0, 0, 0))
+    if len(lens) == LATTICE:
+        return np.empty((orders * channels, 2 * lens.half + 1, 2 * lens.half + 1))
+    return np.empty((width // POWERS, POWERS, orders * channels))
+
+
+def draw_rows(
+    field: Field, near: Pictures, far: Pictures, starts: IntArray, first: int, last: int,
+    theta: FloatArray, group: IntArray, canvas: Canvas,
+) -> None:  # fmt: skip
+    """Bring frames first…last − 1 of the canvas to the rows as they are.
+
+    Parameters
+    ----------
+    field, near, far, starts, first, last, theta, group, canvas
+        As in `iscat_analysis._kernels.canvas.draw_frames`.
+    """
+    draw_frames(
+        field, near, far, starts, first, last, theta, group, canvas, _profile(near, 1),
+        _profile(far, 1), np.empty(max(field.drawn, field.side) ** 2),
+    )  # fmt: skip
 
 
 def fit_rows(
@@ -37,25 +91,26 @@ def fit_rows(
     outcome, information, gain, expected, sums
         As there.
     """
-    pixels, kind = field.side**2, near.nodes.dtype
-    place = np.array([first, 0, starts[first], 0, 0, 0, 0])
-    stand = Stand(place, np.empty(4 * pixels, kind), np.empty(pixels, kind), np.empty(5))
+    place, room = np.array([first, 0, starts[first], 0, 0, 0, 0]), room_for(field, near, search.free)
     while not fit_frames(
         light, field, near, search, starts, last, sweeps, theta, group, canvas, slopes, outcome,
-        information, gain, expected, sums, stand,
+        information, gain, expected, sums, place, room,
     ):  # fmt: skip
         row = int(place[2])
-        gain[row], outcome[row] = climb(field, near, search, stand, int(group[row]), theta[row])
+        gain[row], outcome[row] = climb(
+            field, near, search, place, room, int(group[row]), theta[row]
+        )
 
 
 def climb(
-    field: Field, near: Pictures, search: Search, stand: Stand, group: int, theta: FloatArray
-) -> tuple[float, int]:
+    field: Field, near: Pictures, search: Search, place: IntArray, room: Room, group: int,
+    theta: FloatArray,
+) -> tuple[float, int]:  # fmt: skip
     """Fit a row whose plain steps lead nowhere.
 
     Parameters
     ----------
-    field, near, search, stand
+    field, near, search, place, room
         As in `iscat_analysis._kernels.moving.fit_frames`.
     group : int
         Number of the row's picture.
@@ -69,9 +124,10 @@ def climb(
     int
         How the fit ended.
     """
-    top, bottom, left, right = stand.place[3:]
+    top, bottom, left, right = place[3:]
     shape = 4, bottom - top, right - left
-    data = stand.data[: math.prod(shape)].reshape(shape).astype(np.float64)
+    start = room.small[10]
+    data = room.pixels[: math.prod(shape)].reshape(shape).astype(np.float64)
     heights = near.heights[min(group, len(near.heights) - 1)]
     table = heights, near.first_nm, near.step_nm, near.kappa
     lens = near.lens
@@ -80,8 +136,8 @@ def climb(
     x, y, offsets, weights = field.pixels
     value, _, outcome = maximize(
         table, tuple(lens), (x[left:right], y[top:bottom], offsets, weights), POISSON, data,
-        search.free, np.maximum(search.lower, stand.start - search.reach),
-        np.minimum(search.upper, stand.start + search.reach), search.max_step, search.tolerance,
+        search.free, np.maximum(search.lower, start - search.reach),
+        np.minimum(search.upper, start + search.reach), search.max_step, search.tolerance,
         search.passes, theta, np.empty((5, 5)), -math.inf,
     )  # fmt: skip
     return value, outcome

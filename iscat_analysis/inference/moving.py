@@ -31,7 +31,6 @@ from iscat_analysis._kernels.canvas import (
     Light,
     Pictures,
     add_squares,
-    draw_frames,
     leave_over,
 )
 from iscat_analysis._kernels.following import Slopes
@@ -40,7 +39,7 @@ from iscat_analysis._kernels.moving import Search
 from iscat_analysis._kernels.scoring import CONVERGED
 from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.fit import window_nm
-from iscat_analysis.inference.frame_fits import fit_rows
+from iscat_analysis.inference.frame_fits import draw_rows, fit_rows, room_for
 from iscat_analysis.inference.newton import Response
 from iscat_analysis.inference.pictures import PictureBook
 from iscat_analysis.inference.rows import Ground, Judged, Rows
@@ -235,7 +234,7 @@ class MovingField:
         theta = rows.theta.copy()
         starts = rows.starts(self.frames)
         outcome = np.full(len(theta), CONVERGED, dtype=np.int64)
-        fisher, gain = np.empty((len(theta), 4, 4)), np.empty(len(theta))
+        fisher, gain = np.zeros((len(theta), 4, 4)), np.empty(len(theta))
         canvas = self._canvas_for(rows, coarse=coarse)
         field = self._coarse if coarse else self._whole
         search = self._search if sweeps > 1 else self._search._replace(tolerance=_PASSING)
@@ -244,7 +243,7 @@ class MovingField:
 
         def block(first: int) -> NDArray[np.float32]:
             sums, last = np.zeros(self.used.shape, dtype=np.float32), min(first + BLOCK, self.frames)
-            draw_frames(field, near, far, starts, first, last, theta, rows.group, canvas)
+            draw_rows(field, near, far, starts, first, last, theta, rows.group, canvas)
             fit_rows(
                 light, field, near, search, starts, first, last, sweeps, theta, rows.group, canvas,
                 slopes, outcome, fisher, gain, expected, sums,
@@ -391,7 +390,7 @@ class MovingField:
         canvas = blank(np.empty((last - first, *self.used.shape), dtype=np.float32), within)
         near, far = self._pictures_for(coarse=True)
         starts = np.searchsorted(within.frame, np.arange(first, last + 1)).astype(np.int64)
-        draw_frames(
+        draw_rows(
             self._coarse, near, far, starts, 0, last - first, within.theta, within.group, canvas
         )
         return canvas.total
@@ -422,10 +421,11 @@ class MovingField:
 
         def block(first: int) -> FloatArray:
             last = min(first + BLOCK, self.frames)
-            draw_frames(self._whole, near, far, starts, first, last, rows.theta, rows.group, canvas)
+            draw_rows(self._whole, near, far, starts, first, last, rows.theta, rows.group, canvas)
             judge_frames(
                 light, self._whole, near, self.free, starts, first, last, rows.theta, rows.group,
                 canvas, slopes, fisher, turned, ways, bias, numbers,
+                room_for(self._whole, near, self.free),
             )  # fmt: skip
             return np.zeros(1)
 
@@ -500,12 +500,12 @@ class MovingField:
         theta, n = rows.theta.copy(), len(frame)
         canvas = blank(np.empty(light.counts.shape, dtype=np.float32), rows)
         outcome = np.zeros(n, dtype=np.int64)
-        fisher, gain = np.empty((n, 4, 4)), np.empty(n)
+        fisher, gain = np.zeros((n, 4, 4)), np.empty(n)
         slopes, expected = self._slopes_of(n, 0), np.zeros(times.size)
 
         def block(part: int) -> None:
             first, last = part * _SWEPT, min((part + 1) * _SWEPT, times.size)
-            draw_frames(self._coarse, near, far, starts, first, last, theta, rows.group, canvas)
+            draw_rows(self._coarse, near, far, starts, first, last, theta, rows.group, canvas)
             fit_rows(
                 light, self._coarse, near, self._search, starts, first, last, sweeps, theta,
                 rows.group, canvas, slopes, outcome, fisher, gain, expected,

@@ -73,6 +73,7 @@ class Response:
         frame = np.searchsorted(starts, firsts, side="right") - 1
         factors, steps = np.empty(corners[-1]), np.zeros(slopes.moves.shape if joint else (0, 0))
         self._clusters = Clusters(rows, edges, frame, corners, factors, steps)
+        self._largest = slopes.values.shape[1] * int(count.max(initial=0))
         self._share(
             lambda a, b: join_rows(slopes, self._clusters, light, totals, information, a, b)
         )
@@ -81,6 +82,10 @@ class Response:
         """Run a task for parts of the clusters, half-open ranges, several at a time."""
         edges = np.linspace(0, len(self._clusters.frame), _PARTS + 1).astype(int).tolist()
         return list(self._pool.map(lambda part: task(*part), pairwise(edges)))
+
+    def _room(self) -> tuple[NDArray[np.float32], FloatArray]:
+        """Room for a square and for the steps of a cluster."""
+        return np.empty(self._slopes.values.shape[2], dtype=np.float32), np.empty(self._largest)
 
     def step(
         self, move: FloatArray, total: FloatArray, used: BoolArray, damping: float
@@ -115,7 +120,9 @@ class Response:
 
             def taken(first: int, last: int) -> FloatArray:
                 out = np.zeros(used.shape)
-                follow_rows(self._slopes, self._clusters, first, last, image, room, out)
+                follow_rows(
+                    self._slopes, self._clusters, first, last, image, room, out, *self._room()
+                )
                 return out
 
             out = (1 + damping) * counts * image
@@ -162,7 +169,9 @@ class Response:
         """
         steps, nowhere = np.empty_like(self._slopes.units), np.empty((0, 0))
         self._share(
-            lambda a, b: follow_rows(self._slopes, self._clusters, a, b, step, steps, nowhere)
+            lambda a, b: follow_rows(
+                self._slopes, self._clusters, a, b, step, steps, nowhere, *self._room()
+            )
         )
         out, index = theta.copy(), np.flatnonzero(free[:4])
         low, high = (wall[index] for wall in walls)
