@@ -181,10 +181,11 @@ def find_clusters(squares: IntArray, starts: IntArray, owner: IntArray) -> None:
                         owner[q] = low
 
 
-@kernel()
+@kernel(_nrt=False)
 def join_rows(
     slopes: Slopes, clusters: Clusters, light: Light, totals: NDArray[np.float32],
-    information: FloatArray, first: int, last: int,
+    information: FloatArray, first: int, last: int, numbers: FloatArray, order: IntArray,
+    work: NDArray[np.float32],
 ) -> None:  # fmt: skip
     """Factorise the information on the rows of some clusters, and let these follow one another.
 
@@ -205,39 +206,50 @@ def join_rows(
         On each row alone.
     first, last : int
         Clusters first…last − 1.
+    numbers : ndarray, shape (2 n² + 2 n + k²,)
+        Room for n, the parameters of the largest cluster.
+    order : ndarray of int, shape (n,)
+        Room for their places.
+    work : ndarray of float32, shape (1 + 2 k, side²)
+        Room for what two rows share.
     """
-    k = slopes.values.shape[1]
-    block = np.empty((k, k))
-    work = np.empty((1 + 2 * k, slopes.values.shape[2]), dtype=np.float32)
+    k, most = slopes.values.shape[1], order.size
+    scale, step = numbers[:most], numbers[most : 2 * most]
+    block = numbers[2 * most : 2 * most + k * k].reshape(k, k)
+    squares = numbers[2 * most + k * k :]
     for c in range(first, last):
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
         n, t = k * rows.size, clusters.frame[c]
-        joint, scale, step = np.zeros((n, n)), np.empty(n), np.zeros(n)
-        order = np.empty(n, dtype=np.int64)
+        joint, other = squares[: n * n].reshape(n, n), squares[n * n : 2 * n * n].reshape(n, n)
+        for i in range(n):
+            order[i], step[i] = i, 0.0
+            for j in range(n):
+                joint[i, j] = 0.0
         for a in range(rows.size):
             for i in range(k):
-                copy_line(information[rows[a], i], joint[k * a + i, k * a : k * (a + 1)])
+                for j in range(k):
+                    joint[k * a + i, k * a + j] = information[rows[a], i, j]
             for b in range(a):
                 if _overlap(slopes, light, t, totals[t], rows[a], rows[b], work, block):
                     for i in range(k):
-                        copy_line(block[i], joint[k * a + i, k * b : k * (b + 1)])
                         for j in range(k):
+                            joint[k * a + i, k * b + j] = block[i, j]
                             step[k * b + j] -= block[i, j] * slopes.moves[rows[a], i]
         for i in range(n):
-            order[i] = i
             if not joint[i, i] > 0.0:  # what it changes is not seen
                 joint[i, i] = 1.0
             scale[i] = 1.0 / np.sqrt(joint[i, i])
         low = clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n)
-        stiffer = _STIFFER
-        while not factorise(joint, order, scale, stiffer, low) and stiffer < _STIFFEST:
-            stiffer *= 10.0
-        if rows.size > 1 and clusters.steps.size:
-            shy = np.empty((n, n))
-            factorise(joint, order, scale, max(stiffer, _SHY), shy)
+        shyly, stiffer = rows.size > 1 and clusters.steps.size > 0, _STIFFER
+        for turn in range(2 if shyly else 1):
+            out = low if turn == 0 else other
+            stiffer = max(stiffer, _SHY if turn else _STIFFER)
+            while not factorise(joint, order[:n], scale, stiffer, out) and stiffer < _STIFFEST:
+                stiffer *= 10.0
+        if shyly:
             for i in range(n):
                 step[i] *= scale[i]
-            solve(shy, step)
+            solve(other, step[:n])
             for a in range(rows.size):
                 for i in range(k):
                     clusters.steps[rows[a], i] = step[k * a + i] * scale[k * a + i]

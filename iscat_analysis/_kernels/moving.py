@@ -123,6 +123,7 @@ def fit_frames(
     information: FloatArray,
     gain: FloatArray,
     expected: FloatArray,
+    background: NDArray[np.float32],
     sums: NDArray[np.float32],
     place: IntArray,
     room: Room,
@@ -159,6 +160,8 @@ def fit_frames(
         Filled with its log-likelihood over that without the particle, the others in place.
     expected : ndarray, shape (t,)
         Filled with what particles add to the photoelectrons of the used pixels at power 1.
+    background : ndarray of float32, shape (y, x)
+        That of `light`.
     sums : ndarray of float32, shape (y, x)
         Added to: Σ w C over the frames.
     place : ndarray of int, shape (7,)
@@ -226,7 +229,7 @@ def fit_frames(
                     keep_slopes(data[2], here, index, slopes, r, (r0, r1, c0, c1), room.line)
             place[1] += 1
             place[2] = starts[t]
-        expected[t] = _add_signals(total, light.background, light.power[t], sums)
+        expected[t] = _add_signals(total, background, light.power[t], sums)
         place[0], place[1], place[2] = t + 1, 0, starts[t + 1]
     return True
 
@@ -318,7 +321,7 @@ def _add_signal(
 
 @kernel(fastmath=FAST, _nrt=False)
 def _add_signals(
-    total: NDArray[np.float32], background: FloatArray, power: float,
+    total: NDArray[np.float32], background: NDArray[np.float32], power: float,
     sums: NDArray[np.float32],
 ) -> float:  # fmt: skip
     """Add w C of a frame to `sums`; return Σ B C.  Single precision does, as both are small."""
@@ -327,5 +330,5 @@ def _add_signals(
         signal, light, out = total[i], background[i], sums[i]
         for j in range(signal.size):
             out[j] += w * signal[j]
-            amount += np.float32(light[j]) * signal[j]
+            amount += light[j] * signal[j]
     return float(amount)

@@ -92,9 +92,10 @@ def fit_rows(
         As there.
     """
     place, room = np.array([first, 0, starts[first], 0, 0, 0, 0]), room_for(field, near, search.free)
+    background = light.background.astype(np.float32)
     while not fit_frames(
         light, field, near, search, starts, last, sweeps, theta, group, canvas, slopes, outcome,
-        information, gain, expected, sums, place, room,
+        information, gain, expected, background, sums, place, room,
     ):  # fmt: skip
         row = int(place[2])
         gain[row], outcome[row] = climb(

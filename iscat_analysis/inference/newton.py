@@ -73,10 +73,17 @@ class Response:
         frame = np.searchsorted(starts, firsts, side="right") - 1
         factors, steps = np.empty(corners[-1]), np.zeros(slopes.moves.shape if joint else (0, 0))
         self._clusters = Clusters(rows, edges, frame, corners, factors, steps)
-        self._largest = slopes.values.shape[1] * int(count.max(initial=0))
-        self._share(
-            lambda a, b: join_rows(slopes, self._clusters, light, totals, information, a, b)
-        )
+        k, area = slopes.values.shape[1:]
+        self._largest = n = k * int(count.max(initial=0))
+
+        def join(a: int, b: int) -> None:
+            join_rows(
+                slopes, self._clusters, light, totals, information, a, b,
+                np.empty(2 * n * n + 2 * n + k * k), np.empty(n, dtype=np.int64),
+                np.empty((1 + 2 * k, area), dtype=np.float32),
+            )  # fmt: skip
+
+        self._share(join)
 
     def _share(self, task: Callable[[int, int], T]) -> list[T]:
         """Run a task for parts of the clusters, half-open ranges, several at a time."""
