@@ -339,7 +339,8 @@ def follow_rows(
             size = look(move, slopes.squares[r], seen)
             for a in range(k):
                 step[k * q + a] = slopes.units[r, a] * product(slopes.values[r, a], seen, size)
-        solve(clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n), step[:n])
+        low = clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n)
+        solve(low, step[:n])
         for q in range(rows.size):
             r = rows[q]
             here, square = steps[r], slopes.squares[r]

@@ -150,8 +150,8 @@ def judge_frames(
     slopes : Slopes
         Filled.
     fisher : ndarray, shape (rows, 4, 4)
-        Filled with the expected information in (x, y, z, a).  Of rows without a square this and what
-        follows stay as they are.
+        Filled with the expected information in (x, y, z, a).  Of rows without a square this is left
+        alone, as is what follows.
     turned, ways : ndarray, shape (rows, 4, 4)
         Filled with O V and V, the columns of V directions of one standard deviation in the free
         parameters, and O the observed information; left alone where the information is singular.
@@ -166,7 +166,7 @@ def judge_frames(
         For what is needed for a moment.
     """
     rows, columns = light.background.shape
-    area, index, ways_here = field.side**2, room.index, room.ways
+    area, index, ways_here = field.side**2, room.free, room.ways
     known, pull, g = room.small[:5], room.small[5], room.pixels[4 * area :]
     for t in range(first, last):
         for r in range(starts[t], starts[t + 1]):
@@ -207,8 +207,8 @@ def judge_frames(
 
 @kernel(_nrt=False)
 def _rows_drawn(lens: Lens) -> int:
-    """How many rows `_draw` fills for a row of pixels; what a lens leaves out depends on its type."""
-    return np.int64(BENDS if len(lens) == STAMP else 5)
+    """How many rows `_draw` fills for a row of pixels."""
+    return int(np.int64(BENDS if len(lens) == STAMP else 5))  # a constant is a type of its own
 
 
 @kernel(_nrt=False)
@@ -216,7 +216,10 @@ def _draw(
     near: Pictures, lens: Lens, group: int, p: FloatArray, pixels: Pixels, profile: FloatArray,
     here: AnyFloatArray,
 ) -> None:  # fmt: skip
-    """Draw signal and gradient of a row (ny, 5, nx), and at one height what bends (ny, BENDS, nx)."""
+    """Draw signal and gradient of a row (ny, 5, nx), at one height what bends (ny, BENDS, nx).
+
+    What a lens leaves out depends on its type.
+    """
     if len(lens) == STAMP:
         stamp_bends(near.nodes, lens, pixels, p[0], p[1], p[3], here)
         return
@@ -226,7 +229,8 @@ def _draw(
 @kernel()
 def _curve(
     near: Pictures, lens: Lens, group: int, free: BoolArray, pixels: Pixels, data: AnyFloatArray,
-    here: AnyFloatArray, p: FloatArray, ways: FloatArray, room: Room, turned: FloatArray, bias: FloatArray,
+    here: AnyFloatArray, p: FloatArray, ways: FloatArray, room: Room, turned: FloatArray,
+    bias: FloatArray,
 ) -> None:  # fmt: skip
     """Fill O V of a row and add to its bias; what a lens leaves out depends on its type.
 

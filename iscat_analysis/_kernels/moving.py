@@ -45,7 +45,7 @@ BoolArray = NDArray[np.bool_]
 
 
 ASTRAY = 4
-"""How a fit ended, besides the ways of `iscat_analysis._kernels.scoring`: its steps lead nowhere."""
+"""How a fit ended, besides the ways of `scoring`: its plain steps lead nowhere."""
 
 
 class Search(NamedTuple):
@@ -87,8 +87,8 @@ class Room(NamedTuple):
         For the slopes of a row.
     profile : ndarray
         For a picture and its ∂/∂z, as `iscat_analysis._kernels.scoring.blank_profile` makes it.
-    index : ndarray of int, shape (k,)
-        Free parameters.
+    free : ndarray of int, shape (k,)
+        Places of the free parameters.
     small : ndarray, shape (11, 5)
         For numbers of a row; a fit leaves its start in the last line.
     ways : ndarray, shape (4, k)
@@ -100,7 +100,7 @@ class Room(NamedTuple):
     pixels: AnyFloatArray
     line: NDArray[np.float32]
     profile: FloatArray
-    index: IntArray
+    free: IntArray
     small: FloatArray
     ways: FloatArray
     work: FloatArray
@@ -178,7 +178,7 @@ def fit_frames(
     rows, columns = light.background.shape
     area = field.side**2
     fisher, step, score, start = room.small[:5], room.small[5], room.small[6], room.small[10]
-    index = room.index
+    index = room.free
     while place[0] < last:
         t = place[0]
         total = canvas.total[t]
@@ -254,9 +254,9 @@ def _climb(
     As long as they lie inside the box and improve, the steps of Fisher scoring are taken as they
     are: every picture is drawn once.  Where they do not, the fit is `ASTRAY`.
 
-    Returns how the fit ended, which of `both` holds the picture at the estimate minus the step,
-    which the last one leaves so small that the gradient tells the rest, and the log-likelihood over that
-    without the particle.
+    Returns how the fit ended, which of `both` holds the picture at the estimate minus the step, so
+    small at last that the gradient tells the rest, and the log-likelihood over that without the
+    particle.
     """
     fisher, step, score, trial = room.small[:5], room.small[5], room.small[6], room.small[7]
     lower, upper = room.small[8], room.small[9]

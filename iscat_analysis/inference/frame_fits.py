@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.canvas import Canvas, Field, Light, Pictures, draw_frames
 from iscat_analysis._kernels.following import Slopes
-from iscat_analysis._kernels.lens import LATTICE, STAMP
+from iscat_analysis._kernels.lens import LatticeLens, RoundLens, StampLens
 from iscat_analysis._kernels.moving import Room, Search, fit_frames
 from iscat_analysis._kernels.radial import POWERS
 from iscat_analysis._kernels.scoring import POISSON, maximize
@@ -43,16 +43,16 @@ def room_for(field: Field, near: Pictures, free: BoolArray) -> Room:
     return Room(
         np.empty(15 * area, near.nodes.dtype), np.empty(area, np.float32), _profile(near, 2), index,
         np.empty((11, 5)), np.empty((4, index.size)),
-        np.empty(0 if len(near.lens) == STAMP else 10 * area),
+        np.empty(0 if isinstance(near.lens, StampLens) else 10 * area),
     )  # fmt: skip
 
 
 def _profile(pictures: Pictures, orders: int) -> FloatArray:
     """Make room for a profile, as `iscat_analysis._kernels.scoring.blank_profile` does."""
     lens, (channels, width) = pictures.lens, pictures.heights.shape[3:]
-    if len(lens) == STAMP:
+    if isinstance(lens, StampLens):
         return np.empty((0, 0, 0))
-    if len(lens) == LATTICE:
+    if isinstance(lens, LatticeLens):
         return np.empty((orders * channels, 2 * lens.half + 1, 2 * lens.half + 1))
     return np.empty((width // POWERS, POWERS, orders * channels))
 
@@ -65,8 +65,20 @@ def draw_rows(
 
     Parameters
     ----------
-    field, near, far, starts, first, last, theta, group, canvas
-        As in `iscat_analysis._kernels.canvas.draw_frames`.
+    field : Field
+        The pixels.
+    near, far : Pictures
+        Of the fitted squares, and of what is drawn around them.
+    starts : ndarray of int, shape (t + 1,)
+        First row of each frame.
+    first, last : int
+        Frames.
+    theta : ndarray, shape (rows, 5)
+        The rows.
+    group : ndarray of int, shape (rows,)
+        Number of each row's picture.
+    canvas : Canvas
+        Drawn on.
     """
     draw_frames(
         field, near, far, starts, first, last, theta, group, canvas, _profile(near, 1),
@@ -84,46 +96,47 @@ def fit_rows(
 
     Parameters
     ----------
-    light, field, near, search, starts, sweeps, theta, group, canvas, slopes
-        As in `iscat_analysis._kernels.moving.fit_frames`.
+    light : Light
+        The movie.
+    field, near, search : Field, Pictures, Search
+        Pixels, pictures to fit, and what is fitted.
+    starts : ndarray of int, shape (t + 1,)
+        First row of each frame.
     first, last : int
         Frames.
-    outcome, information, gain, expected, sums
+    sweeps : int
+        How often; 0 sums only.
+    theta : ndarray, shape (rows, 5)
+        Starts; overwritten with the estimates.
+    group : ndarray of int, shape (rows,)
+        Number of each row's picture.
+    canvas : Canvas
+        On which `draw_rows` has drawn the starts.
+    slopes : Slopes
+        As in `iscat_analysis._kernels.moving.fit_frames`.
+    outcome, information, gain, expected, sums : ndarray
         As there.
     """
-    place, room = np.array([first, 0, starts[first], 0, 0, 0, 0]), room_for(field, near, search.free)
+    place = np.array([first, 0, starts[first], 0, 0, 0, 0])
+    room = room_for(field, near, search.free)
     background = light.background.astype(np.float32)
     while not fit_frames(
         light, field, near, search, starts, last, sweeps, theta, group, canvas, slopes, outcome,
         information, gain, expected, background, sums, place, room,
     ):  # fmt: skip
         row = int(place[2])
-        gain[row], outcome[row] = climb(
+        gain[row], outcome[row] = _climb(
             field, near, search, place, room, int(group[row]), theta[row]
         )
 
 
-def climb(
+def _climb(
     field: Field, near: Pictures, search: Search, place: IntArray, room: Room, group: int,
     theta: FloatArray,
 ) -> tuple[float, int]:  # fmt: skip
-    """Fit a row whose plain steps lead nowhere.
+    """Fit a row whose plain steps lead nowhere, from θ, which is overwritten with the estimate.
 
-    Parameters
-    ----------
-    field, near, search, place, room
-        As in `iscat_analysis._kernels.moving.fit_frames`.
-    group : int
-        Number of the row's picture.
-    theta : ndarray, shape (5,)
-        Where it was left; overwritten with the estimate.
-
-    Returns
-    -------
-    float
-        Log-likelihood over that without the particle.
-    int
-        How the fit ended.
+    Returns its log-likelihood over that without the particle, and how the fit ended.
     """
     top, bottom, left, right = place[3:]
     shape = 4, bottom - top, right - left
@@ -132,7 +145,7 @@ def climb(
     heights = near.heights[min(group, len(near.heights) - 1)]
     table = heights, near.first_nm, near.step_nm, near.kappa
     lens = near.lens
-    if "window" in lens._fields:
+    if not isinstance(lens, RoundLens):
         lens = lens._replace(window=near.windows[min(group, len(near.windows) - 1)])
     x, y, offsets, weights = field.pixels
     value, _, outcome = maximize(

@@ -242,7 +242,8 @@ class MovingField:
         expected = np.zeros(self.frames)
 
         def block(first: int) -> NDArray[np.float32]:
-            sums, last = np.zeros(self.used.shape, dtype=np.float32), min(first + BLOCK, self.frames)
+            sums = np.zeros(self.used.shape, dtype=np.float32)
+            last = min(first + BLOCK, self.frames)
             draw_rows(field, near, far, starts, first, last, theta, rows.group, canvas)
             fit_rows(
                 light, field, near, search, starts, first, last, sweeps, theta, rows.group, canvas,
