@@ -11,6 +11,7 @@ from __future__ import annotations
 import gc
 import sys
 from collections.abc import Collection
+from dataclasses import replace
 
 import numpy as np
 
@@ -88,6 +89,7 @@ def _track(model: ForwardModel, *, free_z: bool) -> None:
         corner, sums = np.zeros((2, 2), dtype=np.int64), np.zeros((1, 3, _SQUARE, _SQUARE))
         field.add_squares(ground, rows, np.arange(2), corner, np.zeros(2, dtype=np.int64), sums)
         field.fit(ground, rows)
+        field.fit(replace(ground, level=2.0 * ground.level), rows)  # by more than plain steps
 
 
 def _slopes(rows: int, free: int) -> Slopes:

@@ -166,7 +166,7 @@ MOVING = [
     [
         ("mass", [ONE], 4, set()),
         ("joint", [ONE], 4, {"signal_hessian"}),  # at heights that are held fixed
-        ("landing", [*MOVING, "track.free=mass"], 11, set()),
+        ("landing", [*MOVING, "track.free=mass"], 12, set()),
     ],
 )
 def test_a_rehearsal_compiles_what_an_analysis_needs(sample, changes, kernels, more):
