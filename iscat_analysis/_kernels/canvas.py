@@ -19,8 +19,8 @@ from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens, StampLens
 from iscat_analysis._kernels.lines import copy_line
-from iscat_analysis._kernels.radial import AxialTable
-from iscat_analysis._kernels.scoring import picture_at, span
+from iscat_analysis._kernels.radial import AxialTable, profile_at
+from iscat_analysis._kernels.scoring import span
 from iscat_analysis._kernels.stamp import add_stamp, stamp_gradient
 
 FloatArray = NDArray[np.float64]
@@ -127,14 +127,14 @@ class Canvas(NamedTuple):
     drawn: BoolArray
 
 
-@kernel()
+@kernel(_nrt=False)
 def table_of(pictures: Pictures, group: int) -> AxialTable:
     """Table of one blur."""
     k = min(group, pictures.heights.shape[0] - 1)
     return AxialTable(pictures.heights[k], pictures.first_nm, pictures.step_nm, pictures.kappa)
 
 
-@kernel()
+@kernel(_nrt=False)
 def lens_of(pictures: Pictures, group: int) -> Lens:
     """Lens of one blur."""
     window = pictures.windows[min(group, pictures.windows.shape[0] - 1)]
@@ -142,7 +142,7 @@ def lens_of(pictures: Pictures, group: int) -> Lens:
     return lens
 
 
-@kernel()
+@kernel(_nrt=False)
 def _with_window(lens: Lens, window: FloatArray) -> Lens:
     """Give a lens another window; a round one has none."""
     if len(lens) == ROUND:
@@ -152,14 +152,14 @@ def _with_window(lens: Lens, window: FloatArray) -> Lens:
     return StampLens(lens.inv_step, lens.half, window, lens.fine)
 
 
-@kernel()
+@kernel(_nrt=False)
 def box_of(centre_nm: float, pixel_nm: float, side: int, size: int) -> tuple[int, int]:
     """Half-open range of pixels around a place, cut off at the edge of the field."""
     first = int(np.rint(centre_nm / pixel_nm - (side - 1) / 2))
     return max(first, 0), min(first + side, size)
 
 
-@kernel()
+@kernel(_nrt=False)
 def square_of(
     field: Field, theta: FloatArray, side: int, rows: int, columns: int
 ) -> tuple[int, int, int, int]:
@@ -171,13 +171,13 @@ def square_of(
     return r0, r1, c0, c1
 
 
-@kernel()
+@kernel(_nrt=False)
 def cut(pixels: Pixels, r0: int, r1: int, c0: int, c1: int) -> Pixels:
     """Pixels of a part of the field."""
     return Pixels(pixels.x[c0:c1], pixels.y[r0:r1], pixels.offsets, pixels.weights)
 
 
-@kernel()
+@kernel(_nrt=False)
 def add_row(
     pictures: Pictures, field: Field, group: int, theta: FloatArray, sign: float,
     square: tuple[int, int, int, int], profile: FloatArray, image: FloatArray,
@@ -192,7 +192,7 @@ def add_row(
     _add_row(table, lens, pictures.nodes, theta, sign, pixels, profile, image, total[r0:r1, c0:c1])
 
 
-@kernel()
+@kernel(_nrt=False)
 def _add_row(
     table: AxialTable, lens: Lens, nodes: AnyFloatArray, theta: FloatArray, sign: float,
     pixels: Pixels, profile: FloatArray, image: FloatArray, there: NDArray[np.float32],
@@ -203,12 +203,12 @@ def _add_row(
         return
     out = image[: there.size].reshape(there.shape)
     start, stop = span(lens, pixels, theta, table.heights.shape[3])
-    picture = picture_at(table, lens, theta[2], start, stop, profile)
-    signal_image(picture, lens, pixels, theta[0], theta[1], theta[3], out)
+    profile_at(table, theta[2], start, stop, profile)
+    signal_image(profile, lens, pixels, theta[0], theta[1], theta[3], out)
     add(there, sign, out)
 
 
-@kernel()
+@kernel(_nrt=False)
 def draw_gradient(
     pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
     profile: FloatArray, out: AnyFloatArray,
@@ -218,7 +218,7 @@ def draw_gradient(
     _draw_gradient(table, lens, pictures.nodes, theta, pixels, profile, out)
 
 
-@kernel()
+@kernel(_nrt=False)
 def _draw_gradient(
     table: AxialTable, lens: Lens, nodes: AnyFloatArray, theta: FloatArray, pixels: Pixels,
     profile: FloatArray, out: AnyFloatArray,
@@ -228,8 +228,8 @@ def _draw_gradient(
         stamp_gradient(nodes, lens, pixels, theta[0], theta[1], theta[3], out)
         return
     start, stop = span(lens, pixels, theta, table.heights.shape[3])
-    picture = picture_at(table, lens, theta[2], start, stop, profile)
-    signal_gradient(picture, lens, pixels, theta[0], theta[1], theta[3], out)
+    profile_at(table, theta[2], start, stop, profile)
+    signal_gradient(profile, lens, pixels, theta[0], theta[1], theta[3], out)
 
 
 @kernel(fastmath=FAST, _nrt=False)
@@ -271,8 +271,41 @@ def stage(
             seen[j] = noise[j] + (_electrons(light, counts[j]) if level[j] > 0.0 else 0.0)
 
 
-@kernel()
-def ready_frame(
+@kernel(_nrt=False)
+def draw_frames(
+    field: Field, near: Pictures, far: Pictures, starts: IntArray, first: int, last: int,
+    theta: FloatArray, group: IntArray, canvas: Canvas, near_profile: FloatArray,
+    far_profile: FloatArray, image: FloatArray,
+) -> None:  # fmt: skip
+    """Bring frames first…last − 1 of the canvas to the rows as they are.
+
+    Parameters
+    ----------
+    field, near, far
+        Pixels, and pictures of the fitted squares and of what is drawn around them.
+    starts : ndarray of int, shape (t + 1,)
+        First row of each frame.
+    first, last : int
+        Frames.
+    theta : ndarray, shape (rows, 5)
+        The rows.
+    group : ndarray of int, shape (rows,)
+        Number of each row's picture.
+    canvas : Canvas
+        Drawn on.
+    near_profile, far_profile : ndarray
+        Room for a profile of `near` and one of `far`.
+    image : ndarray, shape (side²,)
+        Room for the larger of the squares that are drawn and fitted.
+    """
+    for t in range(first, last):
+        _ready_frame(
+            field, near, far, starts, t, theta, group, canvas, near_profile, far_profile, image
+        )
+
+
+@kernel(_nrt=False)
+def _ready_frame(
     field: Field, near: Pictures, far: Pictures, starts: IntArray, t: int, theta: FloatArray,
     group: IntArray, canvas: Canvas, near_profile: FloatArray,
     far_profile: FloatArray, image: FloatArray,
@@ -327,7 +360,7 @@ def ready_frame(
             copy_line(now, square)
 
 
-@kernel()
+@kernel(_nrt=False)
 def _is_aside(field: Field, theta: FloatArray, rings: FloatArray) -> bool:
     """Tell whether a row is too far from its rings, or the reverse of them."""
     aside = False
@@ -345,13 +378,13 @@ def _differ(one: FloatArray, other: FloatArray) -> bool:
     return count > 0
 
 
-@kernel()
+@kernel(_nrt=False)
 def _is_other_size(field: Field, theta: FloatArray, rings: FloatArray) -> bool:
     """Tell whether the amplitude of a row is too far from that of its rings."""
     return bool(abs(theta[3] - rings[3]) > field.slack[3] * abs(rings[3]))
 
 
-@kernel()
+@kernel(_nrt=False)
 def _add_rings(
     pictures: Pictures, field: Field, group: int, theta: FloatArray, sign: float,
     inner: tuple[int, int, int, int], outer: tuple[int, int, int, int], profile: FloatArray,

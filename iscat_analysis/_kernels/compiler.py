@@ -9,26 +9,29 @@ Here a kernel is compiled to intermediate code first, its *body*.  When Python c
 function that is no kernel does, a *whole* is made of the body: with a way in from Python,
 optimised together with the bodies that it contains, and as machine code.  Both are kept on disk
 under the same name, the whole in place of the body; it brings its body for those who link it.
-What a kernel computes does therefore not depend on who called it first.
+What a kernel computes does therefore not depend on who called it first.  What Numba writes of NumPy
+for a kernel is a *piece* of it, intermediate code as well.
 """
 
 from __future__ import annotations
 
 import copy
 import gc
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache
 from typing import Any, ClassVar
 
 from llvmlite import binding
 from numba.core import event, sigutils
-from numba.core.caching import CompileResultCacheImpl
+from numba.core.caching import CompileResultCacheImpl, NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags, compile_result
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.decorators import jit
 from numba.core.environment import Environment, lookup_environment
 from numba.core.registry import CPUDispatcher
+from numba.core.target_extension import CPU, jit_registry
 from numba.core.targetconfig import ConfigStack
 from numba.core.types.functions import BaseFunction
 from numba.core.types.misc import SliceLiteral
@@ -56,7 +59,7 @@ class _Body(JITCodeLibrary):  # type: ignore[misc]  # Numba is not typed
                 passes.run(function, builder)
 
     def _optimize_final_module(self) -> None:
-        if not any(isinstance(library, _Body | _Whole) for library in self._linking_libraries):
+        if not any(type(library) in (_Body, _Whole) for library in self._linking_libraries):
             super()._optimize_final_module()
 
     def _finalize_final_module(self) -> None:
@@ -74,6 +77,13 @@ class _Body(JITCodeLibrary):  # type: ignore[misc]  # Numba is not typed
         self._final_module = binding.parse_bitcode(bitcode)
         self._finalize_final_module()
         return self
+
+
+class _Piece(_Body):
+    """Intermediate code of a function of NumPy or Python as it is needed by a kernel."""
+
+    def _optimize_final_module(self) -> None:
+        pass
 
 
 class _Whole(JITCodeLibrary):  # type: ignore[misc]
@@ -155,6 +165,8 @@ class _Options(Flags):  # type: ignore[misc]
 class _Compiler(Compiler):  # type: ignore[misc]
     """Numba's, that makes bodies."""
 
+    _library: ClassVar[type[_Body]] = _Body
+
     def compile_extra(self, func: Any) -> Any:
         global _depth, _made
         state = self.state
@@ -163,13 +175,16 @@ class _Compiler(Compiler):  # type: ignore[misc]
         state.flags.no_compile = True
         context = state.targetctx
         state.typingctx = _types(state.typingctx)
-        state.library = _Body(context.codegen(), func.__qualname__)
+        state.library = self._library(context.codegen(), func.__qualname__)
         _depth += 1
         _made += 1
+        jit_registry.update({CPU: _piece})  # by which Numba compiles what kernels need of NumPy
         try:
             compiled = super().compile_extra(func)
         finally:
             _depth -= 1
+            if not _depth:
+                jit_registry.update({CPU: jit})
         # that by which callers find it, in place of something that Python could call
         compiled = compiled._replace(entry_point=object())
         context.insert_user_function(compiled.entry_point, compiled.fndesc, [compiled.library])
@@ -278,6 +293,29 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
             self.overloads[tuple(cres.signature.args)] = cres
         else:
             super().add_overload(cres)
+
+
+class _Unkept(NullCache):  # type: ignore[misc]
+    """Where a piece is kept: nowhere, as the kernels that need it hold it."""
+
+    def claimed(self, arguments: object) -> AbstractContextManager[None]:
+        del arguments
+        return nullcontext()
+
+
+class _PieceCompiler(_Compiler):
+    _library = _Piece
+
+
+class _PieceDispatcher(Kernel):
+    def __init__(self, function: Any, options: dict[str, Any]) -> None:
+        CPUDispatcher.__init__(self, function, {}, options, _PieceCompiler)
+        self._cache = _Unkept()
+
+
+def _piece(**options: Any) -> Callable[[Any], Any]:
+    """Stand in for `numba.jit` where Numba compiles what a kernel needs of NumPy."""
+    return lambda function: _PieceDispatcher(function, options)
 
 
 class KernelStore(CompileResultCacheImpl):  # type: ignore[misc]

@@ -14,7 +14,7 @@ LEAST = 1e-13
 """Pivot of a matrix with ones on its diagonal below which it is no information."""
 
 
-@kernel(forceinline=True)
+@kernel(forceinline=True, _nrt=False)
 def factorise(
     matrix: FloatArray, index: IntArray, scale: FloatArray, damping: float, lower: FloatArray
 ) -> bool:
@@ -38,7 +38,7 @@ def factorise(
     return True
 
 
-@kernel(forceinline=True)
+@kernel(forceinline=True, _nrt=False)
 def solve(lower: FloatArray, values: FloatArray) -> None:
     """Solve L Lᵀ x = values (n) with a factor L (n, n) from `factorise`, in place."""
     n = values.size

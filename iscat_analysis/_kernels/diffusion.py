@@ -126,9 +126,12 @@ def displacement_likelihoods(
     axes, n = steps.shape
     state = np.empty((4, diffusion.size))
     p, z, product, quad = state[0], state[1], state[2], state[3]
-    out = np.full(diffusion.size, -0.5 * axes * n * LOG_2PI)
+    out = np.empty(diffusion.size)
+    for i in range(diffusion.size):
+        out[i] = -0.5 * axes * n * LOG_2PI
     for c in range(axes):
-        p[:], z[:], product[:], quad[:] = 1.0, 0.0, 1.0, 0.0
+        for i in range(diffusion.size):
+            p[i], z[i], product[i], quad[i] = 1.0, 0.0, 1.0, 0.0
         for k in range(n):
             main, turn, step = error[c, k], rate[k], steps[c, k]
             beside, beside_turn = 0.0, 0.0

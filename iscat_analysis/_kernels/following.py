@@ -152,7 +152,7 @@ def mix(
             out[j] += factor * out.dtype.type(slope[j])
 
 
-@kernel()
+@kernel(_nrt=False)
 def find_clusters(squares: IntArray, starts: IntArray, owner: IntArray) -> None:
     """Say which rows overlap by half their squares, directly or through others.
 
@@ -181,10 +181,11 @@ def find_clusters(squares: IntArray, starts: IntArray, owner: IntArray) -> None:
                         owner[q] = low
 
 
-@kernel()
+@kernel(_nrt=False)
 def join_rows(
     slopes: Slopes, clusters: Clusters, light: Light, totals: NDArray[np.float32],
-    information: FloatArray, first: int, last: int,
+    information: FloatArray, first: int, last: int, numbers: FloatArray, order: IntArray,
+    work: NDArray[np.float32],
 ) -> None:  # fmt: skip
     """Factorise the information on the rows of some clusters, and let these follow one another.
 
@@ -205,39 +206,50 @@ def join_rows(
         On each row alone.
     first, last : int
         Clusters first…last − 1.
+    numbers : ndarray, shape (2 n² + 2 n + k²,)
+        Room for n, the parameters of the largest cluster.
+    order : ndarray of int, shape (n,)
+        Room for their places.
+    work : ndarray of float32, shape (1 + 2 k, side²)
+        Room for what two rows share.
     """
-    k = slopes.values.shape[1]
-    block = np.empty((k, k))
-    work = np.empty((1 + 2 * k, slopes.values.shape[2]), dtype=np.float32)
+    k, most = slopes.values.shape[1], order.size
+    scale, step = numbers[:most], numbers[most : 2 * most]
+    block = numbers[2 * most : 2 * most + k * k].reshape(k, k)
+    squares = numbers[2 * most + k * k :]
     for c in range(first, last):
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
         n, t = k * rows.size, clusters.frame[c]
-        joint, scale, step = np.zeros((n, n)), np.empty(n), np.zeros(n)
-        order = np.empty(n, dtype=np.int64)
+        joint, other = squares[: n * n].reshape(n, n), squares[n * n : 2 * n * n].reshape(n, n)
+        for i in range(n):
+            order[i], step[i] = i, 0.0
+            for j in range(n):
+                joint[i, j] = 0.0
         for a in range(rows.size):
             for i in range(k):
-                copy_line(information[rows[a], i], joint[k * a + i, k * a : k * (a + 1)])
+                for j in range(k):
+                    joint[k * a + i, k * a + j] = information[rows[a], i, j]
             for b in range(a):
                 if _overlap(slopes, light, t, totals[t], rows[a], rows[b], work, block):
                     for i in range(k):
-                        copy_line(block[i], joint[k * a + i, k * b : k * (b + 1)])
                         for j in range(k):
+                            joint[k * a + i, k * b + j] = block[i, j]
                             step[k * b + j] -= block[i, j] * slopes.moves[rows[a], i]
         for i in range(n):
-            order[i] = i
             if not joint[i, i] > 0.0:  # what it changes is not seen
                 joint[i, i] = 1.0
             scale[i] = 1.0 / np.sqrt(joint[i, i])
         low = clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n)
-        stiffer = _STIFFER
-        while not factorise(joint, order, scale, stiffer, low) and stiffer < _STIFFEST:
-            stiffer *= 10.0
-        if rows.size > 1 and clusters.steps.size:
-            shy = np.empty((n, n))
-            factorise(joint, order, scale, max(stiffer, _SHY), shy)
+        shyly, stiffer = rows.size > 1 and clusters.steps.size > 0, _STIFFER
+        for turn in range(2 if shyly else 1):
+            out = low if turn == 0 else other
+            stiffer = max(stiffer, _SHY if turn else _STIFFER)
+            while not factorise(joint, order[:n], scale, stiffer, out) and stiffer < _STIFFEST:
+                stiffer *= 10.0
+        if shyly:
             for i in range(n):
                 step[i] *= scale[i]
-            solve(shy, step)
+            solve(other, step[:n])
             for a in range(rows.size):
                 for i in range(k):
                     clusters.steps[rows[a], i] = step[k * a + i] * scale[k * a + i]
@@ -246,7 +258,7 @@ def join_rows(
                 low[i, j] /= scale[i]
 
 
-@kernel(fastmath=FAST)
+@kernel(fastmath=FAST, _nrt=False)
 def _overlap(
     slopes: Slopes, light: Light, t: int, total: NDArray[np.float32], r: int, s: int,
     work: NDArray[np.float32], out: FloatArray,
@@ -294,30 +306,12 @@ def _look_at_part(
             line[j] = unit * np.float32(there[j])
 
 
-@kernel(fastmath=FAST)
-def _shift(
-    slopes: Slopes, clusters: Clusters, c: int, move: FloatArray, seen: NDArray[np.float32]
-) -> FloatArray:
-    """F⁻¹ G move of a cluster, shape (its rows × k,); `seen` is room for a square."""
-    rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
-    k = slopes.values.shape[1]
-    n = k * rows.size
-    step = np.empty(n)
-    for q in range(rows.size):
-        size = look(move, slopes.squares[rows[q]], seen)
-        for a in range(k):
-            step[k * q + a] = slopes.units[rows[q], a] * product(
-                slopes.values[rows[q], a], seen, size
-            )
-    solve(clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n), step)
-    return step
-
-
-@kernel(fastmath=FAST)
+@kernel(fastmath=FAST, _nrt=False)
 def follow_rows(
-    slopes: Slopes, clusters: Clusters, first: int, last: int, move: FloatArray, out: FloatArray
-) -> None:
-    """Add what the rows of some clusters take up of a change of the logarithm of the background.
+    slopes: Slopes, clusters: Clusters, first: int, last: int, move: FloatArray,
+    steps: FloatArray, out: FloatArray, seen: NDArray[np.float32], step: FloatArray,
+) -> None:  # fmt: skip
+    """Tell by what the rows of some clusters follow a change of the logarithm of the background.
 
     Parameters
     ----------
@@ -327,93 +321,31 @@ def follow_rows(
         Clusters first…last − 1.
     move : ndarray, shape (y, x)
         Change.
+    steps : ndarray, shape (rows, k)
+        Filled with F⁻¹ G move.
     out : ndarray, shape (y, x)
-        Σ Gᵀ F⁻¹ G move is added to it [e].
+        Σ Gᵀ F⁻¹ G move, what they take up of it, is added to it [e]; without room, left alone.
+    seen : ndarray of float32, shape (side²,)
+        Room for a square.
+    step : ndarray
+        Room for the steps of a cluster.
     """
     k = slopes.values.shape[1]
-    seen = np.empty(slopes.values.shape[2], dtype=np.float32)
     for c in range(first, last):
-        step = _shift(slopes, clusters, c, move, seen)
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
+        n = k * rows.size
         for q in range(rows.size):
             r = rows[q]
-            square = slopes.squares[r]
-            size = (square[1] - square[0]) * (square[3] - square[2])
-            mix(slopes.values[r], slopes.units[r], step[k * q : k * (q + 1)], size, seen)
-            put(seen, square, out)
-
-
-@kernel()
-def shift_rows(
-    slopes: Slopes, clusters: Clusters, first: int, last: int, move: FloatArray, index: IntArray,
-    lower: FloatArray, upper: FloatArray, theta: FloatArray,
-) -> None:  # fmt: skip
-    """Let the rows of some clusters follow a change of the logarithm of the background.
-
-    Parameters
-    ----------
-    slopes, clusters
-        As `join_rows` left them.
-    first, last : int
-        Clusters first…last − 1.
-    move : ndarray, shape (y, x)
-        Change.
-    index : ndarray of int, shape (k,)
-        Free parameters.
-    lower, upper : ndarray, shape (5,)
-        Bounds of the parameters.
-    theta : ndarray, shape (rows, 5)
-        Moved.
-    """
-    k = index.size
-    seen = np.empty(slopes.values.shape[2], dtype=np.float32)
-    for c in range(first, last):
-        step = _shift(slopes, clusters, c, move, seen)
-        rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
+            size = look(move, slopes.squares[r], seen)
+            for a in range(k):
+                step[k * q + a] = slopes.units[r, a] * product(slopes.values[r, a], seen, size)
+        low = clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n)
+        solve(low, step[:n])
         for q in range(rows.size):
-            for a in range(k):
-                i = index[a]
-                moved = theta[rows[q], i] - step[k * q + a]
-                theta[rows[q], i] = min(max(moved, lower[i]), upper[i])
-
-
-@kernel()
-def move_together(
-    clusters: Clusters, first: int, last: int, index: IntArray, longest: FloatArray,
-    lower: FloatArray, upper: FloatArray, theta: FloatArray,
-) -> None:  # fmt: skip
-    """Let rows that overlap follow one another, to the maximum of all, to first order.
-
-    Parameters
-    ----------
-    clusters : Clusters
-        As `join_rows` left them.
-    first, last : int
-        Clusters first…last − 1.
-    index : ndarray of int, shape (k,)
-        Free parameters.
-    longest : ndarray, shape (5,)
-        Step of a parameter at most, of the amplitude relative; longer ones are shortened with their
-        cluster.
-    lower, upper : ndarray, shape (5,)
-        Bounds of the parameters.
-    theta : ndarray, shape (rows, 5)
-        Moved.
-    """
-    k = index.size
-    for c in range(first, last):
-        rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
-        if rows.size == 1:
-            continue
-        share = 1.0
-        for r in rows:
-            for a in range(k):
-                i, step = index[a], abs(clusters.steps[r, a])
-                most = longest[i] * (abs(theta[r, 3]) if i == 3 else 1.0)
-                if step > most:
-                    share = min(share, most / step)
-        for r in rows:
-            for a in range(k):
-                i = index[a]
-                moved = theta[r, i] + share * clusters.steps[r, a]
-                theta[r, i] = min(max(moved, lower[i]), upper[i])
+            r = rows[q]
+            here, square = steps[r], slopes.squares[r]
+            copy_line(step[k * q : k * (q + 1)], here)
+            if out.size:
+                size = (square[1] - square[0]) * (square[3] - square[2])
+                mix(slopes.values[r], slopes.units[r], here, size, seen)
+                put(seen, square, out)

@@ -16,19 +16,18 @@ from iscat_analysis._kernels.canvas import (
     cut,
     draw_gradient,
     lens_of,
-    ready_frame,
     square_of,
     stage,
-    table_of,
 )
 from iscat_analysis._kernels.dense import factorise
 from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import STAMP, Lens
-from iscat_analysis._kernels.lines import copy_line, largest, marked
+from iscat_analysis._kernels.lines import copy_line, largest
+from iscat_analysis._kernels.moving import Room
 from iscat_analysis._kernels.place_score import LEAST, place_score
-from iscat_analysis._kernels.scoring import FLOOR, blank_profile
+from iscat_analysis._kernels.scoring import FLOOR
 from iscat_analysis._kernels.stamp_bends import BENDS, stamp_bends
 
 FloatArray = NDArray[np.float64]
@@ -122,12 +121,11 @@ def _left_over(
     numbers[4] = more / known if known > zero else zero
 
 
-@kernel()
+@kernel(_nrt=False)
 def judge_frames(
     light: Light,
     field: Field,
     near: Pictures,
-    far: Pictures,
     free: BoolArray,
     starts: IntArray,
     first: int,
@@ -141,20 +139,22 @@ def judge_frames(
     ways: FloatArray,
     bias: FloatArray,
     numbers: FloatArray,
+    room: Room,
 ) -> None:
     """Say of the rows of frames first…last − 1 what their likelihoods know, at θ.
 
     Parameters
     ----------
-    light, field, near, far, free, starts, first, last, theta, group, canvas
-        As in `fit_frames`.
+    light, field, near, free, starts, theta, group, canvas, first, last
+        As in `fit_frames`; frames first…last − 1.
     slopes : Slopes
         Filled.
     fisher : ndarray, shape (rows, 4, 4)
-        Filled with the expected information in (x, y, z, a).
+        Filled with the expected information in (x, y, z, a).  Of rows without a square this is left
+        alone, as is what follows.
     turned, ways : ndarray, shape (rows, 4, 4)
         Filled with O V and V, the columns of V directions of one standard deviation in the free
-        parameters, and O the observed information; NaN where the information is singular.
+        parameters, and O the observed information; left alone where the information is singular.
     bias : ndarray, shape (rows, 4)
         Filled with what the score is expected to be off by through curvature, −½ Σ V tr(F⁻¹∂²η) ∂η:
         F⁻¹ times it is the bias of order 1/N (see `iscat_analysis.inference.precision`).
@@ -162,38 +162,30 @@ def judge_frames(
         Filled with the log-likelihood over that without the particle, χ², pixels, the largest
         residual in standard deviations, mean background of the square [e], and ∂ ln F/∂ ln a of the
         information F on the amplitude a.
+    room : Room
+        For what is needed for a moment.
     """
     rows, columns = light.background.shape
-    near_profile = blank_profile(table_of(near, 0), near.lens, 1)
-    far_profile = blank_profile(table_of(far, 0), far.lens, 1)
-    profile = blank_profile(table_of(near, 0), near.lens, 2)
-    index = marked(free[:4])
-    image = np.empty(max(field.drawn, field.side) ** 2)
-    square = np.empty(4 * field.side**2, near.nodes.dtype)
-    g = np.empty(BENDS * field.side**2, near.nodes.dtype)
-    room, work = np.empty(field.side**2, np.float32), np.empty(10 * field.side**2)
-    pull, known = np.empty(5), np.empty((5, 5))
-    ways_here = np.empty((4, index.size))
+    area, index, ways_here = field.side**2, room.free, room.ways
+    known, pull, g = room.small[:5], room.small[5], room.pixels[4 * area :]
     for t in range(first, last):
-        ready_frame(
-            field, near, far, starts, t, theta, group, canvas, near_profile, far_profile, image
-        )
         for r in range(starts[t], starts[t + 1]):
             p, f = theta[r], fisher[r]
-            f[:], turned[r], ways[r] = 0.0, np.nan, np.nan
-            bias[r], numbers[r] = 0.0, 0.0
             r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
             if r1 <= r0:
                 continue
             ny, nx = r1 - r0, c1 - c0
             pixels = cut(field.pixels, r0, r1, c0, c1)
-            here = _draw(near, lens_of(near, group[r]), group[r], p, pixels, profile, g)
-            data = square[: 4 * ny * nx].reshape(4, ny, nx)
+            m = _rows_drawn(near.lens)
+            here = g[: m * ny * nx].reshape(ny, m, nx)
+            _draw(near, lens_of(near, group[r]), group[r], p, pixels, room.profile, here)
+            data = room.pixels[: 4 * ny * nx].reshape(4, ny, nx)
             stage(light, t, canvas.total[t], here, r0, c0, data)
-            keep_slopes(data[2], here, index, slopes, r, (r0, r1, c0, c1), room)
+            keep_slopes(data[2], here, index, slopes, r, (r0, r1, c0, c1), room.line)
             value = place_score(data, here, near.lens, pull, known)
             for i in range(4):
-                copy_line(known[i, :4], f[i])
+                for j in range(4):
+                    f[i, j] = known[i, j]
             numbers[r, 0] = value
             _left_over(data, here, p[3], numbers[r, 1:])
             if not _directions(f, index, ways_here):
@@ -209,34 +201,36 @@ def judge_frames(
                     ways[r, a, k] = ways_here[a, k]
             _curve(
                 near, lens_of(near, group[r]), group[r], free, pixels, data, here, p, ways_here,
-                profile, work, turned[r], bias[r],
+                room, turned[r], bias[r],
             )  # fmt: skip
 
 
-@kernel()
+@kernel(_nrt=False)
+def _rows_drawn(lens: Lens) -> int:
+    """How many rows `_draw` fills for a row of pixels."""
+    return int(np.int64(BENDS if len(lens) == STAMP else 5))  # a constant is a type of its own
+
+
+@kernel(_nrt=False)
 def _draw(
     near: Pictures, lens: Lens, group: int, p: FloatArray, pixels: Pixels, profile: FloatArray,
-    room: AnyFloatArray,
-) -> AnyFloatArray:  # fmt: skip
-    """Draw signal and gradient of a row (ny, 5, nx), and at one height what bends (ny, BENDS, nx).
+    here: AnyFloatArray,
+) -> None:  # fmt: skip
+    """Draw signal and gradient of a row (ny, 5, nx), at one height what bends (ny, BENDS, nx).
 
     What a lens leaves out depends on its type.
     """
-    ny, nx = pixels.y.size, pixels.x.size
     if len(lens) == STAMP:
-        bends = room[: BENDS * ny * nx].reshape(ny, BENDS, nx)
-        stamp_bends(near.nodes, lens, pixels, p[0], p[1], p[3], bends)
-        return bends
-    here = room[: 5 * ny * nx].reshape(ny, 5, nx)
+        stamp_bends(near.nodes, lens, pixels, p[0], p[1], p[3], here)
+        return
     draw_gradient(near, group, p, pixels, profile, here)
-    return here
 
 
 @kernel()
 def _curve(
     near: Pictures, lens: Lens, group: int, free: BoolArray, pixels: Pixels, data: AnyFloatArray,
-    here: AnyFloatArray, p: FloatArray, ways: FloatArray, profile: FloatArray, work: FloatArray,
-    turned: FloatArray, bias: FloatArray,
+    here: AnyFloatArray, p: FloatArray, ways: FloatArray, room: Room, turned: FloatArray,
+    bias: FloatArray,
 ) -> None:  # fmt: skip
     """Fill O V of a row and add to its bias; what a lens leaves out depends on its type.
 
@@ -249,7 +243,7 @@ def _curve(
     low = near.first_nm
     high = low + near.step_nm * (near.heights.shape[1] - 1)
     trial, ahead, behind = np.empty(5), np.empty(4), np.empty(4)
-    both = work[: 10 * ny * nx].reshape(2, ny, 5, nx)
+    both = room.work[: 10 * ny * nx].reshape(2, ny, 5, nx)
     for k in range(ways.shape[1]):
         for sign in range(2):
             step = PART if sign == 0 else -PART
@@ -258,7 +252,7 @@ def _curve(
                 trial[a] += step * ways[a, k]
             if free[2]:
                 trial[2] = min(max(trial[2], low), high)
-            draw_gradient(near, group, trial, pixels, profile, both[sign])
+            draw_gradient(near, group, trial, pixels, room.profile, both[sign])
             _score_of(data, both[sign], ahead if sign == 0 else behind)
         _add_curvature(data, here, both[0], both[1], bias)
         for a in range(4):
@@ -271,9 +265,9 @@ def _curve_at_one_height(
     bias: FloatArray,
 ) -> None:  # fmt: skip
     """Do it with the second derivatives of a picture at one height (ny, BENDS, nx)."""
-    sums, spread = np.zeros(9), np.zeros((4, 4), bends.dtype)
-    for a in range(4):
-        for b in range(4):
+    sums, spread, n = np.zeros(9), np.zeros((4, 4), bends.dtype), ways.shape[0]
+    for a in range(n):  # not 4: the compiler would write it out
+        for b in range(n):
             for k in range(ways.shape[1]):
                 spread[a, b] += ways[a, k] * ways[b, k]
     _observe(data, bends, spread, sums)
@@ -283,10 +277,10 @@ def _curve_at_one_height(
         for q in range(3):
             observed[order[m], order[q]] = sums[m + q + (m > 0 and q > 0)]
         bias[order[m]] -= 0.5 * sums[6 + m]
-    for a in range(4):
+    for a in range(n):
         for k in range(ways.shape[1]):
             turned[a, k] = 0.0
-            for b in range(4):
+            for b in range(n):
                 turned[a, k] += observed[a, b] * ways[b, k]
 
 

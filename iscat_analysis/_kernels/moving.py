@@ -24,23 +24,17 @@ from iscat_analysis._kernels.canvas import (
     Pictures,
     cut,
     draw_gradient,
-    lens_of,
-    ready_frame,
     square_of,
     stage,
-    table_of,
 )
 from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.lines import copy_line, marked
+from iscat_analysis._kernels.lines import copy_line
 from iscat_analysis._kernels.place_score import place_score
 from iscat_analysis._kernels.scoring import (
     CONVERGED,
-    POISSON,
     STALLED,
-    blank_profile,
-    maximize,
     scoring_step,
 )
 
@@ -48,6 +42,10 @@ FloatArray = NDArray[np.float64]
 AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+
+ASTRAY = 4
+"""How a fit ended, besides the ways of `scoring`: its plain steps lead nowhere."""
 
 
 class Search(NamedTuple):
@@ -78,15 +76,43 @@ class Search(NamedTuple):
     passes: int
 
 
-@kernel()
+class Room(NamedTuple):
+    """Where the kernels of rows keep what they need for a moment; none of them asks for memory.
+
+    Attributes
+    ----------
+    pixels : ndarray, shape (15 side²,)
+        In the precision of gradients: first the constants of a likelihood, (4, ny, nx).
+    line : ndarray of float32, shape (side²,)
+        For the slopes of a row.
+    profile : ndarray
+        For a picture and its ∂/∂z, as `iscat_analysis._kernels.scoring.blank_profile` makes it.
+    free : ndarray of int, shape (k,)
+        Places of the free parameters.
+    small : ndarray, shape (11, 5)
+        For numbers of a row; a fit leaves its start in the last line.
+    ways : ndarray, shape (4, k)
+        For directions.
+    work : ndarray, shape (10 side²,)
+        For two pictures in double precision; empty at one height.
+    """
+
+    pixels: AnyFloatArray
+    line: NDArray[np.float32]
+    profile: FloatArray
+    free: IntArray
+    small: FloatArray
+    ways: FloatArray
+    work: FloatArray
+
+
+@kernel(_nrt=False)
 def fit_frames(
     light: Light,
     field: Field,
     near: Pictures,
-    far: Pictures,
     search: Search,
     starts: IntArray,
-    first: int,
     last: int,
     sweeps: int,
     theta: FloatArray,
@@ -97,93 +123,115 @@ def fit_frames(
     information: FloatArray,
     gain: FloatArray,
     expected: FloatArray,
+    background: NDArray[np.float32],
     sums: NDArray[np.float32],
-) -> None:
-    """Fit the rows of frames first…last − 1, each `sweeps` times.
+    place: IntArray,
+    room: Room,
+) -> bool:
+    """Fit the rows of frames up to last − 1, each `sweeps` times, as far as plain steps lead.
+
+    A row that needs more care is left to the caller, with its place, its constants and a start in
+    its box; with its maximum in `theta`, `outcome` and `gain` the next call goes on.
 
     Parameters
     ----------
-    light, field, near, far, search
-        Movie, pixels, pictures to fit and to draw, and what is fitted.
+    light, field, near, search
+        Movie, pixels, pictures to fit, and what is fitted.
     starts : ndarray of int, shape (t + 1,)
         First row of each frame.
-    first, last : int
-        Frames.
+    last : int
+        The frame after those that are fitted.
     sweeps : int
-        How often; 0 draws only.
+        How often; 0 sums only.
     theta : ndarray, shape (rows, 5)
         Starts; overwritten with the estimates.
     group : ndarray of int, shape (rows,)
         Number of each row's picture.
     canvas : Canvas
-        Brought to the estimates.
+        From `draw_frames`; the rows' own squares follow the estimates.
     slopes : Slopes
         Filled by the last fit of each row.
     outcome : ndarray of int, shape (rows,)
         Filled with how the last fit ended.
     information : ndarray, shape (rows, 4, 4)
-        Filled with the expected information in (x, y, z, a) of the last fit.
+        Filled with the expected information in (x, y, z, a) of the last fit; left alone where a row
+        has no square.
     gain : ndarray, shape (rows,)
         Filled with its log-likelihood over that without the particle, the others in place.
     expected : ndarray, shape (t,)
-        Filled with the photoelectrons expected in the used pixels at power 1.
+        Filled with what particles add to the photoelectrons of the used pixels at power 1.
+    background : ndarray of float32, shape (y, x)
+        That of `light`.
     sums : ndarray of float32, shape (y, x)
         Added to: Σ w C over the frames.
+    place : ndarray of int, shape (7,)
+        Where to begin, and left where the caller has to help: frame, sweep and row, and the row's
+        square, first and last row and column, half-open; all 0 where it is yet to be found.
+    room : Room
+        The same one until all frames are done.
+
+    Returns
+    -------
+    bool
+        Whether all frames are done.
     """
     rows, columns = light.background.shape
-    near_profile = blank_profile(table_of(near, 0), near.lens, 1)
-    far_profile = blank_profile(table_of(far, 0), far.lens, 1)
-    image = np.empty(max(field.drawn, field.side) ** 2)
-    square = np.empty(4 * field.side**2, near.nodes.dtype)
-    change = np.empty(field.side**2, near.nodes.dtype)
-    gradients = np.empty(10 * field.side**2, near.nodes.dtype)
-    room = np.empty(field.side**2, dtype=np.float32)
-    step, before, index = np.empty(5), np.empty(5), marked(search.free[:4])
-    slope_profile = blank_profile(table_of(near, 0), near.lens, 2)
-    fisher = np.empty((5, 5))
-    background, amount = np.empty((rows, columns), dtype=np.float32), 0.0
-    for i in range(rows):
-        for j in range(columns):
-            background[i, j] = light.background[i, j]
-            amount += light.background[i, j]
-    for t in range(first, last):
-        if sweeps:
-            expected[t] = _look_over(light.counts[t])  # kept for a moment, or nothing would be read
-        ready_frame(
-            field, near, far, starts, t, theta, group, canvas, near_profile, far_profile, image
-        )
+    area = field.side**2
+    fisher, step, score, start = room.small[:5], room.small[5], room.small[6], room.small[10]
+    index = room.free
+    while place[0] < last:
+        t = place[0]
         total = canvas.total[t]
-        for _ in range(sweeps):
-            for r in range(starts[t], starts[t + 1]):
-                p = theta[r]
-                r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
+        if sweeps and place[4] == 0:
+            expected[t] = _look_over(light.counts[t])  # kept for a moment, or nothing would be read
+        while place[1] < sweeps:
+            for r in range(place[2], starts[t + 1]):
+                p, helped = theta[r], place[4] > 0
+                r0, r1, c0, c1 = place[3], place[4], place[5], place[6]
+                if not helped:
+                    r0, r1, c0, c1 = square_of(field, canvas.rings[r], field.side, rows, columns)
                 if r1 <= r0:
-                    outcome[r], information[r], gain[r] = STALLED, 0.0, 0.0
+                    outcome[r], gain[r] = STALLED, 0.0
                     continue
                 ny, nx = r1 - r0, c1 - c0
                 pixels = cut(field.pixels, r0, r1, c0, c1)
-                both = gradients[: 10 * ny * nx].reshape(2, ny, 5, nx)
-                draw_gradient(near, group[r], p, pixels, slope_profile, both[0])
-                data = square[: 4 * ny * nx].reshape(4, ny, nx)
-                stage(light, t, total, both[0], r0, c0, data)
-                signal = change[: ny * nx].reshape(ny, nx)
-                for i in range(ny):
-                    for j in range(nx):
-                        signal[i, j] = both[0, i, 0, j]
-                copy_line(p, before)
-                outcome[r], last_one, gain[r] = _climb(
-                    near, group[r], pixels, data, search, p, both, slope_profile, fisher, step
-                )
+                both = room.pixels[5 * area : 5 * area + 10 * ny * nx].reshape(2, ny, 5, nx)
+                draw_gradient(near, group[r], p, pixels, room.profile, both[0])
+                data = room.pixels[: 4 * ny * nx].reshape(4, ny, nx)
+                signal = room.pixels[4 * area : 4 * area + ny * nx].reshape(ny, nx)
+                if not helped:
+                    stage(light, t, total, both[0], r0, c0, data)
+                    for i in range(ny):
+                        for j in range(nx):
+                            signal[i, j] = both[0, i, 0, j]
+                    copy_line(p, start)
+                value, last_one = place_score(data, both[0], near.lens, score, fisher), 0
+                if helped:
+                    place[4] = 0
+                    for i in range(5):
+                        step[i] = 0.0
+                else:
+                    outcome[r], last_one, gain[r] = _climb(
+                        near, group[r], pixels, data, search, p, both, value, room
+                    )
+                    if outcome[r] == ASTRAY:
+                        place[2], place[3], place[4], place[5], place[6] = r, r0, r1, c0, c1
+                        return False
                 here = both[last_one]
                 _add_signal(here, step, signal, total[r0:r1, c0:c1])
                 copy_line(p, canvas.squares[r])
                 for i in range(4):
-                    copy_line(fisher[i, :4], information[r, i])
+                    for j in range(4):
+                        information[r, i, j] = fisher[i, j]
                 if slopes.values.size:
                     for k in range(index.size):
-                        slopes.moves[r, k] = p[index[k]] - before[index[k]]
-                    keep_slopes(data[2], here, index, slopes, r, (r0, r1, c0, c1), room)
-        expected[t] = amount + _add_signals(total, background, light.power[t], sums)
+                        slopes.moves[r, k] = p[index[k]] - start[index[k]]
+                    keep_slopes(data[2], here, index, slopes, r, (r0, r1, c0, c1), room.line)
+            place[1] += 1
+            place[2] = starts[t]
+        expected[t] = _add_signals(total, background, light.power[t], sums)
+        place[0], place[1], place[2] = t + 1, 0, starts[t + 1]
+    return True
 
 
 @kernel(fastmath=FAST, _nrt=False)
@@ -196,25 +244,26 @@ def _look_over(frame: Counts) -> float:
     return float(total)
 
 
-@kernel()
+@kernel(_nrt=False)
 def _climb(
     near: Pictures, group: int, pixels: Pixels, data: AnyFloatArray, search: Search, p: FloatArray,
-    both: AnyFloatArray, profile: FloatArray, fisher: FloatArray, step: FloatArray,
+    both: AnyFloatArray, value: float, room: Room,
 ) -> tuple[int, int, float]:  # fmt: skip
-    """Fit one row from p, at which both[0] is drawn.
+    """Fit one row from p, at which both[0] is drawn and its value, score and information known.
 
     As long as they lie inside the box and improve, the steps of Fisher scoring are taken as they
-    are: every picture is drawn once.  `maximize` takes over where they do not.
+    are: every picture is drawn once.  Where they do not, the fit is `ASTRAY`.
 
-    Returns how the fit ended, which of `both` holds the picture at the estimate minus `step`, which
-    the last step leaves so small that the gradient tells the rest, and the log-likelihood over that
-    without the particle.
+    Returns how the fit ended, which of `both` holds the picture at the estimate minus the step, so
+    small at last that the gradient tells the rest, and the log-likelihood over that without the
+    particle.
     """
-    lower, upper, trial, score = np.empty(5), np.empty(5), np.empty(5), np.empty(5)
+    fisher, step, score, trial = room.small[:5], room.small[5], room.small[6], room.small[7]
+    lower, upper = room.small[8], room.small[9]
     for i in range(5):
         lower[i] = max(search.lower[i], p[i] - search.reach[i])
         upper[i] = min(search.upper[i], p[i] + search.reach[i])
-    at, value = 0, place_score(data, both[0], near.lens, score, fisher)
+    at = 0
     for _ in range(search.passes):
         gain = _step(search, p, lower, upper, score, fisher, step, trial)
         if gain == np.inf:
@@ -222,7 +271,7 @@ def _climb(
         if gain < search.tolerance:
             copy_line(trial, p)
             return CONVERGED, at, value + gain
-        draw_gradient(near, group, trial, pixels, profile, both[1 - at])
+        draw_gradient(near, group, trial, pixels, room.profile, both[1 - at])
         there = place_score(data, both[1 - at], near.lens, score, fisher)
         if not there > value:
             break
@@ -231,18 +280,10 @@ def _climb(
     for i in range(5):
         if search.free[i]:
             p[i] = min(max(p[i], lower[i]), upper[i])
-    value, _, outcome = maximize(
-        table_of(near, group), lens_of(near, group), pixels, np.int64(POISSON),
-        data.astype(np.float64), search.free, lower, upper, search.max_step, search.tolerance,
-        search.passes, p, fisher, -np.inf,
-    )  # fmt: skip  # np.int64: a constant would be compiled for by itself
-    draw_gradient(near, group, p, pixels, profile, both[0])
-    place_score(data, both[0], near.lens, score, fisher)
-    step[:] = 0.0
-    return outcome, 0, value
+    return ASTRAY, at, value
 
 
-@kernel()
+@kernel(_nrt=False)
 def _step(
     search: Search, p: FloatArray, lower: FloatArray, upper: FloatArray, score: FloatArray,
     fisher: FloatArray, step: FloatArray, trial: FloatArray,

@@ -24,10 +24,12 @@ from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import STAMP, Lens
 from iscat_analysis._kernels.scoring import (
+    FLOOR,
     POISSON,
     SERIES,
     image_score,
     image_value,
+    twice_artanh,
 )
 
 FloatArray = NDArray[np.float64]
@@ -37,7 +39,7 @@ LEAST = 1e-15
 """Least expected count, as `FLOOR` of `scoring`, but its square is a number in single precision."""
 
 
-@kernel()
+@kernel(_nrt=False)
 def place_score(
     data: AnyFloatArray, here: AnyFloatArray, lens: Lens, score: FloatArray, fisher: FloatArray
 ) -> float:
@@ -68,8 +70,23 @@ def place_score(
         return value
     value, beyond = _flat_score(data, here, score, fisher)
     if beyond:
-        value = image_value(np.int64(POISSON), data.astype(np.float64), 1.0, here)
+        value = _bright_value(data, here)
     return value
+
+
+@kernel(_nrt=False)
+def _bright_value(data: AnyFloatArray, here: AnyFloatArray) -> float:
+    """Log-likelihood in double precision, by the logarithm itself where the series is no good."""
+    total = 0.0
+    for i in range(data.shape[1]):
+        c0, c1, c2, c3, s = data[0, i], data[1, i], data[2, i], data[3, i], here[i, 0]
+        for j in range(s.size):
+            base, change = max(float(c1[j]) + c3[j], FLOOR), float(c2[j]) * s[j]
+            if abs(change) < SERIES * base:
+                total += c0[j] * twice_artanh(change / (2.0 * base + change)) - change
+            else:
+                total += c0[j] * np.log(max(base + change, FLOOR) / base) - change
+    return total
 
 
 @kernel(fastmath=FAST, _nrt=False)

@@ -284,7 +284,7 @@ def value_pass(
     return value
 
 
-@kernel()
+@kernel(_nrt=False)
 def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int, int]:
     """Range of the flattened profile, `width` long, that an image needs."""
     zero = int(np.int64(0))  # a plain 0 is a type of its own, for which its callers are compiled

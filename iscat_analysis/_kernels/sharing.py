@@ -17,10 +17,11 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
-@kernel(fastmath=FAST)
+@kernel(fastmath=FAST, _nrt=False)
 def own_shares(
-    slopes: Slopes, rows: IntArray, squares: IntArray, weight: FloatArray, out: FloatArray
-) -> None:
+    slopes: Slopes, rows: IntArray, squares: IntArray, weight: FloatArray, out: FloatArray,
+    work: FloatArray, weighted: FloatArray,
+) -> None:  # fmt: skip
     """Give what the background takes from each row alone.
 
     Parameters
@@ -35,10 +36,10 @@ def own_shares(
         Of the pixels.
     out : ndarray, shape (n, k, k)
         Filled with Σ weight G Gᵀ.
+    work, weighted : ndarray, shape (side²,)
+        Room for squares.
     """
     k = slopes.values.shape[1]
-    work = np.empty(slopes.values.shape[2])
-    weighted = np.empty(slopes.values.shape[2])
     for q in range(rows.size):
         values, units = slopes.values[rows[q]], slopes.units[rows[q]]
         size = look(weight, squares[q], work)
@@ -50,10 +51,11 @@ def own_shares(
                 out[q, a, b] = out[q, b, a] = units[b] * product(values[b], weighted, size)
 
 
-@kernel(fastmath=FAST)
+@kernel(fastmath=FAST, _nrt=False)
 def send(
-    slopes: Slopes, rows: IntArray, squares: IntArray, by: FloatArray, out: FloatArray
-) -> None:
+    slopes: Slopes, rows: IntArray, squares: IntArray, by: FloatArray, out: FloatArray,
+    work: FloatArray,
+) -> None:  # fmt: skip
     """Add to images what rows send to them.
 
     Parameters
@@ -64,8 +66,9 @@ def send(
         Numbers.
     out : ndarray, shape (b, y, x)
         Σ Gᵀ by is added to it.
+    work : ndarray, shape (side²,)
+        Room for a square.
     """
-    work = np.empty(slopes.values.shape[2])
     for q in range(rows.size):
         values, units, square = slopes.values[rows[q]], slopes.units[rows[q]], squares[q]
         size = (square[1] - square[0]) * (square[3] - square[2])
@@ -74,10 +77,10 @@ def send(
             put(work, square, out[v])
 
 
-@kernel(fastmath=FAST)
+@kernel(fastmath=FAST, _nrt=False)
 def follow(
     slopes: Slopes, rows: IntArray, squares: IntArray, covariance: FloatArray,
-    images: FloatArray, felt: FloatArray, out: FloatArray,
+    images: FloatArray, felt: FloatArray, out: FloatArray, work: FloatArray, by: FloatArray,
 ) -> None:  # fmt: skip
     """Give what rows feel of images, and what they send back as they follow.
 
@@ -93,9 +96,12 @@ def follow(
         Filled with G image.
     out : ndarray, shape (b, y, x)
         Σ Gᵀ covariance G image is added to it.
+    work : ndarray, shape (side²,)
+        Room for a square.
+    by : ndarray, shape (k,)
+        Room for a change.
     """
     k = slopes.values.shape[1]
-    work, by = np.empty(slopes.values.shape[2]), np.empty(k)
     for q in range(rows.size):
         values, units, square = slopes.values[rows[q]], slopes.units[rows[q]], squares[q]
         for v in range(images.shape[0]):

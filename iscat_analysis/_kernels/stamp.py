@@ -126,9 +126,9 @@ def mix_nodes_both(
 @kernel(_nrt=False)
 def _make_strip(
     profile: AnyFloatArray, lens: StampLens, row: int, rows: int, columns: int,
-    gradient: bool, at: IntArray, w: AnyFloatArray,
+    images: int, at: IntArray, w: AnyFloatArray,
 ) -> int:  # fmt: skip
-    """Make a strip: P + a Q of its pixels, and with `gradient` ∂/∂x and ∂/∂y of it and P + 2a Q.
+    """Make a strip: P + a Q of its pixels, and if not 1 but 4 images ∂/∂x, ∂/∂y of it and P + 2a Q.
 
     `at` (TAPS) is work space too.  Returns where in the other it begins; each of its images is
     `STRIP` lines long.
@@ -143,7 +143,7 @@ def _make_strip(
     for k in range(TAPS):
         at[k] = k % fine * block + k // fine * line
     more, used = line - columns, rows * line
-    kept = fine * block
+    kept, gradient = fine * block, images > 1
     first, size = left // fine, fine * made
     last = min(first + line, per_phase)
     for phase in range(fine):
@@ -195,7 +195,7 @@ def _fill_gradient(
     line, _, _, strip = sizes(lens, n)
     for row in range(rows):
         if row % STRIP == 0:
-            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, True, at, f)
+            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, np.int64(4), at, f)
         here = out[row]
         for k in range(3):  # one after the other: among ten arrays the compiler gives up on vectors
             made, image = f[begin + k * strip : begin + k * strip + n], here[k]
@@ -220,7 +220,7 @@ def stamp_strip(
     `begin_stamp`, `at` (TAPS) is work space.
     """
     line, _, _, strip = sizes(lens, columns)
-    begin = _make_strip(profile, lens, row, rows, columns, True, at, f)
+    begin = _make_strip(profile, lens, row, rows, columns, np.int64(4), at, f)
     for k in range(4):
         there = out[4 if k == 3 else k]
         factor = out.dtype.type(amplitude if k == 0 else 1.0 if k == 3 else -amplitude)
@@ -262,7 +262,7 @@ def _put_signal(
     line, by = sizes(lens, n)[0], out.dtype.type(factor)
     for row in range(rows):
         if row % STRIP == 0:
-            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, False, at, f)
+            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, np.int64(1), at, f)
         s, here = f[begin : begin + n], out[row]
         begin += line
         if adds:

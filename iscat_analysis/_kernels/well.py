@@ -60,8 +60,9 @@ def harmonic_likelihoods(
     axes, n = positions.shape
     m = diffusion.size
     wells, state = np.empty((7, m)), np.empty((8, m))
-    width, decay, mean, var_end, var_mean, both, kept = wells
-    place, unit, spread, product, q11, q12, q22, log_determinant = state
+    width, decay, mean, var_end, var_mean = wells[0], wells[1], wells[2], wells[3], wells[4]
+    both, kept, place, unit, spread = wells[5], wells[6], state[0], state[1], state[2]
+    product, q11, q12, q22, log_determinant = state[3], state[4], state[5], state[6], state[7]
     for i in range(m):
         width[i] = diffusion[i] / stiffness[i]
         u = stiffness[i] * exposure
@@ -77,11 +78,13 @@ def harmonic_likelihoods(
             else:
                 curved = u - 2.0 * left - 0.5 * math.expm1(-2.0 * u)
                 var_mean[i] = 2.0 * width[i] * curved / (u * u)
-    out = np.full(m, -0.5 * axes * (n - 1) * LOG_2PI)
+    out = np.empty(m)
+    for i in range(m):
+        out[i] = -0.5 * axes * (n - 1) * LOG_2PI
     for c in range(axes):
-        place[:], unit[:], product[:] = 0.0, 0.0, 1.0
-        copy_line(width, spread)
-        q11[:], q12[:], q22[:], log_determinant[:] = 0.0, 0.0, 0.0, 0.0
+        for i in range(m):
+            place[i], unit[i], spread[i], product[i] = 0.0, 0.0, width[i], 1.0
+            q11[i], q12[i], q22[i], log_determinant[i] = 0.0, 0.0, 0.0, 0.0
         for k in range(n):
             if k < 2 or gaps[k - 1] != gaps[k - 2]:
                 dark = gaps[k - 1] - exposure if k else 0.0
@@ -143,16 +146,16 @@ def most_likely_well(
     diffusion, stiffness : float
         D and κ there.
     """
-    low = np.array([-_WIDEST, math.log(softest)])
-    high = np.array([_WIDEST, math.log(stiffest)])
-    points = np.empty((2 * _RUNGS, 2))
-    for k in range(_RUNGS):
-        points[2 * k : 2 * k + 2, 1] = low[1] + (high[1] - low[1]) * k / (_RUNGS - 1.0)
-        points[2 * k, 0], points[2 * k + 1, 0] = 0.0, 0.5
+    low, high, best = np.empty(2), np.empty(2), np.empty(2)
+    low[0], low[1], high[0], high[1] = -_WIDEST, math.log(softest), _WIDEST, math.log(stiffest)
+    points, square, vertex = np.empty((2 * _RUNGS, 2)), np.empty((9, 2)), np.empty((1, 2))
+    for k in range(2 * _RUNGS):
+        points[k, 0] = 0.5 * (k % 2)
+        points[k, 1] = low[1] + (high[1] - low[1]) * (k // 2) / (_RUNGS - 1.0)
     values = _logarithmic(positions, variance, gaps, exposure, scale, points)
     at = largest(values)
-    best, value = points[at].copy(), values[at]
-    apart, square = _FIRST, np.empty((9, 2))
+    copy_line(points[at], best)
+    value, apart = values[at], _FIRST
     for _ in range(_MOST):
         for k in range(9):
             square[k, 0], square[k, 1] = best[0] + (k // 3 - 1) * apart, best[1]
@@ -162,7 +165,8 @@ def most_likely_well(
         values = _logarithmic(positions, variance, gaps, exposure, scale, square)
         at = largest(values)
         if values[at] > value:
-            best, value = square[at].copy(), values[at]
+            copy_line(square[at], best)
+            value = values[at]
             continue
         g0, g1 = 0.5 * (values[7] - values[1]), 0.5 * (values[5] - values[3])
         h0, h1 = values[7] + values[1] - 2.0 * value, values[5] + values[3] - 2.0 * value
@@ -176,13 +180,13 @@ def most_likely_well(
         step0, step1 = (h01 * g1 - h1 * g0) / det, (h01 * g0 - h0 * g1) / det
         if 0.5 * (g0 * step0 + g1 * step1) < _SETTLED:
             break
-        vertex = np.empty((1, 2))
         for a in range(2):
             move = (step0 if a == 0 else step1) * apart / _FINER
             vertex[0, a] = min(max(best[a] + move, low[a]), high[a])
         there = _logarithmic(positions, variance, gaps, exposure, scale, vertex)[0]
         if there > value:
-            best, value = vertex[0].copy(), there
+            copy_line(vertex[0], best)
+            value = there
     return value, scale * math.exp(best[0]), math.exp(best[1])
 
 
@@ -196,7 +200,10 @@ def _logarithmic(
     points: FloatArray,
 ) -> FloatArray:
     """Log-likelihoods at (log D/scale, log κ)."""
+    diffusion, stiffness = np.empty(points.shape[0]), np.empty(points.shape[0])
+    for i in range(points.shape[0]):
+        diffusion[i], stiffness[i] = scale * math.exp(points[i, 0]), math.exp(points[i, 1])
     values: FloatArray = harmonic_likelihoods(
-        positions, variance, gaps, exposure, scale * np.exp(points[:, 0]), np.exp(points[:, 1])
+        positions, variance, gaps, exposure, diffusion, stiffness
     )
     return values

@@ -96,7 +96,7 @@ def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged
     tracks = [mine for mine in _tracks(rows, judged, index) if mine.size]
 
     def of_one(k: int) -> None:
-        coupling = Coupling(field, ground, judged, tracks[k])
+        coupling = Coupling(field, ground, judged.slopes, tracks[k])
         added = _added(coupling, _inverse(judged.fisher[tracks[k]], index))
         covariance[np.ix_(tracks[k], index, index)] = added
 
@@ -253,7 +253,7 @@ def common_amplitudes(
         covariance = _inverse(fisher, index)
         covariance[used] = 0.0
         covariance[used, :-1, :-1] = _inverse(fisher[used], index[:-1])
-        coupling = Coupling(field, ground, judged, mine)
+        coupling = Coupling(field, ground, judged.slopes, mine)
         off = estimate - mean
         mode, pulled = coupling.sent(np.stack([sends, sends * off[:, None]], axis=1))
         total = weight.sum()

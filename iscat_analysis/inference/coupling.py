@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.following import Slopes
 from iscat_analysis._kernels.sharing import follow, own_shares, send
 from iscat_analysis.inference.moving import MovingField
-from iscat_analysis.inference.rows import Ground, Judged
+from iscat_analysis.inference.rows import Ground
 from iscat_analysis.records import FloatArray
 
 
@@ -25,17 +26,17 @@ class Coupling:
         The movie.
     ground : Ground
         Background.
-    judged : Judged
-        Of all rows; the field has fitted nothing since.
+    slopes : Slopes
+        Of all rows, as judged; the field has fitted nothing since.
     rows : ndarray of int, shape (n,)
         Numbers of those that belong together.
     """
 
     def __init__(
-        self, field: MovingField, ground: Ground, judged: Judged, rows: NDArray[np.int64]
+        self, field: MovingField, ground: Ground, slopes: Slopes, rows: NDArray[np.int64]
     ) -> None:
-        self._slopes, self._rows = judged.slopes, rows
-        squares = judged.slopes.squares[rows]
+        self._slopes, self._rows = slopes, rows
+        squares = slopes.squares[rows]
         top, left = squares[:, 0].min(), squares[:, 2].min()
         bottom, right = squares[:, 1].max(), squares[:, 3].max()
         self._squares = squares - np.array([top, top, left, left])
@@ -44,6 +45,7 @@ class Coupling:
         share = np.where(field.used[cut], level / (level + field.read_e2[cut]), 0.0)
         self._weight = share / np.maximum(field.total_e[cut], 1.0)
         self._sigma = np.sqrt(self._weight)
+        self._room = slopes.values.shape[2]
 
     @property
     def pixels(self) -> int:
@@ -60,7 +62,10 @@ class Coupling:
         """
         free = self._slopes.values.shape[1]
         out = np.zeros((len(self._rows), free, free))
-        own_shares(self._slopes, self._rows, self._squares, self._weight, out)
+        own_shares(
+            self._slopes, self._rows, self._squares, self._weight, out,
+            *np.empty((2, self._room)),
+        )  # fmt: skip
         return out
 
     def sent(self, by: FloatArray) -> FloatArray:
@@ -77,7 +82,7 @@ class Coupling:
             Images.
         """
         out = np.zeros((by.shape[1], *self._weight.shape))
-        send(self._slopes, self._rows, self._squares, by, out)
+        send(self._slopes, self._rows, self._squares, by, out, np.empty(self._room))
         return (out * self._sigma).reshape(len(out), -1)
 
     def followed(self, covariance: FloatArray, images: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -100,5 +105,8 @@ class Coupling:
         seen = np.multiply(images.reshape(-1, *self._weight.shape), self._sigma, order="C")
         felt = np.zeros((len(self._rows), len(images), covariance.shape[1]))
         out = np.zeros_like(seen)
-        follow(self._slopes, self._rows, self._squares, covariance, seen, felt, out)
+        follow(
+            self._slopes, self._rows, self._squares, covariance, seen, felt, out,
+            np.empty(self._room), np.empty(covariance.shape[1]),
+        )  # fmt: skip
         return felt, (out * self._sigma).reshape(images.shape)

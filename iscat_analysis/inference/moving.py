@@ -35,10 +35,11 @@ from iscat_analysis._kernels.canvas import (
 )
 from iscat_analysis._kernels.following import Slopes
 from iscat_analysis._kernels.judging import judge_frames
-from iscat_analysis._kernels.moving import Search, fit_frames
+from iscat_analysis._kernels.moving import Search
 from iscat_analysis._kernels.scoring import CONVERGED
 from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.fit import window_nm
+from iscat_analysis.inference.frame_fits import draw_rows, fit_rows, room_for
 from iscat_analysis.inference.newton import Response
 from iscat_analysis.inference.pictures import PictureBook
 from iscat_analysis.inference.rows import Ground, Judged, Rows
@@ -233,7 +234,7 @@ class MovingField:
         theta = rows.theta.copy()
         starts = rows.starts(self.frames)
         outcome = np.full(len(theta), CONVERGED, dtype=np.int64)
-        fisher, gain = np.empty((len(theta), 4, 4)), np.empty(len(theta))
+        fisher, gain = np.zeros((len(theta), 4, 4)), np.empty(len(theta))
         canvas = self._canvas_for(rows, coarse=coarse)
         field = self._coarse if coarse else self._whole
         search = self._search if sweeps > 1 else self._search._replace(tolerance=_PASSING)
@@ -242,10 +243,11 @@ class MovingField:
 
         def block(first: int) -> NDArray[np.float32]:
             sums = np.zeros(self.used.shape, dtype=np.float32)
-            fit_frames(
-                light, field, near, far, search, starts, first,
-                min(first + BLOCK, self.frames), sweeps, theta, rows.group, canvas, slopes,
-                outcome, fisher, gain, expected, sums,
+            last = min(first + BLOCK, self.frames)
+            draw_rows(field, near, far, starts, first, last, theta, rows.group, canvas)
+            fit_rows(
+                light, field, near, search, starts, first, last, sweeps, theta, rows.group, canvas,
+                slopes, outcome, fisher, gain, expected, sums,
             )  # fmt: skip
             return sums
 
@@ -262,6 +264,7 @@ class MovingField:
             fitted = replace(fitted, theta=self._response.together(theta, self.free, walls))
         level = np.where(stretch > 0, self.total_e / np.where(stretch > 0, stretch, 1.0), 1.0)
         totals = self.frame_totals
+        expected += light.background.sum()
         power = np.where(expected > 0, totals / np.where(expected > 0, expected, 1.0), 1.0)
         return fitted, Ground(np.maximum(level, 1e-3), power / power.mean()), outcome == CONVERGED
 
@@ -347,7 +350,7 @@ class MovingField:
         if self._canvas is not None and self._canvas.rows is rows and self._canvas.coarse:
             signal = self._canvas.canvas.total[first:last]
         else:
-            signal = self._signal(ground, rows, first, last)
+            signal = self._signal(rows, first, last)
         left = np.empty_like(signal)
         leave_over(self._light(ground), signal, first, left)
         return left
@@ -382,20 +385,15 @@ class MovingField:
 
         self.share(add, len(out))
 
-    def _signal(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
+    def _signal(self, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
         """Draw the rows of some frames alone."""
-        within, light = rows.only((rows.frame >= first) & (rows.frame < last)), self._light(ground)
-        canvas = blank(np.empty(light.counts[first:last].shape, dtype=np.float32), within)
+        within = rows.only((rows.frame >= first) & (rows.frame < last))
+        canvas = blank(np.empty((last - first, *self.used.shape), dtype=np.float32), within)
         near, far = self._pictures_for(coarse=True)
-        part = light._replace(counts=light.counts[first:last], power=light.power[first:last])
         starts = np.searchsorted(within.frame, np.arange(first, last + 1)).astype(np.int64)
-        n = len(within.frame)
-        fit_frames(
-            part, self._coarse, near, far, self._search, starts, 0, last - first, 0, within.theta,
-            within.group, canvas, self._slopes_of(n, 0), np.zeros(n, dtype=np.int64),
-            within.fisher, within.snr, np.zeros(last - first),
-            np.zeros(self.used.shape, dtype=np.float32),
-        )  # fmt: skip
+        draw_rows(
+            self._coarse, near, far, starts, 0, last - first, within.theta, within.group, canvas
+        )
         return canvas.total
 
     def judge(self, ground: Ground, rows: Rows) -> Judged:
@@ -417,16 +415,18 @@ class MovingField:
         light = self._light(ground)
         near, far = self._pictures_for(coarse=False)
         starts = rows.starts(self.frames)
-        fisher, turned, ways = np.empty((3, n, 4, 4))
-        bias, numbers = np.empty((n, 4)), np.empty((n, 6))
+        fisher, (turned, ways) = np.zeros((n, 4, 4)), np.full((2, n, 4, 4), np.nan)
+        bias, numbers = np.zeros((n, 4)), np.zeros((n, 6))
         canvas = self._canvas_for(rows, coarse=False)
         slopes = self._slopes_of(n, self._whole.side)
 
         def block(first: int) -> FloatArray:
+            last = min(first + BLOCK, self.frames)
+            draw_rows(self._whole, near, far, starts, first, last, rows.theta, rows.group, canvas)
             judge_frames(
-                light, self._whole, near, far, self.free, starts, first,
-                min(first + BLOCK, self.frames), rows.theta, rows.group, canvas, slopes, fisher,
-                turned, ways, bias, numbers,
+                light, self._whole, near, self.free, starts, first, last, rows.theta, rows.group,
+                canvas, slopes, fisher, turned, ways, bias, numbers,
+                room_for(self._whole, near, self.free),
             )  # fmt: skip
             return np.zeros(1)
 
@@ -501,15 +501,16 @@ class MovingField:
         theta, n = rows.theta.copy(), len(frame)
         canvas = blank(np.empty(light.counts.shape, dtype=np.float32), rows)
         outcome = np.zeros(n, dtype=np.int64)
-        fisher, gain = np.empty((n, 4, 4)), np.empty(n)
+        fisher, gain = np.zeros((n, 4, 4)), np.empty(n)
         slopes, expected = self._slopes_of(n, 0), np.zeros(times.size)
 
         def block(part: int) -> None:
-            first = part * _SWEPT
-            fit_frames(
-                light, self._coarse, near, far, self._search, starts, first,
-                min(first + _SWEPT, times.size), sweeps, theta, rows.group, canvas, slopes,
-                outcome, fisher, gain, expected, np.zeros(self.used.shape, dtype=np.float32),
+            first, last = part * _SWEPT, min((part + 1) * _SWEPT, times.size)
+            draw_rows(self._coarse, near, far, starts, first, last, theta, rows.group, canvas)
+            fit_rows(
+                light, self._coarse, near, self._search, starts, first, last, sweeps, theta,
+                rows.group, canvas, slopes, outcome, fisher, gain, expected,
+                np.zeros(self.used.shape, dtype=np.float32),
             )  # fmt: skip
 
         self.share(block, -(-times.size // _SWEPT))

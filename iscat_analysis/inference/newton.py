@@ -18,8 +18,6 @@ from iscat_analysis._kernels.following import (
     find_clusters,
     follow_rows,
     join_rows,
-    move_together,
-    shift_rows,
 )
 from iscat_analysis.records import BoolArray, FloatArray
 
@@ -27,7 +25,8 @@ _PARTS = 8  # of the clusters, that threads take in turn
 _RESIDUE = 0.02  # of a step that is left to the next
 _MOST_STEPS = 40  # of the conjugate gradients
 _FARTHEST = 0.05  # step of the logarithm of the background
-_LONGEST = np.array([50.0, 50.0, 20.0, 0.3, 0.0])  # step of rows that overlap [nm], relative
+_LONGEST = np.array([50.0, 50.0, 20.0, 0.3, 0.0])
+"""Step of rows that overlap [nm], relative; longer ones are shortened with their cluster."""
 
 T = TypeVar("T")
 
@@ -74,14 +73,26 @@ class Response:
         frame = np.searchsorted(starts, firsts, side="right") - 1
         factors, steps = np.empty(corners[-1]), np.zeros(slopes.moves.shape if joint else (0, 0))
         self._clusters = Clusters(rows, edges, frame, corners, factors, steps)
-        self._share(
-            lambda a, b: join_rows(slopes, self._clusters, light, totals, information, a, b)
-        )
+        k, area = slopes.values.shape[1:]
+        self._largest = n = k * int(count.max(initial=0))
+
+        def join(a: int, b: int) -> None:
+            join_rows(
+                slopes, self._clusters, light, totals, information, a, b,
+                np.empty(2 * n * n + 2 * n + k * k), np.empty(n, dtype=np.int64),
+                np.empty((1 + 2 * k, area), dtype=np.float32),
+            )  # fmt: skip
+
+        self._share(join)
 
     def _share(self, task: Callable[[int, int], T]) -> list[T]:
         """Run a task for parts of the clusters, half-open ranges, several at a time."""
         edges = np.linspace(0, len(self._clusters.frame), _PARTS + 1).astype(int).tolist()
         return list(self._pool.map(lambda part: task(*part), pairwise(edges)))
+
+    def _room(self) -> tuple[NDArray[np.float32], FloatArray]:
+        """Room for a square and for the steps of a cluster."""
+        return np.empty(self._slopes.values.shape[2], dtype=np.float32), np.empty(self._largest)
 
     def step(
         self, move: FloatArray, total: FloatArray, used: BoolArray, damping: float
@@ -109,14 +120,16 @@ class Response:
         ndarray, shape (y, x)
             Change of the logarithm of the background.
         """
-        counts = np.where(used, total, 0.0)
+        counts, room = np.where(used, total, 0.0), np.empty_like(self._slopes.units)
 
         def undetermined(step: FloatArray) -> FloatArray:
             image = step.reshape(used.shape)
 
             def taken(first: int, last: int) -> FloatArray:
                 out = np.zeros(used.shape)
-                follow_rows(self._slopes, self._clusters, first, last, image, out)
+                follow_rows(
+                    self._slopes, self._clusters, first, last, image, room, out, *self._room()
+                )
                 return out
 
             out = (1 + damping) * counts * image
@@ -161,10 +174,15 @@ class Response:
         ndarray, shape (rows, 5)
             Where the next fit would find them.
         """
-        out, index = theta.copy(), np.flatnonzero(free[:4])
+        steps, nowhere = np.empty_like(self._slopes.units), np.empty((0, 0))
         self._share(
-            lambda a, b: shift_rows(self._slopes, self._clusters, a, b, step, index, *walls, out)
+            lambda a, b: follow_rows(
+                self._slopes, self._clusters, a, b, step, steps, nowhere, *self._room()
+            )
         )
+        out, index = theta.copy(), np.flatnonzero(free[:4])
+        low, high = (wall[index] for wall in walls)
+        out[:, index] = np.clip(theta[:, index] - steps, low, high)
         return out
 
     def together(
@@ -185,5 +203,17 @@ class Response:
             Where fits of all of them together would end.
         """
         out, index = theta.copy(), np.flatnonzero(free[:4])
-        self._share(lambda a, b: move_together(self._clusters, a, b, index, _LONGEST, *walls, out))
+        count = np.diff(self._clusters.edges)
+        rows = self._clusters.rows[np.repeat(count > 1, count)]
+        if rows.size:
+            count = count[count > 1]
+            here, steps = theta[np.ix_(rows, index)], self._clusters.steps[rows]
+            most = np.broadcast_to(_LONGEST[index], here.shape).copy()
+            most[:, index == 3] *= np.abs(here[:, index == 3])
+            length = np.abs(steps)
+            share = np.divide(most, length, out=np.ones_like(most), where=length > most)
+            share = np.minimum.reduceat(share.min(axis=1), np.cumsum(count) - count)
+            low, high = (wall[index] for wall in walls)
+            here = here + np.repeat(share, count)[:, None] * steps
+            out[np.ix_(rows, index)] = np.clip(here, low, high)
         return out

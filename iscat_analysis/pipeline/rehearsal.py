@@ -11,10 +11,12 @@ from __future__ import annotations
 import gc
 import sys
 from collections.abc import Collection
+from dataclasses import replace
 
 import numpy as np
 
 from iscat_analysis._kernels.canvas import Light
+from iscat_analysis._kernels.following import Slopes
 from iscat_analysis.config import Config
 from iscat_analysis.inference.coupling import Coupling
 from iscat_analysis.inference.exposures import Exposures
@@ -22,7 +24,8 @@ from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.newton import Response
 from iscat_analysis.inference.noise import compile_kernels
 from iscat_analysis.inference.rows import Ground, Rows
-from iscat_analysis.optics.forward import ForwardModel, forward_model
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.search.moving import link
 from iscat_analysis.species.motion import confinement_test
 from iscat_analysis.threads import threads
 
@@ -47,7 +50,11 @@ def rehearse(needs: Collection[str]) -> None:
 
 
 def _track(model: ForwardModel, *, free_z: bool) -> None:
-    """Run what is done with tracks, with judged rows, with rows that follow, and with frames."""
+    """Run what is done with tracks, with slopes of rows, with judged rows, and with frames.
+
+    The first process begins with pictures, and draws and fits frames before it needs any other
+    kernel here, so that what is judged, which is drawn as well, comes late.
+    """
     walk = np.cumsum(np.random.default_rng(1).normal(0, 100, (12, 2)), axis=0)
     confinement_test(np.arange(12), walk, 1.0, frame_rate_hz=100, resamples=1)
     shape = (_FRAMES, _SIDE, _SIDE)
@@ -60,28 +67,36 @@ def _track(model: ForwardModel, *, free_z: bool) -> None:
     rows = Rows.of(frame, track, theta.reshape(-1, 5))
     ground = Ground(np.full(shape[1:], 100.0), np.ones(_FRAMES))
     used = np.ones(shape[1:], dtype=np.bool_)
+    model.gradient(PixelGrid.centred(3, _PIXEL_NM), 0.0, 0.0, model.height_nm, 1.0)
     with threads(1) as pool:
+        slopes = _slopes(len(frame), 4 if free_z else 3)
+        light = Light(counts, 1.0, 0.0, ground.power, ground.level, np.ones(shape[1:]))
+        response = Response(
+            slopes, rows.starts(_FRAMES), light, np.zeros(shape, dtype=np.float32),
+            np.tile(np.eye(slopes.values.shape[1]), (len(frame), 1, 1)), pool, joint=True,
+        )  # fmt: skip
+        response.step(np.full(shape[1:], 1e-3), _FRAMES * ground.level, used, 0.0)
         field = MovingField(
             Exposures(counts), np.ones(shape[1:]), used, model, model, pixel_nm=_PIXEL_NM,
             roi_px=_SQUARE, z_range_nm=(0.0, 100.0) if free_z else None, largest=1.0, pool=pool,
         )  # fmt: skip
-        judged = field.judge(ground, rows)
-        coupling = Coupling(field, ground, judged, np.arange(2))
+        coupling = Coupling(field, ground, slopes, np.arange(2))
         own = coupling.own()
         coupling.followed(own, coupling.sent(np.zeros((2, 1, own.shape[1]))))
-        response = Response(
-            judged.slopes, rows.starts(_FRAMES),
-            Light(counts, 1.0, 0.0, ground.power, ground.level, np.ones(shape[1:])),
-            np.zeros(shape, dtype=np.float32), np.ones((len(theta) * 2, *own.shape[1:])), pool,
-            joint=True,
-        )  # fmt: skip
-        walls = np.full(5, -1e9), np.full(5, 1e9)
-        change = np.full(shape[1:], 1e-3)
-        response.together(rows.theta, field.free, walls)
-        response.followed(rows.theta, change, field.free, walls)
-        response.step(change, field.total_e, used, 0.0)
+        field.judge(ground, rows)
         field.residual(ground, rows, 0, 1)
+        link(frame, rows.theta[:, :2], reach_nm=1.0, memory=1)
+        corner, sums = np.zeros((2, 2), dtype=np.int64), np.zeros((1, 3, _SQUARE, _SQUARE))
+        field.add_squares(ground, rows, np.arange(2), corner, np.zeros(2, dtype=np.int64), sums)
         field.fit(ground, rows)
+        field.fit(replace(ground, level=2.0 * ground.level), rows)  # by more than plain steps
+
+
+def _slopes(rows: int, free: int) -> Slopes:
+    """Make slopes of rows that see nothing in their squares."""
+    squares = np.tile(np.array([0, _SQUARE, 0, _SQUARE]), (rows, 1))
+    values = np.zeros((rows, free, _SQUARE**2), dtype=np.int16)
+    return Slopes(squares, values, np.ones((rows, free)), np.zeros((rows, free)))
 
 
 if __name__ == "__main__":

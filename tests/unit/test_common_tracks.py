@@ -78,7 +78,7 @@ def test_information_lost_is_that_of_all_parameters(
     ground = Ground(ground.level, np.ones(FRAMES))
     judged = field.judge(ground, rows)
     one = np.array([0.0, 0.0, 1.0])
-    coupling = Coupling(field, ground, judged, np.arange(FRAMES))
+    coupling = Coupling(field, ground, judged.slopes, np.arange(FRAMES))
     taken = np.sum(coupling.sent(np.broadcast_to(one, (FRAMES, 1, 3))) ** 2)
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
     own = across = within = 0.0
@@ -194,7 +194,7 @@ def test_a_particle_that_hardly_moves_is_worked_out_to_the_last_digit(
     every = np.ones(FRAMES, dtype=bool)
     index = np.array([0, 1, 3])
     inverse = np.linalg.inv(judged.fisher[:, index][:, :, index])
-    coupling = Coupling(field, ground, judged, np.arange(FRAMES))
+    coupling = Coupling(field, ground, judged.slopes, np.arange(FRAMES))
     alone = np.eye(3 * FRAMES).reshape(3 * FRAMES, FRAMES, 3).swapaxes(0, 1)
     slopes = coupling.sent(alone).reshape(FRAMES, 3, -1)
     follow = inverse @ slopes

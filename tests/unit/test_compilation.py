@@ -127,8 +127,8 @@ from pathlib import Path
 
 from iscat_analysis.config import load_config
 from iscat_analysis._kernels import (
-    curvature, diffusion, following, goodness, hessian, judging, moving, scan, scoring, sharing,
-    well,
+    canvas, curvature, diffusion, following, goodness, hessian, judging, moving, scan, scoring,
+    sharing, well,
 )
 from iscat_analysis.pipeline.compilation import needs_of
 from iscat_analysis.pipeline.rehearsal import rehearse
@@ -136,10 +136,9 @@ from iscat_cli import main
 
 names = (
     scoring.maximize, scan.scan_heights, hessian.signal_hessian, curvature.errors_and_bias,
-    goodness.look, judging.judge_frames, moving.fit_frames, following.find_clusters,
-    following.join_rows, following.follow_rows, following.shift_rows, following.move_together,
-    sharing.own_shares, sharing.send, sharing.follow, diffusion.most_likely_diffusion,
-    well.most_likely_well,
+    goodness.look, canvas.draw_frames, judging.judge_frames, moving.fit_frames,
+    following.find_clusters, following.join_rows, following.follow_rows, sharing.own_shares,
+    sharing.send, sharing.follow, diffusion.most_likely_diffusion, well.most_likely_well,
 )
 sample, *changes = sys.argv[1:]
 rehearse(needs_of(load_config(Path(sample), changes)))

@@ -113,6 +113,25 @@ def test_function_that_is_no_kernel_calls_one() -> None:
         outside(np.zeros(0))
 
 
+def test_what_numba_writes_of_numpy_for_a_kernel_serves_other_functions_as_well() -> None:
+    def filled(n: int) -> float:
+        room, other = np.empty(n, np.float32), np.zeros((n, n))
+        for i in range(n):
+            room[i] = max(i, 2)
+        return float(room.sum() + other[0, 0])
+
+    ours, theirs = kernel()(filled), njit(filled)
+    ours._cache.disable()
+    assert ours(4) == theirs(4) == 9.0
+
+    @kernel()
+    def both(n: int) -> float:
+        return theirs(n) + np.empty(n, np.float32).size
+
+    both._cache.disable()
+    assert both(4) == 13.0
+
+
 def test_cycles_are_searched_for_after_compilation() -> None:
     @kernel()
     def plain(x: float) -> float:

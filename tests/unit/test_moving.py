@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.stamp import add_stamp
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.inference import settling
+from iscat_analysis.inference import frame_fits, settling
 from iscat_analysis.inference.climbing import climb, log_likelihood
 from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.moving import MovingField
@@ -269,6 +270,28 @@ def test_rows_are_fitted_by_the_one_likelihood(pool: ThreadPoolExecutor) -> None
         assert judged.worst[row] == pytest.approx(np.nanmax(np.abs(residuals)), rel=1e-4)
         gain = likelihood.values(theta[None])[0]
         assert judged.gain[row] == pytest.approx(gain, rel=1e-4)
+
+
+def test_rows_that_plain_steps_do_not_fit_are_fitted(
+    pool: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts, ground, truth = _movie(_paths(30.0), noise=True)
+    field, asked, search = _field(counts, pool), [], frame_fits._climb
+
+    def climbed(*given: Any) -> tuple[float, int]:
+        asked.append(given)
+        return search(*given)
+
+    monkeypatch.setattr(frame_fits, "_climb", climbed)
+    near, _, done = field.fit(ground, truth, sweeps=4)
+    assert done.all()
+    assert not asked
+    away = np.array([90.0, -90.0, 0.0, 0.0, 0.0])
+    far, _, done = field.fit(ground, replace(truth, theta=truth.theta + away), sweeps=4)
+    assert done.all()
+    assert 0 < len(asked) < 2 * FRAMES
+    sigma = 1 / np.sqrt(near.fisher[:, (0, 1, 3), (0, 1, 3)])
+    assert np.all(np.abs(far.theta - near.theta)[:, [0, 1, 3]] < 0.5 * sigma)  # other squares
 
 
 def test_rows_know_what_their_last_fit_saw(pool: ThreadPoolExecutor) -> None:

@@ -1,0 +1,157 @@
+"""Fits of rows, frame after frame, by plain steps where these lead and with more care elsewhere.
+
+Nearly all rows are fitted by the steps of Fisher scoring as they are.  The search that brakes them
+is a kernel of its own, which is compiled by the first row that needs it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.canvas import Canvas, Field, Light, Pictures, draw_frames
+from iscat_analysis._kernels.following import Slopes
+from iscat_analysis._kernels.lens import LatticeLens, RoundLens, StampLens
+from iscat_analysis._kernels.moving import Room, Search, fit_frames
+from iscat_analysis._kernels.radial import POWERS
+from iscat_analysis._kernels.scoring import POISSON, maximize
+from iscat_analysis.records import BoolArray, FloatArray
+
+IntArray = NDArray[np.int64]
+
+
+def room_for(field: Field, near: Pictures, free: BoolArray) -> Room:
+    """Make room for the kernels of rows.
+
+    Parameters
+    ----------
+    field : Field
+        Sides of squares.
+    near : Pictures
+        What is fitted.
+    free : ndarray of bool, shape (5,)
+        Free parameters.
+
+    Returns
+    -------
+    Room
+        For one thread.
+    """
+    index, area = np.flatnonzero(free[:4]), field.side**2
+    return Room(
+        np.empty(15 * area, near.nodes.dtype), np.empty(area, np.float32), _profile(near, 2), index,
+        np.empty((11, 5)), np.empty((4, index.size)),
+        np.empty(0 if isinstance(near.lens, StampLens) else 10 * area),
+    )  # fmt: skip
+
+
+def _profile(pictures: Pictures, orders: int) -> FloatArray:
+    """Make room for a profile, as `iscat_analysis._kernels.scoring.blank_profile` does."""
+    lens, (channels, width) = pictures.lens, pictures.heights.shape[3:]
+    if isinstance(lens, StampLens):
+        return np.empty((0, 0, 0))
+    if isinstance(lens, LatticeLens):
+        return np.empty((orders * channels, 2 * lens.half + 1, 2 * lens.half + 1))
+    return np.empty((width // POWERS, POWERS, orders * channels))
+
+
+def draw_rows(
+    field: Field, near: Pictures, far: Pictures, starts: IntArray, first: int, last: int,
+    theta: FloatArray, group: IntArray, canvas: Canvas,
+) -> None:  # fmt: skip
+    """Bring frames first…last − 1 of the canvas to the rows as they are.
+
+    Parameters
+    ----------
+    field : Field
+        The pixels.
+    near, far : Pictures
+        Of the fitted squares, and of what is drawn around them.
+    starts : ndarray of int, shape (t + 1,)
+        First row of each frame.
+    first, last : int
+        Frames.
+    theta : ndarray, shape (rows, 5)
+        The rows.
+    group : ndarray of int, shape (rows,)
+        Number of each row's picture.
+    canvas : Canvas
+        Drawn on.
+    """
+    draw_frames(
+        field, near, far, starts, first, last, theta, group, canvas, _profile(near, 1),
+        _profile(far, 1), np.empty(max(field.drawn, field.side) ** 2),
+    )  # fmt: skip
+
+
+def fit_rows(
+    light: Light, field: Field, near: Pictures, search: Search, starts: IntArray, first: int,
+    last: int, sweeps: int, theta: FloatArray, group: IntArray, canvas: Canvas, slopes: Slopes,
+    outcome: IntArray, information: FloatArray, gain: FloatArray, expected: FloatArray,
+    sums: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Fit the rows of frames first…last − 1, each `sweeps` times.
+
+    Parameters
+    ----------
+    light : Light
+        The movie.
+    field, near, search : Field, Pictures, Search
+        Pixels, pictures to fit, and what is fitted.
+    starts : ndarray of int, shape (t + 1,)
+        First row of each frame.
+    first, last : int
+        Frames.
+    sweeps : int
+        How often; 0 sums only.
+    theta : ndarray, shape (rows, 5)
+        Starts; overwritten with the estimates.
+    group : ndarray of int, shape (rows,)
+        Number of each row's picture.
+    canvas : Canvas
+        On which `draw_rows` has drawn the starts.
+    slopes : Slopes
+        As in `iscat_analysis._kernels.moving.fit_frames`.
+    outcome, information, gain, expected, sums : ndarray
+        As there.
+    """
+    place = np.array([first, 0, starts[first], 0, 0, 0, 0])
+    room = room_for(field, near, search.free)
+    background = light.background.astype(np.float32)
+    while not fit_frames(
+        light, field, near, search, starts, last, sweeps, theta, group, canvas, slopes, outcome,
+        information, gain, expected, background, sums, place, room,
+    ):  # fmt: skip
+        row = int(place[2])
+        gain[row], outcome[row] = _climb(
+            field, near, search, place, room, int(group[row]), theta[row]
+        )
+
+
+def _climb(
+    field: Field, near: Pictures, search: Search, place: IntArray, room: Room, group: int,
+    theta: FloatArray,
+) -> tuple[float, int]:  # fmt: skip
+    """Fit a row whose plain steps lead nowhere, from θ, which is overwritten with the estimate.
+
+    Returns its log-likelihood over that without the particle, and how the fit ended.
+    """
+    top, bottom, left, right = place[3:]
+    shape = 4, bottom - top, right - left
+    start = room.small[10]
+    data = room.pixels[: math.prod(shape)].reshape(shape).astype(np.float64)
+    heights = near.heights[min(group, len(near.heights) - 1)]
+    table = heights, near.first_nm, near.step_nm, near.kappa
+    lens = near.lens
+    if not isinstance(lens, RoundLens):
+        lens = lens._replace(window=near.windows[min(group, len(near.windows) - 1)])
+    x, y, offsets, weights = field.pixels
+    value, _, outcome = maximize(
+        table, tuple(lens), (x[left:right], y[top:bottom], offsets, weights), POISSON, data,
+        search.free, np.maximum(search.lower, start - search.reach),
+        np.minimum(search.upper, start + search.reach), search.max_step, search.tolerance,
+        search.passes, theta, np.empty((5, 5)), -math.inf,
+    )  # fmt: skip
+    return value, outcome
