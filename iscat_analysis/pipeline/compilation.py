@@ -167,12 +167,13 @@ def needs_of(config: Config) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        As from `iscat_analysis.inference.noise.parts_of`, and ``"tracks"`` where particles move.
+        As from `iscat_analysis.inference.noise.parts_of`, and ``"tracks"`` where particles move,
+        ``"sliding"`` where windows slide.
     """
-    tracks = way_of(config) == "tracks"
-    free = FREE_PARAMETERS[config.track.free if tracks else config.fit.mode]
+    way = way_of(config)
+    free = FREE_PARAMETERS[config.track.free if way == "tracks" else config.fit.mode]
     parts = parts_of(free, posteriors=config.samples_posterior)
-    return (*parts, "tracks") if tracks else parts
+    return parts if way == "fixed" else (*parts, way)
 
 
 @contextmanager

@@ -17,15 +17,29 @@ import numpy as np
 
 from iscat_analysis._kernels.canvas import Light
 from iscat_analysis._kernels.following import Slopes
+from iscat_analysis._kernels.sliding import strongest_maps
+from iscat_analysis._kernels.stepping import add_image
 from iscat_analysis.config import Config
 from iscat_analysis.inference.coupling import Coupling
 from iscat_analysis.inference.exposures import Exposures
 from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.newton import Response
 from iscat_analysis.inference.noise import compile_kernels
+from iscat_analysis.inference.repeats import repeats_of, series_of
 from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.movie.background import find_defects
+from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.pipeline.sidelobes import Sieve
 from iscat_analysis.search.moving import link
+from iscat_analysis.search.sliding import (
+    STRIDES,
+    find_steps,
+    make_chunk,
+    make_filter,
+    measure_frames,
+    sliding_maps,
+)
 from iscat_analysis.species.motion import confinement_test
 from iscat_analysis.threads import threads
 
@@ -47,6 +61,32 @@ def rehearse(needs: Collection[str]) -> None:
         _track(model, free_z="heights" in needs)
         return
     compile_kernels(model, needs, backwards=True)
+    if "sliding" in needs:
+        _slide()
+
+
+def _slide() -> None:
+    """Run what is done with the windows of a landing movie once the optics are known.
+
+    The first process is at its fits by then.
+    """
+    camera, side = Camera(), _SIDE
+    counts = np.random.default_rng(1).poisson(100.0, (2 * side, side, side)).astype(np.uint16)
+    light, repeats = measure_frames(counts, camera)
+    chunk = make_chunk(0, counts, ~repeats, light, camera, stride=2, defects=find_defects)
+    patch = chunk.patch(0, len(counts), (0, side), (0, side))
+    patch.windows([0, side, 2 * side])
+    series = series_of(
+        patch.counts, np.ones((1, side, side)), patch.power,
+        gain=1.0, offset=0.0, mean_e=patch.mean_e, read_variance_e2=np.zeros((side, side)),
+    )  # fmt: skip
+    repeats_of((series, series))
+    matched = make_filter(chunk, np.ones((3, 3)))
+    snr, effective = sliding_maps(chunk, matched, STRIDES)
+    add_image(snr[0], (0, 0), matched.response((0, 0), np.ones((3, 3)))[1], np.float32(1.0))
+    peaks = find_steps(chunk, matched, snr, effective, 0.0)
+    Sieve(0, 2, 2 * STRIDES, _SQUARE).sift(peaks, [], snr)
+    strongest_maps(snr, np.empty((side, side), dtype=np.int64))
 
 
 def _track(model: ForwardModel, *, free_z: bool) -> None:

@@ -128,7 +128,7 @@ from pathlib import Path
 from iscat_analysis.config import load_config
 from iscat_analysis._kernels import (
     canvas, curvature, diffusion, following, goodness, hessian, judging, moving, scan, scoring,
-    sharing, well,
+    sharing, sliding, stepping, well,
 )
 from iscat_analysis.pipeline.compilation import needs_of
 from iscat_analysis.pipeline.rehearsal import rehearse
@@ -139,6 +139,8 @@ names = (
     goodness.look, canvas.draw_frames, judging.judge_frames, moving.fit_frames,
     following.find_clusters, following.join_rows, following.follow_rows, sharing.own_shares,
     sharing.send, sharing.follow, diffusion.most_likely_diffusion, well.most_likely_well,
+    stepping.part_sums, stepping.frame_scores, stepping.spreads, stepping.add_image,
+    sliding.contrast_map, sliding.step_peaks, sliding.in_shadow, sliding.strongest_maps,
 )
 sample, *changes = sys.argv[1:]
 rehearse(needs_of(load_config(Path(sample), changes)))
@@ -153,6 +155,7 @@ for kernel, before in zip(names, known):
         print(kernel.py_func.__name__)
 """
 FEW = ["simulation.shape=[64, 64]", "compute.workers=1", "posterior.enabled=false"]
+REPEATS = {"frame_scores", "spreads"}  # which take 0.3 s
 ONE = "simulation.events=[{frame=200, x_px=31.2, y_px=30.8, mass_kda=900.0}]"
 MOVING = [
     "simulation.count=0", "simulation.leavings=0", "simulation.frames=60",
@@ -164,8 +167,9 @@ MOVING = [
 @pytest.mark.parametrize(
     ("sample", "changes", "kernels", "more"),
     [
-        ("mass", [ONE], 4, set()),
-        ("joint", [ONE], 4, {"signal_hessian"}),  # at heights that are held fixed
+        ("mass", [ONE], 4, REPEATS),
+        ("joint", [ONE], 4, {*REPEATS, "signal_hessian"}),  # at heights that are held fixed
+        ("landing", ["simulation.frames=600"], 12, set()),
         ("landing", [*MOVING, "track.free=mass"], 12, set()),
     ],
 )
@@ -203,7 +207,7 @@ print(*(len(kernel.signatures) for kernel in (radial_signal, lattice_signal, sta
     [
         ("mass", [], ("posteriors",)),
         ("mass", ["posterior.enabled=false"], ()),
-        ("landing", [], ()),
+        ("landing", [], ("sliding",)),
         ("joint", [], ("heights",)),
         ("joint", ["posterior.enabled=true"], ("heights", "posteriors")),
         ("landing", ["fit.mode=track", "track.free=mass"], ("tracks",)),
@@ -220,7 +224,7 @@ def test_an_analysis_compiles_what_it_needs(monkeypatch, sample, changes, parts)
     monkeypatch.setattr(Likelihood, "maximize", lambda *given, **_: free.append(given[2][2]))
     for backwards in (False, True):
         compile_kernels(forward_model(config, 2000.0), parts, backwards=backwards)
-    assert run == set(parts) - {"tracks"}
+    assert run == set(parts) - {"tracks", "sliding"}
     assert free == 2 * ["heights" in parts]
 
 
