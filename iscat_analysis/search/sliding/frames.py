@@ -174,11 +174,11 @@ class Patch:
         power : float
             Their power.
         """
-        here = slice(max(start - self.first, 0), max(stop - self.first, 0))
+        part = self.frames(start, stop)
         out = np.zeros(self.mean_e.shape)
-        region_sum(self.pixels[here], self.good[here], out.reshape(-1))
-        frames = int(np.count_nonzero(self.good[here]))
-        return self.gain * (out - frames * self.offset), frames, float(self.power[here].sum())
+        region_sum(part.pixels, part.good, out.reshape(-1))
+        frames = int(np.count_nonzero(part.good))
+        return self.gain * (out - frames * self.offset), frames, float(part.power.sum())
 
     def windows(self, ends: Sequence[int]) -> tuple[FloatArray, NDArray[np.int64], FloatArray]:
         """Sum contiguous parts of the frames.
