@@ -106,26 +106,6 @@ def region_sum(counts: NDArray[Any], good: BoolArray, out: FloatArray) -> None:
                 out[i] += counts[t, i]
 
 
-@kernel(fastmath=True)
-def region_scores(counts: NDArray[Any], weights: FloatArray, out: FloatArray) -> None:
-    """Weighted sum of every frame.
-
-    Parameters
-    ----------
-    counts : ndarray, shape (t, n)
-        Stored counts of n pixels.
-    weights : ndarray, shape (n,)
-        Of the pixels.
-    out : ndarray, shape (t,)
-        Filled.
-    """
-    for t in range(counts.shape[0]):
-        total = 0.0
-        for i in range(weights.size):
-            total += weights[i] * counts[t, i]
-        out[t] = total
-
-
 @kernel(fastmath={"reassoc", "nsz"})
 def contrast_map(earlier: FloatArray, later: FloatArray, weight: MapArray, out: MapArray) -> float:
     """Weighted contrast of two sums over the field, with its weighted mean taken off.

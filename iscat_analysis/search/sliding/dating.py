@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iscat_analysis._kernels.sliding import region_scores
-from iscat_analysis._kernels.stepping import one_change, projector
+from iscat_analysis._kernels.stepping import frame_scores, one_change, projector
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.sliding.frames import Patch
 
@@ -152,12 +151,13 @@ def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArr
         The weight of a frame of unit power.
     """
     weights, scale = _projector(patch, image)
-    scores = np.empty(len(patch.counts))
-    region_scores(patch.pixels, (weights * patch.gain).reshape(-1), scores)
+    scores = np.empty((1, len(patch.counts)))
+    every = np.ones(scores.size, dtype=np.bool_)
+    frame_scores(patch.pixels, every, (weights * patch.gain).reshape(1, -1), scores)
     power = patch.power
     lit = power > 0
     zero = float(np.sum(weights * patch.gain * patch.offset))
-    heights = (scores - zero) / np.where(lit, power, 1.0) / scale
+    heights = (scores[0] - zero) / np.where(lit, power, 1.0) / scale
     return heights, np.where(lit, power, 0.0) * scale, scale
 
 
