@@ -3,11 +3,42 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-_UNFINISHED: set[Path] = set()
+_UNFINISHED: dict[Path, None] = {}  # the last begun is last
+
+
+@contextmanager
+def unfinished(path: Path) -> Iterator[None]:
+    """Have `discard_unfinished` remove something for as long as the block runs.
+
+    Parameters
+    ----------
+    path : Path
+        A file or a folder, which need not exist yet.
+
+    Yields
+    ------
+    None
+
+    Raises
+    ------
+    KeyboardInterrupt
+        The block ended well, but `path` is being discarded: the process ends.
+    """
+    _UNFINISHED[path] = None
+    try:
+        yield
+    except BaseException:
+        _UNFINISHED.pop(path, None)
+        raise
+    try:
+        del _UNFINISHED[path]
+    except KeyError:
+        raise KeyboardInterrupt from None
 
 
 @contextmanager
@@ -25,16 +56,34 @@ def whole_file(path: Path) -> Iterator[Path]:
         Beside it: where to write.  It is removed if writing fails.
     """
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    _UNFINISHED.add(partial)
     try:
-        yield partial
+        with unfinished(partial):
+            yield partial
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
-        _UNFINISHED.discard(partial)
 
 
 def discard_unfinished() -> None:
     """Remove what is being written, for a process that ends without unwinding its stack."""
-    for partial in tuple(_UNFINISHED):
-        partial.unlink(missing_ok=True)
+    while _UNFINISHED:
+        path, _ = _UNFINISHED.popitem()
+        if path.is_dir():
+            remove_folder(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder, also if an interrupt or a new file arrives meanwhile.
+
+    Parameters
+    ----------
+    folder : Path
+        It need not exist.
+    """
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        if folder.exists():
+            shutil.rmtree(folder, ignore_errors=True)

@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.files import remove_folder, unfinished
 
 OUTPUT_NAMES = frozenset(
     {
@@ -120,15 +121,18 @@ def claim_output(
         raise DataError(
             f"{folder}: cannot be made ({error.strerror}); choose another `out`"
         ) from None
-    try:
-        if held is not None:
-            _recover(target)
+    if held is None:
         check_output(folder, overwrite, known=known)
         yield
+        return
+    try:
+        with unfinished(lock):
+            _recover(target)
+            check_output(folder, overwrite, known=known)
+            yield
     finally:
-        if held is not None:
-            lock.unlink(missing_ok=True)  # before it is released: no other run waits for this file
-            os.close(held)
+        lock.unlink(missing_ok=True)  # before it is released: no other run waits for this file
+        os.close(held)
 
 
 @contextmanager
@@ -160,29 +164,21 @@ def atomic_folder(
         target = _resolved(folder)
         building = _hidden(_BUILDING, target)
         try:
-            try:
-                building.mkdir(0o700)
-            except OSError as error:
-                raise DataError(
-                    f"{folder}: cannot be made ({error.strerror}); choose another `out`"
-                ) from None
-            yield building
-            _like_an_ordinary_folder(building)
-            check_output(folder, overwrite, known=known)
+            with unfinished(building):
+                try:
+                    building.mkdir(0o700)
+                except OSError as error:
+                    raise DataError(
+                        f"{folder}: cannot be made ({error.strerror}); choose another `out`"
+                    ) from None
+                yield building
+                _like_an_ordinary_folder(building)
+                check_output(folder, overwrite, known=known)
             _swap(building, target)
         except OSError as error:
             raise DataError(f"{folder}: cannot be written ({error.strerror or error})") from error
         finally:
-            _remove(building)
-
-
-def _remove(folder: Path) -> None:
-    """Remove a folder that this module made, completely even if an interrupt arrives meanwhile."""
-    try:
-        shutil.rmtree(folder, ignore_errors=True)
-    finally:
-        if folder.exists():
-            shutil.rmtree(folder, ignore_errors=True)
+            remove_folder(building)
 
 
 def _resolved(folder: Path) -> Path:
@@ -285,4 +281,4 @@ def _swap(building: Path, target: Path) -> None:
         if kept.exists() and not target.exists():
             kept.rename(target)
         if target.exists():
-            _remove(earlier)
+            remove_folder(earlier)

@@ -383,10 +383,8 @@ def test_progress_does_not_hide_the_one_error(movie: Path, tmp_path: Path) -> No
 _DEAF = """
 import itertools, sys, time
 import iscat_cli
-from iscat_analysis.study import simulate
 
-def deaf(frames, *_):
-    yield from itertools.islice(frames, 2)
+def deaf():
     while True:
         try:
             print("deaf", file=sys.stderr, flush=True)
@@ -394,24 +392,52 @@ def deaf(frames, *_):
         except KeyboardInterrupt:
             pass
 
-simulate._counted = deaf
+def counted(frames, *_):
+    yield from itertools.islice(frames, 2)
+    deaf()
+
+def fill_report(analysis, folder, **_):
+    (folder / "fits.csv").write_text("half of it")
+    deaf()
+
+if sys.argv[1] == "simulate":
+    from iscat_analysis.study import simulate
+    simulate._counted = counted
+else:
+    from iscat_analysis import pipeline
+    from iscat_cli import ending
+    pipeline.fill_report = fill_report
+    ending.WRITING_GRACE_S = 0.5
 sys.exit(iscat_cli.main())
 """
 
 
-def test_ctrl_c_that_goes_unanswered(tmp_path: Path) -> None:
-    """A process that does not answer an interrupt is ended, and leaves no partial movie."""
-    setup = _simulation(tmp_path, "[camera]\npixel_size_nm = 84.4\n[simulation]\nframes = 60\n")
+@pytest.mark.parametrize("command", ["simulate", "fit"])
+def test_ctrl_c_that_goes_unanswered(command: str, tmp_path: Path) -> None:
+    """A process that does not answer an interrupt is ended, and leaves nothing half-written."""
+    setup = _simulation(
+        tmp_path,
+        "[camera]\npixel_size_nm = 84.4\n[background]\nframes = [0, 10]\n"
+        "[posterior]\nenabled = false\n[calibration]\ngradient_per_kda = -3.1e-5\n"
+        "[simulation]\nframes = 20\n",
+    )
+    movie = tmp_path / "movie.tif"
+    simulate = ["simulate", "--config", str(setup), "--out", str(movie)]
+    if command == "fit":
+        assert main([*simulate, "--quiet"]) == 0
     left = _listing(tmp_path)
-    command = ["simulate", "--config", str(setup), "--out", str(tmp_path / "movie.tif")]
+    fit = ["fit", str(movie), "--config", str(setup)]
     process = subprocess.Popen(
-        [sys.executable, "-c", _DEAF, *command], stderr=subprocess.PIPE, text=True, cwd=tmp_path
+        [sys.executable, "-c", _DEAF, *(simulate if command == "simulate" else fit)],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
     )
     try:
         for line in process.stderr:
             if "deaf" in line:
                 break
-        assert list(tmp_path.glob("movie.tif.*.partial"))
+        assert len(_listing(tmp_path)) > len(left)
         process.send_signal(signal.SIGINT)
         said = process.communicate(timeout=120)[1]
     finally:
