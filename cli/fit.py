@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from iscat_analysis.records import Analysis
 
 FLAGGED = 3
-_LARGE_BYTES = 2**27  # of a movie, whose analysis takes longer than loading what draws
 ROWS_SHOWN = 20
 GAP = 3  # characters between the columns of a table on a terminal
 
@@ -133,8 +132,7 @@ def fit(
         from iscat_analysis.draughtsman import Draughtsman
 
         with closing(Draughtsman()) as pen:
-            if resolved.background.method != "sliding" or not _is_large(stack):
-                pen.start()  # early, because it has as much to load
+            pen.start()  # early, because it has as much to load
             from iscat_analysis.movie.addresses import MARK, beside
             from iscat_analysis.pipeline import fit_stack
             from iscat_analysis.places import open_place
@@ -175,11 +173,6 @@ def fit(
         understated = analysis.summary.get("repeats", {}).get("understated", False)
         if strict and (flagged or understated):
             raise typer.Exit(FLAGGED)
-
-
-def _is_large(stack: Path) -> bool:
-    """Whether memory for figures is better taken when that for its chunks is free again."""
-    return stack.is_file() and stack.stat().st_size > _LARGE_BYTES
 
 
 def _changes(

@@ -1,8 +1,7 @@
 """A process that draws figures, started before they are wanted so that it is ready then.
 
 Loading Matplotlib and drawing take as long as the rest of a small run.  The process loads it while
-a movie is analysed, and then draws while tables are written.  What it has loaded is 100 MB, so that
-it is started for a large movie when most of the work is done.  On Linux it is a copy of the process
+a movie is analysed, and then draws while tables are written.  On Linux it is a copy of the process
 that starts it, and has what that has loaded; elsewhere it is started from a file of this package,
 never from the user's script.  It ends when the process that started it does.
 """

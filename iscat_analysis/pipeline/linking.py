@@ -436,6 +436,8 @@ def bridge(config: Config, rows: Rows) -> IntArray:
     apart = scipy.spatial.distance.cdist(rows.theta[last, :2], rows.theta[first, :2])
     may = (gap > 0) & (gap <= _BRIDGE_FRAMES + 1) & (apart < reach)
     may &= np.maximum(square, square[:, None]) * np.maximum(gap, 1) < reach**2
+    if not may.any():
+        return rows.track
     before, after = scipy.optimize.linear_sum_assignment(np.where(may, apart, reach) ** 2)
     track = rows.track.copy()
     for i, j in zip(before.tolist(), after.tolist(), strict=True):

@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
+from PIL import Image
 
 from iscat_analysis.records import Analysis
 from iscat_analysis.report.event_figures import event_figures
 from iscat_analysis.report.page import page_context, page_of, page_sketches, templates
-from iscat_analysis.report.style import Sketch, drawn, inline_svg, publish
+from iscat_analysis.report.style import Sketch, drawn, inline_svg, new_figure, publish
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.threads import processors
 
@@ -125,8 +126,13 @@ class Desk:
 
     def __init__(self) -> None:
         gc.disable()  # the process is short, and what it makes stays
-        for name in templates().list_templates():  # compiled while the other process is at work
+        # while the other process is at work: templates are compiled, formats and fonts are loaded
+        for name in templates().list_templates():
             templates().get_template(name)
+        Image.preinit()
+        sample = new_figure(1.0, 1.0, constrained=False)
+        sample.text(0.5, 0.5, "σ")
+        publish([("sample", sample)])
         self._begun: tuple[Drawing, Analysis] | None = None
 
     def begin(self, analysis: Analysis, folder: Path, most: int) -> None:

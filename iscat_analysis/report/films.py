@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, WebPImagePlugin
 
 from iscat_analysis.records import Analysis, Clip, Film, FloatArray
 from iscat_analysis.report.numbers import number
@@ -160,9 +160,9 @@ def _stepped(values: FloatArray) -> FloatArray:
 
 
 def _animated(pictures: list[Image.Image]) -> bytes:
-    buffer = io.BytesIO()
+    buffer, kind = io.BytesIO(), WebPImagePlugin.WebPImageFile  # else all kinds are loaded for it
     pictures[0].save(
-        buffer, "WEBP", save_all=True, append_images=pictures[1:], duration=FRAME_MS, loop=0,
+        buffer, kind.format, save_all=True, append_images=pictures[1:], duration=FRAME_MS, loop=0,
         lossless=True, quality=60, method=4, minimize_size=False,
     )  # fmt: skip
     return buffer.getvalue()

@@ -218,9 +218,10 @@ def mass_d(analysis: Analysis) -> Figure:
         (np.log(d[shown]), d_sigma[shown] / d[shown], np.log(y_ends)),
     )
     shade = LinearSegmentedColormap.from_list("shade", ["#FFFFFF00", BLUE])
-    axes.pcolormesh(
-        np.linspace(*x_ends, _CELLS), np.geomspace(*y_ends, _CELLS), density, cmap=shade,
-        vmin=0, rasterized=True, shading="gouraud",
+    half = 0.5 / (_CELLS - 1)  # the outermost cells have their middles at the ends of the axes
+    axes.imshow(
+        density, cmap=shade, vmin=0, origin="lower", aspect="auto", interpolation="bilinear",
+        extent=(-half, 1 + half, -half, 1 + half), transform=axes.transAxes,
     )  # fmt: skip
     for rows, color, mark in ((good, INK, "ok"), (usable & ~good, PURPLE, "flagged")):
         at = np.flatnonzero(rows)
