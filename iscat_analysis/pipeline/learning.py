@@ -131,7 +131,9 @@ def learn_optics(
     first_tested = optics.calibrate == "auto" and way_of(config) == "sliding"
     with threads(config.compute.workers) as pool:
         enough = _TESTED if first_tested else MOST_SIGHTS
-        sights, others = bright_sights(movie, config, camera, pool, opening, enough)
+        sights, others = bright_sights(
+            movie, config, camera, pool, opening, enough, rings=not first_tested
+        )
         alone, source = len(sights), {"movie": movie.name}
         try:
             if alone < LEAST_TESTED and way_of(config) == "fixed":
@@ -142,7 +144,7 @@ def learn_optics(
             if len(sights) < LEAST_TESTED:
                 raise DataError(_too_few(movie.name, len(sights)))
             median = _median_p(sights, config, others, pool.map)
-            if first_tested and median < REJECTED_P:  # learning them takes more particles
+            if first_tested and median < REJECTED_P:  # more particles, and whose rings they show
                 sights, others = bright_sights(movie, config, camera, pool, opening)
                 alone, median = len(sights), _median_p(sights, config, others, pool.map)
             if optics.calibrate == "auto" and median < REJECTED_P and not heights_free(config):
@@ -330,7 +332,7 @@ def _median_p(
 ) -> float:
     """Median p-value of the brightest particles in the configured microscope.
 
-    The rings of neighbours, which take time, are put into the pictures where these fail without.
+    The rings of neighbours, where any are known, are put into the pictures that fail without.
     """
     settings = settings_of(config)
     build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])

@@ -66,6 +66,7 @@ def bright_sights(
     pool: ThreadPoolExecutor,
     opening: Opening | None = None,
     enough: int = MOST_SIGHTS,
+    rings: bool = True,
 ) -> tuple[list[Sight], list[Sight]]:
     """Find the bright particles of a movie, in the way in which it is analysed.
 
@@ -86,20 +87,22 @@ def bright_sights(
         Of a landing movie, where it was judged; its reader keeps what is read here.
     enough : int
         Bright steps of a landing movie after which no further chunk is searched.
+    rings : bool
+        Whether to look for those of a landing movie whose rings may lie in the pictures of others.
 
     Returns
     -------
     sights : list of Sight
         At most `MOST_SIGHTS`, the brightest first.
     others : list of Sight
-        Every bright particle, on small regions.
+        Every bright particle, on small regions; of a landing movie with `rings` only.
     """
     if way_of(config) == "sliding":
         if opening is not None:
-            return landing_sights(opening.reader, opening.window, config, pool, enough)
+            return landing_sights(opening.reader, opening.window, config, pool, enough, rings)
         reader = Reader(movie, camera, *fitted_frames(movie, config), counts_budget(config))
         window = judge_window(reader, config, pool.map)[2]
-        return landing_sights(reader, window, config, pool, enough)
+        return landing_sights(reader, window, config, pool, enough, rings)
     if heights_free(config) and way_of(config) == "fixed":
         return [], []
     windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
@@ -123,7 +126,12 @@ def kind_of(config: Config) -> str:
 
 
 def landing_sights(
-    reader: Reader, window: int, config: Config, pool: ThreadPoolExecutor, enough: int
+    reader: Reader,
+    window: int,
+    config: Config,
+    pool: ThreadPoolExecutor,
+    enough: int,
+    rings: bool,
 ) -> tuple[list[Sight], list[Sight]]:
     """Find bright steps of a landing movie, chunk by chunk until there are enough.
 
@@ -137,15 +145,15 @@ def landing_sights(
         Resolved.
     pool : ThreadPoolExecutor
         Runs the search.
-    enough : int
-        Bright steps after which no further chunk is searched.
+    enough, rings
+        As in `bright_sights`.
 
     Returns
     -------
     sights : list of Sight
         At most `MOST_SIGHTS`, the brightest first.
     others : list of Sight
-        Every bright step, on small regions.
+        Every bright step, on small regions; empty without `rings`.
     """
     stride = max(1, window // STRIDES)
     found: list[BrightStep] = []
@@ -159,6 +167,7 @@ def landing_sights(
             resolution_nm=config.optics.wavelength_nm / config.optics.na,
             roi_px=_roi_px(config),
             most=MOST_SIGHTS,
+            rings=rings,
             mapper=pool.map,
         )
         found += alone

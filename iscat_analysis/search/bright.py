@@ -99,6 +99,7 @@ def find_bright_steps(
     resolution_nm: float,
     roi_px: int,
     most: int,
+    rings: bool = True,
     mapper: Mapper = map,
 ) -> tuple[tuple[BrightStep, ...], tuple[BrightStep, ...]]:
     """Bright steps that stand alone, and all of them, brightest first.
@@ -117,6 +118,8 @@ def find_bright_steps(
         Side of the region that is cut out.
     most : int
         Steps that are returned at most.
+    rings : bool
+        Whether to cut out the others, too, which takes as long again.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -126,17 +129,17 @@ def find_bright_steps(
         Each with nothing else within `ALONE_NM` in the frames summed.
     others : tuple of BrightStep
         Every step with nothing else at its own place, in the middle of its region: what the rings
-        in the pictures of the first come from.
+        in the pictures of the first come from.  Empty without `rings`.
     """
     spots = _spots(chunk, _SPOT * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, mapper)
-    cut = list(
-        mapper(
-            lambda s: _cut(chunk, s, spots, window, pixel_nm, roi_px, ALONE_NM), spots[: 4 * most]
-        )
-    )
+    # one after the other: between small kernels threads wait for each other at the interpreter
+    cut = [
+        _cut(chunk, spot, spots, window, pixel_nm, roi_px, ALONE_NM) for spot in spots[: 4 * most]
+    ]
     alone = sorted((step for step in cut if step), key=lambda step: -step.snr)[:most]
     small = max(5, round(_OTHERS_NM / pixel_nm))
-    rest = mapper(lambda s: _cut(chunk, s, spots, window, pixel_nm, small, _SHADOW_NM), spots)
+    around = spots if rings else ()
+    rest = (_cut(chunk, spot, spots, window, pixel_nm, small, _SHADOW_NM) for spot in around)
     return tuple(alone), tuple(step for step in rest if step)
 
 
