@@ -10,7 +10,6 @@ another microscope, one parameter at a time.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -149,11 +148,12 @@ def likely_cause(
         share, step = _explained(left, changes, excess, whole=name in _WHOLE)
         if len(changes) == 1 and name not in (_TURNED, *_OTHERS) and share > WORTH_NAMING:
             # far from a first order: the same, as far away as it seems, if a microscope is there
-            with suppress(ConfigError):
-                there = _neighbours(config, name, reach, float(step[0]))
+            if there := _neighbours(config, name, reach, float(step[0])):
                 share, step = _explained(left, there, excess)
         for far in _FAR.get(name, ()):
-            larger, asked = _explained(left, _neighbours(config, name, reach, far), excess)
+            if not (there := _neighbours(config, name, reach, far)):
+                continue
+            larger, asked = _explained(left, there, excess)
             if larger > share and _WHOLE_STEP < asked[0] / far < 1 / _WHOLE_STEP:
                 share, step = larger, np.array([far])
         if share > WORTH_NAMING and (best is None or share > best.share):
@@ -216,8 +216,6 @@ def _explained(
 
     `whole` changes are there or not: just one of them is taken.
     """
-    if not changes:
-        return 0.0, np.zeros(0)
     slope, curvature = np.zeros(len(changes)), np.zeros((len(changes), len(changes)))
     for each in left:
         change = np.stack([each.change(*one) for one in changes], axis=1)
@@ -234,7 +232,8 @@ def _neighbours(
 ) -> list[tuple[float, _Picture]]:
     """Give the microscopes that differ in one respect, and by how much; none where there are none.
 
-    They are `far` away where that is given, else as in `_STEPS`.
+    They are `far` away where that is given, else as in `_STEPS`.  There are none beyond what optics
+    can be, nor where particles that the configuration's line has dark would be bright.
     """
     optics = config.optics
     if name == PIXEL:
@@ -268,15 +267,14 @@ def _neighbours(
         other = dict(_OTHERS[name])
         same = all(getattr(optics, key) == value for key, value in other.items())
         updates = [] if same or ("mask_na" in other and optics.mask_na > 0) else [(1.0, other)]
-    return [
-        (
-            step,
-            forward_model(
-                config.model_copy(update={"optics": optics.model_copy(update=update)}), reach_nm
-            ).image,
-        )
+    others = [
+        (step, config.model_copy(update={"optics": optics.model_copy(update=update)}))
         for step, update in updates
     ]
+    try:
+        return [(step, forward_model(other, reach_nm).image) for step, other in others]
+    except ConfigError:
+        return []
 
 
 def _further(aberrations: Mapping[str, float], key: str, step: float) -> dict[str, float]:

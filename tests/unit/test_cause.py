@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scenes import PIXEL_NM, make_config
 
+from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference import noise
 from iscat_analysis.inference.cause import Cause, likely_cause
 from iscat_analysis.inference.fit import fit_particle
@@ -20,13 +21,18 @@ LIGHT = 2e7
 
 
 def _cause(
-    seen: dict[str, Any], *, stretch: float = 1.0, turned: bool = False, count: int = 4
+    seen: dict[str, Any],
+    *,
+    stretch: float = 1.0,
+    turned: bool = False,
+    count: int = 4,
+    focus_nm: float = -300.0,
 ) -> Cause | None:
     """Fit bright particles of another microscope, in pixels of another size, or transposed."""
-    config, rng = make_config(), np.random.default_rng(4)
+    config, rng = make_config(optics={"focus_nm": focus_nm}), np.random.default_rng(4)
     grid = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM)
     true = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM * stretch)
-    other = forward_model(make_config(optics=seen), true.diagonal_nm)
+    other = forward_model(make_config(optics={"focus_nm": focus_nm} | seen), true.diagonal_nm)
     model = forward_model(config, grid.diagonal_nm)
     fits = []
     for x, y in rng.uniform(15.0, 17.0, (count, 2)):
@@ -108,6 +114,16 @@ def test_a_transposed_movie_is_named() -> None:
     circular = _cause({"polarization": "circular", "analyzer": True})
     assert circular is not None
     assert "circular" in circular.message
+
+
+def test_a_microscope_with_particles_of_the_other_sign_is_no_cause() -> None:
+    """At this focus they are bright where a mask is in the pupil, and the configured line dark."""
+    defocused = {"focus_nm": -500.0}
+    with pytest.raises(ConfigError, match="wrong sign"):
+        forward_model(make_config(optics=defocused | {"mask_na": 0.6, "attenuation": 0.3}), 1500.0)
+    cause = _cause({"aberrations_nm": {"z11": 25.0}}, **defocused)
+    assert cause is not None
+    assert cause.name == "spherical aberration"
 
 
 def test_nothing_is_named_where_all_is_right() -> None:
