@@ -146,10 +146,11 @@ def likely_cause(
         if not changes:
             continue
         share, step = _explained(left, changes, excess, whole=name in _WHOLE)
-        if len(changes) == 1 and name not in (_TURNED, *_OTHERS) and share > WORTH_NAMING:
-            # far from a first order: the same, as far away as it seems, if a microscope is there
-            if there := _neighbours(config, name, reach, float(step[0])):
-                share, step = _explained(left, there, excess)
+        graded = len(changes) == 1 and name not in (_TURNED, *_OTHERS)
+        # far from a first order: the same, as far away as it seems, if a microscope is there
+        far_away = graded and share > WORTH_NAMING
+        if far_away and (there := _neighbours(config, name, reach, float(step[0]))):
+            share, step = _explained(left, there, excess)
         for far in _FAR.get(name, ()):
             if not (there := _neighbours(config, name, reach, far)):
                 continue
