@@ -42,6 +42,7 @@ SETTINGS: dict[str, Any] = {
     "fit.mode": "track",
     "track.free": "mass",
     "optics.calibrate": "never",
+    "compute.workers": 1,  # threads gain nothing where every core runs tests
 }
 """What an analysis of these movies is told."""
 

@@ -37,6 +37,7 @@ def test_many_particles_at_a_time_are_not_taken_for_noise() -> None:
             "optics.calibrate": "never",
             "background.method": "sliding",
             "calibration.gradient_per_kda": -PEAK_PER_KDA,
+            "compute.workers": 1,
         },
     )
     assert result.summary["landing"]["noise_variance_over_shot"][-1] > 1.4
@@ -78,6 +79,7 @@ def _analysed(counts: np.ndarray, calibrate: str) -> ia.Result:
             "calibration.gradient_per_kda": -PEAK_PER_KDA,
             "posterior.enabled": False,
             "detection.false_alarms_per_movie": 1e-3,
+            "compute.workers": 1,
         },
     )
 

@@ -92,6 +92,17 @@ def test_two_particles_are_too_few_to_tell() -> None:
 
 
 @pytest.mark.usefixtures("sketched")
+def test_threads_change_no_track() -> None:
+    movie = wander((100, 64, 64), seed=2, species=((400.0, 0.3, 3),))
+    one, three = (
+        ia.fit_movie(movie.counts, settings={**SETTINGS, "compute.workers": workers})
+        for workers in (1, 3)
+    )
+    assert len(one.tracks)
+    pd.testing.assert_frame_equal(one.tracks, three.tracks, check_exact=True)
+    pd.testing.assert_frame_equal(one.table, three.table, check_exact=True)
+
+
 def test_repeated_and_empty_frames_are_left_out_of_tracks() -> None:
     movie = wander((120, 64, 64), seed=2, species=((400.0, 0.3, 2),))
     counts = movie.counts.copy()
