@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from iscat_analysis.records import Analysis
 
 FLAGGED = 3
+_LARGE_BYTES = 2**30  # of a movie whose chunks take more time and memory than what draws
 ROWS_SHOWN = 20
 GAP = 3  # characters between the columns of a table on a terminal
 
@@ -132,7 +133,8 @@ def fit(
         from iscat_analysis.draughtsman import Draughtsman
 
         with closing(Draughtsman()) as pen:
-            pen.start()  # early, because it has as much to load
+            if resolved.background.method != "sliding" or not _is_large(stack):
+                pen.start()  # early, because it has as much to load
             from iscat_analysis.movie.addresses import MARK, beside
             from iscat_analysis.pipeline import fit_stack
             from iscat_analysis.places import open_place
@@ -173,6 +175,11 @@ def fit(
         understated = analysis.summary.get("repeats", {}).get("understated", False)
         if strict and (flagged or understated):
             raise typer.Exit(FLAGGED)
+
+
+def _is_large(stack: Path) -> bool:
+    """Whether memory for figures is better taken when that for its chunks is free again."""
+    return stack.is_file() and stack.stat().st_size > _LARGE_BYTES
 
 
 def _changes(

@@ -1,9 +1,11 @@
 """A process that draws figures, started before they are wanted so that it is ready then.
 
 Loading Matplotlib and drawing take as long as the rest of a small run.  The process loads it while
-a movie is analysed, and then draws while tables are written.  On Linux it is a copy of the process
-that starts it, and has what that has loaded; elsewhere it is started from a file of this package,
-never from the user's script.  It ends when the process that started it does.
+a movie is analysed, and then draws while tables are written.  What it has loaded is 100 MB, and as
+much is no longer shared with the process that it is a copy of, so that for a movie of many chunks
+it is started when most of the work is done.  On Linux it is a copy of the process that starts it,
+and has what that has loaded; elsewhere it is started from a file of this package, never from the
+user's script.  It ends when the process that started it does.
 """
 
 from __future__ import annotations

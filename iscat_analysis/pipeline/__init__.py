@@ -49,6 +49,9 @@ FIND: Mapping[Way, Callable[[Prepared, Run], Found]] = {
 }
 """Background, search and fits of a movie, by which of its frames stand against which."""
 
+_CHUNKS_DONE = {("landing", True), ("report", False)}
+"""Stages of a landing movie, and whether they are done, when its chunks need no more memory."""
+
 FEW_FIGURES = 2
 """Events of a landing movie that are drawn for print; the page shows hundreds."""
 
@@ -90,7 +93,8 @@ def fit_stack(
     place : Place, optional
         Where the chunks of a landing movie are analysed; default in this process.
     draughtsman : Draughtsman, optional
-        The process that draws the report, started before; default this one.
+        The process that draws the report, started with it or, by a landing movie, when its chunks
+        are done; default this one.
 
     Returns
     -------
@@ -107,6 +111,12 @@ def fit_stack(
         The user stopped it; what was finished is in the folder, or kept beside it where the report
         was not yet begun or not done, as the interrupt says.
     """
+
+    def told(stage: str, done: int, total: int) -> None:
+        if draughtsman is not None and (stage, done >= total) in _CHUNKS_DONE:
+            draughtsman.start()
+        progress(stage, done, total)
+
     stack = path_in("`stack`", stack)
     folder = beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
@@ -130,7 +140,7 @@ def fit_stack(
                 analysis = analyse(
                     movie,
                     config,
-                    progress=progress,
+                    progress=told,
                     notify=notify,
                     command=command,
                     partial=partial,

@@ -10,14 +10,18 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from iscat_analysis import draughtsman as module
+from iscat_analysis.config import load_config
 from iscat_analysis.draughtsman import Draughtsman
+from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.records import Analysis
 from iscat_analysis.report import write_report
 from iscat_analysis.report.drawing import Drawing
+from iscat_analysis.study.simulate import write_stack
 from iscat_analysis.threads import processors
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -187,6 +191,23 @@ def test_where_there_are_no_copies_a_program_draws(
         pen.end(analysis.summary)
         page = pen.page()
     assert (page or "").encode() == (expected["report.html"] if there else b"")
+
+
+def test_it_is_started_at_the_latest_when_the_chunks_of_a_movie_are_done(tmp_path: Path) -> None:
+    fewer = ["simulation.frames=200", "simulation.count=2", "simulation.leavings=0"]
+    config = load_config(Path("sample_configs/landing.toml"), fewer)
+    write_stack(config, tmp_path / "movie.tif")
+    told: list[Any] = []
+
+    class Pen(Draughtsman):
+        def start(self) -> None:
+            told.append("start")
+
+    fit_stack(
+        tmp_path / "movie.tif", config, draughtsman=Pen(),
+        progress=lambda stage, done, total: told.append((stage, done >= total)),
+    )  # fmt: skip
+    assert told.index("start") + 1 == told.index(("landing", True))
 
 
 def test_what_the_copy_cannot_draw_is_an_error(
