@@ -210,16 +210,30 @@ def taken(
     summary : dict
         What ``summary.json`` says.
     """
-    summary = {**tested, **_told(found)}
     learned, why = usable(found, config)
     if learned is None:
         tell(f"{verdict}: {why}; the analysis goes on as configured")
-        return config, summary | {"calibrated": False, "reason": why}
+        return config, {**tested, **_told(found), "calibrated": False, "reason": why}
+    if learned.optics.reference_phase_deg != found.config.optics.reference_phase_deg:
+        found = found.with_phase(learned.optics.reference_phase_deg, _turned(config))
     headline = found.headline(pictures_of)
     tell(f"optics learned from the movie, instead of the configured ones: {headline}")
     for note in found.notes:
         tell(note)
-    return learned, summary | {"calibrated": True}
+    return learned, {**tested, **_told(found), "calibrated": True}
+
+
+def _turned(config: Config) -> str:
+    """Say why the phase is not the one that was found, and what that may mean for masses."""
+    line = config.calibration
+    wanted, found = "brighten", "darken"
+    if line is not None and line.gradient_per_kda < 0:
+        wanted, found = found, wanted
+    return (
+        f"the phase is half a turn from the one that was found, with which particles {found} the "
+        f"image: by calibration.gradient_per_kda they {wanted} it; if that sign is wrong, so is "
+        "that of every mass"
+    )
 
 
 def calibrate_movie(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +15,7 @@ from scipy.ndimage import gaussian_filter, shift
 
 from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.calibration.optics import Sight
-from iscat_analysis.config import Config
+from iscat_analysis.config import Calibration, Config
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.optics.forward import PixelGrid, forward_model
@@ -128,6 +129,34 @@ def test_always_is_told_why_not(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stayed
     assert len(said) == 1
     assert said[0].startswith("the optics cannot be learned from this movie: movie.tif: shows 8 ")
+
+
+@pytest.mark.parametrize("focus_nm", [-380.0, 300.0])
+def test_a_phase_that_the_line_of_masses_turns_is_told(
+    monkeypatch: pytest.MonkeyPatch, focus_nm: float
+) -> None:
+    """Beyond focus particles are bright; the control is on the configured side."""
+    sights, _, _ = make_sights({"focus_nm": focus_nm}, 16, seed=3)
+    monkeypatch.setattr(learning, "_noise_differs", lambda *_: False)
+    monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
+    config = _config("auto").model_copy(
+        update={"calibration": Calibration(gradient_per_kda=-3.1e-5)}
+    )
+    camera = camera_from_config(config.camera, (64, 64), "uint16")
+    said: list[str] = []
+    learned, summary = learn_optics(MOVIE, config, camera, tell=said.append)
+    phase = learned.optics.reference_phase_deg
+    assert summary["calibrated"]
+    assert abs(learned.optics.focus_nm - focus_nm) < 50
+    (row,) = [r for r in summary["parameters"] if r["parameter"] == "reference_phase_deg"]
+    assert row["value"] == phase
+    headline = re.search(r"phase (\S+) ±", said[0])
+    assert headline is not None
+    assert float(headline[1]) == pytest.approx(phase, abs=0.1)
+    turned = [text for text in said if "half a turn" in text]
+    assert (abs(phase) > 90) == bool(turned) == (focus_nm > 0)
+    assert not turned or "with which particles brighten the image" in turned[0]
+    assert set(turned) <= set(summary["notes"])
 
 
 def test_never_looks_at_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

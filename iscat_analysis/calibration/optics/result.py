@@ -135,6 +135,34 @@ class OpticsCalibration:
             f"({np.mean(before.chi2_reduced):.3g} as configured)"
         )
 
+    def with_phase(self, phase_deg: float, note: str) -> OpticsCalibration:
+        """Take the reference phase half a turn away, which explains the pictures as well.
+
+        Parameters
+        ----------
+        phase_deg : float
+            That phase; particles that landed then have left, and the other way round.
+        note : str
+            Why it is taken, for the user.
+
+        Returns
+        -------
+        OpticsCalibration
+            With this phase and the same errors.
+        """
+        name = "reference_phase_deg"
+        parameters = self.parameters.copy()
+        parameters.loc[parameters["parameter"] == name, "value"] = phase_deg
+        optics = self.config.optics.model_copy(update={name: phase_deg})
+        measured = replace(self.measured, settings={**self.measured.settings, name: phase_deg})
+        return replace(
+            self,
+            config=self.config.model_copy(update={"optics": optics}),
+            parameters=parameters,
+            measured=measured,
+            notes=(note, *self.notes),
+        )
+
     def to_toml(self) -> str:
         """Write what ``[optics] file`` reads.
 
