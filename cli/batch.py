@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -171,6 +172,8 @@ def _part(text: str | None, *, merge: bool) -> tuple[int, int] | None:
 
 def print_batch(found: Batch) -> None:
     """Print a line per movie, and what there is now."""
+    from iscat_analysis.units import count
+
     done = int((found.movies["state"] == "done").sum())
     shown = table("movie")
     shown.add_column("sample", no_wrap=True)
@@ -191,9 +194,12 @@ def print_batch(found: Batch) -> None:
     for row in found.kd.to_dict("records"):
         if not row["why"]:
             where = f" of {row['condition']}" if row["condition"] else ""
+            p = "" if math.isnan(row["p_value"]) else f", p = {row['p_value']:.2g}"
+            high = "∞" if math.isinf(row["kd_high"]) else short(row["kd_high"])
+            remarks = f"; {row['remarks']}" if row["remarks"] else ""
             print_result(
-                f"K_D{where} = {short(row['kd_nm'])} nM (95 %: {short(row['kd_low'])} to "
-                f"{short(row['kd_high'])}), {row['movies']} movies, p = {row['p_value']:.2g}"
+                f"K_D{where} = {short(row['kd_nm'])} nM (95 %: {short(row['kd_low'])} to {high}), "
+                f"{count(row['movies'], 'movie')}{p}{remarks}"
             )
     if len(found.movies) > ROWS_SHOWN:
         print_result(f"… and {len(found.movies) - ROWS_SHOWN} more in {found.out / 'movies.csv'}")

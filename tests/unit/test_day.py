@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
 import threading
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -296,6 +298,30 @@ def test_a_series_of_concentrations_has_its_equilibrium(finished: Path, capsys) 
     assert f"K_D of pH 7 = {row['kd_nm']:.4g} nM" in capsys.readouterr().out
     assert not len(_run(finished).kd)
     assert not (finished / "out" / "kd.csv").exists()
+
+
+def _partly_told(finished: Path, *few: int) -> str:
+    """Give some movies few events and add one that is damaged; give the line on K_D."""
+    totals = np.array([[1.0], [2.0], [3.0]])
+    drawn = draw_series(np.random.default_rng(3), "dimer", totals, 2.0, [66.0], number=1500)
+    _fill(finished, [t.head(2) if k in few else t for k, t in enumerate(drawn)])
+    _table(finished, (*NAMES, "cut"))
+    config = finished / "out" / "movies" / "a.iscat" / "config.toml"
+    command = ["batch", finished / "samples.csv", "--out", finished / "out", "--config", config]
+    with redirect_stdout(io.StringIO()) as out:
+        assert main([*map(str, command), "--kd", "dimer", "--kd-masses", "66"]) == 3
+    (line,) = [line for line in out.getvalue().splitlines() if line.startswith("K_D")]
+    return line
+
+
+def test_the_line_on_an_equilibrium_has_its_remarks(finished: Path) -> None:
+    line = _partly_told(finished, 1)
+    assert "2 movies, p = " in line
+    assert "left out, with less than 10 events: b" in line
+    line = _partly_told(finished, 0, 1)
+    assert "1 movie; left out" in line
+    assert "a single table tests no model" in line
+    assert "nan" not in line
 
 
 def test_what_is_no_series_says_why_it_has_no_equilibrium(finished: Path) -> None:
