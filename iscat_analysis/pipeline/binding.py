@@ -127,7 +127,8 @@ def fit_kd(
         One row for each table of events: ``path``, and ``concentration_nm`` (monomers in all), or
         ``a_nm`` and ``b_nm`` (A and B in all) [nM]; further columns are kept.  Of a column
         ``role`` only rows with ``sample`` are used.  Paths are as for `find_species`, beside the
-        file of the samples; a movie stands for its output folder.
+        file of the samples; a movie stands for its output folder.  Of the ``movies.csv`` of a batch
+        those movies are used that the batch would use: analysed, with a concentration and events.
     model : {"dimer", "ab"}
         2 M ⇌ D, K_D = [M]²/[D]; or A + B ⇌ AB, K_D = [A][B]/[AB].
     masses_kda : sequence of float, optional
@@ -191,6 +192,10 @@ def fit_kd(
         else _read_samples(path_in("`samples`", samples))
     )
     rows, kept = _used(rows, name)
+    notes: list[str] = []
+    of_batch = tables is None and "report" in rows
+    if of_batch:
+        rows, notes = _analysed(rows, CONCENTRATIONS[model], name)
     totals = _totals(rows, model, name)
     rows[list(CONCENTRATIONS[model])] = totals
     base = None if isinstance(samples, pd.DataFrame) else Path(samples).parent
@@ -210,6 +215,12 @@ def fit_kd(
         )
         for number, table in enumerate(sources)
     ]  # fmt: skip
+    enough = [table.mass_kda.size >= LEAST_EVENTS for table in found]
+    if of_batch and any(enough) and not all(enough):
+        few = [table.name for table, keep in zip(found, enough, strict=True) if not keep]
+        notes.append(f"left out, with less than {LEAST_EVENTS} events: {', '.join(few)}")
+        found = [table for table, keep in zip(found, enough, strict=True) if keep]
+        rows, totals = rows[enough].reset_index(drop=True), totals[enough]
     for table in found:
         if table.mass_kda.size < LEAST_EVENTS:
             raise DataError(
@@ -227,7 +238,7 @@ def fit_kd(
         _laid_out(rows, found, fit),
         _curve(totals, fit, model, landing_power),
         landing_power,
-        _notes(found, fit, totals, inactive=inactive),
+        (*notes, *_notes(found, fit, totals, inactive=inactive)),
     )
     if notify is not None:
         for note in result.notes:
@@ -301,6 +312,28 @@ def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:
     if not kept.any():
         raise DataError(f"{name}: has no row of a sample")
     return rows[kept].reset_index(drop=True), kept
+
+
+def _analysed(
+    rows: pd.DataFrame, columns: Sequence[str], name: str
+) -> tuple[pd.DataFrame, list[str]]:
+    """Keep the movies of a batch that have a result and a concentration; say which have not."""
+    has_result = rows["report"].astype(object).fillna("").ne("").to_numpy()
+    given = rows.reindex(columns=list(columns)).notna().all(axis=1).to_numpy()
+    if not set(columns) <= set(rows):
+        given[:] = True  # that a column is missing is said of the whole table
+    names = rows["movie"] if "movie" in rows else rows["path"] if "path" in rows else rows["report"]
+    notes = [
+        f"left out, {what}: {', '.join(names[gone].astype(str))}"
+        for what, gone in (
+            ("not analysed", given & ~has_result),
+            (f"without {' and '.join(columns)}", ~given),
+        )
+        if gone.any()
+    ]
+    if not (given & has_result).any():
+        raise DataError(f"{name}: has no sample that is analysed and has a concentration")
+    return rows[given & has_result].reset_index(drop=True), notes
 
 
 def _totals(rows: pd.DataFrame, model: Model, name: str) -> FloatArray:

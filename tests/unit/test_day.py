@@ -24,7 +24,7 @@ from iscat_analysis.day import Batch, run
 from iscat_analysis.day.equilibria import KD_COLUMNS
 from iscat_analysis.day.gather import MOVIE_COLUMNS, SPECIES_COLUMNS
 from iscat_analysis.day.state import STATE, Records
-from iscat_analysis.errors import ConfigError
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.schemas import schema, to_json
 from iscat_cli import main
 
@@ -322,6 +322,26 @@ def test_the_line_on_an_equilibrium_has_its_remarks(finished: Path) -> None:
     assert "1 movie; left out" in line
     assert "a single table tests no model" in line
     assert "nan" not in line
+
+
+def test_the_table_of_a_batch_with_movies_that_tell_nothing_has_the_same_equilibrium(
+    finished: Path,
+) -> None:
+    """One is damaged and one has few events; both are left out, and named."""
+    _partly_told(finished, 1)
+    table = finished / "out" / "movies.csv"
+    alone = ia.fit_kd(table, model="dimer", masses_kda=[66])
+    of_day = pd.read_csv(finished / "out" / "kd.csv")
+    assert alone.fit.kd_nm == pytest.approx(of_day["kd_nm"][0], rel=1e-6)
+    assert alone.notes[0] == "left out, not analysed: cut"
+    assert "less than 10 events" in alone.notes[1]
+    rows = pd.read_csv(table)
+    rows.assign(concentration_nm=[1, None, 3, 4]).to_csv(table, index=False)
+    alone = ia.fit_kd(table, model="dimer", masses_kda=[66])
+    assert alone.notes[1] == "left out, without concentration_nm: b"
+    rows.assign(report=None).to_csv(table, index=False)
+    with pytest.raises(DataError, match="no sample that is analysed"):
+        ia.fit_kd(table, model="dimer", masses_kda=[66])
 
 
 def test_what_is_no_series_says_why_it_has_no_equilibrium(finished: Path) -> None:
