@@ -177,7 +177,8 @@ def analyse_block(
     best = table.loc[table[inside].groupby("track")["snr"].idxmax()]
     aligned, noise = None, Noise()
     if not goes_on[0]:
-        aligned, noise = pictures.result(), judged.result()
+        aligned = pictures.result()
+        noise = judged.result().beside(table["chi2_reduced"].to_numpy(float))
     return Block(
         span=span,
         rows=replace(rows, frame=rows.frame + first),

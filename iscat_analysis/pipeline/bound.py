@@ -136,9 +136,10 @@ def _judged_beside(ready: Prepared, scene: Scene, windows: Windows, table: pd.Da
             image /= 1 + signal
         return electrons
 
-    return judge_beside(
+    noise = judge_beside(
         scene, movie, camera, (first, last), (frame, particles[:, :2]), ~windows.masked, without
     )
+    return noise.beside(table["chi2_reduced"].to_numpy(float))
 
 
 def _together(

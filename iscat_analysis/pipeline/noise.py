@@ -44,6 +44,9 @@ _MOST_LEFT = 1.1  # of the noise that the light has, with an offset that the noi
 _SUBTRACTED = 4.0  # standard errors below no counts, where no camera has its offset
 _FREE = 0.25  # share of the pixels that no particle may come near in the frames judged
 _AWAY = 1.5  # λ/NA from a particle, from where its light changes the variance by some per cent
+_ENOUGH_FITS = 10  # of which the best
+_BEST_FITS = 0.1  # leave over the noise and no more; this quantile is theirs
+_LESS = 0.75  # of the noise, which small pictures leave over by chance at least
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,28 @@ class Noise:
         if self.spectrum is not None and self.spectrum.message:
             yield f"{name}: {self.spectrum.message}"
         yield from self.messages
+
+    def beside(self, chi2: FloatArray) -> Noise:
+        """Hold what noise around particles is said to be against what fits of them leave over.
+
+        Too much noise is in all fits alike.  Where some leave over less, what seems to be noise is
+        what a wrong model leaves over of rings, or the blur of motion.
+
+        Parameters
+        ----------
+        chi2 : ndarray, shape (n,)
+            Reduced χ² of the fits.
+
+        Returns
+        -------
+        Noise
+            Silent where fits contradict it.
+        """
+        known = chi2[np.isfinite(chi2)]
+        if self.excess is None or len(known) < _ENOUGH_FITS:
+            return self
+        least = float(np.quantile(known, _BEST_FITS))
+        return Noise() if least < _LESS * self.excess.ratio else self
 
     @property
     def summary(self) -> dict[str, Any] | None:

@@ -17,10 +17,11 @@ from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pieces.regions import SATURATION_NM
-from iscat_analysis.pipeline import analyse
-from iscat_analysis.pipeline.noise import judge_beside
+from iscat_analysis.pipeline import analyse, block_store, bound
+from iscat_analysis.pipeline.noise import Noise, judge_beside
 from iscat_analysis.pipeline.scene import make_scene
 from iscat_analysis.records import Analysis
+from iscat_analysis.search.templates import ExcessNoise
 
 GAIN, TOO_LARGE = 20.0, 1.6
 SHAPE, FRAMES, LEVEL_E = (40, 44), 26, 2e5
@@ -111,6 +112,31 @@ def test_particles_that_go_everywhere_leave_nothing_to_judge(wandering: Counts) 
         ]  # fmt: skip
     assert not said[0]
     assert said[1]
+
+
+@pytest.mark.parametrize("way", ["track", "known track"])
+def test_noise_that_fits_do_not_have_is_not_blamed_on_the_gain(
+    way: str, wandering: Counts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As rings seem to be, of which a wrong microscope leaves over something everywhere."""
+    said = "set camera.gain_e_per_adu = 12.9"
+    rings = Noise((said,), True, ExcessNoise(1.55, said))
+    learnt = way == "track"
+    module = block_store if learnt else bound
+    monkeypatch.setattr(module, "judge_beside", lambda *_: rings)
+    counts = wandering if learnt else _movie(moves=True)
+    assert not _gains(_analysed(counts, _learnt(GAIN) if learnt else _known("track", GAIN)))
+
+
+def test_noise_that_all_fits_have_is_told() -> None:
+    noise = Noise(("set camera.gain_e_per_adu = 12.9",), True, ExcessNoise(1.55, ""))
+    spread = np.linspace(-0.1, 0.1, 50)
+    assert noise.beside(1.55 + spread) is noise
+    assert noise.beside(3.0 + spread) is noise  # of a wrong microscope as well
+    assert not noise.beside(np.append(3.0 + spread, [1.1] * 10)).messages
+    assert noise.beside(np.full(5, 1.0)) is noise  # too few to tell
+    less = Noise(("set camera.gain_e_per_adu = 30",), True)
+    assert less.beside(1.0 + spread) is less
 
 
 def test_tracks_near_saturated_pixels_are_flagged() -> None:
