@@ -19,6 +19,20 @@ class FloodError(DataError):
     """More places pass the detection threshold than particles and expected noise explain."""
 
 
+class SignError(DataError):
+    """Most particles of a calibrant have the sign of those that leave.
+
+    Attributes
+    ----------
+    said : str
+        That, and what is then to be done up to the name of it.
+    """
+
+    def __init__(self, said: str, advice: str) -> None:
+        super().__init__(f"{said}, {advice}")
+        self.said = said
+
+
 class ConfigError(IscatError):
     """The configuration or an argument is wrong: names key, value and remedy (status 2)."""
 

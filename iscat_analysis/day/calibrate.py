@@ -18,7 +18,7 @@ from iscat_analysis.config.files import read_toml
 from iscat_analysis.day.plan import Movie, Plan, configured
 from iscat_analysis.day.run import Outcome, Runner
 from iscat_analysis.day.state import hash_of, sha256_of
-from iscat_analysis.errors import DataError
+from iscat_analysis.errors import DataError, SignError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline.calibrations import camera_calibration, mass_calibration
 
@@ -175,13 +175,19 @@ def _mass(plan: Plan, tables: Mapping[str, Path], runner: Runner) -> tuple[Outco
         frames = [pd.read_csv(path) for path in tables.values()]
         joined = pd.concat([f for f in frames if len(f)] or frames, ignore_index=True)
         joined.to_csv(events, index=False, lineterminator="\n")
-        found = mass_calibration(
-            events,
-            [mass for mass, _ in plan.standards],
-            out,
-            standards_se_kda=[se for _, se in plan.standards],
-            overwrite=True,
-        )
+        try:
+            found = mass_calibration(
+                events,
+                [mass for mass, _ in plan.standards],
+                out,
+                standards_se_kda=[se for _, se in plan.standards],
+                overwrite=True,
+            )
+        except SignError as error:  # which way they land is what the configuration says
+            raise DataError(
+                f"{error.said}, correct the sign of calibration.gradient_per_kda, or "
+                "optics.focus_nm or optics.reference_phase_deg"
+            ) from None
         masses = [float(mass) for mass in found.standards["mass_kda"]]
         hashes = {name: {"sha256": sha256_of(path)} for name, path in tables.items()}
         return {"standards_kda": masses, "inputs": hashes}

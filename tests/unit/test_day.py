@@ -531,6 +531,19 @@ def test_a_calibrant_that_fails_leaves_the_scale_as_configured_and_says_so(
     assert "as configured, because the day's calibration failed" in cautions
 
 
+def test_calibrants_of_the_other_sign_say_what_of_the_configuration_is_wrong(
+    day: Path, tmp_path: Path
+) -> None:
+    """A batch has no option that says how particles land."""
+    lab = tmp_path / "day"
+    shutil.copytree(day, lab, ignore=shutil.ignore_patterns("out"))
+    found = _calibrated(lab, settings={"optics.reference_phase_deg": 180.0})
+    ((what, why),) = found.failed
+    assert what == "calibration of the mass"
+    assert "if your particles land dark, correct the sign of calibration.gradient_per_kda" in why
+    assert "`landing`" not in why
+
+
 def test_parts_share_the_calibrations(day: Path, tmp_path: Path) -> None:
     lab = tmp_path / "day"
     shutil.copytree(day, lab, ignore=shutil.ignore_patterns("out"))

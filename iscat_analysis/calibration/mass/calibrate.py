@@ -14,7 +14,7 @@ from iscat_analysis.calibration.mass.line import york_line
 from iscat_analysis.calibration.mass.matching import check_match, match
 from iscat_analysis.calibration.mass.peaks import ContrastPeak, find_contrast_peaks
 from iscat_analysis.calibration.mass.result import Landing, MassCalibration
-from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.errors import ConfigError, DataError, SignError
 from iscat_analysis.records import FloatArray
 
 STANDARD_ERROR = 0.01
@@ -79,10 +79,10 @@ def calibrate_mass(
     lands = direction * signed > 0
     if signed.size >= LEAST_EVENTS and lands.mean() < _LANDING_SHARE:
         other = "bright" if landing == "dark" else "dark"
-        raise DataError(
+        raise SignError(
             f"{name}: only {lands.sum()} of {signed.size} events are {landing}, which landing "
-            f"should be: the contrast has the wrong sign; if your particles land {other}, say "
-            f"`landing` = {other}"
+            f"should be: the contrast has the wrong sign; if your particles land {other}",
+            f"say `landing` = {other}",
         )
     size, size_errors = np.abs(signed[lands]), errors[lands]
     if size.size < LEAST_EVENTS:
