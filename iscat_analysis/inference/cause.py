@@ -26,11 +26,13 @@ WORTH_NAMING = 0.3
 """Share of χ² in excess that a parameter must explain to be named."""
 
 PIXEL = "camera.pixel_size_nm"
+_PHASE = "reference phase"
+_MASS = 3  # of θ
 _STEPS: Mapping[str, Mapping[str, float]] = {
     "focus": {"focus_nm": 20.0},
     "numerical aperture": {"na": 0.005},
     "wavelength": {"wavelength_nm": 2.0},
-    "reference phase": {"reference_phase_deg": 5.0},
+    _PHASE: {"reference_phase_deg": 5.0},
     "spherical aberration": {"z11": 5.0},
     "astigmatism": {"z5": 5.0, "z6": 5.0},
     "coma": {"z7": 5.0, "z8": 5.0},
@@ -58,7 +60,7 @@ _OTHERS: Mapping[str, Mapping[str, Any]] = {
 }  # fmt: skip
 _TURNED = "polarisation, as if turned by 90° (or the movie transposed)"
 _UNITS = {
-    "focus": "nm", "reference phase": "degrees", "spherical aberration": "nm rms",
+    "focus": "nm", _PHASE: "degrees", "spherical aberration": "nm rms",
     "wavelength": "nm", PIXEL: "%", "numerical aperture": "",
 }  # fmt: skip
 _WHOLE = (_TURNED, *(name for name in _OTHERS if "mask" not in name))  # there or not
@@ -149,8 +151,12 @@ def likely_cause(
         graded = len(changes) == 1 and name not in (_TURNED, *_OTHERS)
         # far from a first order: the same, as far away as it seems, if a microscope is there
         far_away = graded and share > WORTH_NAMING
+        turns = name == _PHASE and bool(fits[0][2][_MASS])
+        if turns:
+            step = _angle(step)
         if far_away and (there := _neighbours(config, name, reach, float(step[0]))):
-            share, step = _explained(left, there, excess)
+            share, asked = _explained(left, there, excess)
+            step = step if turns else asked
         for far in _FAR.get(name, ()):
             if not (there := _neighbours(config, name, reach, far)):
                 continue
@@ -204,6 +210,15 @@ class _Left:
         """Give the change of the picture per unit of a step."""
         change = (picture(self.grid, *self.place) - self.signal)[self.used] * self.root / step
         return np.asarray(change - self.fitted @ (self.fitted.T @ change))
+
+
+def _angle(step: FloatArray) -> FloatArray:
+    """Give the angle by which a phase is off, of what it seems to be to first order [degrees].
+
+    A turned picture is cos Δ of the picture and sin Δ of what a small turn adds to it.  The fitted
+    mass has taken up the cosine, and per mass tan Δ is left over.
+    """
+    return np.degrees(np.arctan(np.radians(step)))
 
 
 def _explained(

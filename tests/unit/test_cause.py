@@ -65,6 +65,15 @@ def test_the_wrong_number_is_named_with_its_error(name: str, key: str, off: floa
     assert f"off by about {math.copysign(1, off):+g}"[:-1] in cause.message
 
 
+@pytest.mark.parametrize("off", [25.0, 40.0, -40.0, 60.0])
+def test_a_wrong_phase_is_named_with_its_angle(off: float) -> None:
+    """Of the tangent that is left over beside a fitted mass, 60° seem to be 87° or more."""
+    cause = _cause({"reference_phase_deg": off})
+    assert cause is not None
+    assert cause.name == "reference phase"
+    assert cause.step == pytest.approx(off, rel=0.2)
+
+
 @pytest.mark.parametrize(
     ("name", "key", "off", "found"),
     [
