@@ -144,11 +144,12 @@ def judge_lines(
         return None
     first, last = background.recorded or config.fit.frames or (0, movie.shape[0])
     counts = movie.read(first, max(first, min(last, movie.shape[0], first + SPECTRUM_FRAMES)))
+    counts = counts[_good(counts, camera)]
     if not len(counts):
         return None
     with threads(config.compute.workers) as pool:
         surface = find_surface([(p.before, p.after) for p in pairs], camera, window)
-        return find_lines(counts[_good(counts, camera)], camera, surface, mapper=pool.map)
+        return find_lines(counts, camera, surface, mapper=pool.map)
 
 
 def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:

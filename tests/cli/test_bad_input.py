@@ -135,6 +135,14 @@ def test_impossible_counts(value: float, frame: int, refused: Run, tmp_path: Pat
     assert f"frame {frame}" in line
 
 
+def test_a_pixel_without_a_number_in_every_frame(refused: Run, tmp_path: Path) -> None:
+    """No frame is left in which lines could be looked for, before the frames are refused."""
+    counts = _counts("f4")
+    counts[:, 20, 9] = np.nan
+    line = refused(_save(tmp_path / "odd.tif", counts))
+    assert "frame 0 is NaN or infinite in 1 pixel, the first at y = 20, x = 9" in line
+
+
 def test_zero_frames(refused: Run, tmp_path: Path) -> None:
     counts = _counts()
     counts[7] = 0
