@@ -143,6 +143,7 @@ def likely_cause(
         return None
     reach = fits[0][0].model.reach_nm
     best: Cause | None = None
+    most = WORTH_NAMING  # above 1 where there is less noise than the camera's numbers say
     for name in (*_STEPS, PIXEL, _TURNED, *_OTHERS):
         changes = _neighbours(config, name, reach)
         if not changes:
@@ -163,7 +164,8 @@ def likely_cause(
             larger, asked = _explained(left, there, excess)
             if larger > share and _WHOLE_STEP < asked[0] / far < 1 / _WHOLE_STEP:
                 share, step = larger, np.array([far])
-        if share > WORTH_NAMING and (best is None or share > best.share):
+        if share > most:
+            most = share
             size = float(step[0]) if name in _UNITS else None
             unit, learned = _UNITS.get(name, ""), config.optics.scheme != "darkfield"
             best = Cause(name, min(share, 1.0), size, unit, len(fits), learned)
