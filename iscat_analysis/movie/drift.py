@@ -139,6 +139,7 @@ def _register(
     spectrum = mover.spectrum(pattern)
     deviation = np.empty(pattern.shape)
     normal, right = np.empty((3, 3)), np.empty(3)
+    nowhere = math.inf, np.zeros(2), np.full(2, math.inf), 0.0
 
     def refined(shift: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:
         for _ in range(_PASSES):
@@ -147,13 +148,16 @@ def _register(
                 image_there = mover.image(spectrum * mover.transfer(shift[None], np.ones(1)))
                 moved = np.ascontiguousarray(image_there)  # a cut would compile its own kernels
             mismatch(moved, image, usable, pattern_read, image_read, ratio, deviation)
-            scale = max(1.4826 * float(np.nanmedian(np.abs(deviation[::2, ::3]))), 1.0)
+            some = np.abs(deviation[::2, ::3])
+            if np.isnan(some).all():
+                return nowhere
+            scale = max(1.4826 * float(np.nanmedian(some)), 1.0)
             spurious = shift_equations(
                 moved, pattern_read, image_read, ratio, deviation, _CLIP * scale, normal, right
             )
             clear = float(normal[0, 0] + normal[1, 1]) / max(2 * spurious, 1e-300)
             if not clear > 0 or np.linalg.eigvalsh(normal)[0] <= 0:
-                return math.inf, np.zeros(2), np.full(2, math.inf), 0.0
+                return nowhere
             inverse = np.linalg.inv(normal)
             step = (inverse @ right)[:2]
             shift = shift + step

@@ -9,7 +9,14 @@ from scipy.ndimage import gaussian_filter
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.movie.drift import Mover, Trajectory, derivatives, measure_drift, trusted
+from iscat_analysis.movie.drift import (
+    Mover,
+    Trajectory,
+    derivatives,
+    follow_pattern,
+    measure_drift,
+    trusted,
+)
 from iscat_analysis.pipeline.pattern import MovingPattern, follow
 from iscat_analysis.pipeline.regions import Region
 from iscat_analysis.search.sliding import Chunk, make_chunk, measure_frames
@@ -48,6 +55,16 @@ def _chunk(config: Config, seed: int, jump: int = 0) -> Chunk:
 
 
 # ---- registration ----------------------------------------------------------------------------
+
+
+def test_a_pattern_of_which_hardly_a_pixel_is_usable_is_not_followed() -> None:
+    """None of those whose scatter is looked at is: no warning of an empty median either."""
+    shape = 64, 64
+    blocks = np.random.default_rng(5).poisson(1e6, (2, *shape)).astype(float)
+    usable = np.zeros(shape, dtype=bool)
+    usable[33, 10:12] = True
+    two = np.array([1.0, 1.0])
+    assert follow_pattern(blocks, two, np.array([10.0, 30.0]), usable, np.zeros(shape)) is None
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.15), (2.4, 1.1)])
