@@ -38,6 +38,7 @@ from iscat_analysis.report.headline import (
 from iscat_analysis.report.numbers import UNITS, number
 from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
 from iscat_analysis.report.posterior import posterior_groups
+from iscat_analysis.report.spread import counted
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.report.tracks import tracks_headline, tracks_of
 from iscat_analysis.units import count
@@ -230,7 +231,7 @@ class Result:
     def _heading(self) -> str:
         analysis = self.analysis
         name = Path(analysis.provenance.input_path).name or "movie"
-        found = count(len(self), "event")
+        found = count(len(counted(analysis.table)), "event")
         if analysis.tracks is not None:
             found = f"{count(len(self.tracks), 'track')} of {count(len(self), 'position')}"
         return f"{found} in {name}, mode {analysis.mode}"

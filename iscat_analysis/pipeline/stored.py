@@ -176,7 +176,8 @@ class StoredResult:
             There is no such row.
         """
         if not 0 <= row < len(self):
-            raise ConfigError(f"row = {row}: {self.folder.name} has rows 0 to {len(self) - 1}")
+            rows = f"rows 0 to {len(self) - 1}" if len(self) else "none, nothing was found"
+            raise ConfigError(f"row = {row}: {self.folder.name} has {rows}")
         if not self.table[["x_px", "y_px", "mass_kda"]].iloc[row].notna().all():
             raise DataError(f"{self.folder.name}: row {row} has no place, so there is no image")
         return self._opened[1](row)

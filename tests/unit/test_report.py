@@ -301,6 +301,8 @@ def test_side_lobes_are_no_events() -> None:
     table = event_table(analysis).replace({"status": {"poor_fit": "sidelobe"}})
     assert headline(analysis, table)[0].startswith("10 events, all of them ok. Median mass")
     assert "×10⁹" not in headline(analysis, table)[0]
+    sides = analysis.table.replace({"status": {"poor_fit": "sidelobe"}})
+    assert repr(Result(replace(analysis, table=sides))).startswith("Result: 10 events in ")
 
 
 @pytest.mark.usefixtures("sketched")

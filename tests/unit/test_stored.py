@@ -129,6 +129,17 @@ def test_what_is_no_result_is_refused(written, tmp_path) -> None:
         ia.open_result(broken)
 
 
+def test_of_no_rows_none_is_there(written, sample_configs, tmp_path: Path) -> None:
+    """A movie without particles has no "rows 0 to -1"."""
+    empty = {"background.frames": (0, 25), "fit.frames": (25, 50)}
+    config = ia.configure(sample_configs["mass"], settings=BOUND | empty)
+    movie, blank = written["bound"][0].parent / "movie.tif", tmp_path / "blank.iscat"
+    ia.fit_movie(movie, config=config, out=blank)
+    none = pytest.raises(ia.ConfigError, match=r"row = 0: blank\.iscat has none")
+    with ia.open_result(blank) as result, none:
+        result.images(0)
+
+
 def test_rows_that_are_not_there_are_refused(written) -> None:
     with ia.open_result(written["bound"][0]) as result:
         for row in (-1, len(result)):
