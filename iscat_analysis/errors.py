@@ -29,8 +29,11 @@ class SignError(DataError):
     """
 
     def __init__(self, said: str, advice: str) -> None:
-        super().__init__(f"{said}, {advice}")
+        super().__init__(said, advice)  # both, so that it can be pickled
         self.said = said
+
+    def __str__(self) -> str:
+        return ", ".join(self.args)
 
 
 class ConfigError(IscatError):
