@@ -115,16 +115,14 @@ def learn_optics(
         The frames are impossible, for the analysis too.
     """
     optics = config.optics
-    suited = optics.scheme != "darkfield" and optics.convention == "exact"
-    suited = suited and optics.psf == "model"
-    measured = config.background.method != "known"
+    reason = _why_not(config)
+    if reason and optics.calibrate == "always":
+        tell(f"the optics are not learned {reason}; the analysis goes on as configured")
     if (
-        optics.calibrate == "never"
+        reason
+        or config.fit.mode == "track"  # which learns from its tracks
+        or optics.calibrate == "never"
         or (optics.calibrate == "auto" and optics.file is not None)
-        or (heights_free(config) and way_of(config) != "fixed")
-        or not suited
-        or not measured
-        or config.fit.mode == "track"
     ):
         return config, {}
     tested: dict[str, Any] = {}
@@ -167,6 +165,23 @@ def learn_optics(
             tell(f"{_verdict(tested)}: {error}; the analysis goes on as configured")
             return config, tested | {"calibrated": False, "reason": str(error)}
     return taken(found, config, tested, _verdict(tested), tell=tell)
+
+
+def _why_not(config: Config) -> str:
+    """Say of what movies, or with what configuration, no optics are learned; else nothing."""
+    optics, mode, way = config.optics, config.fit.mode, way_of(config)
+    if mode == "track":
+        if way == "tracks" and config.track.free == "mass":
+            return ""
+        return 'in mode track but with track.free = "mass" and without background frames'
+    reasons = (
+        (optics.scheme == "darkfield", "from dark field"),
+        (optics.convention != "exact", f'with optics.convention = "{optics.convention}"'),
+        (optics.psf != "model", f'with optics.psf = "{optics.psf}"'),
+        (config.background.method == "known", 'with background.method = "known"'),
+        (heights_free(config) and way != "fixed", f"in mode {mode} without background frames"),
+    )
+    return next((reason for holds, reason in reasons if holds), "")
 
 
 def _too_few(name: str, number: int) -> str:

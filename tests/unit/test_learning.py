@@ -13,6 +13,7 @@ from calibrations import GRID, PHOTONS, configuration, make_sights, microscope
 from scenes import PIXEL_NM, Stack, make_config
 from scipy.ndimage import gaussian_filter, shift
 
+import iscat_analysis as ia
 from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.calibration.optics import Sight
 from iscat_analysis.config import Calibration, Config
@@ -157,6 +158,28 @@ def test_a_phase_that_the_line_of_masses_turns_is_told(
     assert (abs(phase) > 90) == bool(turned) == (focus_nm > 0)
     assert not turned or "with which particles brighten the image" in turned[0]
     assert set(turned) <= set(summary["notes"])
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"optics.scheme": "darkfield", "particle.photons_per_frame": 1e4}, "from dark field"),
+        ({"optics.convention": "dong2021"}, 'with optics.convention = "dong2021"'),
+        ({"background.method": "known", "background.level_e": 1e4}, 'background.method = "known"'),
+        ({"fit.mode": "joint"}, "in mode joint without background frames"),
+        ({"fit.mode": "track", "track.free": "joint"}, 'but with track.free = "mass"'),
+    ],
+)
+def test_always_is_told_where_nothing_is_learned_from_such_movies(
+    settings: dict[str, Any], reason: str
+) -> None:
+    camera = camera_from_config(_config("always").camera, (64, 64), "uint16")
+    for calibrate in ("always", "auto"):
+        config = ia.configure(settings={"optics.calibrate": calibrate, **settings})
+        said: list[str] = []
+        assert learn_optics(MOVIE, config, camera, tell=said.append) == (config, {})
+        assert len(said) == (calibrate == "always")
+        assert not said or reason in said[0]
 
 
 def test_never_looks_at_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
