@@ -206,7 +206,8 @@ def _offset_of(camera: Camera) -> str:
 
 def _effect(share: float) -> str:
     """Say what a part of the light that is none does to masses."""
-    return f"masses {100 * abs(share):.2g} % too {'small' if share > 0 else 'large'}"
+    percent = float(f"{100 * abs(share):.2g}")  # in full where it is hundreds
+    return f"masses {percent:g} % too {'small' if share > 0 else 'large'}"
 
 
 def _wrong_offset(zero: LightZero, camera: Camera) -> str:

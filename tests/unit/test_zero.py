@@ -141,6 +141,8 @@ def test_where_nothing_tells_them_apart_both_are_named() -> None:
     said = _said(flat)
     assert "does not tell whether by its gain or by camera.offset_adu = 0" in said
     assert "7.5 % too small" in said
+    much = _said(_movie(3, power=0.0, speckle=0.0, gain=GAIN / 2.5))
+    assert re.search(r"masses 1[45]0 % too large", much)  # and not 1.5e+02 %
     assert not _said(_movie(3, power=0.0, speckle=0.0))
     assert not _said(flat, additive=True)
 
