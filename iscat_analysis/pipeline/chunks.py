@@ -182,6 +182,7 @@ class Reader:
         counts, good, _ = self.counts(self.first, stop, mapper)
         used = counts[good] if self._placed or not good.all() else counts
         if len(used) < 2:
+            check_counts(counts, self.first, self.name, camera=self.camera)
             raise DataError(f"{self.name}: has no two frames that differ; export it again")
         return used
 

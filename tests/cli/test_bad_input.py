@@ -135,11 +135,15 @@ def test_impossible_counts(value: float, frame: int, refused: Run, tmp_path: Pat
     assert f"frame {frame}" in line
 
 
-def test_a_pixel_without_a_number_in_every_frame(refused: Run, tmp_path: Path) -> None:
-    """No frame is left in which lines could be looked for, before the frames are refused."""
-    counts = _counts("f4")
+@pytest.mark.parametrize("background", [["--background", "0:12"], []])
+def test_a_pixel_without_a_number_in_every_frame(
+    background: list[str], refused: Run, tmp_path: Path
+) -> None:
+    """No frame is left in which lines, or noise, could be looked for before they are refused."""
+    counts = np.tile(_counts("f4"), (2, 1, 1))  # enough for two windows
     counts[:, 20, 9] = np.nan
-    line = refused(_save(tmp_path / "odd.tif", counts))
+    options = ["--set", "camera.pixel_size_nm=84.4", "--no-posterior", *background]
+    line = refused(_save(tmp_path / "odd.tif", counts), options=options)
     assert "frame 0 is NaN or infinite in 1 pixel, the first at y = 20, x = 9" in line
 
 
