@@ -145,7 +145,9 @@ def landing_sights(
         Resolved.
     pool : ThreadPoolExecutor
         Runs the search.
-    enough, rings
+    enough : int
+        Bright steps after which no further chunk is searched.
+    rings : bool
         As in `bright_sights`.
 
     Returns
