@@ -22,10 +22,17 @@ class FloodError(DataError):
 class SignError(DataError):
     """Most particles of a calibrant have the sign of those that leave.
 
+    Parameters
+    ----------
+    said : str
+        That, and in which case what is to be done.
+    advice : str
+        What is to be done.
+
     Attributes
     ----------
     said : str
-        That, and what is then to be done up to the name of it.
+        As given, for another advice.
     """
 
     def __init__(self, said: str, advice: str) -> None:
