@@ -16,6 +16,7 @@ from iscat_analysis.calibration.optics.settings import exists, is_term, with_set
 from iscat_analysis.calibration.optics.sights import FOCUS_STEP
 from iscat_analysis.config import Config, OpticsCovariance
 from iscat_analysis.records import FloatArray
+from iscat_analysis.units import count
 
 _ODD_NA = 0.02  # between the aperture of an objective and what is engraved on it
 _ODD_SIGMAS = 5.0
@@ -319,8 +320,8 @@ def _notes(measured: Measured) -> tuple[str, ...]:
         )
     if measured.contaminated:
         notes.append(
-            f"{measured.contaminated} pictures were left out, because something else happened in "
-            "them"
+            f"{count(measured.contaminated, 'picture')} left out, because something else happened "
+            "there"
         )
     twin = measured.twin
     if twin is not None:
