@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from iscat_cli.console import Messages, failures, print_json, print_result, short, table
-from iscat_cli.kd import Reaction
+from iscat_cli.kd import Reaction, upper_end
 from iscat_cli.options import (
     ConfigOption,
     DebugOption,
@@ -172,6 +172,7 @@ def _part(text: str | None, *, merge: bool) -> tuple[int, int] | None:
 
 def print_batch(found: Batch) -> None:
     """Print a line per movie, and what there is now."""
+    from iscat_analysis.day.equilibria import kd_name
     from iscat_analysis.units import count
 
     done = int((found.movies["state"] == "done").sum())
@@ -193,12 +194,11 @@ def print_batch(found: Batch) -> None:
     print_result(shown)
     for row in found.kd.to_dict("records"):
         if not row["why"]:
-            where = f" of {row['condition']}" if row["condition"] else ""
             p = "" if math.isnan(row["p_value"]) else f", p = {row['p_value']:.2g}"
-            high = "∞" if math.isinf(row["kd_high"]) else short(row["kd_high"])
             remarks = f"; {row['remarks']}" if row["remarks"] else ""
             print_result(
-                f"K_D{where} = {short(row['kd_nm'])} nM (95 %: {short(row['kd_low'])} to {high}), "
+                f"{kd_name(row['condition'])} = {short(row['kd_nm'])} nM (95 %: "
+                f"{short(row['kd_low'])} to {upper_end(row['kd_high'])}), "
                 f"{count(row['movies'], 'movie')}{p}{remarks}"
             )
     if len(found.movies) > ROWS_SHOWN:

@@ -145,10 +145,11 @@ def _print(found: Binding) -> None:
         inert = f", inactive {100 * fit.inactive:.2g} ± {100 * fit.inactive_se:.1g} %"
     masses = ", ".join(short(mass) for mass in fit.masses_kda)
     print_result(
-        f"K_D = {short(fit.kd_nm)} nM (95 %: {short(fit.kd_low)} to {_upper(fit.kd_high)} nM)"
+        f"K_D = {short(fit.kd_nm)} nM (95 %: {short(fit.kd_low)} to {upper_end(fit.kd_high)} nM)"
         f"{inert}; species of {masses} kDa; p = {short(fit.p_value, 2)} of the equilibrium"
     )
 
 
-def _upper(value: float) -> str:
+def upper_end(value: float) -> str:
+    """Write the upper end of an interval of K_D, which may be infinite."""
     return "∞" if value == float("inf") else short(value)

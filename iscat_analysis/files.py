@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-_UNFINISHED: dict[Path, None] = {}  # the last begun is last
+_UNFINISHED: dict[Path, bool] = {}  # all true; the last begun is last
 
 
 @contextmanager
@@ -29,16 +29,13 @@ def unfinished(path: Path) -> Iterator[None]:
     KeyboardInterrupt
         The block ended well, but `path` is being discarded: the process ends.
     """
-    _UNFINISHED[path] = None
+    _UNFINISHED[path] = True
     try:
         yield
-    except BaseException:
-        _UNFINISHED.pop(path, None)
-        raise
-    try:
-        del _UNFINISHED[path]
-    except KeyError:
-        raise KeyboardInterrupt from None
+    finally:
+        kept = _UNFINISHED.pop(path, False)
+    if not kept:
+        raise KeyboardInterrupt
 
 
 @contextmanager

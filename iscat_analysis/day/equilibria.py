@@ -9,7 +9,13 @@ import pandas as pd
 
 from iscat_analysis.day.gather import Found
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.pipeline.binding import CONCENTRATIONS, Binding, check_reaction, fit_kd
+from iscat_analysis.pipeline.binding import (
+    CONCENTRATIONS,
+    Binding,
+    check_reaction,
+    fit_kd,
+    with_events,
+)
 from iscat_analysis.species import LEAST_EVENTS
 from iscat_analysis.species.mass_action import Model
 from iscat_analysis.species.tables import event_table
@@ -185,9 +191,7 @@ def _fit(
 ) -> Series:
     """Fit all movies of a condition that have enough events."""
     tables = [event_table(each.folder, name=each.movie.name) for each in members]
-    kept = [table.mass_kda.size >= LEAST_EVENTS for table in tables]
-    few = [each.movie.name for each, keep in zip(members, kept, strict=True) if not keep]
-    remarks = (f"left out, with less than {LEAST_EVENTS} events: {', '.join(few)}",) if few else ()
+    kept, remarks = with_events(tables)
     used = [each for each, keep in zip(members, kept, strict=True) if keep]
     if not used:
         return Series(condition, 0, None, why=f"no movie has {LEAST_EVENTS} events")

@@ -18,6 +18,7 @@ import numpy as np
 from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.fit import AMPLITUDE
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import BoolArray, FloatArray
@@ -27,7 +28,6 @@ WORTH_NAMING = 0.3
 
 PIXEL = "camera.pixel_size_nm"
 _PHASE = "reference phase"
-_MASS = 3  # of θ
 _STEPS: Mapping[str, Mapping[str, float]] = {
     "focus": {"focus_nm": 20.0},
     "numerical aperture": {"na": 0.005},
@@ -152,7 +152,7 @@ def likely_cause(
         graded = len(changes) == 1 and name not in (_TURNED, *_OTHERS)
         # far from a first order: the same, as far away as it seems, if a microscope is there
         far_away = graded and share > WORTH_NAMING
-        turns = name == _PHASE and bool(fits[0][2][_MASS])
+        turns = name == _PHASE and bool(fits[0][2][AMPLITUDE])
         if turns:
             step = _angle(step)
         if far_away and (there := _neighbours(config, name, reach, float(step[0]))):

@@ -215,10 +215,9 @@ def fit_kd(
         )
         for number, table in enumerate(sources)
     ]  # fmt: skip
-    enough = [table.mass_kda.size >= LEAST_EVENTS for table in found]
-    if of_batch and any(enough) and not all(enough):
-        few = [table.name for table, keep in zip(found, enough, strict=True) if not keep]
-        notes.append(f"left out, with less than {LEAST_EVENTS} events: {', '.join(few)}")
+    enough, few = with_events(found)
+    if of_batch and any(enough):
+        notes += few
         found = [table for table, keep in zip(found, enough, strict=True) if keep]
         rows, totals = rows[enough].reset_index(drop=True), totals[enough]
     for table in found:
@@ -312,6 +311,28 @@ def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:
     if not kept.any():
         raise DataError(f"{name}: has no row of a sample")
     return rows[kept].reset_index(drop=True), kept
+
+
+def with_events(tables: Sequence[EventTable]) -> tuple[list[bool], tuple[str, ...]]:
+    """Tell which tables have events enough for an equilibrium.
+
+    Parameters
+    ----------
+    tables : sequence of EventTable
+        Of a series.
+
+    Returns
+    -------
+    enough : list of bool
+        Of each table.
+    notes : tuple of str
+        Names the others, where there are any.
+    """
+    enough = [table.mass_kda.size >= LEAST_EVENTS for table in tables]
+    few = [table.name for table, keep in zip(tables, enough, strict=True) if not keep]
+    return enough, (
+        (f"left out, with less than {LEAST_EVENTS} events: {', '.join(few)}",) if few else ()
+    )
 
 
 def _analysed(
