@@ -392,6 +392,26 @@ def test_progress_does_not_hide_the_one_error(movie: Path, tmp_path: Path) -> No
     assert movie.exists()
 
 
+def _interrupted(
+    command: list[str], folder: Path, begun: Callable[[subprocess.Popen[str]], None]
+) -> tuple[int, str]:
+    """Interrupt a command once it has begun; give its status, and what it said from then on."""
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=folder)
+    try:
+        begun(process)
+        process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=120)[1]
+    finally:
+        process.kill()
+    return process.returncode, said
+
+
+def _wait_until_said(sign: str, process: subprocess.Popen[str]) -> None:
+    for line in process.stderr:
+        if sign in line:
+            break
+
+
 _DEAF = """
 import itertools, sys, time
 import iscat_cli
@@ -439,22 +459,14 @@ def test_ctrl_c_that_goes_unanswered(command: str, tmp_path: Path) -> None:
         assert main([*simulate, "--quiet"]) == 0
     left = _listing(tmp_path)
     fit = ["fit", str(movie), "--config", str(setup)]
-    process = subprocess.Popen(
-        [sys.executable, "-c", _DEAF, *(simulate if command == "simulate" else fit)],
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=tmp_path,
-    )
-    try:
-        for line in process.stderr:
-            if "deaf" in line:
-                break
+
+    def begun(process: subprocess.Popen[str]) -> None:
+        _wait_until_said("deaf", process)
         assert len(_listing(tmp_path)) > len(left)
-        process.send_signal(signal.SIGINT)
-        said = process.communicate(timeout=120)[1]
-    finally:
-        process.kill()
-    assert process.returncode == INTERRUPTED
+
+    deaf = [sys.executable, "-c", _DEAF, *(simulate if command == "simulate" else fit)]
+    status, said = _interrupted(deaf, tmp_path, begun)
+    assert status == INTERRUPTED
     assert "interrupted: SIGINT was received" in said
     assert _listing(tmp_path) == left
 
@@ -475,25 +487,20 @@ def test_ctrl_c_midway(stage: str, tmp_path: Path) -> None:
     if stage == "posterior":
         assert main([*simulate, "--quiet"]) == 0
         command += ["fit", str(movie), "--config", str(setup)]
-        sign = "detect: 8 of 8"
     else:
         command += simulate
-        sign = None
     left = _listing(tmp_path)
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
-    try:
-        if sign is None:
-            while not list(tmp_path.glob("movie.tif.*.partial")) and process.poll() is None:
-                time.sleep(0.05)
-        else:
-            for line in process.stderr:
-                if sign in line:
-                    break
-        process.send_signal(signal.SIGINT)
-        said = process.communicate(timeout=120)[1]
-    finally:
-        process.kill()
-    assert process.returncode == INTERRUPTED
+
+    def begun(process: subprocess.Popen[str]) -> None:
+        if stage == "posterior":
+            _wait_until_said("detect: 8 of 8", process)
+        while stage == "simulate" and process.poll() is None:
+            if list(tmp_path.glob("movie.tif.*.partial")):
+                break
+            time.sleep(0.05)
+
+    status, said = _interrupted(command, tmp_path, begun)
+    assert status == INTERRUPTED
     assert [line for line in said.splitlines() if "interrupted" in line]
     assert "Traceback" not in said
     if stage == "simulate":
