@@ -6,6 +6,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from report_factory import make_analysis
 from scenes import PIXEL_NM, make_config
@@ -371,6 +372,20 @@ def test_a_rejected_model_is_named_where_the_spread_is() -> None:
     said = headline(replace(analysis, table=table), table)
     assert any("measured spread" in line for line in said)
     assert any("model is rejected" in line for line in said)
+
+
+def test_the_model_of_moving_particles_is_rejected_by_most_tracks_and_not_by_two() -> None:
+    rng = np.random.default_rng(2)
+    p, track = rng.uniform(size=3000), np.repeat(np.arange(15), 200)
+    table = pd.DataFrame({"p_value": p, "track": track, "status": "ok"})
+    assert rejection(table) == ""
+    disturbed = table.assign(p_value=np.where(track < 2, p**4, p))  # as by one out of the field
+    assert rejection(disturbed) == ""
+    assert "rejected" in rejection(disturbed.drop(columns="track"))
+    everywhere = table.assign(p_value=p**1.5)
+    assert "rejected" in rejection(everywhere)
+    alone = disturbed[track == 0]
+    assert "rejected" in rejection(alone)
 
 
 def test_the_width_of_a_species_is_told_with_its_interval() -> None:
