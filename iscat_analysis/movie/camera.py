@@ -337,7 +337,8 @@ def refuse_ratio(frame: NDArray[Any], where: str, camera: Camera) -> None:
     mean, spread = float(frame.mean(dtype=np.float64)), float(frame.std(dtype=np.float64))
     gain = float(np.mean(camera.gain_e_per_adu))
     ratio = abs(mean - 1) < _RATIO_TOLERANCE and spread < 1 / 2 and mean * gain < _RATIO_MOST_E
-    contrast = abs(mean) < spread < _RATIO_TOLERANCE and 0 < spread * gain < 1 and frame.min() < 0
+    small = abs(mean) < _RATIO_TOLERANCE and 0 < spread < _RATIO_TOLERANCE
+    contrast = small and spread * gain < 1 and frame.min() < 0
     if ratio or contrast:
         raise DataError(
             f"{where} is ratiometric (floats around {int(ratio)}): its shot noise cannot be known "

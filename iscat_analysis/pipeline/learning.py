@@ -66,7 +66,7 @@ LEAST_TESTED = 4
 _TESTED = 24  # the brightest
 _MOST_STEP_NM = 5e3  # farther than the model's pictures reach
 _LEAST_SCAN_NM = 10.0  # over all frames; a step in µm stays below it
-_NOISE = "its noise is not what the camera's numbers predict; the analysis goes on as configured"
+_NOISE = "its noise is not what the camera's numbers predict"
 _STUCK = 0.02  # share of frames that repeat another, which sums of frames count
 _STARTS_NM = tuple(range(-400, 401, 100))  # along each axis; rings are some 200 nm apart
 _FITTED = 3  # of these starts
@@ -140,7 +140,8 @@ def learn_optics(
                     raise DataError("the edges of a fixed pattern that moved look like particles")
                 sights, others = seen_in_field(windows, config, pool)
             if len(sights) < LEAST_TESTED:
-                raise DataError(_too_few(movie.name, len(sights)))
+                by_noise = _noise_differs(movie, config, camera)
+                raise DataError(_too_few(movie.name, len(sights), by_noise=by_noise))
             median = _median_p(sights, config, others, pool.map)
             if first_tested and median < REJECTED_P:  # more particles, and whose rings they show
                 sights, others = bright_sights(movie, config, camera, pool, opening)
@@ -155,7 +156,10 @@ def learn_optics(
             if optics.calibrate == "auto" and median >= REJECTED_P:
                 return config, tested | {"calibrated": False}
             if optics.calibrate == "auto" and _noise_differs(movie, config, camera):
-                tell(f"the optics cannot be tested on this movie: {_NOISE}")
+                tell(
+                    f"the optics cannot be tested on this movie: {_NOISE}; the analysis goes on as "
+                    "configured"
+                )
                 return config, tested | {"calibrated": False, "reason": _NOISE}
             notify("learning the optics from the particles of the movie, which may take minutes…")
             found = _learned(
@@ -184,12 +188,15 @@ def _why_not(config: Config) -> str:
     return next((reason for holds, reason in reasons if holds), "")
 
 
-def _too_few(name: str, number: int) -> str:
-    """Say that too few particles stand alone."""
-    return (
+def _too_few(name: str, number: int, *, by_noise: bool = False) -> str:
+    """Say that too few particles stand alone, perhaps as they are told by a noise that is wrong."""
+    said = (
         f"{name}: shows {count(number, 'bright particle')} standing alone, and {LEAST_TESTED} are "
         f"needed to test the optics, {LEAST_SIGHTS} to learn them"
     )
+    if by_noise:
+        said += "; they stand out by the noise, which is not what the camera's numbers predict"
+    return said
 
 
 def taken(

@@ -207,6 +207,8 @@ def test_ratios_are_refused_and_scaled_counts_are_not() -> None:
         check_counts(ratio, 5, "m.tif")
     with pytest.raises(DataError, match=r"frame 5 is ratiometric \(floats around 0\)"):
         refuse_ratio(ratio[0] - 1, "frame 5", Camera())
+    with pytest.raises(DataError, match=r"frame 5 is ratiometric \(floats around 0\)"):
+        refuse_ratio(ratio[0] - 0.98, "frame 5", Camera())  # its level was not divided out
     refuse_ratio(ratio[0] - 1, "a dark", Camera(gain_e_per_adu=1e4))
     check_counts(ratio, 5, "m.tif", camera=Camera(gain_e_per_adu=1e4))
     check_counts(good("f4") / 10, 5, "m.tif")  # floats around 100

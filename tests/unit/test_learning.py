@@ -27,12 +27,17 @@ MOVIE: Any = SimpleNamespace(name="movie.tif")
 
 
 def _learn(
-    monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], count: int, calibrate: str = "auto"
+    monkeypatch: pytest.MonkeyPatch,
+    changes: dict[str, Any],
+    count: int,
+    calibrate: str = "auto",
+    *,
+    noise_differs: bool = False,
 ) -> tuple[bool, dict[str, Any], list[str]]:
     """Whether the configuration stayed, the summary, and what the user was told."""
     config = _config(calibrate)
     sights, _, _ = make_sights(changes, count, seed=3)
-    monkeypatch.setattr(learning, "_noise_differs", lambda *_: False)
+    monkeypatch.setattr(learning, "_noise_differs", lambda *_: noise_differs)
     monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
@@ -103,10 +108,16 @@ def test_pairs_that_land_at_once_do_not_condemn_the_optics(
     assert bool(said) != fits
 
 
-def test_too_few_particles_to_test_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    stayed, summary, said = _learn(monkeypatch, {}, LEAST_TESTED - 1)
+@pytest.mark.parametrize("noise_differs", [False, True])
+def test_too_few_particles_to_test_are_said(
+    noise_differs: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a wrong gain bright particles are not told, or all the field is one."""
+    count = LEAST_TESTED - 1
+    stayed, summary, said = _learn(monkeypatch, {}, count, noise_differs=noise_differs)
     assert stayed
     assert len(said) == 1
+    assert ("the noise, which is not what the camera's numbers predict" in said[0]) == noise_differs
     assert said[0].startswith("the optics cannot be tested on this movie: movie.tif: shows 3 ")
     assert said[0].endswith("the analysis goes on as configured")
     assert summary == {"calibrated": False, "reason": summary["reason"]}
