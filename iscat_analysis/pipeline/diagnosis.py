@@ -22,7 +22,7 @@ from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, first_counts, is_lit
 from iscat_analysis.pipeline.systematic import is_bent
-from iscat_analysis.records import Status, Windows
+from iscat_analysis.records import FloatArray, Status, Windows
 from iscat_analysis.search.sliding import measure_noise
 from iscat_analysis.units import count, listed
 
@@ -37,7 +37,9 @@ _BRIGHTEST = 8  # isolated particles on which the model is judged
 _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
 _NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
 _LONGEST = 100  # average of the noise curve
-_SMALLEST_PX = 32  # side of a field in which a pattern is followed
+_SMALLEST_PX = 32  # side of a field in which a pattern is followed, and of its parts
+_FEWEST_PARTS = 4  # whose differences tell an error
+_NORMAL_QUARTILE = 0.6745
 _SWAPPED = 10.0  # times less change along the axis of time than along both of space
 _LOOKED_AT = 96  # frames, rows and columns in which axes are judged
 _ENOUGH_STEPS = 30
@@ -174,16 +176,9 @@ def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[s
         some = first_counts(movie, windows, max(2, _NOISE_BYTES // frame_bytes))
         noise = measure_noise(some, camera, min(_LONGEST, len(some) // 2))
         curve, limit = (noise.frames, noise.variance_over_shot), noise.shot_limited
-        if min(movie.shape[1:]) >= _SMALLEST_PX:
-            way = follow_pattern(
-                np.stack([windows.before_e, windows.after_e]),
-                np.array([1.0, windows.power_ratio]),
-                np.array([np.mean(windows.frames_before), np.mean(windows.frames_after)]),
-                ~windows.masked,
-                windows.read_variance_before_e2,
-            )
-            if way is not None and np.isfinite(way.error_px).all():
-                drift, error = way.shift_px[1].tolist(), way.error_px[1].tolist()
+        moved = _pattern_moved(windows)
+        if moved is not None:
+            drift, error = moved[0].tolist(), moved[1].tolist()
     return {
         "noise_frames": list(curve[0]),
         "noise_variance_over_shot": list(curve[1]),
@@ -191,6 +186,48 @@ def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[s
         "drift_px": drift,
         "drift_error_px": error,
     }
+
+
+def _pattern_moved(windows: Windows) -> tuple[FloatArray, FloatArray] | None:
+    """Give how far the pattern moved along y and x, and the errors; None where there is none.
+
+    A particle changes the light at its place as an edge that moved does, but in every part of the
+    field another way: the errors are at least what the parts differ by.
+    """
+    rows, columns = windows.before_e.shape
+    whole = _part_moved(windows, np.s_[:rows, :columns])
+    if whole is None:
+        return None
+    side = _SMALLEST_PX
+    parts = [
+        _part_moved(windows, np.s_[top : top + side, left : left + side])
+        for top in range(0, rows - side + 1, side)
+        for left in range(0, columns - side + 1, side)
+    ]
+    shifts = np.array([part[0] for part in parts if part is not None])
+    if len(shifts) < _FEWEST_PARTS:
+        return whole
+    apart = np.median(np.abs(shifts - np.median(shifts, axis=0)), axis=0) / _NORMAL_QUARTILE
+    return whole[0], np.maximum(whole[1], apart * math.sqrt(math.pi / 2 / len(shifts)))
+
+
+def _part_moved(
+    windows: Windows, part: tuple[slice, slice]
+) -> tuple[FloatArray, FloatArray] | None:
+    """Give how far the pattern of a part of the field moved; None where it is too small."""
+    used = ~windows.masked[part]
+    if min(used.shape) < _SMALLEST_PX:
+        return None
+    way = follow_pattern(
+        np.stack([windows.before_e[part], windows.after_e[part]]),
+        np.array([1.0, windows.power_ratio]),
+        np.array([np.mean(windows.frames_before), np.mean(windows.frames_after)]),
+        np.ascontiguousarray(used),
+        np.ascontiguousarray(windows.read_variance_before_e2[part]),
+    )
+    if way is None or not np.isfinite(way.error_px).all():
+        return None
+    return way.shift_px[1], way.error_px[1]
 
 
 def drift_warning(name: str, background: dict[str, Any]) -> str | None:
