@@ -28,12 +28,14 @@ from iscat_analysis.calibration.optics.settings import (
     FREE,
     build_microscope,
     free_groups,
+    free_names,
     heights_free,
     is_term,
     settings_of,
     with_settings,
 )
 from iscat_analysis.calibration.optics.sights import FOCUS_STEP, PRIVATE, Settings, Sight
+from iscat_analysis.calibration.optics.starts import with_masses
 
 __all__ = [
     "FAINTEST",
@@ -56,6 +58,7 @@ __all__ = [
     "build_microscope",
     "forecast_optics",
     "free_groups",
+    "free_names",
     "heights_free",
     "is_term",
     "judge",
@@ -65,5 +68,6 @@ __all__ = [
     "measure_microscope",
     "optics_limits",
     "settings_of",
+    "with_masses",
     "with_settings",
 ]
