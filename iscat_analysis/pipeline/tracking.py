@@ -77,7 +77,9 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         The user stopped it before the first block was finished.
     """
     config, camera = ready.config, ready.camera
-    kept = keep_frames(ready.steady, camera, fitted_frames(ready.steady, config))
+    additive = config.optics.scheme == "darkfield"
+    span = fitted_frames(ready.steady, config)
+    kept = keep_frames(ready.steady, camera, span, additive=additive)
     movie, (first, last) = kept.movie, kept.span
     if kept.message:
         run.tell(kept.message)

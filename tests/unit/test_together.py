@@ -111,7 +111,7 @@ def test_repeated_and_empty_frames_are_left_out_of_tracks() -> None:
     counts[[57, 58]] = 0
     result = ia.fit_movie(counts, settings=SETTINGS)
     (said,) = [line for line in result.warnings if "left out" in line]
-    assert "frames 10, 15, 20, 25 and 16 more are zero throughout or repeat" in said
+    assert "frames 10, 15, 20, 25 and 16 more are dark or repeat" in said
     odd = [*stuck.tolist(), 57, 58]
     assert not result.table["frame"].isin(odd).any()
     own = result.table.merge(movie.truth, on="frame", suffixes=("", "_true"))
@@ -123,6 +123,21 @@ def test_repeated_and_empty_frames_are_left_out_of_tracks() -> None:
     assert (np.abs(tracks["d_um2_s"] - 0.3) < 4 * tracks["sigma_d_um2_s"]).all()
     power = result.analysis.power
     assert np.isnan(power).sum() == len(odd)
+
+
+def test_frames_behind_a_closed_shutter_are_left_out_of_tracks() -> None:
+    movie = wander((120, 64, 64), seed=3, species=((400.0, 0.3, 2),))
+    counts = movie.counts.copy()
+    counts[70:80] = np.random.default_rng(1).poisson(3.0, counts[70:80].shape)
+    result = ia.fit_movie(counts, settings=SETTINGS)
+    (said,) = [line for line in result.warnings if "left out" in line]
+    assert "frames 70, 71, 72, 73 and 6 more are dark" in said
+    assert "D is too small" not in said  # what is dark is no frame that repeats
+    assert not result.table["frame"].between(70, 79).any()
+    tracks = result.tracks[result.tracks["n_frames"] > 60]
+    assert len(tracks) == len(result.tracks) == 1
+    assert (np.abs(tracks["d_um2_s"] - 0.3) < 4 * tracks["sigma_d_um2_s"]).all()
+    assert (np.abs(tracks["mass_kda"] - 400.0) < 4 * tracks["sigma_mass_kda"]).all()
 
 
 def test_a_movie_without_odd_frames_is_itself() -> None:
