@@ -28,6 +28,8 @@ EXAMPLE = """Example: a thousand repetitions of one experiment.
 
 MODES = ("mass", "localize", "joint")
 
+_AMBIGUOUS = "ambiguous_z"
+
 
 def benchmark(
     context: typer.Context,
@@ -88,6 +90,25 @@ def benchmark(
         else:
             print_result(benchmark_table(study))
             print_result(f"report: {out / 'benchmark.html'}")
+        for note in left_out(study):
+            messages.notify(note)
+
+
+def left_out(study: Mapping[str, Any]) -> list[str]:
+    """Say where fits are part of no bias and no spread though they did not fail."""
+    notes = []
+    for mode in MODES:
+        entry = study[mode]
+        ambiguous, trials = entry["flagged"][_AMBIGUOUS], entry["trials"]
+        if ambiguous:
+            verb = "is" if ambiguous == 1 else "are"
+            notes.append(
+                f"mode {mode}: of {trials} fits {ambiguous} {verb} {_AMBIGUOUS} and left out of "
+                "bias and spread: several heights describe the pixels about as well; more photons "
+                "or frames (bounds.photons_per_pixel, bounds.n_after) or a narrower "
+                "fit.z_range_nm tell which"
+            )
+    return notes
 
 
 def benchmark_table(study: Mapping[str, Any]) -> Table:

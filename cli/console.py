@@ -215,6 +215,7 @@ _OPTIONS = {
     "interval_s": "interval",
     "landing_power": "landing",
     "limit_kda": "limit",
+    "limit_sigma_kda": "limit",
     "kd_masses_kda": "kd-masses",
     "masses_kda": "masses",
     "offset_adu": "offset",

@@ -27,6 +27,7 @@ CEILING_REPEATS = 4
 _RATIO_TOLERANCE = 0.1  # of a mean of 1; a power that was not divided out is within it
 _RATIO_MOST_E = 10.0  # photoelectrons in a pixel, of which no interferometric image is made
 _LEAP = 0.75  # of the largest number, from one frame to the next
+_BRIGHT = 0.99  # quantile of a frame, below which too few pixels lie for light to be on
 _OVERFLOWN = 1e-4  # of a frame's pixels that leap; more than blink
 _NEGATIVE_SIGMAS = 6.0  # 1e-9 of pixels in the dark
 _NEGATIVE_FRACTION = 0.01  # more pixels below the offset than a sensor has dead ones
@@ -373,7 +374,7 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
     for before, after in pairwise(counts):
         high = np.maximum(before, after)
         leap = (high - np.minimum(before, after) > _LEAP * largest) & (high < largest)
-        if _OVERFLOWN < leap.mean() < 1 / 2:
+        if _OVERFLOWN < leap.mean() < 1 / 2 and not _lights_up(before, after):
             y, x = np.unravel_index(int(np.argmax(leap)), leap.shape)
             raise DataError(
                 f"{name}: counts have overflowed {8 * counts.dtype.itemsize} bits: pixels leap "
@@ -381,6 +382,12 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
                 f"{after[y, x]} at y = {y}, x = {x}; record or export the movie without "
                 "multiplying counts, with less light, or with more bits"
             )
+
+
+def _lights_up(before: NDArray[Any], after: NDArray[Any]) -> bool:
+    """Whether a shutter opens or closes: even the brightest pixels of one frame are dark."""
+    low, high = sorted(float(np.quantile(frame, _BRIGHT)) for frame in (before, after))
+    return low < high / 2
 
 
 def converter_ceiling(counts: NDArray[Any]) -> float:

@@ -19,9 +19,17 @@ from iscat_analysis.report.style import drawn, publish
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.schemas import jsonable, to_json
 from iscat_analysis.species import LEAST_EVENTS, Distribution, describe
-from iscat_analysis.species.choices import Choice, Given, Ladder, Number, Searched, Widths
+from iscat_analysis.species.choices import (
+    MOST_RUNGS,
+    Choice,
+    Given,
+    Ladder,
+    Number,
+    Searched,
+    Widths,
+)
 from iscat_analysis.species.describe import Branch
-from iscat_analysis.species.tables import EventTable, event_table
+from iscat_analysis.species.tables import EventTable, event_table, refuse_far
 from iscat_analysis.units import count
 
 SPECIES_FILES = frozenset({"species.csv", "species.json", "figures"})
@@ -138,6 +146,12 @@ def find_species(
             f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few for {k} species, "
             f"which need {_EVENTS_EACH} each; give a smaller `k`"
         )
+    if isinstance(choice, Given):
+        refuse_far([table], choice.masses_kda, "`masses_kda`")
+    elif isinstance(choice, Ladder) and choice.monomer_kda is not None:
+        rungs = choice.steps or (1, MOST_RUNGS)
+        monomer = choice.monomer_kda
+        refuse_far([table], [n * monomer for n in rungs], f"`ladder` = {monomer:.4g}")
     found = describe(
         table.mass_kda,
         table.sigma_kda,

@@ -26,7 +26,7 @@ from iscat_analysis.species.choices import Ladder
 from iscat_analysis.species.equilibrium import EquilibriumFit, fit_equilibrium
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mass_action import LANDING_POWER, Model, landing_logits
-from iscat_analysis.species.tables import EventTable, event_table
+from iscat_analysis.species.tables import EventTable, event_table, refuse_far
 from iscat_analysis.units import count
 
 BINDING_FILES = frozenset({"kd.csv", "kd.json", "figures"})
@@ -227,6 +227,9 @@ def fit_kd(
                 f"{LEAST_EVENTS} are needed, or leave it out of {name}"
             )
     masses = _monomer(found) if masses_kda is None else tuple(map(float, masses_kda))
+    if masses_kda is not None:
+        complex_kda = 2 * masses[0] if model == "dimer" else sum(masses)
+        refuse_far(found, [*masses, complex_kda], "`masses_kda`")
     fit = fit_equilibrium(
         [table.events for table in found], totals, model=model, masses_kda=masses,
         power=landing_power, inactive=inactive,

@@ -13,7 +13,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.pieces.regions import lines_from
-from iscat_analysis.pipeline.chunks import Reader, counts_budget
+from iscat_analysis.pipeline.chunks import Reader, reader_of
 from iscat_analysis.pipeline.diagnosis import misfit_warning
 from iscat_analysis.pipeline.events import posterior_of
 from iscat_analysis.pipeline.merging import CLIPS, VIEWS, Done
@@ -73,7 +73,7 @@ class ChunkSetting:
     @cached_property
     def reader(self) -> Reader:
         """The frames, for one chunk after the other."""
-        return Reader(self.frames, self.camera, *self.span, counts_budget(self.config))
+        return reader_of(self.frames, self.config, self.camera, self.span)
 
     @cached_property
     def scene(self) -> Scene:

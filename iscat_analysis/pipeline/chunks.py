@@ -21,7 +21,7 @@ from iscat_analysis.records import (
     Mapper,
     PlacedSource,
 )
-from iscat_analysis.search.sliding import Chunk, make_chunk, measure_frames
+from iscat_analysis.search.sliding import DARK, Chunk, make_chunk, measure_frames, well_lit
 
 NOISE_FRAMES = 800
 """Frames on which the noise is judged, and the windows are chosen."""
@@ -29,6 +29,7 @@ NOISE_FRAMES = 800
 HALO = 2
 """Windows on either side of a chunk's core: a step, its neighbours, and theirs."""
 
+_LOOKS = 24  # frames all over a movie, that tell how much light there is
 _MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
@@ -46,11 +47,21 @@ class Reader:
         Half-open range of frames to analyse.
     room_bytes : int
         Of counts, for the longest chunk; from `counts_budget`.
+    dark_e : float
+        Light of a frame [e per pixel] below which it has none, as behind a closed shutter.
     """
 
     def __init__(
-        self, movie: CountSource, camera: Camera, first: int, last: int, room_bytes: int
+        self,
+        movie: CountSource,
+        camera: Camera,
+        first: int,
+        last: int,
+        room_bytes: int,
+        *,
+        dark_e: float = -math.inf,
     ) -> None:
+        self._dark_e = dark_e
         self._movie = movie
         self.camera = camera
         self.first, self.last = first, last
@@ -148,6 +159,7 @@ class Reader:
         ahead = 1 if begin > start else 0  # the first new frame is compared with the last old one
         part = self._frames(begin - ahead, end)
         light, repeats = measure_frames(part, self.camera, mapper=mapper)
+        light[light < self._dark_e] = -np.inf
         lit = np.isfinite(light[ahead:])
         for _ in mapper(check, pieces):
             pass
@@ -179,7 +191,9 @@ class Reader:
     def opening(self, mapper: Mapper = map) -> NDArray[Any]:
         """Good frames among the first, on which the noise is judged; a copy of a file's."""
         stop = min(self.last, self.first + NOISE_FRAMES)
-        counts, good, _ = self.counts(self.first, stop, mapper)
+        counts, good, light = self.counts(self.first, stop, mapper)
+        if self._dark_e > 0:  # of frames with a background
+            good = good & well_lit(light)
         used = counts[good] if self._placed or not good.all() else counts
         if len(used) < 2:
             check_counts(counts, self.first, self.name, camera=self.camera)
@@ -192,6 +206,35 @@ def _runs(flags: BoolArray) -> Iterator[slice]:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     for start, stop in edges.reshape(-1, 2):
         yield slice(int(start), int(stop))
+
+
+def reader_of(movie: CountSource, config: Config, camera: Camera, span: tuple[int, int]) -> Reader:
+    """Read frames of a landing movie.
+
+    Parameters
+    ----------
+    movie : CountSource
+        The movie.
+    config : Config
+        ``compute.memory_limit_mb``, and the scheme: of dark field the background says nothing.
+    camera : Camera
+        Counts → photoelectrons.
+    span : (int, int)
+        Half-open range of frames to analyse.
+
+    Returns
+    -------
+    Reader
+        Which takes frames behind a closed shutter for frames without light.
+    """
+    dark_e = -math.inf
+    if config.optics.scheme != "darkfield" and span[0] < span[1]:
+        numbers = np.linspace(span[0], span[1] - 1, _LOOKS).astype(int).tolist()
+        some = np.concatenate([movie.read(k, k + 1) for k in numbers])
+        light = measure_frames(some, camera)[0]
+        lit = light[well_lit(light)]
+        dark_e = DARK * float(np.median(lit)) if lit.size else dark_e
+    return Reader(movie, camera, *span, counts_budget(config), dark_e=max(dark_e, 0.0) or -math.inf)
 
 
 def counts_budget(config: Config) -> int:

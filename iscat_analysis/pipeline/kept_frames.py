@@ -18,7 +18,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.kept import KeptFrames
 from iscat_analysis.pipeline.results import Compared, Found
 from iscat_analysis.records import BoolArray, FloatArray, StackMetadata, Windows
-from iscat_analysis.search.sliding import measure_frames
+from iscat_analysis.search.sliding import DARK, measure_frames, well_lit
 from iscat_analysis.units import listed
 
 MANY = 0.05
@@ -97,7 +97,9 @@ class Kept:
         )
 
 
-def keep_frames(movie: Stack, camera: Camera, span: tuple[int, int]) -> Kept:
+def keep_frames(
+    movie: Stack, camera: Camera, span: tuple[int, int], *, additive: bool = False
+) -> Kept:
     """Leave out frames that show nothing new.
 
     Parameters
@@ -108,23 +110,26 @@ def keep_frames(movie: Stack, camera: Camera, span: tuple[int, int]) -> Kept:
         Counts → photoelectrons.
     span : (int, int)
         Half-open range of frames to be analysed.
+    additive : bool
+        Whether particles add light to a background that is next to none, as in dark field.
 
     Returns
     -------
     Kept
         The others.
     """
-    good = _good(movie, camera, span)
+    dark, repeats = _odd(movie, camera, span, additive=additive)
+    good = ~(dark | repeats)
     if good.all() or not good.any():
         return Kept(movie, span)
     numbers = span[0] + np.flatnonzero(good)
     seen = movie.seen_as(_Frames(movie, numbers))
-    missing, share = span[0] + np.flatnonzero(~good), float(np.mean(~good))
+    missing, share = span[0] + np.flatnonzero(~good), float(np.mean(repeats & ~dark))
     many, is_, same = ("s", "are", "repeat") if len(missing) > 1 else ("", "is", "repeats")
     message = (
-        f"{movie.name}: frame{many} {listed(missing, _NAMED)} {is_} zero throughout or {same} the "
-        "one before (dropped or stuck in the camera); left out, and steps over them count as "
-        "several frames"
+        f"{movie.name}: frame{many} {listed(missing, _NAMED)} {is_} dark or {same} the one "
+        "before (behind a shutter, dropped or stuck in the camera); left out, and steps over them "
+        "count as several frames"
     )
     if share > MANY:
         message += (
@@ -134,15 +139,19 @@ def keep_frames(movie: Stack, camera: Camera, span: tuple[int, int]) -> Kept:
     return Kept(seen, (0, len(numbers)), numbers, message)
 
 
-def _good(movie: Stack, camera: Camera, span: tuple[int, int]) -> BoolArray:
-    """Tell which frames have light and are not those before them."""
-    good = np.ones(span[1] - span[0], dtype=bool)
+def _odd(
+    movie: Stack, camera: Camera, span: tuple[int, int], *, additive: bool
+) -> tuple[BoolArray, BoolArray]:
+    """Tell which frames have no light, and which repeat those before them."""
+    light_e = np.empty(span[1] - span[0])
+    same = np.empty(light_e.size, dtype=np.bool_)
     for start in range(*span, _READ):
         begin, stop = max(start - 1, span[0]), min(start + _READ, span[1])
         light, repeats = measure_frames(movie.read(begin, stop), camera)
-        fine = ~repeats & ~np.isneginf(light)
-        good[start - span[0] : stop - span[0]] = fine[start - begin :]
-    return good
+        here = slice(start - span[0], stop - span[0])
+        light_e[here], same[here] = light[start - begin :], repeats[start - begin :]
+    dark = np.isneginf(light_e)
+    return dark if additive else dark | ~well_lit(np.where(dark, np.nan, light_e), DARK), same
 
 
 def _renumbered(windows: Windows, numbers: IntArray) -> Windows:

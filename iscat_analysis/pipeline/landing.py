@@ -23,7 +23,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import Trajectory
 from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.pipeline.chunk_work import ChunkSetting, analyse_chunk, chunk_job
-from iscat_analysis.pipeline.chunks import Reader, counts_budget, plan_chunks
+from iscat_analysis.pipeline.chunks import plan_chunks, reader_of
 from iscat_analysis.pipeline.companion import paired
 from iscat_analysis.pipeline.merging import Done, Merged
 from iscat_analysis.pipeline.noise import Opening, judge_opening
@@ -149,7 +149,7 @@ def analyse_landings(
     first, last = fitted_frames(movie, config)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     if opening is None:
-        reader = Reader(frames, camera, first, last, counts_budget(config))
+        reader = reader_of(frames, config, camera, (first, last))
         opening = judge_opening(reader, config)
     reader, noise, window = opening.reader, opening.noise, opening.window
     for text in noise.said(movie.name):

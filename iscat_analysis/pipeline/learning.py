@@ -52,7 +52,7 @@ from iscat_analysis.pipeline.run import unheard
 from iscat_analysis.pipeline.sights import bright_sights, kind_of, reach_nm, scan_sights
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import Mapper, Progress, Windows, silent
-from iscat_analysis.search.sliding import measure_frames
+from iscat_analysis.search.sliding import measure_frames, well_lit
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
 
@@ -436,7 +436,7 @@ def _noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
     counts = movie.read(first, min(last, first + SPECTRUM_FRAMES, movie.shape[0]))
     light, repeats = measure_frames(counts, camera)
     stuck = way_of(config) != "sliding" and repeats.mean() > _STUCK
-    return bool(stuck or judge_counts(counts[np.isfinite(light) & ~repeats], camera).differs)
+    return bool(stuck or judge_counts(counts[well_lit(light) & ~repeats], camera).differs)
 
 
 def _centre(

@@ -20,7 +20,7 @@ from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import BoolArray
 from iscat_analysis.search.changes import least_beside, spot_of
-from iscat_analysis.search.sliding import longest_window, measure_frames
+from iscat_analysis.search.sliding import longest_window, measure_frames, well_lit
 from iscat_analysis.threads import threads
 
 PAIRS = 12
@@ -168,9 +168,9 @@ def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:
 
 
 def _good(counts: NDArray[Any], camera: Camera) -> BoolArray:
-    """Leave out frames without light, and those that repeat the one before."""
+    """Leave out frames that are dark beside the others, and those that repeat the one before."""
     light, repeats = measure_frames(counts, camera)
-    return np.isfinite(light) & ~repeats
+    return well_lit(light) & ~repeats
 
 
 def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], int]:
@@ -196,7 +196,8 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
         window = max(stop - start for start, stop in spans)
     frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
     most = min(together, _SAMPLE_BYTES // (2 * places * frame_bytes) or 1)
-    pairs = []
+    places_read: list[tuple[int, int]] = []
+    parts: list[NDArray[Any]] = []
     for start, stop in spans:
         gap = min(window, (stop - start) // 2)
         together = min(most, gap, (stop - start - gap) // _LEAST_PAIRS)
@@ -205,8 +206,20 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
         room = stop - gap - together - start
         number = min(places // len(spans), room // together + 1)  # none has another's frames
         for place in np.linspace(start, start + room, number).astype(int).tolist():
-            two = [movie.read(k, k + together) for k in (place, place + gap)]
-            good = [part[_good(part, camera)] for part in two]
-            if all(map(len, good)):
-                pairs.append(Pair(place, good[0], place + gap, good[1]))
+            places_read.append((place, place + gap))
+            parts += [movie.read(k, k + together) for k in places_read[-1]]
+    if not parts:
+        return [], window
+    measured = [measure_frames(part, camera) for part in parts]
+    lit = well_lit(np.concatenate([light for light, _ in measured]))  # a shutter may hide a part
+    cuts = np.cumsum([len(part) for part in parts])[:-1]
+    good = [
+        part[seen & ~repeats]
+        for part, seen, (_, repeats) in zip(parts, np.split(lit, cuts), measured, strict=True)
+    ]
+    pairs = [
+        Pair(place, before, later, after)
+        for (place, later), before, after in zip(places_read, good[::2], good[1::2], strict=True)
+        if len(before) and len(after)
+    ]
     return pairs, window

@@ -20,7 +20,7 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.movie.background import measure_windows, start_power
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.lines import Lines, SteadyFrames, steady
-from iscat_analysis.pipeline.chunks import Reader, counts_budget
+from iscat_analysis.pipeline.chunks import reader_of
 from iscat_analysis.pipeline.field import search_field
 from iscat_analysis.pipeline.moving_field import (
     LEAST_FRAMES,
@@ -148,7 +148,7 @@ class LandingSearch:
         self.longest = (last - first) // 2
         frames = movie if lines is None else SteadyFrames(movie, lines, camera)
         self._config = config
-        self._reader = Reader(frames, camera, first, last, counts_budget(config))
+        self._reader = reader_of(frames, config, camera, (first, last))
         opening = judge_opening(self._reader, config)
         noise, self.window = opening.noise, opening.window
 

@@ -30,6 +30,7 @@ from iscat_analysis.search.sliding import (
     longest_window,
     measure_frames,
     measure_noise,
+    well_lit,
 )
 from iscat_analysis.search.templates import ExcessNoise
 from iscat_analysis.threads import threads
@@ -281,8 +282,9 @@ def judge_background(
     if frames < 2 or not is_lit(windows):
         return Noise()
     counts = first_counts(movie, windows, SPECTRUM_FRAMES)
-    repeats = measure_frames(counts, camera)[1]
-    return judge_counts(counts[~repeats], camera, masked=windows.masked, additive=additive)
+    light, repeats = measure_frames(counts, camera)
+    good = ~repeats if additive else ~repeats & well_lit(light)
+    return judge_counts(counts[good], camera, masked=windows.masked, additive=additive)
 
 
 def judge_beside(

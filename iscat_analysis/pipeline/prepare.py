@@ -17,7 +17,7 @@ from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_overf
 from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pieces.setups import darkfield_photons
-from iscat_analysis.pipeline.chunks import Reader, counts_budget
+from iscat_analysis.pipeline.chunks import reader_of
 from iscat_analysis.pipeline.diagnosis import axes_warning
 from iscat_analysis.pipeline.learning import learn_optics
 from iscat_analysis.pipeline.light import judge_light
@@ -139,13 +139,10 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     looking: Future[Changes] | None = None
     opening: Future[Opening] | None = None
 
-    def reader_of(frames: Stack) -> Reader:
-        return Reader(frames, camera, *span, counts_budget(config))
-
     with one_thread_algebra():  # in all threads until the light is judged
         # meanwhile, in the light as it is; again if anything of it is unsteady
         if way == "sliding":
-            opening = beside(judge_opening, reader_of(movie), config)
+            opening = beside(judge_opening, reader_of(movie, config, camera, span), config)
         elif tracked:
             looking = beside(look_at_changes, movie, config, camera, span)
         judged = judge_light(movie, config, camera)
@@ -158,7 +155,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
             summary["lines"] = lines.summary
             steady = movie.seen_as(SteadyFrames(movie, lines, camera))
         if way == "sliding" and unsteady:
-            opening = beside(judge_opening, reader_of(steady), config)
+            opening = beside(judge_opening, reader_of(steady, config, camera, span), config)
         opened = None if opening is None else opening.result()
     if way == "sliding" or (tracked and unsteady):
         looking = beside(look_at_changes, steady, config, camera, span)

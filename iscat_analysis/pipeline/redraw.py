@@ -26,7 +26,7 @@ from iscat_analysis.movie.background import refine_power
 from iscat_analysis.movie.camera import Camera, camera_from_config
 from iscat_analysis.movie.lines import Lines, SteadyFrames, steady
 from iscat_analysis.pipeline.block_store import row_view
-from iscat_analysis.pipeline.chunks import HALO, Reader, counts_budget
+from iscat_analysis.pipeline.chunks import HALO, reader_of
 from iscat_analysis.pipeline.events import Fitted, PlaceAndMass
 from iscat_analysis.pipeline.field import add_signal
 from iscat_analysis.pipeline.light import judge_light
@@ -117,7 +117,7 @@ def _landings(
     """Draw what landed or left: windows before and after, in a chunk of their own."""
     first, last = fitted_frames(movie, config)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
-    reader = Reader(frames, camera, first, last, counts_budget(config))
+    reader = reader_of(frames, config, camera, (first, last))
     scene = make_scene(config, reader.shape, lines=lines, sliding=True)
     stride = stride_of(window)
 

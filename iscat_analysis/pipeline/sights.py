@@ -28,7 +28,7 @@ from iscat_analysis.movie.camera import Camera, check_counts
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.model import ForwardModel
-from iscat_analysis.pipeline.chunks import Reader, counts_budget, plan_chunks
+from iscat_analysis.pipeline.chunks import Reader, plan_chunks, reader_of
 from iscat_analysis.pipeline.noise import Opening, judge_window
 from iscat_analysis.pipeline.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.pipeline.ways import way_of
@@ -100,7 +100,7 @@ def bright_sights(
     if way_of(config) == "sliding":
         if opening is not None:
             return landing_sights(opening.reader, opening.window, config, pool, enough, rings)
-        reader = Reader(movie, camera, *fitted_frames(movie, config), counts_budget(config))
+        reader = reader_of(movie, config, camera, fitted_frames(movie, config))
         window = judge_window(reader, config, pool.map)[2]
         return landing_sights(reader, window, config, pool, enough, rings)
     if heights_free(config) and way_of(config) == "fixed":

@@ -38,6 +38,7 @@ from iscat_analysis.pipeline.results import Compared, Followed, Found, lines_of,
 from iscat_analysis.pipeline.resume import GOES_ON, saying
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene
+from iscat_analysis.pipeline.taken import taken_warning
 from iscat_analysis.pipeline.tracked_optics import Begun, learn_from_tracks
 from iscat_analysis.records import (
     CountSource,
@@ -77,7 +78,9 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         The user stopped it before the first block was finished.
     """
     config, camera = ready.config, ready.camera
-    kept = keep_frames(ready.steady, camera, fitted_frames(ready.steady, config))
+    additive = config.optics.scheme == "darkfield"
+    span = fitted_frames(ready.steady, config)
+    kept = keep_frames(ready.steady, camera, span, additive=additive)
     movie, (first, last) = kept.movie, kept.span
     if kept.message:
         run.tell(kept.message)
@@ -127,6 +130,9 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         run.tell(text)
     for text in pixel_warnings(*windows.left_out):
         run.tell(text)
+    taken = taken_warning(scene, ready.lines, movie.name) if len(joined.fits) else ""
+    if taken:
+        run.tell(taken)
     if not len(joined.fits) and not interrupted:
         run.tell(f"{movie.name}: {_nothing_found(scene, blocks[0])}")
     run.clock.lap("track")

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -44,6 +44,7 @@ _ENOUGH = 10  # events to measure σ_d by
 _NEAR_EDGE = 10  # values that tell where a distribution begins
 _SHARP = 1e-6  # of a cut: its width
 _OURS = ("fits.parquet", "fits.csv")
+_NEAREST = 0.5  # of the lightest mass, and the heaviest over it, between which an event must lie
 _LARGEST = 2_000_000_000  # bytes
 
 
@@ -86,6 +87,35 @@ class EventTable:
     def events(self) -> Events:
         """Magnitudes of the masses, as fits take them."""
         return Events(np.abs(self.mass_kda), self.sigma_kda, self.efficiency)
+
+
+def refuse_far(tables: Sequence[EventTable], masses_kda: Sequence[float], argument: str) -> None:
+    """Refuse masses of species that no event is near, as those in another unit.
+
+    Parameters
+    ----------
+    tables : sequence of EventTable
+        What was seen.
+    masses_kda : sequence of float
+        Lightest and heaviest species that are looked for, and others [kDa].
+    argument : str
+        That gave them, and its value.
+
+    Raises
+    ------
+    DataError
+        Every event is lighter than half of the lightest, or heavier than twice the heaviest.
+    """
+    seen = np.abs(np.concatenate([table.mass_kda for table in tables]))
+    low, high = _NEAREST * min(masses_kda), max(masses_kda) / _NEAREST
+    if not seen.size or ((seen >= low) & (seen <= high)).any():
+        return
+    middle = float(np.median(seen))
+    raise DataError(
+        f"{tables[0].name}: no event is near the masses that {argument} asks for: none lies "
+        f"between {low:.6g} and {high:.6g} kDa, and their median is "
+        f"{middle:.6g} kDa; give both in kDa, not in Da or MDa"
+    )
 
 
 def event_table(

@@ -59,6 +59,17 @@ def test_benchmark_refuses_too_few_trials(
     assert not (tmp_path / "out").exists()
 
 
+def test_fits_of_ambiguous_height_that_are_left_out_are_told(
+    sample_configs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dim = ["--set", "bounds.photons_per_pixel=20", "--set", "fit.roi_nm=900", "--no-posterior"]
+    arguments = ["--config", str(sample_configs["mass"]), "--out", str(tmp_path / "out"), *dim]
+    assert main(["benchmark", *arguments, "--trials", "20"]) == 0
+    said = capsys.readouterr().err
+    assert "mode joint: of 20 fits 20 are ambiguous_z and left out" in said
+    assert "mode mass" not in said
+
+
 def test_a_mode_without_usable_fits_has_one_dash_in_each_cell() -> None:
     none = math.nan, math.nan
     score = dict.fromkeys(("bias", "spread", "spread_over_crb", "coverage68"), math.nan)

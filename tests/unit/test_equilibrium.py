@@ -103,6 +103,11 @@ def test_landings_that_are_taken_alike_change_kd(dimers) -> None:
     assert alike.kd_nm > 1.1 * right.kd_nm
 
 
+def test_a_mass_in_another_unit_is_refused(dimers) -> None:
+    with pytest.raises(ia.DataError, match="no event is near the masses"):
+        ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66e3])
+
+
 def test_two_partners() -> None:
     random = np.random.default_rng(7)
     totals = PARTNERS.to_numpy(float)

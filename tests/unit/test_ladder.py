@@ -223,6 +223,22 @@ def test_wrong_tables_are_refused_with_what_to_do(text: str, said: str, tmp_path
         ia.find_species(path)
 
 
+@pytest.mark.parametrize(
+    "options",
+    [{"ladder": 66.0}, {"ladder": 66.0, "steps": (1, 2, 4), "hold": True},
+     {"masses_kda": (66.0, 132.0)}],
+)  # fmt: skip
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_masses_in_another_unit_are_refused(
+    options: dict, factor: float, oligomers: pd.DataFrame
+) -> None:
+    scaled = oligomers.assign(
+        mass_kda=factor * oligomers["mass_kda"], sigma_mass_kda=factor * oligomers["sigma_mass_kda"]
+    )
+    with pytest.raises(ia.DataError, match="no event is near the masses"):
+        ia.find_species(scaled, **options, draws=0)
+
+
 def test_results_are_written(tmp_path: Path, oligomers: pd.DataFrame) -> None:
     out = tmp_path / "answer"
     notes: list[str] = []

@@ -323,6 +323,17 @@ def test_stuck_and_dropped_frames_are_left_out(counts: np.ndarray) -> None:
     assert 0.005 < spread < 0.02, "of the other frames, whose light has 1 % of noise"
 
 
+def test_frames_behind_a_closed_shutter_are_left_out(counts: np.ndarray) -> None:
+    """Of three photoelectrons in a pixel no ratio is noise as of 1e5."""
+    odd = counts.copy()
+    odd[:12] = np.random.default_rng(1).poisson(3.0, odd[:12].shape)
+    result, told = _run(odd)
+    _assert_all_found(result.fits)
+    (line,) = told
+    assert "frames 0, 1, 2, 3 and 8 more are dark" in line
+    assert result.summary["frames_left_out"] == 12
+
+
 @pytest.mark.parametrize(("polarity", "sign"), [("dark", 1), ("bright", -1)])
 def test_one_polarity_is_that_part_of_both(
     counts: np.ndarray, plain: tuple[Any, list[str]], polarity: str, sign: int

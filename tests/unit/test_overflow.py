@@ -41,7 +41,11 @@ def test_what_else_is_bright_and_dark_is_not_taken_for_it(counts: NDArray[np.uin
     flashes = counts.copy()
     flashes[::2] = 65535
     flashes[1::2] = 0
+    shutter = 2 * counts
+    assert shutter.max() < 65535
+    shutter[:20] = 3
     for right in (
+        shutter,
         counts,
         stops.astype(np.uint16),
         blinking,

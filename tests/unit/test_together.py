@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -111,7 +112,7 @@ def test_repeated_and_empty_frames_are_left_out_of_tracks() -> None:
     counts[[57, 58]] = 0
     result = ia.fit_movie(counts, settings=SETTINGS)
     (said,) = [line for line in result.warnings if "left out" in line]
-    assert "frames 10, 15, 20, 25 and 16 more are zero throughout or repeat" in said
+    assert "frames 10, 15, 20, 25 and 16 more are dark or repeat" in said
     odd = [*stuck.tolist(), 57, 58]
     assert not result.table["frame"].isin(odd).any()
     own = result.table.merge(movie.truth, on="frame", suffixes=("", "_true"))
@@ -125,6 +126,21 @@ def test_repeated_and_empty_frames_are_left_out_of_tracks() -> None:
     assert np.isnan(power).sum() == len(odd)
 
 
+def test_frames_behind_a_closed_shutter_are_left_out_of_tracks() -> None:
+    movie = wander((120, 64, 64), seed=3, species=((400.0, 0.3, 2),))
+    counts = movie.counts.copy()
+    counts[70:80] = np.random.default_rng(1).poisson(3.0, counts[70:80].shape)
+    result = ia.fit_movie(counts, settings=SETTINGS)
+    (said,) = [line for line in result.warnings if "left out" in line]
+    assert "frames 70, 71, 72, 73 and 6 more are dark" in said
+    assert "D is too small" not in said  # what is dark is no frame that repeats
+    assert not result.table["frame"].between(70, 79).any()
+    tracks = result.tracks[result.tracks["n_frames"] > 60]
+    assert len(tracks) == len(result.tracks) == 1
+    assert (np.abs(tracks["d_um2_s"] - 0.3) < 4 * tracks["sigma_d_um2_s"]).all()
+    assert (np.abs(tracks["mass_kda"] - 400.0) < 4 * tracks["sigma_mass_kda"]).all()
+
+
 def test_a_movie_without_odd_frames_is_itself() -> None:
     from iscat_analysis.movie import open_stack
 
@@ -133,3 +149,22 @@ def test_a_movie_without_odd_frames_is_itself() -> None:
         kept = keep_frames(movie, Camera(), (0, 30))
         assert kept.movie is movie
         assert not kept.message
+
+
+def test_what_rows_that_flicker_take_of_a_mass_is_told() -> None:
+    rows = 1 + 0.01 * np.random.default_rng(7).standard_normal((120, 64, 1))
+    steady, flickering = (
+        ia.fit_movie(
+            wander((120, 64, 64), seed=3, species=((400.0, 0.3, 1),), shade=shade).counts,
+            settings=SETTINGS,
+        )
+        for shade in (None, lambda t: rows[t])
+    )
+    assert not [line for line in steady.warnings if "too small" in line]
+    (said,) = [line for line in flickering.warnings if "too small" in line]
+    told = re.search(r"its mass about ([\d.]+) % too small", said)
+    assert told is not None
+    (one,), (other,) = (r.tracks["mass_kda"].tolist() for r in (steady, flickering))
+    error = float(flickering.tracks["sigma_mass_kda"].iloc[0])
+    assert one - other > 4 * error
+    assert abs(one - other - float(told[1]) / 100 * one) < 4 * error

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from noisy import GAIN, SIDE, speckled_counts
 from numpy.typing import NDArray
 from scenes import make_config
+from small_movies import SETUP, simulate
 
 import iscat_analysis as ia
 from iscat_analysis.movie.camera import Camera
@@ -155,3 +157,16 @@ def test_a_landing_movie_with_pixels_that_blink(monkeypatch: pytest.MonkeyPatch)
     assert any("noise that is not the light's" in text for text in found.warnings)
     monkeypatch.setattr("iscat_analysis.pipeline.light.find_unsteady", lambda *_: None)
     assert len(ia.fit_movie(counts, config=config).table) > 3
+
+
+@pytest.mark.parametrize("light", [np.full(5, 3e-4), np.linspace(0.02, 0.8, 6)])
+def test_a_shutter_that_is_closed_or_opens_is_no_pixels_and_no_gain(
+    light: NDArray[np.float64], tmp_path: Path
+) -> None:
+    """Of the first of 30 background frames; the noise of the others is that of their light."""
+    simulate(tmp_path / "movie.tif", seed=3)
+    counts = tifffile.imread(tmp_path / "movie.tif")
+    first = counts[: len(light)].astype(np.int64)
+    counts[: len(light)] = np.random.default_rng(1).binomial(first, light[:, None, None])
+    settings = {key: value for key, value in SETUP.items() if not key.startswith("simulation")}
+    assert ia.fit_movie(counts, settings=settings).warnings == ()

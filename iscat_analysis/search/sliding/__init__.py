@@ -14,7 +14,14 @@ from iscat_analysis.search.sliding.dating import (
     frame_heights,
     locate_step,
 )
-from iscat_analysis.search.sliding.frames import Chunk, Patch, make_chunk, measure_frames
+from iscat_analysis.search.sliding.frames import (
+    DARK,
+    Chunk,
+    Patch,
+    make_chunk,
+    measure_frames,
+    well_lit,
+)
 from iscat_analysis.search.sliding.noise import (
     LONGEST_WINDOW,
     MOVIE_SHARE,
@@ -42,6 +49,7 @@ from iscat_analysis.search.sliding.search import (
 __all__ = [
     "CORRELATION",
     "CREDIBLE",
+    "DARK",
     "LONGEST_WINDOW",
     "MOVIE_SHARE",
     "SHORTEST_MOVIE",
@@ -68,4 +76,5 @@ __all__ = [
     "measure_noise",
     "sliding_maps",
     "stride_of",
+    "well_lit",
 ]

@@ -15,6 +15,15 @@ from iscat_analysis._kernels.stepping import part_sums
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 
+HALF = 0.5
+"""Share of the usual light, below which a shutter is not open."""
+
+DARK = 0.05
+"""Share of the usual light, below which it is closed."""
+
+_CHANGES = 8.0  # times the usual change from one frame to the next, that it takes at least
+_USUAL = 0.75  # quantile of the light of frames
+
 
 @dataclass(frozen=True)
 class Chunk:
@@ -273,6 +282,31 @@ def measure_frames(
     else:
         light = camera.gain_e_per_adu * (totals / pixels - float(np.mean(camera.offset_adu)))
     return np.where(totals == 0, -np.inf, light), repeats
+
+
+def well_lit(light_e: FloatArray, least: float = HALF) -> BoolArray:
+    """Tell which frames have the light of most, and not that of a shutter that is closed or opens.
+
+    Parameters
+    ----------
+    light_e : ndarray, shape (t,)
+        Light of frames, as `measure_frames` gives it; not finite where there is none.
+    least : float
+        Share of the usual light, which a quarter of the frames exceeds.
+
+    Returns
+    -------
+    ndarray of bool, shape (t,)
+        Frames with at least that share, and those that miss it by no more than frames differ from
+        the next, as where a background is next to none.
+    """
+    lit: BoolArray = np.isfinite(light_e)
+    if lit.any():
+        known = light_e[lit]
+        usual = float(np.quantile(known, _USUAL))
+        change = float(np.median(np.abs(np.diff(known)))) if known.size > 1 else 0.0
+        lit &= usual - light_e <= max((1 - least) * usual, _CHANGES * change)
+    return lit
 
 
 def make_chunk(
