@@ -6,10 +6,8 @@ the optics are learned, and the analysis goes on with what was learned.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
@@ -19,60 +17,42 @@ from iscat_analysis.calibration.optics import (
     FREE,
     LEAST_SIGHTS,
     MOST_SIGHTS,
-    Neighbours,
     OpticsCalibration,
-    Settings,
     Sight,
     free_groups,
     heights_free,
-    maximise,
-    settings_of,
 )
-from iscat_analysis.calibration.optics.starts import average_sights, with_masses
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera, camera_from_config
 from iscat_analysis.movie.metadata import resolve_metadata
-from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.pipeline.crowded import learn_in_field, seen_in_field
 from iscat_analysis.pipeline.diagnosis import drift_warning, examine_background
 from iscat_analysis.pipeline.microscope import (
     calibrate_sights,
-    goodness,
-    microscopes,
     refuse_uncalibratable,
-    rings_of,
     with_sign,
 )
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, Opening, judge_counts
 from iscat_analysis.pipeline.ranges import frame_ranges, measured_windows
 from iscat_analysis.pipeline.run import unheard
-from iscat_analysis.pipeline.sights import bright_sights, kind_of, reach_nm, scan_sights
+from iscat_analysis.pipeline.sights import bright_sights, kind_of, scan_sights
+from iscat_analysis.pipeline.tested_optics import REJECTED_P, TESTED, median_p, not_alone
 from iscat_analysis.pipeline.ways import way_of
-from iscat_analysis.records import Mapper, Progress, Windows, silent
+from iscat_analysis.records import Progress, Windows, silent
 from iscat_analysis.search.sliding import measure_frames
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
 
-REJECTED_P = 1e-3
-"""Half of the brightest particles must fit worse than this before the optics are doubted: a few
-that are not alone do not suffice."""
-
 LEAST_TESTED = 4
 """Bright particles without which the optics are not even tested."""
 
-_TESTED = 24  # the brightest
 _MOST_STEP_NM = 5e3  # farther than the model's pictures reach
 _LEAST_SCAN_NM = 10.0  # over all frames; a step in µm stays below it
 _NOISE = "its noise is not what the camera's numbers predict; the analysis goes on as configured"
 _STUCK = 0.02  # share of frames that repeat another, which sums of frames count
-_STARTS_NM = tuple(range(-400, 401, 100))  # along each axis; rings are some 200 nm apart
-_FITTED = 3  # of these starts
-_CLEAR = 10.0  # standard errors of χ² by which a wrong microscope would be seen in a picture
-_DESCRIBED = 0.1  # of that, which a picture that is described has at most
-_DESCRIBED_SHARE = 0.25  # of the pictures, that must be described where others are not
 
 
 def learn_optics(
@@ -128,7 +108,7 @@ def learn_optics(
     tested: dict[str, Any] = {}
     first_tested = optics.calibrate == "auto" and way_of(config) == "sliding"
     with threads(config.compute.workers) as pool:
-        enough = _TESTED if first_tested else MOST_SIGHTS
+        enough = TESTED if first_tested else MOST_SIGHTS
         sights, others = bright_sights(
             movie, config, camera, pool, opening, enough, rings=not first_tested
         )
@@ -141,12 +121,12 @@ def learn_optics(
                 sights, others = seen_in_field(windows, config, pool)
             if len(sights) < LEAST_TESTED:
                 raise DataError(_too_few(movie.name, len(sights)))
-            median = _median_p(sights, config, others, pool.map)
+            median = median_p(sights, config, others, pool.map)
             if first_tested and median < REJECTED_P:  # more particles, and whose rings they show
                 sights, others = bright_sights(movie, config, camera, pool, opening)
-                alone, median = len(sights), _median_p(sights, config, others, pool.map)
+                alone, median = len(sights), median_p(sights, config, others, pool.map)
             if optics.calibrate == "auto" and median < REJECTED_P and not heights_free(config):
-                pairs, median = _not_alone(sights, config, others, pool.map)
+                pairs, median = not_alone(sights, config, others, pool.map)
                 sights = [sight for k, sight in enumerate(sights) if k not in pairs]
                 alone -= sum(k < alone for k in pairs)
                 if len(sights) < LEAST_TESTED:
@@ -356,73 +336,6 @@ def _summed(movie: Stack, config: Config, camera: Camera) -> Windows:
     return measured_windows(movie, config, camera, *frame_ranges(movie, config))
 
 
-def _median_p(
-    sights: list[Sight], config: Config, others: Sequence[Sight] = (), mapper: Mapper = map
-) -> float:
-    """Median p-value of the brightest particles in the configured microscope.
-
-    The rings of neighbours, where any are known, are put into the pictures that fail without.
-    """
-    settings = settings_of(config)
-    build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
-    model = build(settings)
-    shown: Sequence[Sight] = sights[:_TESTED]
-    x, y = 0.0, 0.0
-    if not heights_free(config):
-        averages, shown = average_sights(shown)
-        x, y = _centre(averages[0], model, build, settings)
-
-    def median(pictures: Sequence[Sight]) -> tuple[float, Sequence[Sight]]:
-        fitted = maximise(pictures, build, settings, (), mapper=mapper).sights
-        return float(np.median([goodness(sight, model)[1] for sight in fitted])), fitted
-
-    moved = [sight.placed(sight.x_nm + x, sight.y_nm + y) for sight in shown]
-    found, fitted = median(with_masses(moved, build, settings))
-    if found >= REJECTED_P or not any(sight.neighbours for sight in fitted):
-        return found
-    elsewhere = [other.placed(other.x_nm + x, other.y_nm + y) for other in others]
-    near = Neighbours.fitted(elsewhere, build, rings_of(config, sights[0]), settings, mapper)
-    return max(found, median(near.around(fitted, mapper))[0])
-
-
-def _not_alone(
-    sights: Sequence[Sight], config: Config, others: Sequence[Sight] = (), mapper: Mapper = map
-) -> tuple[list[int], float]:
-    """Find bright places that the configured microscope describes badly, and others well.
-
-    Returns their numbers, and the median p-value of the others.
-
-    A microscope that is wrong is so for all particles, and is seen the better the brighter they
-    are.  Where some as bright are described, the places that are not show two that landed at once.
-    From a place that others drew aside a fit ends in another optimum: each begins anew here.
-    """
-    settings = settings_of(config)
-    build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
-    model = build(settings)
-
-    def fitted(sight: Sight) -> Sight:
-        x, y = _centre(sight, model, build, settings)
-        (placed,) = with_masses([sight.placed(x, y)], build, settings)
-        return maximise([placed], build, settings, ()).sights[0]
-
-    some = list(mapper(fitted, sights[:_TESTED]))
-    if any(sight.neighbours for sight in some):
-        near = Neighbours.fitted(others, build, rings_of(config, some[0]), settings, mapper)
-        pictures = near.around(some, mapper)
-        some = list(maximise(pictures, build, settings, (), mapper=mapper).sights)
-    chi2, p = np.transpose([goodness(sight, model) for sight in some])
-    mass = np.array([sight.mass_kda for sight in some])
-    poor = p < REJECTED_P
-    if not poor.any() or poor.all():
-        return [], float(np.median(p))
-    expected = float(np.median((chi2 - 1)[poor] / mass[poor] ** 2)) * mass**2
-    clear = expected > _CLEAR * np.sqrt(2 / math.prod(some[0].grid.shape))
-    described = ~poor & clear & (chi2 - 1 < _DESCRIBED * expected)
-    if described.sum() < max(2, _DESCRIBED_SHARE * len(some)):
-        return [], float(np.median(p))
-    return np.flatnonzero(poor).tolist(), float(np.median(p[~poor]))
-
-
 def _noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
     """Whether the first frames have another noise than p-values rest on, or repeat each other."""
     first, last = config.background.recorded or config.fit.frames or (0, movie.shape[0])
@@ -432,31 +345,6 @@ def _noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
     return bool(stuck or judge_counts(counts[np.isfinite(light) & ~repeats], camera).differs)
 
 
-def _centre(
-    sight: Sight,
-    model: ForwardModel,
-    build: Callable[[Settings], ForwardModel],
-    settings: Settings,
-) -> tuple[float, float]:
-    """Find the particle in a picture [nm], whose brightest spot may be of a ring.
-
-    From a place half a ring away a fit ends in another optimum, with the mass of the other sign.
-    """
-    starts = [
-        replace(sight, x_nm=sight.x_nm + x, y_nm=sight.y_nm + y)
-        for x in _STARTS_NM
-        for y in _STARTS_NM
-    ]
-
-    def misfit(one: Sight) -> float:
-        return goodness(one, model)[0]
-
-    likely = sorted(with_masses(starts, build, settings), key=misfit)[:_FITTED]
-    fits = [maximise([sight], build, settings, ()).sights[0] for sight in likely]
-    best = min(fits, key=misfit)
-    return best.x_nm, best.y_nm
-
-
 def _verdict(tested: dict[str, Any]) -> str:
     """Say what the test found where the optics are not learned."""
     if not tested:
@@ -464,7 +352,7 @@ def _verdict(tested: dict[str, Any]) -> str:
     if tested["median_p"] >= REJECTED_P:
         return "the optics cannot be learned from this movie"
     return (
-        f"the configured optics do not describe the brightest {min(tested['tested'], _TESTED)} "
+        f"the configured optics do not describe the brightest {min(tested['tested'], TESTED)} "
         f"particles (median p-value {tested['median_p']:.1g}), and they cannot be learned from them"
     )
 

@@ -21,7 +21,8 @@ from iscat_analysis.inference.noise import conditional
 from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import learning
-from iscat_analysis.pipeline.learning import LEAST_TESTED, _median_p, learn_optics
+from iscat_analysis.pipeline.learning import LEAST_TESTED, learn_optics
+from iscat_analysis.pipeline.tested_optics import REJECTED_P, median_p
 
 MOVIE: Any = SimpleNamespace(name="movie.tif")
 
@@ -53,7 +54,7 @@ def test_optics_that_describe_the_particles_stay_without_a_word(
     assert stayed
     assert not said
     assert summary["tested"] == 14
-    assert summary["median_p"] > learning.REJECTED_P
+    assert summary["median_p"] > REJECTED_P
     assert summary["calibrated"] is False
 
 
@@ -64,7 +65,7 @@ def test_places_on_a_ring_do_not_condemn_the_optics(y_nm: float) -> None:
     for changes, fits in (({}, True), ({"focus_nm": -300.0}, False)):
         sights, _, _ = make_sights(changes, 8, seed=5, config=config)
         moved = [replace(sight, y_nm=sight.y_nm + y_nm) for sight in sights]
-        assert (_median_p(moved, config) > learning.REJECTED_P) == fits
+        assert (median_p(moved, config) > REJECTED_P) == fits
 
 
 def _pairs(changes: dict[str, Any], count: int, seed: int) -> list[Sight]:
@@ -98,7 +99,7 @@ def test_pairs_that_land_at_once_do_not_condemn_the_optics(
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     learned, summary = learn_optics(MOVIE, config, camera, tell=said.append)
     assert learned == config
-    assert (summary["median_p"] > learning.REJECTED_P) == fits
+    assert (summary["median_p"] > REJECTED_P) == fits
     assert summary["tested"] == (11 if not fits else 5)
     assert bool(said) != fits
 
@@ -121,7 +122,7 @@ def test_too_few_particles_to_learn_from_are_said_where_the_test_fails(
     assert "do not describe the brightest 8 particles" in said[0]
     assert "at least 12 are needed to learn the optics; record more" in said[0]
     assert said[0].endswith("the analysis goes on as configured")
-    assert summary["median_p"] < learning.REJECTED_P
+    assert summary["median_p"] < REJECTED_P
     assert summary["calibrated"] is False
 
 
