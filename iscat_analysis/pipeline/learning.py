@@ -51,7 +51,9 @@ LEAST_TESTED = 4
 
 _MOST_STEP_NM = 5e3  # farther than the model's pictures reach
 _LEAST_SCAN_NM = 10.0  # over all frames; a step in µm stays below it
-_NOISE = "its noise is not what the camera's numbers predict; the analysis goes on as configured"
+NOISE = "its noise is not what the camera's numbers predict"
+"""Why optics are not judged where p-values cannot be."""
+
 _STUCK = 0.02  # share of frames that repeat another, which sums of frames count
 
 
@@ -95,7 +97,7 @@ def learn_optics(
         The frames are impossible, for the analysis too.
     """
     optics = config.optics
-    reason = _why_not(config)
+    reason = why_not(config)
     if reason and optics.calibrate == "always":
         tell(f"the optics are not learned {reason}; the analysis goes on as configured")
     if (
@@ -120,7 +122,7 @@ def learn_optics(
                     raise DataError("the edges of a fixed pattern that moved look like particles")
                 sights, others = seen_in_field(windows, config, pool)
             if len(sights) < LEAST_TESTED:
-                raise DataError(_too_few(movie.name, len(sights)))
+                raise DataError(too_few(movie.name, len(sights)))
             median = median_p(sights, config, others, pool.map)
             if first_tested and median < REJECTED_P:  # more particles, and whose rings they show
                 sights, others = bright_sights(movie, config, camera, pool, opening)
@@ -130,15 +132,16 @@ def learn_optics(
                 sights = [sight for k, sight in enumerate(sights) if k not in pairs]
                 alone -= sum(k < alone for k in pairs)
                 if len(sights) < LEAST_TESTED:
-                    raise DataError(_too_few(movie.name, len(sights)))
+                    raise DataError(too_few(movie.name, len(sights)))
             tested = {"tested": len(sights), "median_p": median}
             if optics.calibrate == "auto" and median >= REJECTED_P:
                 return config, tested | {"calibrated": False}
-            if optics.calibrate == "auto" and _noise_differs(movie, config, camera):
-                tell(f"the optics cannot be tested on this movie: {_NOISE}")
-                return config, tested | {"calibrated": False, "reason": _NOISE}
+            if optics.calibrate == "auto" and noise_differs(movie, config, camera):
+                reason = f"{NOISE}; the analysis goes on as configured"
+                tell(f"the optics cannot be tested on this movie: {reason}")
+                return config, tested | {"calibrated": False, "reason": reason}
             notify("learning the optics from the particles of the movie, which may take minutes…")
-            found = _learned(
+            found = learned_from(
                 sights[:alone], others, movie, config, camera, tuple(FREE), source, pool
             )
         except DataError as error:
@@ -147,8 +150,19 @@ def learn_optics(
     return taken(found, config, tested, _verdict(tested), tell=tell)
 
 
-def _why_not(config: Config) -> str:
-    """Say of what movies, or with what configuration, no optics are learned; else nothing."""
+def why_not(config: Config) -> str:
+    """Say of what movies, or with what configuration, no optics are learned.
+
+    Parameters
+    ----------
+    config : Config
+        Resolved.
+
+    Returns
+    -------
+    str
+        Some words; empty where they can be learned.
+    """
     optics, mode, way = config.optics, config.fit.mode, way_of(config)
     if mode == "track":
         if way == "tracks" and config.track.free == "mass":
@@ -164,8 +178,21 @@ def _why_not(config: Config) -> str:
     return next((reason for holds, reason in reasons if holds), "")
 
 
-def _too_few(name: str, number: int) -> str:
-    """Say that too few particles stand alone."""
+def too_few(name: str, number: int) -> str:
+    """Say that too few particles stand alone.
+
+    Parameters
+    ----------
+    name : str
+        Of the movie.
+    number : int
+        How many do.
+
+    Returns
+    -------
+    str
+        One line.
+    """
     return (
         f"{name}: shows {count(number, 'bright particle')} standing alone, and {LEAST_TESTED} are "
         f"needed to test the optics, {LEAST_SIGHTS} to learn them"
@@ -294,7 +321,7 @@ def calibrate_movie(
             "version": version("iscat-analysis"),
         }  # fmt: skip
         if focus_step_nm is None:
-            return _learned(sights, others, movie, config, camera, groups, source, pool)
+            return learned_from(sights, others, movie, config, camera, groups, source, pool)
         return calibrate_sights(
             sights, others, config, groups, source,
             focus_step_nm=focus_step_nm, mapper=pool.map,
@@ -312,7 +339,7 @@ def _check_step(step_nm: float, frames: int) -> None:
         )
 
 
-def _learned(
+def learned_from(
     sights: Sequence[Sight],
     others: Sequence[Sight],
     movie: Stack,
@@ -322,7 +349,37 @@ def _learned(
     source: Mapping[str, str],
     pool: ThreadPoolExecutor,
 ) -> OpticsCalibration:
-    """Learn the optics from particles that stand alone, or where these do not suffice from all."""
+    """Learn the optics from particles that stand alone, or where these do not suffice from all.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        Those that stand alone.
+    others : sequence of Sight
+        Every particle that `Sight.neighbours` counts.
+    movie : Stack
+        The movie.
+    config : Config
+        Resolved; with the optics where the search begins.
+    camera : Camera
+        Counts → photoelectrons.
+    groups : sequence of str
+        As for `calibrate_sights`.
+    source : mapping of str to str
+        As for `calibrate_sights`.
+    pool : ThreadPoolExecutor
+        Runs the fits.
+
+    Returns
+    -------
+    OpticsCalibration
+        What was found.
+
+    Raises
+    ------
+    DataError
+        There are too few particles.
+    """
     crowded = way_of(config) == "fixed"
     if not crowded or len(sights) >= LEAST_SIGHTS:
         found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
@@ -336,8 +393,23 @@ def _summed(movie: Stack, config: Config, camera: Camera) -> Windows:
     return measured_windows(movie, config, camera, *frame_ranges(movie, config))
 
 
-def _noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
-    """Whether the first frames have another noise than p-values rest on, or repeat each other."""
+def noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
+    """Tell whether the first frames repeat each other, or have not the noise of p-values.
+
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        Resolved.
+    camera : Camera
+        Counts → photoelectrons.
+
+    Returns
+    -------
+    bool
+        Whether p-values cannot be right.
+    """
     first, last = config.background.recorded or config.fit.frames or (0, movie.shape[0])
     counts = movie.read(first, min(last, first + SPECTRUM_FRAMES, movie.shape[0]))
     light, repeats = measure_frames(counts, camera)

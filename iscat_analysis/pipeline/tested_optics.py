@@ -93,7 +93,13 @@ def not_alone(
 
     Parameters
     ----------
-    sights, config, others, mapper
+    sights : list of Sight
+        As for `median_p`.
+    config : Config
+        As for `median_p`.
+    others : sequence of Sight
+        As for `median_p`.
+    mapper : callable
         As for `median_p`.
 
     Returns

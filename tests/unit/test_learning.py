@@ -33,7 +33,7 @@ def _learn(
     """Whether the configuration stayed, the summary, and what the user was told."""
     config = _config(calibrate)
     sights, _, _ = make_sights(changes, count, seed=3)
-    monkeypatch.setattr(learning, "_noise_differs", lambda *_: False)
+    monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
     monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
@@ -93,7 +93,7 @@ def test_pairs_that_land_at_once_do_not_condemn_the_optics(
     config = _config("auto")
     singles, _, _ = make_sights(changes, 5, seed=3)
     sights = [*_pairs(changes, 6, 4), *singles]
-    monkeypatch.setattr(learning, "_noise_differs", lambda *_: False)
+    monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
     monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
     said: list[str] = []
     camera = camera_from_config(config.camera, (64, 64), "uint16")
@@ -139,7 +139,7 @@ def test_a_phase_that_the_line_of_masses_turns_is_told(
 ) -> None:
     """Beyond focus particles are bright; the control is on the configured side."""
     sights, _, _ = make_sights({"focus_nm": focus_nm}, 16, seed=3)
-    monkeypatch.setattr(learning, "_noise_differs", lambda *_: False)
+    monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
     monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
     config = _config("auto").model_copy(
         update={"calibration": Calibration(gradient_per_kda=-3.1e-5)}
@@ -235,7 +235,7 @@ def test_particles_at_heights_of_their_own_do_not_condemn_the_optics(
     config = _config("auto")
     free = config.model_copy(update={"fit": config.fit.model_copy(update={"mode": mode})})
     sights, _, _ = make_sights({"focus_nm": -450.0}, 8, seed=3)
-    monkeypatch.setattr(learning, "_noise_differs", lambda *_: False)
+    monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
     monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
