@@ -153,19 +153,19 @@ def judge_counts(
     shared = shared_light(counts, camera, masked=masked)
     if shared is not None:
         return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
-    excess = (
-        ExcessNoise(gain.noise_ratio, gain.message)
-        if gain.message and gain.noise_ratio > 1
-        else None
-    )
     zero = None if additive else find_zero(counts, camera, masked=masked)
     leaks = spectrum is not None and spectrum.correlated
     if zero is not None and leaks and not zero.flickers:
         zero = None  # the variance of a pixel is then of its neighbours' light as well
-    if zero is None or not _tells(zero, gain):
-        said = (gain.message, "" if additive else _undecided(gain, zero, camera))
-        return Noise(tuple(text for text in said if text), gain.off, excess, spectrum)
-    messages = [_wrong_offset(zero, camera)]
+    told = zero is not None and _tells(zero, gain)
+    if zero is not None and told:
+        said = _wrong_offset(zero, camera)
+    else:
+        said = ("" if additive else _undecided(gain, zero, camera)) or gain.message or ""
+    excess = ExcessNoise(gain.noise_ratio, said) if gain.off and gain.noise_ratio > 1 else None
+    if zero is None or not told:
+        return Noise((said,) if said else (), gain.off, excess, spectrum)
+    messages = [said]
     moved = replace(camera, offset_adu=camera.offset_adu + zero.electrons / camera.gain_e_per_adu)
     with contextlib.suppress(DataError):  # too dark to tell
         rest = diagnose_gain(counts[:_GAIN_FRAMES], moved, masked=masked)
@@ -244,12 +244,13 @@ def _undecided(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> s
         return ""
     if zero is not None and not zero.may_be(share):
         return ""
-    cause = "its gain, or light that is noisy by itself" if gain.noise_ratio > 1 else "its gain"
+    noisy = "by light that is noisy by itself, " if gain.noise_ratio > 1 else ""
     return (
         f"the noise variance is {gain.noise_ratio:.3g} ± {gain.noise_ratio_se:.1g} times what the "
-        f"camera's numbers predict, and this movie does not tell whether by {cause} or by "
-        f"{_offset_of(camera)}, which would make {_effect(share)}: record a dark, and measure both "
-        "with `iscat calibrate camera`"
+        "camera's numbers predict, and this movie does not tell whether by the gain (then set "
+        f"camera.gain_e_per_adu = {gain.gain_e_per_adu:.4g}), {noisy}or by {_offset_of(camera)}, "
+        f"which would make {_effect(share)}: record a dark, and measure both with "
+        "`iscat calibrate camera`"
     )
 
 
