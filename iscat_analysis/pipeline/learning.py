@@ -164,16 +164,21 @@ def why_not(config: Config) -> str:
         Some words; empty where they can be learned.
     """
     optics, mode, way = config.optics, config.fit.mode, way_of(config)
-    if mode == "track":
-        if way == "tracks" and config.track.free == "mass":
-            return ""
-        return 'in mode track but with track.free = "mass" and without background frames'
+    tracks = mode == "track"
+    followed = way == "tracks" and config.track.free == "mass"
     reasons = (
+        (
+            tracks and not followed,
+            'in mode track but with track.free = "mass" and without background frames',
+        ),
         (optics.scheme == "darkfield", "from dark field"),
         (optics.convention != "exact", f'with optics.convention = "{optics.convention}"'),
         (optics.psf != "model", f'with optics.psf = "{optics.psf}"'),
         (config.background.method == "known", 'with background.method = "known"'),
-        (heights_free(config) and way != "fixed", f"in mode {mode} without background frames"),
+        (
+            not tracks and heights_free(config) and way != "fixed",
+            f"in mode {mode} without background frames",
+        ),
     )
     return next((reason for holds, reason in reasons if holds), "")
 

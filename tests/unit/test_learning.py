@@ -169,6 +169,10 @@ def test_a_phase_that_the_line_of_masses_turns_is_told(
         ({"background.method": "known", "background.level_e": 1e4}, 'background.method = "known"'),
         ({"fit.mode": "joint"}, "in mode joint without background frames"),
         ({"fit.mode": "track", "track.free": "joint"}, 'but with track.free = "mass"'),
+        (
+            {"fit.mode": "track", "track.free": "mass", "optics.convention": "dong2021"},
+            'with optics.convention = "dong2021"',
+        ),
     ],
 )
 def test_always_is_told_where_nothing_is_learned_from_such_movies(
