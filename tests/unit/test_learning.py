@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -270,3 +271,30 @@ def test_edges_of_a_pattern_that_moved_are_not_learned_from(moved_px: float, why
     assert not summary["calibrated"]
     assert len(said) == 1
     assert why in said[0]
+
+
+def test_a_median_has_its_own_noise_when_optics_are_tested(tmp_path: Path) -> None:
+    """With the variance of a mean the right optics were rejected: p-values of 1e-5 and less."""
+    events = [
+        {"frame": 60, "x_px": 22.3 + 40 * (k % 2), "y_px": 21.6 + 40 * (k // 2), "mass_kda": 1000.0}
+        for k in range(4)
+    ]
+    setup = {
+        "camera.pixel_size_nm": PIXEL_NM,
+        "background.frames": (0, 60),
+        "fit.frames": (60, 120),
+        "calibration.gradient_per_kda": -3.1e-5,
+        "posterior.enabled": False,
+        "compute.workers": 1,
+    }
+    light = {
+        "simulation.shape": (84, 84),
+        "simulation.frames": 120,
+        "simulation.photons_per_pixel": 3e4,
+        "simulation.events": events,
+    }
+    ia.simulate_movie({**setup, **light}, tmp_path / "movie.tif", seed=1)
+    result = ia.fit_movie(tmp_path / "movie.tif", config={**setup, "background.method": "median"})
+    assert result.summary["optics"]["tested"] == 4
+    assert result.summary["optics"]["median_p"] > 10 * REJECTED_P
+    assert not [text for text in result.warnings if "optics" in text]
