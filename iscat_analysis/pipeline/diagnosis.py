@@ -22,7 +22,7 @@ from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, first_counts, is_lit
 from iscat_analysis.pipeline.systematic import is_bent
-from iscat_analysis.records import Status, Windows
+from iscat_analysis.records import FloatArray, Status, Windows
 from iscat_analysis.search.sliding import measure_noise
 from iscat_analysis.units import count, listed
 
@@ -33,6 +33,9 @@ FLAT = 0.05
 """Variance of the steps along z over that in the plane, below which particles move in a plane:
 near the coverslip those that do not have less along z too, but not so much less."""
 
+_RINGS = 0.01  # of the light, which rings of many bright particles make uneven
+_LEAST_PIXELS = 100  # away from particles, of which the light is said to be uneven
+_GAUSS = 1.4826  # standard deviation over the median deviation of a Gaussian
 _BRIGHTEST = 8  # isolated particles on which the model is judged
 _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
 _NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
@@ -218,6 +221,61 @@ def drift_warning(name: str, background: dict[str, Any]) -> str | None:
         f"{name}: the fixed pattern moved by {x:+.2f} pixels in x and {y:+.2f} in y between the "
         "background and the frames after it; its edges look like particles: take background frames "
         "nearer to them (background.frames), or fewer frames (fit.frames)"
+    )
+
+
+def uneven_warning(
+    config: Config, name: str, windows: Windows, explained: FloatArray | None = None
+) -> str:
+    """Say that the light is uneven where one level is taken for the background of all pixels.
+
+    Parameters
+    ----------
+    config : Config
+        With the level.
+    name : str
+        Of the movie.
+    windows : Windows
+        The sum of the frames, over that level.
+    explained : ndarray, shape (y, x), optional
+        Contrast of all particles, as they were fitted, or their photoelectrons in dark field; NaN
+        where a particle is so near that a wrong model leaves much over.  Without it rings may make
+        some of what is uneven.
+
+    Returns
+    -------
+    str
+        One line; empty where the background was measured, or pixels differ by their noise.
+    """
+    level = windows.power_ratio * windows.before_e
+    used = ~windows.masked & (level > 0)
+    if windows.n_before or not used.any():
+        return ""
+    signal = np.zeros(level.shape) if explained is None else explained
+    expected = level + signal if config.optics.scheme == "darkfield" else level * (1 + signal)
+    used &= np.isfinite(expected) & (expected > 0)
+    if used.sum() < _LEAST_PIXELS:
+        return ""
+    expected, after = expected[used], windows.after_e[used]
+    light = after / expected
+    noise = after + windows.read_variance_after_e2[used]
+    shot = math.sqrt(max(float(np.median(noise / expected**2)), 0.0))
+    middle = float(np.median(light))
+    spread = _GAUSS * float(np.median(np.abs(light - middle)))
+    uneven = math.sqrt(max(spread**2 - shot**2, 0.0))
+    if uneven <= max(shot, 0.0 if explained is not None else _RINGS * middle):
+        return ""
+    times = float(f"{uneven / shot:.2g}")
+    advice = "give frames without particles as background.frames"
+    if config.fit.mode == "track":
+        advice += ', or learn the background with background.method = "tracks"'
+    elif config.optics.scheme != "darkfield":
+        advice += ', or follow landings with background.method = "sliding"'
+    return (
+        f"{name}: the light differs by {100 * uneven / middle:.2g} % of its mean from pixel to "
+        f'pixel, {times:g} times its noise, where background.method = "known" has '
+        f"{config.background.level_e:g} in all of them: what differs is taken for particles, or "
+        f"makes their masses and places wrong; {advice}"
     )
 
 
