@@ -39,6 +39,7 @@ _STEPS: Mapping[str, Mapping[str, float]] = {
     "coma": {"z7": 5.0, "z8": 5.0},
 }  # small enough for a first order, and for what a table of the field resolves
 _FAR: Mapping[str, Sequence[float]] = {
+    "focus": (*range(-300, 0, 50), *range(50, 301, 50)),
     "numerical aperture": (-0.15, -0.12, -0.09, -0.06, -0.03, 0.03, 0.06, 0.09, 0.12, 0.15),
     "wavelength": (-80.0, -60.0, -40.0, -20.0, 20.0, 40.0, 60.0, 80.0),
     PIXEL: (-20.0, -15.0, -10.0, -5.0, 5.0, 10.0, 15.0, 20.0),

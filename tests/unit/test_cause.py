@@ -70,6 +70,15 @@ def test_the_wrong_number_is_named_with_its_error(name: str, key: str, off: floa
     assert f"off by about {math.copysign(1, off):+g}"[:-1] in cause.message
 
 
+@pytest.mark.parametrize(("configured", "true"), [(-380.0, -300.0), (-500.0, -400.0)])
+def test_a_focus_is_tried_whole(configured: float, true: float) -> None:
+    """To first order both were 170 nm off."""
+    cause = _cause({"focus_nm": true}, focus_nm=configured)
+    assert cause is not None
+    assert cause.name == "focus"
+    assert cause.step == pytest.approx(true - configured, abs=30)
+
+
 @pytest.mark.parametrize("off", [25.0, 40.0, -40.0, 60.0])
 def test_a_wrong_phase_is_named_with_its_angle(off: float) -> None:
     """Of the tangent that is left over beside a fitted mass, 60° seem to be 87° or more."""
