@@ -49,5 +49,9 @@ class ConfigError(IscatError):
     exit_status = 2
 
 
+class ContrastError(ConfigError):
+    """The model's particles are bright where the calibration of masses has them dark, or dark."""
+
+
 class SchedulerError(IscatError):
     """The cluster that does the work is gone, or was told to stop (status 1)."""

@@ -9,6 +9,7 @@ another microscope, one parameter at a time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -38,7 +39,9 @@ _STEPS: Mapping[str, Mapping[str, float]] = {
     "coma": {"z7": 5.0, "z8": 5.0},
 }  # small enough for a first order, and for what a table of the field resolves
 _FAR: Mapping[str, Sequence[float]] = {
+    "focus": (*range(-300, 0, 50), *range(50, 301, 50)),
     "numerical aperture": (-0.15, -0.12, -0.09, -0.06, -0.03, 0.03, 0.06, 0.09, 0.12, 0.15),
+    "wavelength": (-80.0, -60.0, -40.0, -20.0, 20.0, 40.0, 60.0, 80.0),
     PIXEL: (-20.0, -15.0, -10.0, -5.0, 5.0, 10.0, 15.0, 20.0),
 }
 """Steps that are tried whole.
@@ -46,6 +49,18 @@ _FAR: Mapping[str, Sequence[float]] = {
 Beside the critical angle, and where rings have moved by half of their distance, a first order says
 little.
 """
+
+_FAR_DARK: Mapping[str, Sequence[float]] = {
+    "focus": (*range(-1000, 0, 50), *range(50, 1001, 50)),
+    "spherical aberration": (-60.0, -45.0, -30.0, -15.0, 15.0, 30.0, 45.0, 60.0),
+}
+"""The same in dark field, where light on either side of the best focus looks much alike."""
+
+_SCALES = (PIXEL, "wavelength")
+"""What stretches pictures: a movie may not tell one from the other."""
+
+_AT_LEAST = 0.03  # of χ² in excess, by which two causes must differ where both are tried whole
+_SIGMAS = 4.0  # standard errors of χ², by which they must too
 
 _OTHERS: Mapping[str, Mapping[str, Any]] = {
     "polarisation, as if circular light passed an analyser": {
@@ -88,6 +103,10 @@ class Cause:
         Fits that were looked at.
     learned : bool
         Whether the optics can be learned from such a movie.
+    other_steps : tuple of float
+        What might have to be added instead, as far as these pictures tell.
+    rivals : tuple of (str, float, str)
+        Other parts of the microscope that explain as much, with the step and unit of each.
     """
 
     name: str
@@ -96,16 +115,25 @@ class Cause:
     unit: str
     events: int
     learned: bool
+    other_steps: tuple[float, ...] = ()
+    rivals: tuple[tuple[str, float, str], ...] = ()
 
     @property
     def likeness(self) -> str:
         """What the residuals look most like."""
-        by = (
-            ""
-            if self.step is None
-            else f", off by about {float(f'{self.step:.2g}'):+g} {self.unit}".rstrip()
+        by = ""
+        if self.step is not None:
+            steps = [_rounded(step) for step in (self.step, *self.other_steps)]
+            *first, last = steps
+            several = f"{', '.join(first)} or {last}" if first else last
+            by = f", off by about {several} {self.unit}".rstrip()
+        by += "".join(
+            f", or {name}, by {_rounded(step)} {unit}" for name, step, unit in self.rivals
         )
-        return f"a wrong {self.name}{by} ({self.share:.0%} of it)"
+        alike = (
+            ", which these pictures do not tell apart" if self.other_steps or self.rivals else ""
+        )
+        return f"a wrong {self.name}{by}{alike} ({self.share:.0%} of it)"
 
     @property
     def message(self) -> str:
@@ -141,35 +169,92 @@ def likely_cause(
     excess = sum(each.excess for each in left)
     if excess <= 0:
         return None
-    reach = fits[0][0].model.reach_nm
-    best: Cause | None = None
-    most = WORTH_NAMING  # above 1 where there is less noise than the camera's numbers say
-    for name in (*_STEPS, PIXEL, _TURNED, *_OTHERS):
-        changes = _neighbours(config, name, reach)
-        if not changes:
+    found = {name: _told(config, name, left, excess) for name in _names()}
+    named = {name: tried for name, tried in found.items() if tried[0][0] > WORTH_NAMING}
+    if not named:  # a share is above 1 where there is less noise than the camera's numbers say
+        return None
+    name = max(named, key=lambda name: named[name][0][0])
+    share, step = named[name][0]
+    pixels = sum(each.rest.size for each in left)
+    margin = max(1 - share, _AT_LEAST) + _SIGMAS * math.sqrt(2 * pixels) / excess
+
+    def alike(other: str) -> bool:
+        return other in named and named[other][0][0] > share - margin
+
+    others = [(s, other) for s, other in named[name][1:] if s > share - margin]
+    rivals = [n for n in _SCALES if n != name and name in _SCALES and alike(n)]
+    return Cause(
+        name=name,
+        share=min(share, 1.0),
+        step=step if name in _UNITS else None,
+        unit=_UNITS.get(name, ""),
+        events=len(fits),
+        learned=config.optics.scheme != "darkfield",
+        other_steps=tuple(other for _, other in others),
+        rivals=tuple((n, named[n][0][1], _UNITS[n]) for n in rivals),
+    )
+
+
+def _names() -> tuple[str, ...]:
+    return (*_STEPS, PIXEL, _TURNED, *_OTHERS)
+
+
+def _told(
+    config: Config, name: str, left: Sequence[_Left], excess: float
+) -> list[tuple[float, float]]:
+    """Share of χ² in excess that a part of the microscope explains, and by what step.
+
+    The best first; others are as far away from it as pictures on the other side of focus are.
+    """
+    reach = left[0].reach_nm
+    changes = _neighbours(config, name, reach)
+    if not changes:
+        return [(0.0, 0.0)]
+    share, steps = _explained(left, changes, excess, whole=name in _WHOLE)
+    graded = len(changes) == 1 and name not in (_TURNED, *_OTHERS)
+    # far from a first order: the same, as far away as it seems, if a microscope is there
+    turns = name == _PHASE and left[0].free_mass
+    if turns:
+        steps = _angle(steps)
+    if (
+        graded
+        and share > WORTH_NAMING
+        and (there := _neighbours(config, name, reach, float(steps[0])))
+    ):
+        share, asked = _explained(left, there, excess)
+        steps = steps if turns else asked
+    best = (share, float(steps[0]))
+    whole: list[tuple[float, float]] = []
+    dark = config.optics.scheme == "darkfield"
+    for far in _FAR.get(name, ()) if not dark else _FAR_DARK.get(name, _FAR.get(name, ())):
+        if not (there := _neighbours(config, name, reach, far)):
             continue
-        share, step = _explained(left, changes, excess, whole=name in _WHOLE)
-        graded = len(changes) == 1 and name not in (_TURNED, *_OTHERS)
-        # far from a first order: the same, as far away as it seems, if a microscope is there
-        far_away = graded and share > WORTH_NAMING
-        turns = name == _PHASE and bool(fits[0][2][AMPLITUDE])
-        if turns:
-            step = _angle(step)
-        if far_away and (there := _neighbours(config, name, reach, float(step[0]))):
-            share, asked = _explained(left, there, excess)
-            step = step if turns else asked
-        for far in _FAR.get(name, ()):
-            if not (there := _neighbours(config, name, reach, far)):
-                continue
-            larger, asked = _explained(left, there, excess)
-            if larger > share and _WHOLE_STEP < asked[0] / far < 1 / _WHOLE_STEP:
-                share, step = larger, np.array([far])
-        if share > most:
-            most = share
-            size = float(step[0]) if name in _UNITS else None
-            unit, learned = _UNITS.get(name, ""), config.optics.scheme != "darkfield"
-            best = Cause(name, min(share, 1.0), size, unit, len(fits), learned)
-    return best
+        share, asked = _explained(left, there, excess)
+        # what is as bright elsewhere may be much brighter here: of |E|² only the shape is alike
+        alike = _WHOLE_STEP < asked[0] / far < 1 / _WHOLE_STEP
+        if alike or (dark and name in _FAR_DARK and asked[0] / far > 0):
+            whole.append((share, far))
+    if not dark or name not in _FAR_DARK:
+        return [max([best, *whole])]
+    return _peaks(best, whole)
+
+
+def _peaks(
+    best: tuple[float, float], whole: list[tuple[float, float]]
+) -> list[tuple[float, float]]:
+    """Give the steps that explain more than those tried beside them, the best first.
+
+    A step of first order takes the place of the one that is tried next to it, if it is better.
+    """
+    tops = [
+        each
+        for before, each, after in zip([None, *whole], whole, [*whole[1:], None], strict=False)
+        if (before is None or each > before) and (after is None or each > after)
+    ]
+    near = [top for top in tops if top[1] * best[1] > 0]
+    if not near or best > max(near):
+        tops = [top for top in tops if top not in near] + [best]
+    return sorted(tops, reverse=True)
 
 
 @dataclass(frozen=True)
@@ -184,6 +269,8 @@ class _Left:
     fitted: FloatArray
     rest: FloatArray
     excess: float
+    reach_nm: float
+    free_mass: bool
 
     @classmethod
     def of(cls, likelihood: Likelihood, theta: FloatArray, free: BoolArray) -> _Left:
@@ -206,12 +293,18 @@ class _Left:
             place=(float(theta[0]), float(theta[1]), float(theta[2]), mass),
             signal=signal, used=used, root=root, fitted=fitted,
             rest=rest - fitted @ (fitted.T @ rest), excess=float(rest @ rest) - rest.size,
+            reach_nm=likelihood.model.reach_nm, free_mass=bool(free[AMPLITUDE]),
         )  # fmt: skip
 
     def change(self, step: float, picture: _Picture) -> FloatArray:
         """Give the change of the picture per unit of a step."""
         change = (picture(self.grid, *self.place) - self.signal)[self.used] * self.root / step
         return np.asarray(change - self.fitted @ (self.fitted.T @ change))
+
+
+def _rounded(step: float) -> str:
+    """Two digits, with the sign."""
+    return f"{float(f'{step:.2g}'):+g}"
 
 
 def _angle(step: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ from iscat_analysis._kernels.lattice import LATTICE_STEP, reach_of_samples
 from iscat_analysis._kernels.pupil import rectangle
 from iscat_analysis._kernels.radial import STEP
 from iscat_analysis.config import Calibration, Config, Optics
-from iscat_analysis.errors import ConfigError
+from iscat_analysis.errors import ConfigError, ContrastError
 from iscat_analysis.optics.aperture import (
     NEAR_CRITICAL,
     Aperture,
@@ -51,6 +51,7 @@ __all__ = [
     "check_table",
     "forward_model",
     "peak_per_amplitude",
+    "signed_peak",
     "with_template",
 ]
 
@@ -98,8 +99,9 @@ def forward_model(
     Raises
     ------
     ConfigError
-        The particle's material has no data at this wavelength, or a calibration has the sign that
-        this focus cannot give.
+        The particle's material has no data at this wavelength.
+    ContrastError
+        A calibration has the sign that this focus cannot give.
     """
     optics = config.optics
     if config.calibration is not None:
@@ -201,9 +203,25 @@ def peak_per_amplitude(model: ForwardModel) -> float:
     """
     if isinstance(model.wave, MeasuredField):
         return model.wave.gain
+    return abs(signed_peak(model))
+
+
+def signed_peak(model: ForwardModel) -> float:
+    """Give the peak contrast of a faint particle, per unit amplitude.
+
+    Parameters
+    ----------
+    model : ForwardModel
+        As for `peak_per_amplitude`, and computed from optics.
+
+    Returns
+    -------
+    float
+        Contrast per unit amplitude; negative where the particle is dark.
+    """
     weak = 1e-6 / math.sqrt(collected_area_nm2(model, model.height_nm, 1.0))
     linear, _ = model.wave.peak(model.height_nm, weak, model.rho)
-    return abs(linear / weak)
+    return linear / weak
 
 
 def _pupil(
@@ -270,7 +288,7 @@ def _mass_scale(model: ForwardModel, line: Calibration) -> MassScale:
     if linear * line.gradient_per_kda < 0:
         seen = "bright" if linear > 0 else "dark"
         cause = "optics.template" if measured else f"optics.focus_nm = {model.optics.focus_nm:g}"
-        raise ConfigError(
+        raise ContrastError(
             f"calibration.gradient_per_kda = {line.gradient_per_kda:g} has the wrong sign: with "
             f"{cause} the model's particles are {seen}; change the sign"
             f"{'' if measured else ' or the focus'}"

@@ -13,18 +13,18 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.pipeline.diagnosis import (
-    drift_warning,
-    examine_background,
     misfit_warning,
     pixel_warnings,
     repeats_warning,
+    uneven_warning,
 )
 from iscat_analysis.pipeline.events import Event, posterior_of
 from iscat_analysis.pipeline.field import add_signal, fit_field
+from iscat_analysis.pipeline.fixed_pattern import drift_warning, examine_background
 from iscat_analysis.pipeline.noise import Noise, judge_background, judge_beside
 from iscat_analysis.pipeline.prepare import Prepared
 from iscat_analysis.pipeline.ranges import checked, frame_ranges, measured_windows
-from iscat_analysis.pipeline.regions import Region, contrast_image
+from iscat_analysis.pipeline.regions import Region, contrast_image, photons_scale
 from iscat_analysis.pipeline.repeats import field_repeats
 from iscat_analysis.pipeline.results import Compared, Found, table_of, view_of
 from iscat_analysis.pipeline.run import Run
@@ -47,6 +47,8 @@ CHANGES = 4.0
 no constant particle: with 4 degrees of freedom or more by chance once in 10¹²."""
 
 _LEAST_DEGREES = 4
+_LEAST_AWAY = 0.25  # of the field, from which what no particle explains is told
+_NEAR = 2.0  # λ/NA from a particle, within which a wrong model leaves most of it over
 
 
 def find_bound(ready: Prepared, run: Run) -> Found:
@@ -105,9 +107,10 @@ def _background(ready: Prepared, run: Run) -> tuple[Scene, Windows, Noise, dict[
         )
     for text in (*noise.said(movie.name), *pixel_warnings(*windows.left_out)):
         run.tell(text)
-    repeated = repeats_warning(movie, windows)
-    if repeated:
-        run.tell(repeated)
+    uneven = "" if still else uneven_warning(config, movie.name, windows)
+    for text in (repeats_warning(movie, windows), uneven):
+        if text:
+            run.tell(text)
     summary: dict[str, Any] = {}
     if not scene.additive:
         summary = examine_background(movie, camera, windows)
@@ -156,7 +159,9 @@ def _together(
         scene, windows, excess_noise=noise.excess, pool=pool, progress=run.progress
     )
     run.clock.lap("fit")
+    # rings of many particles that a wrong microscope leaves over look uneven too
     cause = misfit_warning(scene.config, events)
+    cause = cause or _uneven(scene, ready.steady.name, windows, events)
     if cause:
         run.tell(cause)
     repeats, empty = field_repeats(scene, ready.steady, ready.camera, windows, events)
@@ -189,6 +194,28 @@ def _together(
         empty=empty,
         interrupted=interrupted,
     )
+
+
+def _uneven(scene: Scene, name: str, windows: Windows, events: Sequence[Event]) -> str:
+    """Say that a known background is uneven, away from the particles that were fitted over it."""
+    if windows.n_before:
+        return ""
+    rows, columns = windows.after_e.shape
+    field, signal = Region((0, rows), (0, columns)), np.zeros(windows.after_e.shape)
+    optics = scene.config.optics
+    near_nm = _NEAR * optics.wavelength_nm / optics.na
+    y, x = (scene.pixel_nm * index for index in np.indices(signal.shape))
+    away = np.ones(signal.shape, dtype=np.bool_)
+    for event in events:
+        x_nm, y_nm, z_nm = (float(v) for v in event.fit.theta[:3])
+        mass = float(scene.model.scale.mass(event.fit.theta[3]))
+        add_signal(scene, (x_nm, y_nm, z_nm, mass), field, signal)
+        away &= np.hypot(x - x_nm, y - y_nm) > near_nm
+    if away.mean() < _LEAST_AWAY:
+        return uneven_warning(scene.config, name, windows)
+    if scene.additive:
+        signal = signal * photons_scale(scene, windows)
+    return uneven_warning(scene.config, name, windows, np.where(away, signal, np.nan))
 
 
 def _with_changes(

@@ -16,35 +16,27 @@ from iscat_analysis.inference.cause import likely_cause
 from iscat_analysis.inference.fit import OUTWARD
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.movie.drift import follow_pattern
 from iscat_analysis.movie.metadata import diagnose_gain
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.pipeline.events import Event
-from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, first_counts, is_lit
+from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES
 from iscat_analysis.pipeline.systematic import is_bent
 from iscat_analysis.records import FloatArray, Status, Windows
-from iscat_analysis.search.sliding import measure_noise
 from iscat_analysis.units import count, listed
-
-DRIFT_PX = 0.02
-"""Shift of the fixed pattern below which it is not worth a line."""
 
 FLAT = 0.05
 """Variance of the steps along z over that in the plane, below which particles move in a plane:
 near the coverslip those that do not have less along z too, but not so much less."""
 
+_RINGS = 0.01  # of the light, which rings of many bright particles make uneven
+_LEAST_PIXELS = 100  # away from particles, of which the light is said to be uneven
+_GAUSS = 1.4826  # standard deviation over the median deviation of a Gaussian
 _BRIGHTEST = 8  # isolated particles on which the model is judged
 _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
-_NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
-_LONGEST = 100  # average of the noise curve
-_SMALLEST_PX = 32  # side of a field in which a pattern is followed, and of its parts
-_FEWEST_PARTS = 4  # whose differences tell an error
-_NORMAL_QUARTILE = 0.6745
 _SWAPPED = 10.0  # times less change along the axis of time than along both of space
 _LOOKED_AT = 96  # frames, rows and columns in which axes are judged
 _ENOUGH_STEPS = 30
 _NORMAL = (0.4549, 1.3863)  # medians of χ² with one and two degrees of freedom
-_SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
 _FEWEST_TURNED = 5  # particles of the other sign that make it worth a line,
 _NEARLY_ALL = 0.9  # and their share
 
@@ -151,110 +143,58 @@ def _repeats(movie: Stack, number: int) -> bool:
     return np.array_equal(pair[0], pair[1])
 
 
-def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[str, Any]:
-    """Measure noise against averaging, and how far the fixed pattern moved.
+def uneven_warning(
+    config: Config, name: str, windows: Windows, explained: FloatArray | None = None
+) -> str:
+    """Say that the light is uneven where one level is taken for the background of all pixels.
 
     Parameters
     ----------
-    movie : Stack
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    windows : Windows
-        The background, and the frames with the particles.
-
-    Returns
-    -------
-    dict
-        What ``summary.json`` adds under ``"background"``; drift is from the background to the
-        frames after it, None where there is no pattern to follow.
-    """
-    curve: tuple[tuple[int, ...], tuple[float, ...]] = ((), ())
-    limit = drift = error = None
-    if windows.n_before >= 2 and is_lit(windows):
-        frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
-        some = first_counts(movie, windows, max(2, _NOISE_BYTES // frame_bytes))
-        noise = measure_noise(some, camera, min(_LONGEST, len(some) // 2))
-        curve, limit = (noise.frames, noise.variance_over_shot), noise.shot_limited
-        moved = _pattern_moved(windows)
-        if moved is not None:
-            drift, error = moved[0].tolist(), moved[1].tolist()
-    return {
-        "noise_frames": list(curve[0]),
-        "noise_variance_over_shot": list(curve[1]),
-        "shot_noise_limited_frames": limit,
-        "drift_px": drift,
-        "drift_error_px": error,
-    }
-
-
-def _pattern_moved(windows: Windows) -> tuple[FloatArray, FloatArray] | None:
-    """Give how far the pattern moved along y and x, and the errors; None where there is none.
-
-    A particle changes the light at its place as an edge that moved does, but in every part of the
-    field another way: the errors are at least what the parts differ by.
-    """
-    rows, columns = windows.before_e.shape
-    whole = _part_moved(windows, np.s_[:rows, :columns])
-    if whole is None:
-        return None
-    side = _SMALLEST_PX
-    parts = [
-        _part_moved(windows, np.s_[top : top + side, left : left + side])
-        for top in range(0, rows - side + 1, side)
-        for left in range(0, columns - side + 1, side)
-    ]
-    shifts = np.array([part[0] for part in parts if part is not None])
-    if len(shifts) < _FEWEST_PARTS:
-        return whole
-    apart = np.median(np.abs(shifts - np.median(shifts, axis=0)), axis=0) / _NORMAL_QUARTILE
-    return whole[0], np.maximum(whole[1], apart * math.sqrt(math.pi / 2 / len(shifts)))
-
-
-def _part_moved(
-    windows: Windows, part: tuple[slice, slice]
-) -> tuple[FloatArray, FloatArray] | None:
-    """Give how far the pattern of a part of the field moved; None where it is too small."""
-    used = ~windows.masked[part]
-    if min(used.shape) < _SMALLEST_PX:
-        return None
-    way = follow_pattern(
-        np.stack([windows.before_e[part], windows.after_e[part]]),
-        np.array([1.0, windows.power_ratio]),
-        np.array([np.mean(windows.frames_before), np.mean(windows.frames_after)]),
-        np.ascontiguousarray(used),
-        np.ascontiguousarray(windows.read_variance_before_e2[part]),
-    )
-    if way is None or not np.isfinite(way.error_px).all():
-        return None
-    return way.shift_px[1], way.error_px[1]
-
-
-def drift_warning(name: str, background: dict[str, Any]) -> str | None:
-    """Say that the fixed pattern moved, where that can be taken for particles.
-
-    Parameters
-    ----------
+    config : Config
+        With the level.
     name : str
         Of the movie.
-    background : dict
-        From `examine_background`.
+    windows : Windows
+        The sum of the frames, over that level.
+    explained : ndarray, shape (y, x), optional
+        Contrast of all particles, as they were fitted, or their photoelectrons in dark field; NaN
+        where a particle is so near that a wrong model leaves much over.  Without it rings may make
+        some of what is uneven.
 
     Returns
     -------
-    str or None
-        None where it stood still, as far as one can tell.
+    str
+        One line; empty where the background was measured, or pixels differ by their noise.
     """
-    if background["drift_px"] is None:
-        return None
-    (y, x), (y_error, x_error) = background["drift_px"], background["drift_error_px"]
-    pull = math.hypot(y / y_error, x / x_error)
-    if math.hypot(y, x) <= DRIFT_PX or pull <= _SIGNIFICANT:
-        return None
+    level = windows.power_ratio * windows.before_e
+    used = ~windows.masked & (level > 0)
+    if windows.n_before or not used.any():
+        return ""
+    signal = np.zeros(level.shape) if explained is None else explained
+    expected = level + signal if config.optics.scheme == "darkfield" else level * (1 + signal)
+    used &= np.isfinite(expected) & (expected > 0)
+    if used.sum() < _LEAST_PIXELS:
+        return ""
+    expected, after = expected[used], windows.after_e[used]
+    light = after / expected
+    noise = after + windows.read_variance_after_e2[used]
+    shot = math.sqrt(max(float(np.median(noise / expected**2)), 0.0))
+    middle = float(np.median(light))
+    spread = _GAUSS * float(np.median(np.abs(light - middle)))
+    uneven = math.sqrt(max(spread**2 - shot**2, 0.0))
+    if uneven <= max(shot, 0.0 if explained is not None else _RINGS * middle):
+        return ""
+    times = float(f"{uneven / shot:.2g}")
+    advice = "give frames without particles as background.frames"
+    if config.fit.mode == "track":
+        advice += ', or learn the background with background.method = "tracks"'
+    elif config.optics.scheme != "darkfield":
+        advice += ', or follow landings with background.method = "sliding"'
     return (
-        f"{name}: the fixed pattern moved by {x:+.2f} pixels in x and {y:+.2f} in y between the "
-        "background and the frames after it; its edges look like particles: take background frames "
-        "nearer to them (background.frames), or fewer frames (fit.frames)"
+        f"{name}: the light differs by {100 * uneven / middle:.2g} % of its mean from pixel to "
+        f'pixel, {times:g} times its noise, where background.method = "known" has '
+        f"{config.background.level_e:g} in all of them: what differs is taken for particles, or "
+        f"makes their masses and places wrong; {advice}"
     )
 
 

@@ -6,73 +6,53 @@ the optics are learned, and the analysis goes on with what was learned.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
-
-import numpy as np
 
 from iscat_analysis.calibration.optics import (
     FREE,
     LEAST_SIGHTS,
     MOST_SIGHTS,
-    Neighbours,
     OpticsCalibration,
-    Settings,
     Sight,
     free_groups,
     heights_free,
-    maximise,
-    settings_of,
 )
-from iscat_analysis.calibration.optics.starts import average_sights, with_masses
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera, camera_from_config
 from iscat_analysis.movie.metadata import resolve_metadata
-from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.pipeline.crowded import learn_in_field, seen_in_field
-from iscat_analysis.pipeline.diagnosis import drift_warning, examine_background
+from iscat_analysis.pipeline.fixed_pattern import drift_warning, examine_background
 from iscat_analysis.pipeline.microscope import (
     calibrate_sights,
-    goodness,
-    microscopes,
     refuse_uncalibratable,
-    rings_of,
     with_sign,
 )
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, Opening, judge_counts
 from iscat_analysis.pipeline.ranges import frame_ranges, measured_windows
 from iscat_analysis.pipeline.run import unheard
-from iscat_analysis.pipeline.sights import bright_sights, kind_of, reach_nm, scan_sights
+from iscat_analysis.pipeline.sights import bright_sights, kind_of, scan_sights
+from iscat_analysis.pipeline.tested_optics import REJECTED_P, TESTED, median_p, not_alone
 from iscat_analysis.pipeline.ways import way_of
-from iscat_analysis.records import Mapper, Progress, Windows, silent
+from iscat_analysis.records import Progress, Windows, silent
 from iscat_analysis.search.sliding import measure_frames, well_lit
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
 
-REJECTED_P = 1e-3
-"""Half of the brightest particles must fit worse than this before the optics are doubted: a few
-that are not alone do not suffice."""
-
 LEAST_TESTED = 4
 """Bright particles without which the optics are not even tested."""
 
-_TESTED = 24  # the brightest
 _MOST_STEP_NM = 5e3  # farther than the model's pictures reach
 _LEAST_SCAN_NM = 10.0  # over all frames; a step in µm stays below it
-_NOISE = "its noise is not what the camera's numbers predict"
+NOISE = "its noise is not what the camera's numbers predict"
+"""Why optics are not judged where p-values cannot be."""
+
 _STUCK = 0.02  # share of frames that repeat another, which sums of frames count
-_STARTS_NM = tuple(range(-400, 401, 100))  # along each axis; rings are some 200 nm apart
-_FITTED = 3  # of these starts
-_CLEAR = 10.0  # standard errors of χ² by which a wrong microscope would be seen in a picture
-_DESCRIBED = 0.1  # of that, which a picture that is described has at most
-_DESCRIBED_SHARE = 0.25  # of the pictures, that must be described where others are not
 
 
 def learn_optics(
@@ -115,7 +95,7 @@ def learn_optics(
         The frames are impossible, for the analysis too.
     """
     optics = config.optics
-    reason = _why_not(config)
+    reason = why_not(config)
     if reason and optics.calibrate == "always":
         tell(f"the optics are not learned {reason}; the analysis goes on as configured")
     if (
@@ -128,41 +108,40 @@ def learn_optics(
     tested: dict[str, Any] = {}
     first_tested = optics.calibrate == "auto" and way_of(config) == "sliding"
     with threads(config.compute.workers) as pool:
-        enough = _TESTED if first_tested else MOST_SIGHTS
+        enough = TESTED if first_tested else MOST_SIGHTS
         sights, others = bright_sights(
             movie, config, camera, pool, opening, enough, rings=not first_tested
         )
         alone, source = len(sights), {"movie": movie.name}
+        together = alone < LEAST_TESTED and way_of(config) == "fixed"
+        windows = _summed(movie, config, camera) if together else None
         try:
-            if alone < LEAST_TESTED and way_of(config) == "fixed":
-                windows = _summed(movie, config, camera)
+            if windows is not None:
                 if drift_warning(movie.name, examine_background(movie, camera, windows)):
                     raise DataError("the edges of a fixed pattern that moved look like particles")
                 sights, others = seen_in_field(windows, config, pool)
             if len(sights) < LEAST_TESTED:
-                by_noise = _noise_differs(movie, config, camera)
-                raise DataError(_too_few(movie.name, len(sights), by_noise=by_noise))
-            median = _median_p(sights, config, others, pool.map)
+                by_noise = noise_differs(movie, config, camera)
+                raise DataError(too_few(movie.name, len(sights), by_noise=by_noise))
+            median = median_p(sights, config, others, pool.map)
             if first_tested and median < REJECTED_P:  # more particles, and whose rings they show
                 sights, others = bright_sights(movie, config, camera, pool, opening)
-                alone, median = len(sights), _median_p(sights, config, others, pool.map)
+                alone, median = len(sights), median_p(sights, config, others, pool.map)
             if optics.calibrate == "auto" and median < REJECTED_P and not heights_free(config):
-                pairs, median = _not_alone(sights, config, others, pool.map)
+                pairs, median = not_alone(sights, config, others, pool.map)
                 sights = [sight for k, sight in enumerate(sights) if k not in pairs]
                 alone -= sum(k < alone for k in pairs)
                 if len(sights) < LEAST_TESTED:
-                    raise DataError(_too_few(movie.name, len(sights)))
+                    raise DataError(too_few(movie.name, len(sights)))
             tested = {"tested": len(sights), "median_p": median}
             if optics.calibrate == "auto" and median >= REJECTED_P:
                 return config, tested | {"calibrated": False}
-            if optics.calibrate == "auto" and _noise_differs(movie, config, camera):
-                tell(
-                    f"the optics cannot be tested on this movie: {_NOISE}; the analysis goes on as "
-                    "configured"
-                )
-                return config, tested | {"calibrated": False, "reason": _NOISE}
+            if optics.calibrate == "auto" and noise_differs(movie, config, camera):
+                reason = f"{NOISE}; the analysis goes on as configured"
+                tell(f"the optics cannot be tested on this movie: {reason}")
+                return config, tested | {"calibrated": False, "reason": reason}
             notify("learning the optics from the particles of the movie, which may take minutes…")
-            found = _learned(
+            found = learned_from(
                 sights[:alone], others, movie, config, camera, tuple(FREE), source, pool
             )
         except DataError as error:
@@ -171,25 +150,56 @@ def learn_optics(
     return taken(found, config, tested, _verdict(tested), tell=tell)
 
 
-def _why_not(config: Config) -> str:
-    """Say of what movies, or with what configuration, no optics are learned; else nothing."""
+def why_not(config: Config) -> str:
+    """Say of what movies, or with what configuration, no optics are learned.
+
+    Parameters
+    ----------
+    config : Config
+        Resolved.
+
+    Returns
+    -------
+    str
+        Some words; empty where they can be learned.
+    """
     optics, mode, way = config.optics, config.fit.mode, way_of(config)
-    if mode == "track":
-        if way == "tracks" and config.track.free == "mass":
-            return ""
-        return 'in mode track but with track.free = "mass" and without background frames'
+    tracks = mode == "track"
+    followed = way == "tracks" and config.track.free == "mass"
     reasons = (
+        (
+            tracks and not followed,
+            'in mode track but with track.free = "mass" and without background frames',
+        ),
         (optics.scheme == "darkfield", "from dark field"),
         (optics.convention != "exact", f'with optics.convention = "{optics.convention}"'),
         (optics.psf != "model", f'with optics.psf = "{optics.psf}"'),
         (config.background.method == "known", 'with background.method = "known"'),
-        (heights_free(config) and way != "fixed", f"in mode {mode} without background frames"),
+        (
+            not tracks and heights_free(config) and way != "fixed",
+            f"in mode {mode} without background frames",
+        ),
     )
     return next((reason for holds, reason in reasons if holds), "")
 
 
-def _too_few(name: str, number: int, *, by_noise: bool = False) -> str:
-    """Say that too few particles stand alone, perhaps as they are told by a noise that is wrong."""
+def too_few(name: str, number: int, *, by_noise: bool = False) -> str:
+    """Say that too few particles stand alone.
+
+    Parameters
+    ----------
+    name : str
+        Of the movie.
+    number : int
+        How many do.
+    by_noise : bool
+        Whether they are told by a noise that is not what it seems.
+
+    Returns
+    -------
+    str
+        One line.
+    """
     said = (
         f"{name}: shows {count(number, 'bright particle')} standing alone, and {LEAST_TESTED} are "
         f"needed to test the optics, {LEAST_SIGHTS} to learn them"
@@ -321,7 +331,7 @@ def calibrate_movie(
             "version": version("iscat-analysis"),
         }  # fmt: skip
         if focus_step_nm is None:
-            return _learned(sights, others, movie, config, camera, groups, source, pool)
+            return learned_from(sights, others, movie, config, camera, groups, source, pool)
         return calibrate_sights(
             sights, others, config, groups, source,
             focus_step_nm=focus_step_nm, mapper=pool.map,
@@ -339,7 +349,7 @@ def _check_step(step_nm: float, frames: int) -> None:
         )
 
 
-def _learned(
+def learned_from(
     sights: Sequence[Sight],
     others: Sequence[Sight],
     movie: Stack,
@@ -349,7 +359,37 @@ def _learned(
     source: Mapping[str, str],
     pool: ThreadPoolExecutor,
 ) -> OpticsCalibration:
-    """Learn the optics from particles that stand alone, or where these do not suffice from all."""
+    """Learn the optics from particles that stand alone, or where these do not suffice from all.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        Those that stand alone.
+    others : sequence of Sight
+        Every particle that `Sight.neighbours` counts.
+    movie : Stack
+        The movie.
+    config : Config
+        Resolved; with the optics where the search begins.
+    camera : Camera
+        Counts → photoelectrons.
+    groups : sequence of str
+        As for `calibrate_sights`.
+    source : mapping of str to str
+        As for `calibrate_sights`.
+    pool : ThreadPoolExecutor
+        Runs the fits.
+
+    Returns
+    -------
+    OpticsCalibration
+        What was found.
+
+    Raises
+    ------
+    DataError
+        There are too few particles.
+    """
     crowded = way_of(config) == "fixed"
     if not crowded or len(sights) >= LEAST_SIGHTS:
         found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
@@ -363,105 +403,28 @@ def _summed(movie: Stack, config: Config, camera: Camera) -> Windows:
     return measured_windows(movie, config, camera, *frame_ranges(movie, config))
 
 
-def _median_p(
-    sights: list[Sight], config: Config, others: Sequence[Sight] = (), mapper: Mapper = map
-) -> float:
-    """Median p-value of the brightest particles in the configured microscope.
+def noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
+    """Tell whether the first frames repeat each other, or have not the noise of p-values.
 
-    The rings of neighbours, where any are known, are put into the pictures that fail without.
+    Parameters
+    ----------
+    movie : Stack
+        The movie.
+    config : Config
+        Resolved.
+    camera : Camera
+        Counts → photoelectrons.
+
+    Returns
+    -------
+    bool
+        Whether p-values cannot be right.
     """
-    settings = settings_of(config)
-    build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
-    model = build(settings)
-    shown: Sequence[Sight] = sights[:_TESTED]
-    x, y = 0.0, 0.0
-    if not heights_free(config):
-        averages, shown = average_sights(shown)
-        x, y = _centre(averages[0], model, build, settings)
-
-    def median(pictures: Sequence[Sight]) -> tuple[float, Sequence[Sight]]:
-        fitted = maximise(pictures, build, settings, (), mapper=mapper).sights
-        return float(np.median([goodness(sight, model)[1] for sight in fitted])), fitted
-
-    moved = [sight.placed(sight.x_nm + x, sight.y_nm + y) for sight in shown]
-    found, fitted = median(with_masses(moved, build, settings))
-    if found >= REJECTED_P or not any(sight.neighbours for sight in fitted):
-        return found
-    elsewhere = [other.placed(other.x_nm + x, other.y_nm + y) for other in others]
-    near = Neighbours.fitted(elsewhere, build, rings_of(config, sights[0]), settings, mapper)
-    return max(found, median(near.around(fitted, mapper))[0])
-
-
-def _not_alone(
-    sights: Sequence[Sight], config: Config, others: Sequence[Sight] = (), mapper: Mapper = map
-) -> tuple[list[int], float]:
-    """Find bright places that the configured microscope describes badly, and others well.
-
-    Returns their numbers, and the median p-value of the others.
-
-    A microscope that is wrong is so for all particles, and is seen the better the brighter they
-    are.  Where some as bright are described, the places that are not show two that landed at once.
-    From a place that others drew aside a fit ends in another optimum: each begins anew here.
-    """
-    settings = settings_of(config)
-    build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
-    model = build(settings)
-
-    def fitted(sight: Sight) -> Sight:
-        x, y = _centre(sight, model, build, settings)
-        (placed,) = with_masses([sight.placed(x, y)], build, settings)
-        return maximise([placed], build, settings, ()).sights[0]
-
-    some = list(mapper(fitted, sights[:_TESTED]))
-    if any(sight.neighbours for sight in some):
-        near = Neighbours.fitted(others, build, rings_of(config, some[0]), settings, mapper)
-        pictures = near.around(some, mapper)
-        some = list(maximise(pictures, build, settings, (), mapper=mapper).sights)
-    chi2, p = np.transpose([goodness(sight, model) for sight in some])
-    mass = np.array([sight.mass_kda for sight in some])
-    poor = p < REJECTED_P
-    if not poor.any() or poor.all():
-        return [], float(np.median(p))
-    expected = float(np.median((chi2 - 1)[poor] / mass[poor] ** 2)) * mass**2
-    clear = expected > _CLEAR * np.sqrt(2 / math.prod(some[0].grid.shape))
-    described = ~poor & clear & (chi2 - 1 < _DESCRIBED * expected)
-    if described.sum() < max(2, _DESCRIBED_SHARE * len(some)):
-        return [], float(np.median(p))
-    return np.flatnonzero(poor).tolist(), float(np.median(p[~poor]))
-
-
-def _noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
-    """Whether the first frames have another noise than p-values rest on, or repeat each other."""
     first, last = config.background.recorded or config.fit.frames or (0, movie.shape[0])
     counts = movie.read(first, min(last, first + SPECTRUM_FRAMES, movie.shape[0]))
     light, repeats = measure_frames(counts, camera)
     stuck = way_of(config) != "sliding" and repeats.mean() > _STUCK
     return bool(stuck or judge_counts(counts[well_lit(light) & ~repeats], camera).differs)
-
-
-def _centre(
-    sight: Sight,
-    model: ForwardModel,
-    build: Callable[[Settings], ForwardModel],
-    settings: Settings,
-) -> tuple[float, float]:
-    """Find the particle in a picture [nm], whose brightest spot may be of a ring.
-
-    From a place half a ring away a fit ends in another optimum, with the mass of the other sign.
-    """
-    starts = [
-        replace(sight, x_nm=sight.x_nm + x, y_nm=sight.y_nm + y)
-        for x in _STARTS_NM
-        for y in _STARTS_NM
-    ]
-
-    def misfit(one: Sight) -> float:
-        return goodness(one, model)[0]
-
-    likely = sorted(with_masses(starts, build, settings), key=misfit)[:_FITTED]
-    fits = [maximise([sight], build, settings, ()).sights[0] for sight in likely]
-    best = min(fits, key=misfit)
-    return best.x_nm, best.y_nm
 
 
 def _verdict(tested: dict[str, Any]) -> str:
@@ -471,7 +434,7 @@ def _verdict(tested: dict[str, Any]) -> str:
     if tested["median_p"] >= REJECTED_P:
         return "the optics cannot be learned from this movie"
     return (
-        f"the configured optics do not describe the brightest {min(tested['tested'], _TESTED)} "
+        f"the configured optics do not describe the brightest {min(tested['tested'], TESTED)} "
         f"particles (median p-value {tested['median_p']:.1g}), and they cannot be learned from them"
     )
 

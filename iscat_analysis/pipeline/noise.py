@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,14 +11,20 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from iscat_analysis.calibration.camera import LightZero, find_zero
+from iscat_analysis.calibration.camera import find_zero
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain
+from iscat_analysis.movie.metadata import diagnose_gain
 from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.movie.successive import shared_light
+from iscat_analysis.pipeline.camera_numbers import (
+    allow_for_correlation,
+    either_said,
+    offset_is_wrong,
+    offset_said,
+)
 from iscat_analysis.pipeline.chunks import NOISE_FRAMES, Reader
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Mapper, Windows
@@ -40,9 +45,6 @@ SPECTRUM_FRAMES = 128
 
 _GAIN_FRAMES = 64  # on which the gain is judged
 _FEWEST_FRAMES = 8  # on which it is judged beside particles that move
-_SUSPICIOUS = 0.03  # of the noise, and of masses if it is the offset, that is not left unsaid
-_MOST_LEFT = 1.1  # of the noise that the light has, with an offset that the noise alone tells
-_SUBTRACTED = 4.0  # standard errors below no counts, where no camera has its offset
 _FREE = 0.25  # share of the pixels that no particle may come near in the frames judged
 _AWAY = 1.5  # λ/NA from a particle, from where its light changes the variance by some per cent
 _ENOUGH_FITS = 10  # of which the best
@@ -154,19 +156,19 @@ def judge_counts(
     shared = shared_light(counts, camera, masked=masked)
     if shared is not None:
         return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
-    excess = (
-        ExcessNoise(gain.noise_ratio, gain.message)
-        if gain.message and gain.noise_ratio > 1
-        else None
-    )
     zero = None if additive else find_zero(counts, camera, masked=masked)
     leaks = spectrum is not None and spectrum.correlated
     if zero is not None and leaks and not zero.flickers:
         zero = None  # the variance of a pixel is then of its neighbours' light as well
-    if zero is None or not _tells(zero, gain):
-        said = (gain.message, "" if additive else _undecided(gain, zero, camera))
-        return Noise(tuple(text for text in said if text), gain.off, excess, spectrum)
-    messages = [_wrong_offset(zero, camera)]
+    told = zero is not None and offset_is_wrong(zero, gain)
+    if zero is not None and told:
+        said = offset_said(zero, camera)
+    else:
+        said = ("" if additive else either_said(gain, zero, camera)) or gain.message or ""
+    excess = ExcessNoise(gain.noise_ratio, said) if gain.off and gain.noise_ratio > 1 else None
+    if zero is None or not told:
+        return Noise((said,) if said else (), gain.off, excess, spectrum)
+    messages = [said]
     moved = replace(camera, offset_adu=camera.offset_adu + zero.electrons / camera.gain_e_per_adu)
     with contextlib.suppress(DataError):  # too dark to tell
         rest = diagnose_gain(counts[:_GAIN_FRAMES], moved, masked=masked)
@@ -181,76 +183,6 @@ def _filtered(shared: float) -> str:
         f"frames next to each other differ by {shared:.2g} times the variance of those farther "
         "apart: they were averaged, interpolated or filtered in time, so that their noise does not "
         "tell the gain, landings are blurred and σ may be too small: record or export raw frames"
-    )
-
-
-def _tells(zero: LightZero, gain: GainDiagnosis) -> bool:
-    """Whether it is the offset that is wrong, where the noise is not the only one to say so.
-
-    Light that is noisy by itself, or shakes, bends the line of variance against mean, which then
-    meets zero elsewhere; but it leaves more noise than the light has, whatever the offset.
-    """
-    if not zero.off or gain.shakes:
-        return False
-    if zero.flickers:
-        return True
-    left = gain.noise_ratio / (1 - zero.share)
-    return left < _MOST_LEFT and not (zero.share > 0 and gain.noise_ratio > 1)
-
-
-def _offset_of(camera: Camera) -> str:
-    offset = camera.offset_adu
-    if np.ndim(offset):
-        return f"the map camera.offset_adu, {np.mean(offset):.4g} on average,"
-    return f"camera.offset_adu = {offset:.4g}"
-
-
-def _effect(share: float) -> str:
-    """Say what a part of the light that is none does to masses."""
-    percent = float(f"{100 * abs(share):.2g}")  # in full where it is hundreds
-    return f"masses {percent:g} % too {'small' if share > 0 else 'large'}"
-
-
-def _wrong_offset(zero: LightZero, camera: Camera) -> str:
-    """Say where the light is zero, and what a wrong offset does."""
-    per_count = float(np.mean(camera.gain_e_per_adu))
-    counts = zero.electrons / per_count
-    se = zero.se * counts / zero.share
-    found = float(np.mean(camera.offset_adu)) + counts
-    how = "pixels follow the laser's power" if zero.flickers else "the noise grows with the light"
-    read = zero.electrons < 0 and not zero.flickers
-    said = (
-        f"{_offset_of(camera)} is too {'low' if zero.share > 0 else 'high'} by {abs(counts):.4g} ± "
-        f"{se:.2g} counts, as {how}, and makes {_effect(zero.share)}: "
-    )
-    if np.ndim(camera.offset_adu):
-        said += "record a dark for `iscat calibrate camera --maps`"
-    elif found < -_SUBTRACTED * se:
-        said += "see whether counts were subtracted from the movie; record raw counts"
-    else:
-        said += f"set camera.offset_adu = {max(found, 0.0):.4g}, or the mean of a dark"
-    if read:
-        missing = math.sqrt(-zero.electrons)
-        said += f" (unless {missing:.3g} e of read noise are missing in camera.read_noise_e)"
-    return said
-
-
-def _undecided(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> str:
-    """Say that an offset may be as wrong as a gain, where the noise fits both.
-
-    An offset that is wrong by a share s of the light leaves 1 − s of the noise that is expected.
-    """
-    share = 1 - gain.noise_ratio
-    if gain.shakes or gain.noise_counts < 1 or abs(share) < _SUSPICIOUS + 3 * gain.noise_ratio_se:
-        return ""
-    if zero is not None and not zero.may_be(share):
-        return ""
-    cause = "its gain, or light that is noisy by itself" if gain.noise_ratio > 1 else "its gain"
-    return (
-        f"the noise variance is {gain.noise_ratio:.3g} ± {gain.noise_ratio_se:.1g} times what the "
-        f"camera's numbers predict, and this movie does not tell whether by {cause} or by "
-        f"{_offset_of(camera)}, which would make {_effect(share)}: record a dark, and measure both "
-        "with `iscat calibrate camera`"
     )
 
 
@@ -448,38 +380,6 @@ def judge_window(
     curve = measure_noise(opening, reader.camera, longest, mapper=mapper)
     window = given or choose_window(curve, frames)
     return opening, curve, window
-
-
-def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:
-    """Judge the gain by the noise that neighbouring pixels have together.
-
-    Parameters
-    ----------
-    gain : GainDiagnosis
-        From the variance of single pixels.
-    spectrum : NoiseSpectrum or None
-        Of the same frames.
-
-    Returns
-    -------
-    GainDiagnosis
-        The same where pixels are independent.
-
-    Notes
-    -----
-    Light is Poisson before charge leaks to neighbours; leaking moves variance into covariances
-    (M. Downing et al., Proc. SPIE 6276, 627609, 2006).
-    """
-    if spectrum is None or not spectrum.correlated:
-        return gain
-    ratio, error = spectrum.summed
-    return replace(
-        gain,
-        noise_ratio=ratio,
-        noise_ratio_se=error,
-        gain_e_per_adu=gain.configured_gain / ratio,
-        gain_se=gain.configured_gain / ratio**2 * error,
-    )
 
 
 def first_counts(movie: Stack, windows: Windows, most: int) -> NDArray[Any]:

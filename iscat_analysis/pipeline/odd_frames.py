@@ -8,7 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.pipeline.diagnosis import DRIFT_PX, pixel_warnings
+from iscat_analysis.pipeline.diagnosis import pixel_warnings
+from iscat_analysis.pipeline.fixed_pattern import DRIFT_PX
 from iscat_analysis.pipeline.merging import Merged
 from iscat_analysis.records import FloatArray
 from iscat_analysis.units import listed

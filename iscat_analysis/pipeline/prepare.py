@@ -18,6 +18,7 @@ from iscat_analysis.movie.lines import Lines, SteadyFrames
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pieces.setups import darkfield_photons
 from iscat_analysis.pipeline.chunks import reader_of
+from iscat_analysis.pipeline.contrast_sign import learn_sign, wrong_sign
 from iscat_analysis.pipeline.diagnosis import axes_warning
 from iscat_analysis.pipeline.learning import learn_optics
 from iscat_analysis.pipeline.light import judge_light
@@ -161,9 +162,15 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         looking = beside(look_at_changes, steady, config, camera, span)
     digest = beside(movie.sha256)
     configured = config
-    config, learned = learn_optics(
-        steady, config, camera, tell=run.tell, notify=run.notify, opening=opened
-    )
+    wrong = wrong_sign(config)
+    if wrong is not None:
+        config, learned = learn_sign(
+            steady, wrong, camera, tell=run.tell, notify=run.notify, opening=opened
+        )
+    else:
+        config, learned = learn_optics(
+            steady, config, camera, tell=run.tell, notify=run.notify, opening=opened
+        )
     if learned:
         summary["optics"] = learned
     run.clock.lap("optics")

@@ -102,7 +102,7 @@ class Scene:
     @property
     def background_variance(self) -> float:
         """Variance of the background over that of the mean of its frames."""
-        return _VARIANCE_OF_BACKGROUND[str(self.config.background.method)]
+        return variance_of_background(self.config)
 
     @property
     def additive(self) -> bool:
@@ -275,6 +275,22 @@ def reported_steps(scene: Scene) -> int:
         1 landings, −1 leavings, 0 both.
     """
     return scene.config.detection.sign * int(scene.templates.signs[0])
+
+
+def variance_of_background(config: Config) -> float:
+    """Give the variance of the background over that of the mean of its frames.
+
+    Parameters
+    ----------
+    config : Config
+        Method of its background.
+
+    Returns
+    -------
+    float
+        0 where it is known.
+    """
+    return _VARIANCE_OF_BACKGROUND[str(config.background.method)]
 
 
 def is_counted(config: Config) -> bool:

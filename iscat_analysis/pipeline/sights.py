@@ -22,6 +22,7 @@ from iscat_analysis.calibration.optics import (
     settings_of,
 )
 from iscat_analysis.config import Config
+from iscat_analysis.inference.counts import counts_likelihood
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional, poisson
 from iscat_analysis.movie.camera import Camera, check_counts
@@ -31,6 +32,7 @@ from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.pipeline.chunks import Reader, plan_chunks, reader_of
 from iscat_analysis.pipeline.noise import Opening, judge_window
 from iscat_analysis.pipeline.ranges import fitted_frames, frame_ranges, measured_windows
+from iscat_analysis.pipeline.scene import is_counted, variance_of_background
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.bright import (
@@ -326,19 +328,13 @@ def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], Sight
         columns = max(left, 0), min(right, shape[1])
         grid = PixelGrid.region(rows, columns, _pixel_nm(config))
         cut = slice(*rows), slice(*columns)
-        if windows.n_before:
-            likelihood = conditional(
-                model, grid, windows.before_e[cut], windows.after_e[cut], ratio,
-                read_variance_before_e2=windows.read_variance_before_e2[cut],
-                read_variance_after_e2=windows.read_variance_after_e2[cut],
-                masked=windows.masked[cut],
-            )  # fmt: skip
-        else:
-            level = ratio * windows.before_e[cut]
-            likelihood = poisson(
-                model, grid, windows.after_e[cut], level, level,
-                extra_variance_e2=windows.read_variance_after_e2[cut], masked=windows.masked[cut],
-            )  # fmt: skip
+        likelihood = counts_likelihood(
+            model, grid, windows.before_e[cut], windows.after_e[cut], ratio,
+            background=variance_of_background(config), use_conditional=is_counted(config),
+            read_variance_before_e2=windows.read_variance_before_e2[cut],
+            read_variance_after_e2=windows.read_variance_after_e2[cut],
+            masked=windows.masked[cut],
+        )  # fmt: skip
         return _centred(likelihood, config, frame=windows.frames_after[0])
 
     return cut_out

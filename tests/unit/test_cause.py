@@ -70,6 +70,15 @@ def test_the_wrong_number_is_named_with_its_error(name: str, key: str, off: floa
     assert f"off by about {math.copysign(1, off):+g}"[:-1] in cause.message
 
 
+@pytest.mark.parametrize(("configured", "true"), [(-380.0, -300.0), (-500.0, -400.0)])
+def test_a_focus_is_tried_whole(configured: float, true: float) -> None:
+    """To first order both were 170 nm off."""
+    cause = _cause({"focus_nm": true}, focus_nm=configured)
+    assert cause is not None
+    assert cause.name == "focus"
+    assert cause.step == pytest.approx(true - configured, abs=30)
+
+
 @pytest.mark.parametrize("off", [25.0, 40.0, -40.0, 60.0])
 def test_a_wrong_phase_is_named_with_its_angle(off: float) -> None:
     """Of the tangent that is left over beside a fitted mass, 60° seem to be 87° or more."""
@@ -77,6 +86,26 @@ def test_a_wrong_phase_is_named_with_its_angle(off: float) -> None:
     assert cause is not None
     assert cause.name == "reference phase"
     assert cause.step == pytest.approx(off, rel=0.2)
+
+
+def _dark_cause(
+    configured: dict[str, Any], seen: dict[str, Any], scale: float = 1e14
+) -> Cause | None:
+    """Fit particles of another microscope in dark field."""
+    dark = {"scheme": "darkfield"}
+    config = make_config(calibrated=False, optics=dark | configured)
+    grid = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM)
+    model = forward_model(config, grid.diagonal_nm)
+    other = forward_model(make_config(calibrated=False, optics=dark | seen), grid.diagonal_nm)
+    level, rng = np.full(grid.shape, 2e4), np.random.default_rng(5)
+    fits = []
+    for x, y in rng.uniform(15.0, 17.0, (4, 2)):
+        light = level + scale * other.image(grid, x * PIXEL_NM, y * PIXEL_NM, 5.0, 1000.0)
+        likelihood = noise.poisson(model, grid, rng.poisson(light).astype(float), level, scale)
+        start = Candidate(x, y, 5.0, 1000.0, 10.0)
+        fit = fit_particle(likelihood, start, "mass", (0, 1000), level=False)
+        fits.append((likelihood, fit.theta, fit.box.free))
+    return likely_cause(config, fits)
 
 
 @pytest.mark.parametrize(
@@ -91,26 +120,45 @@ def test_a_wrong_phase_is_named_with_its_angle(off: float) -> None:
 def test_the_wrong_number_is_named_in_dark_field(
     name: str, key: str, off: float, found: float
 ) -> None:
-    dark = {"scheme": "darkfield"}
     usual = {"focus_nm": -300.0, "na": 1.42}
     seen = {"aberrations_nm": {key: off}} if key == "z11" else {key: usual[key] + off}
-    config, rng = make_config(calibrated=False, optics=dark), np.random.default_rng(5)
-    grid = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM)
-    model = forward_model(config, grid.diagonal_nm)
-    other = forward_model(make_config(calibrated=False, optics=dark | seen), grid.diagonal_nm)
-    level, scale = np.full(grid.shape, 2e4), 1e14
-    fits = []
-    for x, y in rng.uniform(15.0, 17.0, (4, 2)):
-        light = level + scale * other.image(grid, x * PIXEL_NM, y * PIXEL_NM, 5.0, 1000.0)
-        likelihood = noise.poisson(model, grid, rng.poisson(light).astype(float), level, scale)
-        start = Candidate(x, y, 5.0, 1000.0, 10.0)
-        fit = fit_particle(likelihood, start, "mass", (0, 1000), level=False)
-        fits.append((likelihood, fit.theta, fit.box.free))
-    cause = likely_cause(config, fits)
+    cause = _dark_cause({}, seen)
     assert cause is not None
     assert cause.name == name
     assert cause.step == pytest.approx(found, rel=0.5)
     assert "with an interferometric movie" in cause.message
+
+
+@pytest.mark.parametrize(
+    ("configured", "true"),
+    [(-300.0, 500.0), (-300.0, 200.0), (-300.0, -800.0), (300.0, -400.0), (300.0, 800.0)],
+)
+def test_a_focus_that_is_far_off_in_dark_field_is_named_on_its_side(
+    configured: float, true: float
+) -> None:
+    """To first order -280 nm explained most of what +800 nm leaves over."""
+    cause = _dark_cause({"focus_nm": configured}, {"focus_nm": true})
+    assert cause is not None
+    assert cause.name == "focus"
+    assert cause.step == pytest.approx(true - configured, abs=50)
+    assert not cause.other_steps
+
+
+@pytest.mark.parametrize("na", [1.2, 1.42])
+@pytest.mark.parametrize(("configured", "true"), [(0.0, -300.0), (-300.0, -500.0)])
+def test_the_side_of_focus_that_dark_field_does_not_tell_is_left_open(
+    configured: float, true: float, na: float
+) -> None:
+    """A picture of |E|² is nearly that on the other side, the less so the larger the aperture."""
+    here, there = ({"focus_nm": focus, "na": na} for focus in (configured, true))
+    cause = _dark_cause(here, there, scale=1e13 if configured else 1e14)
+    assert cause is not None
+    assert cause.name == "focus"
+    steps = (cause.step or 0.0, *cause.other_steps)
+    assert min(abs(step - (true - configured)) for step in steps) <= 100
+    sides = {math.copysign(1, configured + step) for step in steps}
+    assert sides == {-1.0, 1.0}
+    assert "which these pictures do not tell apart" in cause.message
 
 
 def test_the_wrong_number_is_named_where_frames_were_averaged_before() -> None:
@@ -127,6 +175,37 @@ def test_a_wrong_pixel_size_is_named(stretch: float) -> None:
     assert cause is not None
     assert cause.name == "camera.pixel_size_nm"
     assert cause.step == pytest.approx(100 * (stretch - 1), rel=0.35)
+
+
+@pytest.mark.parametrize(
+    ("seen", "stretch"), [({}, 0.96), ({}, 1.04), ({"wavelength_nm": 505.0}, 1.0)]
+)
+def test_wavelength_and_pixel_size_are_named_together(
+    seen: dict[str, float], stretch: float
+) -> None:
+    """Near focus both stretch the picture, and only one of them was named."""
+    cause = _cause(seen, stretch=stretch, focus_nm=-100.0)
+    assert cause is not None
+    (rival,) = cause.rivals
+    steps = {cause.name: cause.step or 0.0, rival[0]: rival[1]}
+    larger = 100 * (stretch * 525.0 / seen.get("wavelength_nm", 525.0) - 1)
+    assert steps["camera.pixel_size_nm"] == pytest.approx(larger, rel=0.35)
+    assert steps["wavelength"] == pytest.approx(-5.25 * larger, rel=0.35)
+    assert f"or {rival[0]}, by " in cause.message
+    assert "which these pictures do not tell apart" in cause.message
+
+
+@pytest.mark.parametrize(
+    ("seen", "stretch", "name"),
+    [({}, 1.04, "camera.pixel_size_nm"), ({"wavelength_nm": 480.0}, 1.0, "wavelength")],
+)
+def test_far_from_focus_bright_particles_tell_wavelength_from_pixel_size(
+    seen: dict[str, float], stretch: float, name: str
+) -> None:
+    cause = _cause(seen, stretch=stretch, focus_nm=-600.0)
+    assert cause is not None
+    assert cause.name == name
+    assert not cause.rivals
 
 
 def test_a_transposed_movie_is_named() -> None:

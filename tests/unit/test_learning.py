@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,7 +22,8 @@ from iscat_analysis.inference.noise import conditional
 from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import learning
-from iscat_analysis.pipeline.learning import LEAST_TESTED, _median_p, learn_optics
+from iscat_analysis.pipeline.learning import LEAST_TESTED, learn_optics
+from iscat_analysis.pipeline.tested_optics import REJECTED_P, median_p
 
 MOVIE: Any = SimpleNamespace(name="movie.tif")
 
@@ -37,7 +39,7 @@ def _learn(
     """Whether the configuration stayed, the summary, and what the user was told."""
     config = _config(calibrate)
     sights, _, _ = make_sights(changes, count, seed=3)
-    monkeypatch.setattr(learning, "_noise_differs", lambda *_: noise_differs)
+    monkeypatch.setattr(learning, "noise_differs", lambda *_: noise_differs)
     monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
@@ -58,7 +60,7 @@ def test_optics_that_describe_the_particles_stay_without_a_word(
     assert stayed
     assert not said
     assert summary["tested"] == 14
-    assert summary["median_p"] > learning.REJECTED_P
+    assert summary["median_p"] > REJECTED_P
     assert summary["calibrated"] is False
 
 
@@ -69,7 +71,7 @@ def test_places_on_a_ring_do_not_condemn_the_optics(y_nm: float) -> None:
     for changes, fits in (({}, True), ({"focus_nm": -300.0}, False)):
         sights, _, _ = make_sights(changes, 8, seed=5, config=config)
         moved = [replace(sight, y_nm=sight.y_nm + y_nm) for sight in sights]
-        assert (_median_p(moved, config) > learning.REJECTED_P) == fits
+        assert (median_p(moved, config) > REJECTED_P) == fits
 
 
 def _pairs(changes: dict[str, Any], count: int, seed: int) -> list[Sight]:
@@ -97,13 +99,13 @@ def test_pairs_that_land_at_once_do_not_condemn_the_optics(
     config = _config("auto")
     singles, _, _ = make_sights(changes, 5, seed=3)
     sights = [*_pairs(changes, 6, 4), *singles]
-    monkeypatch.setattr(learning, "_noise_differs", lambda *_: False)
+    monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
     monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
     said: list[str] = []
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     learned, summary = learn_optics(MOVIE, config, camera, tell=said.append)
     assert learned == config
-    assert (summary["median_p"] > learning.REJECTED_P) == fits
+    assert (summary["median_p"] > REJECTED_P) == fits
     assert summary["tested"] == (11 if not fits else 5)
     assert bool(said) != fits
 
@@ -132,7 +134,7 @@ def test_too_few_particles_to_learn_from_are_said_where_the_test_fails(
     assert "do not describe the brightest 8 particles" in said[0]
     assert "at least 12 are needed to learn the optics; record more" in said[0]
     assert said[0].endswith("the analysis goes on as configured")
-    assert summary["median_p"] < learning.REJECTED_P
+    assert summary["median_p"] < REJECTED_P
     assert summary["calibrated"] is False
 
 
@@ -149,7 +151,7 @@ def test_a_phase_that_the_line_of_masses_turns_is_told(
 ) -> None:
     """Beyond focus particles are bright; the control is on the configured side."""
     sights, _, _ = make_sights({"focus_nm": focus_nm}, 16, seed=3)
-    monkeypatch.setattr(learning, "_noise_differs", lambda *_: False)
+    monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
     monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
     config = _config("auto").model_copy(
         update={"calibration": Calibration(gradient_per_kda=-3.1e-5)}
@@ -179,6 +181,10 @@ def test_a_phase_that_the_line_of_masses_turns_is_told(
         ({"background.method": "known", "background.level_e": 1e4}, 'background.method = "known"'),
         ({"fit.mode": "joint"}, "in mode joint without background frames"),
         ({"fit.mode": "track", "track.free": "joint"}, 'but with track.free = "mass"'),
+        (
+            {"fit.mode": "track", "track.free": "mass", "optics.convention": "dong2021"},
+            'with optics.convention = "dong2021"',
+        ),
     ],
 )
 def test_always_is_told_where_nothing_is_learned_from_such_movies(
@@ -245,7 +251,7 @@ def test_particles_at_heights_of_their_own_do_not_condemn_the_optics(
     config = _config("auto")
     free = config.model_copy(update={"fit": config.fit.model_copy(update={"mode": mode})})
     sights, _, _ = make_sights({"focus_nm": -450.0}, 8, seed=3)
-    monkeypatch.setattr(learning, "_noise_differs", lambda *_: False)
+    monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
     monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
@@ -276,3 +282,30 @@ def test_edges_of_a_pattern_that_moved_are_not_learned_from(moved_px: float, why
     assert not summary["calibrated"]
     assert len(said) == 1
     assert why in said[0]
+
+
+def test_a_median_has_its_own_noise_when_optics_are_tested(tmp_path: Path) -> None:
+    """With the variance of a mean the right optics were rejected: p-values of 1e-5 and less."""
+    events = [
+        {"frame": 60, "x_px": 22.3 + 40 * (k % 2), "y_px": 21.6 + 40 * (k // 2), "mass_kda": 1000.0}
+        for k in range(4)
+    ]
+    setup = {
+        "camera.pixel_size_nm": PIXEL_NM,
+        "background.frames": (0, 60),
+        "fit.frames": (60, 120),
+        "calibration.gradient_per_kda": -3.1e-5,
+        "posterior.enabled": False,
+        "compute.workers": 1,
+    }
+    light = {
+        "simulation.shape": (84, 84),
+        "simulation.frames": 120,
+        "simulation.photons_per_pixel": 3e4,
+        "simulation.events": events,
+    }
+    ia.simulate_movie({**setup, **light}, tmp_path / "movie.tif", seed=1)
+    result = ia.fit_movie(tmp_path / "movie.tif", config={**setup, "background.method": "median"})
+    assert result.summary["optics"]["tested"] == 4
+    assert result.summary["optics"]["median_p"] > 10 * REJECTED_P
+    assert not [text for text in result.warnings if "optics" in text]

@@ -139,12 +139,23 @@ def test_where_nothing_tells_them_apart_both_are_named() -> None:
     """A flat field and a steady laser leave one number: the noise over the light."""
     flat = _movie(3, offset=TRUE_COUNTS, power=0.0, speckle=0.0)
     said = _said(flat)
-    assert "does not tell whether by its gain or by camera.offset_adu = 0" in said
+    assert re.search(r"whether by the gain \(.*\), or by camera.offset_adu = 0", said)
     assert "7.5 % too small" in said
     much = _said(_movie(3, power=0.0, speckle=0.0, gain=GAIN / 2.5))
     assert re.search(r"masses 1[45]0 % too large", much)  # and not 1.5e+02 %
     assert not _said(_movie(3, power=0.0, speckle=0.0))
     assert not _said(flat, additive=True)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_what_may_be_either_is_one_line(factor: float) -> None:
+    """The gain was said to be wrong in one line, and not to be told from the offset in the next."""
+    movie = _movie(3, power=0.0, speckle=0.0, gain=GAIN / factor)
+    (said,) = judge_counts(movie, Camera(gain_e_per_adu=GAIN)).messages
+    (advised,) = map(float, re.findall(r"then set camera.gain_e_per_adu = ([\d.]+)", said))
+    assert advised == pytest.approx(GAIN / factor, rel=0.02)
+    assert "does not tell" in said
+    assert ("light that is noisy by itself" in said) == (factor > 1)
 
 
 def test_few_frames_say_nothing() -> None:

@@ -1,0 +1,79 @@
+"""Light that is uneven over a known level is said to be, and particles are not blamed for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import iscat_analysis as ia
+
+LEVEL_E = 3e4
+SETUP: dict[str, Any] = {
+    "camera.pixel_size_nm": 84.4,
+    "particle.mass_kda": 1000.0,
+    "fit.frames": (60, 100),
+    "posterior.enabled": False,
+    "calibration.gradient_per_kda": -3.1e-5,
+    "optics.calibrate": "never",
+    "compute.workers": 1,
+}
+KNOWN = {"background.method": "known", "background.level_e": LEVEL_E}
+MEASURED = {"background.frames": (0, 60)}
+
+
+def _movie(path: Path, *, speckle: float, heavy: bool = False) -> Path:
+    """Record nine particles, or sixteen heavy ones whose rings are everywhere."""
+    side, apart, mass = (4, 20, 3000.0) if heavy else (3, 29, 1000.0)
+    events = [
+        {"frame": 60, "x_px": 19.7 + apart * (k % side), "y_px": 20.2 + apart * (k // side),
+         "mass_kda": mass}
+        for k in range(side**2)
+    ]  # fmt: skip
+    light = {
+        "simulation.shape": (96, 96),
+        "simulation.frames": 100,
+        "simulation.photons_per_pixel": LEVEL_E,
+        "simulation.background": "speckle",
+        "simulation.speckle_contrast": speckle,
+        "simulation.events": events,
+    }
+    ia.simulate_movie({**SETUP, **MEASURED, **light}, path, seed=1)
+    return path
+
+
+def _said(path: Path, changes: dict[str, Any]) -> list[str]:
+    result = ia.fit_movie(path, config={**SETUP, **changes})
+    return [text for text in result.warnings if "from pixel to pixel" in text]
+
+
+@pytest.mark.parametrize("speckle", [0.003, 0.03])
+def test_an_uneven_field_over_a_known_level_is_named(tmp_path: Path, speckle: float) -> None:
+    """Every row was a poor fit without a word."""
+    movie = _movie(tmp_path / "movie.tif", speckle=speckle)
+    (said,) = _said(movie, KNOWN)
+    percent = float(said.split("differs by ")[1].split(" %")[0])
+    assert percent == pytest.approx(100 * speckle, rel=0.15)
+    assert f'background.method = "known" has {LEVEL_E:g} in all of them' in said
+    assert not _said(movie, MEASURED)  # where it divides out
+
+
+@pytest.mark.parametrize("heavy", [False, True])
+def test_rings_of_particles_are_not_called_uneven(tmp_path: Path, heavy: bool) -> None:
+    movie = _movie(tmp_path / "movie.tif", speckle=0.0, heavy=heavy)
+    assert not _said(movie, KNOWN)
+
+
+def test_what_a_wrong_focus_leaves_over_is_not_called_uneven(tmp_path: Path) -> None:
+    movie = _movie(tmp_path / "movie.tif", speckle=0.0, heavy=True)
+    assert not _said(movie, {**KNOWN, "optics.focus_nm": -380.0})
+
+
+def test_frames_in_which_particles_move_are_judged_before_they_are_followed(
+    tmp_path: Path,
+) -> None:
+    movie = _movie(tmp_path / "movie.tif", speckle=0.03)
+    track = {"fit.mode": "track", "track.free": "mass", "fit.frames": (60, 62)}
+    (said,) = _said(movie, {**KNOWN, **track})
+    assert 'background.method = "tracks"' in said
