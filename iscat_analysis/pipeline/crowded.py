@@ -90,12 +90,13 @@ def seen_in_field(
     others : list of Sight
         Every particle, on small regions.
     """
-    fit = config.fit.model_copy(update={"mode": "joint" if heights_free(config) else "mass"})
+    free = heights_free(config)
+    fit = config.fit.model_copy(update={"mode": "joint" if free else "mass"})
     rows, columns = windows.after_e.shape
     scene = make_scene(config.model_copy(update={"fit": fit}), (rows, columns))
     events, _ = fit_field(scene, windows, pool=pool)
-    # what wrong optics leave over of particles is beside them, and would leave none alone
-    known = [event.fit.theta for event in events if Status.SIDELOBE not in event.flags]
+    # with free heights what wrong optics leave over is beside particles, which would not be alone
+    known = [e.fit.theta for e in events if not (free and Status.SIDELOBE in e.flags)]
     return known_places(windows, config, known, LEAST_SIGHTS)
 
 
