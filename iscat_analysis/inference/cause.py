@@ -27,6 +27,9 @@ from iscat_analysis.records import BoolArray, FloatArray
 WORTH_NAMING = 0.3
 """Share of χ² in excess that a parameter must explain to be named."""
 
+MOST_OF_IT = 0.6
+"""Share below which more may be wrong, and a correction of that parameter alone is no advice."""
+
 PIXEL = "camera.pixel_size_nm"
 _PHASE = "reference phase"
 _STEPS: Mapping[str, Mapping[str, float]] = {
@@ -139,10 +142,12 @@ class Cause:
     def message(self) -> str:
         """One line for the user."""
         elsewhere = "" if self.learned else " with an interferometric movie of the same microscope"
+        remedy = f"correct it, or calibrate the optics{elsewhere}"
+        if self.share < MOST_OF_IT:
+            remedy = f"that explains only a part, so calibrate the optics{elsewhere}"
         return (
             f"the model does not describe the brightest particles ({self.events} looked at): what "
-            f"it leaves over looks most like {self.likeness}; correct it, or calibrate the "
-            f"optics{elsewhere}"
+            f"it leaves over looks most like {self.likeness}; {remedy}"
         )
 
 

@@ -230,3 +230,14 @@ def test_a_microscope_with_particles_of_the_other_sign_is_no_cause() -> None:
 def test_nothing_is_named_where_all_is_right() -> None:
     assert _cause({}) is None
     assert likely_cause(make_config(), []) is None
+
+
+def test_a_part_of_what_is_wrong_is_not_told_to_be_corrected() -> None:
+    """Where several parts are wrong at once the likeliest explains little; control: one alone."""
+    cause = _cause({"na": 1.34, "aberrations_nm": {"z5": 20.0, "z7": 20.0}})
+    assert cause is not None
+    assert "explains only a part, so calibrate the optics" in cause.message
+    assert "correct it" not in cause.message
+    alone = _cause({"aberrations_nm": {"z11": 25.0}})
+    assert alone is not None
+    assert "correct it, or calibrate the optics" in alone.message
