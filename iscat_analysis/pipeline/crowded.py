@@ -13,7 +13,7 @@ tried, with every particle at the height that suits it best among the rings of a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -223,7 +223,7 @@ def _likeliest(
         anywhere = [moved + fringe * k for k in (-1.0, -0.5, 0.0, 0.5, 1.0)]
 
         def best(few: Sequence[Sight], shifts: Sequence[float]) -> list[tuple[float, Sight]]:
-            return _best_heights(few, shifts, model, lambda _: model, settings, mapper)
+            return _best_heights(few, shifts, model, settings, mapper)
 
         near = [sight for _, sight in best(around, anywhere)]
         for _ in range(_TURNS):  # each among the rings of all, which other heights change
@@ -266,7 +266,6 @@ def _best_heights(
     sights: Sequence[Sight],
     shifts_nm: Sequence[float],
     model: ForwardModel,
-    build: Callable[[Settings], ForwardModel],
     settings: Settings,
     mapper: Mapper,
 ) -> list[tuple[float, Sight]]:
@@ -275,6 +274,10 @@ def _best_heights(
     Half a fringe away a particle of the other sign looks much the same, but none leaves here: a fit
     with the sign that the mass had is preferred.
     """
+
+    def build(_: Settings) -> ForwardModel:
+        return model
+
     found: list[list[tuple[bool, float, Sight]]] = [[] for _ in sights]
     for shift in shifts_nm:
         moved = [_raised(sight, shift) for sight in sights]

@@ -29,6 +29,7 @@ _AMPLITUDES = 4  # at which the response to the optics is computed, for the span
 _BENT = 0.02  # of a mass; beneath, lines of standards that scatter by a per cent are as wrong
 _BENT_SIGMAS = 5.0  # beyond which the square is clear in a single row, however small its share
 _TOLD = 0.5  # of σ, beyond which it is told of every row
+_NOTHING = 1e-9  # nm or kDa: what rounding leaves of a place that the optics do not move
 _HEIGHTS_PER_FRINGE = 10  # between them it is interpolated
 
 Source = Callable[[Config, pd.DataFrame], Mapping[str, FloatArray]]
@@ -71,7 +72,8 @@ def systematic(
     for source in sources:
         for name, sigma in source(config, table).items():
             squares[name] = squares.get(name, np.zeros(len(table))) + np.square(sigma)
-    return {name: np.sqrt(squares[name]) for name in _COMMON if name in squares}
+    sums = {name: np.sqrt(squares[name]) for name in _COMMON if name in squares}
+    return {name: np.where(sigma > _NOTHING, sigma, 0.0) for name, sigma in sums.items()}
 
 
 def _of_what_is_left_over(
