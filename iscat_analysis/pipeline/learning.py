@@ -14,7 +14,6 @@ from typing import Any
 from iscat_analysis.calibration.optics import (
     FREE,
     LEAST_SIGHTS,
-    MOST_SIGHTS,
     OpticsCalibration,
     Sight,
     free_groups,
@@ -108,10 +107,7 @@ def learn_optics(
     tested: dict[str, Any] = {}
     first_tested = optics.calibrate == "auto" and way_of(config) == "sliding"
     with threads(config.compute.workers) as pool:
-        enough = TESTED if first_tested else MOST_SIGHTS
-        sights, others = bright_sights(
-            movie, config, camera, pool, opening, enough, rings=not first_tested
-        )
+        sights, others = bright_sights(movie, config, camera, pool, opening, rings=not first_tested)
         alone, source = len(sights), {"movie": movie.name}
         together = alone < LEAST_TESTED and way_of(config) == "fixed"
         windows = _summed(movie, config, camera) if together else None

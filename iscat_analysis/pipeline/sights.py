@@ -67,7 +67,6 @@ def bright_sights(
     camera: Camera,
     pool: ThreadPoolExecutor,
     opening: Opening | None = None,
-    enough: int = MOST_SIGHTS,
     rings: bool = True,
 ) -> tuple[list[Sight], list[Sight]]:
     """Find the bright particles of a movie, in the way in which it is analysed.
@@ -87,8 +86,6 @@ def bright_sights(
         Runs the search.
     opening : Opening, optional
         Of a landing movie, where it was judged; its reader keeps what is read here.
-    enough : int
-        Bright steps of a landing movie after which no further chunk is searched.
     rings : bool
         Whether to look for those of a landing movie whose rings may lie in the pictures of others.
 
@@ -101,10 +98,10 @@ def bright_sights(
     """
     if way_of(config) == "sliding":
         if opening is not None:
-            return landing_sights(opening.reader, opening.window, config, pool, enough, rings)
+            return landing_sights(opening.reader, opening.window, config, pool, rings)
         reader = reader_of(movie, config, camera, fitted_frames(movie, config))
         window = judge_window(reader, config, pool.map)[2]
-        return landing_sights(reader, window, config, pool, enough, rings)
+        return landing_sights(reader, window, config, pool, rings)
     if heights_free(config) and way_of(config) == "fixed":
         return [], []
     windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
@@ -132,7 +129,6 @@ def landing_sights(
     window: int,
     config: Config,
     pool: ThreadPoolExecutor,
-    enough: int,
     rings: bool,
 ) -> tuple[list[Sight], list[Sight]]:
     """Find bright steps of a landing movie, chunk by chunk until there are enough.
@@ -147,8 +143,6 @@ def landing_sights(
         Resolved.
     pool : ThreadPoolExecutor
         Runs the search.
-    enough : int
-        Bright steps after which no further chunk is searched.
     rings : bool
         As in `bright_sights`.
 
@@ -177,7 +171,7 @@ def landing_sights(
         found += alone
         rest += every
         bright = [step for step in found if step.snr > FAINTEST]
-        if len(bright) >= enough:
+        if len(bright) >= MOST_SIGHTS:
             break
     bright.sort(key=lambda step: -step.snr)
     unique = _without_repeats(bright)
