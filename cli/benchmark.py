@@ -28,8 +28,6 @@ EXAMPLE = """Example: a thousand repetitions of one experiment.
 
 MODES = ("mass", "localize", "joint")
 
-_AMBIGUOUS = "ambiguous_z"
-
 
 def benchmark(
     context: typer.Context,
@@ -96,16 +94,18 @@ def benchmark(
 
 def left_out(study: Mapping[str, Any]) -> list[str]:
     """Say where fits are part of no bias and no spread though they did not fail."""
+    from iscat_analysis.records import Status
+
     notes = []
     for mode in MODES:
         entry = study[mode]
-        ambiguous, trials = entry["flagged"][_AMBIGUOUS], entry["trials"]
+        ambiguous, trials = entry["flagged"][Status.AMBIGUOUS_Z], entry["trials"]
         if ambiguous:
             verb = "is" if ambiguous == 1 else "are"
             notes.append(
-                f"mode {mode}: of {trials} fits {ambiguous} {verb} {_AMBIGUOUS} and left out of "
-                "bias and spread: several heights describe the pixels about as well; more photons "
-                "or frames (bounds.photons_per_pixel, bounds.n_after) or a narrower "
+                f"mode {mode}: of {trials} fits {ambiguous} {verb} {Status.AMBIGUOUS_Z} and "
+                "left out of bias and spread: several heights describe the pixels about as well; "
+                "more photons or frames (bounds.photons_per_pixel, bounds.n_after) or a narrower "
                 "fit.z_range_nm tell which"
             )
     return notes

@@ -81,6 +81,7 @@ _UNITS = {
     "focus": "nm", _PHASE: "degrees", "spherical aberration": "nm rms",
     "wavelength": "nm", PIXEL: "%", "numerical aperture": "",
 }  # fmt: skip
+_NAMES = (*_STEPS, PIXEL, _TURNED, *_OTHERS)
 _WHOLE = (_TURNED, *(name for name in _OTHERS if "mask" not in name))  # there or not
 _WHOLE_STEP = 0.5  # of one that is tried whole, which the residuals ask for at least
 _STRETCH = 30.0  # per cent, farther than which no pixel size is tried
@@ -174,7 +175,7 @@ def likely_cause(
     excess = sum(each.excess for each in left)
     if excess <= 0:
         return None
-    found = {name: _told(config, name, left, excess) for name in _names()}
+    found = {name: _told(config, name, left, excess) for name in _NAMES}
     named = {name: tried for name, tried in found.items() if tried[0][0] > WORTH_NAMING}
     if not named:  # a share is above 1 where there is less noise than the camera's numbers say
         return None
@@ -183,11 +184,9 @@ def likely_cause(
     pixels = sum(each.rest.size for each in left)
     margin = max(1 - share, _AT_LEAST) + _SIGMAS * math.sqrt(2 * pixels) / excess
 
-    def alike(other: str) -> bool:
-        return other in named and named[other][0][0] > share - margin
-
-    others = [(s, other) for s, other in named[name][1:] if s > share - margin]
-    rivals = [n for n in _SCALES if n != name and name in _SCALES and alike(n)]
+    others = [other for s, other in named[name][1:] if s > share - margin]
+    scales = [n for n in _SCALES if n in named and name in _SCALES and n != name]
+    rivals = [n for n in scales if named[n][0][0] > share - margin]
     return Cause(
         name=name,
         share=min(share, 1.0),
@@ -195,13 +194,9 @@ def likely_cause(
         unit=_UNITS.get(name, ""),
         events=len(fits),
         learned=config.optics.scheme != "darkfield",
-        other_steps=tuple(other for _, other in others),
+        other_steps=tuple(others),
         rivals=tuple((n, named[n][0][1], _UNITS[n]) for n in rivals),
     )
-
-
-def _names() -> tuple[str, ...]:
-    return (*_STEPS, PIXEL, _TURNED, *_OTHERS)
 
 
 def _told(

@@ -233,8 +233,9 @@ def reader_of(movie: CountSource, config: Config, camera: Camera, span: tuple[in
         some = np.concatenate([movie.read(k, k + 1) for k in numbers])
         light = measure_frames(some, camera)[0]
         lit = light[well_lit(light)]
-        dark_e = DARK * float(np.median(lit)) if lit.size else dark_e
-    return Reader(movie, camera, *span, counts_budget(config), dark_e=max(dark_e, 0.0) or -math.inf)
+        if lit.size and np.median(lit) > 0:
+            dark_e = DARK * float(np.median(lit))
+    return Reader(movie, camera, *span, counts_budget(config), dark_e=dark_e)
 
 
 def counts_budget(config: Config) -> int:

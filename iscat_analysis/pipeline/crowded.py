@@ -31,9 +31,9 @@ from iscat_analysis.calibration.optics import (
     maximise,
     optics_limits,
     settings_of,
-    with_masses,
     with_settings,
 )
+from iscat_analysis.calibration.optics.starts import FOCUS_STEP_NM, with_masses
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.optics.forward import ForwardModel
@@ -55,7 +55,7 @@ LEAST_ROUGH = 6
 ROUNDS = 3
 """Of a fit of the field and optics learned from it."""
 
-_FOCUS_MOVES_NM = (0.0, -80.0, 80.0, -160.0, 160.0, -240.0, 240.0)
+_FOCUS_MOVES_NM = tuple(FOCUS_STEP_NM * i for i in (0, -1, 1, -2, 2, -3, 3))
 _TURNS = 2  # of heights of neighbours, and of their rings
 _PASSES = 12  # of a fit from one of several heights
 _OPTICS_PASSES = 8

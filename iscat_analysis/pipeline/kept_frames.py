@@ -150,8 +150,7 @@ def _odd(
         light, repeats = measure_frames(movie.read(begin, stop), camera)
         here = slice(start - span[0], stop - span[0])
         light_e[here], same[here] = light[start - begin :], repeats[start - begin :]
-    dark = np.isneginf(light_e)
-    return dark if additive else dark | ~well_lit(np.where(dark, np.nan, light_e), DARK), same
+    return np.isneginf(light_e) if additive else ~well_lit(light_e, DARK), same
 
 
 def _renumbered(windows: Windows, numbers: IntArray) -> Windows:

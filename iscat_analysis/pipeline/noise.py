@@ -160,16 +160,16 @@ def judge_counts(
     leaks = spectrum is not None and spectrum.correlated
     if zero is not None and leaks and not zero.flickers:
         zero = None  # the variance of a pixel is then of its neighbours' light as well
-    told = zero is not None and offset_is_wrong(zero, gain)
-    if zero is not None and told:
-        said = offset_said(zero, camera)
+    wrong = zero if zero is not None and offset_is_wrong(zero, gain) else None
+    if wrong is not None:
+        said = offset_said(wrong, camera)
     else:
         said = ("" if additive else either_said(gain, zero, camera)) or gain.message or ""
     excess = ExcessNoise(gain.noise_ratio, said) if gain.off and gain.noise_ratio > 1 else None
-    if zero is None or not told:
+    if wrong is None:
         return Noise((said,) if said else (), gain.off, excess, spectrum)
     messages = [said]
-    moved = replace(camera, offset_adu=camera.offset_adu + zero.electrons / camera.gain_e_per_adu)
+    moved = replace(camera, offset_adu=camera.offset_adu + wrong.electrons / camera.gain_e_per_adu)
     with contextlib.suppress(DataError):  # too dark to tell
         rest = diagnose_gain(counts[:_GAIN_FRAMES], moved, masked=masked)
         rest = allow_for_correlation(rest, measure_spectrum(counts, moved, masked=masked))

@@ -35,7 +35,6 @@ from iscat_analysis.calibration.optics.settings import (
     with_settings,
 )
 from iscat_analysis.calibration.optics.sights import FOCUS_STEP, PRIVATE, Settings, Sight
-from iscat_analysis.calibration.optics.starts import with_masses
 
 __all__ = [
     "FAINTEST",
@@ -68,6 +67,5 @@ __all__ = [
     "measure_microscope",
     "optics_limits",
     "settings_of",
-    "with_masses",
     "with_settings",
 ]
