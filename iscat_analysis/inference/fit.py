@@ -19,12 +19,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
 from iscat_analysis.inference.precision import precision
+from iscat_analysis.inference.reach import reach, reaches_far
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     PARAMETERS,
@@ -180,33 +182,29 @@ def fit_particle(
     begin = start_theta(likelihood, start)
     box = _box_around(likelihood, begin, mode, z_range_nm, level)
     optima, all_followed = _optima(likelihood, begin, box)
-    best = optima[0]
-    derivatives, chi2_reduced, p_value = _judged(likelihood, best, box)
-    if not all_followed and not p_value >= POOR_FIT_P:
-        last = _follow(likelihood, _inside(begin, box), box, best.log_likelihood)
-        optima = _ranked([*optima, last])
-        if optima[0] is not best:
-            best = optima[0]
-            derivatives, chi2_reduced, p_value = _judged(likelihood, best, box)
+    found = _judged(likelihood, optima[0], box)
+    if not all_followed and not found.p_value >= POOR_FIT_P:
+        optima, found = _also_from(likelihood, _inside(begin, box), box, optima, found)
+    if reaches_far(likelihood, found.sigma):
+        wider, higher = _far(likelihood, box, found)
+        if higher is not None:
+            optima, found = _also_from(likelihood, higher, box, optima, found)
+            wider, _ = _far(likelihood, box, found)
+        found = wider
+    best, known, sigma, bias = found.best, found.known, found.sigma, found.bias
     model = likelihood.model
     alternatives = _alternatives(optima, model.fringe_nm)
-    walls = _walls(best.theta, box)
-    slope = abs(model.scale.slope(float(best.theta[AMPLITUDE])))
-    known, sigma, covariance, bias = precision(
-        likelihood, best.theta, best.fisher, box.free, derivatives, walls=np.array(walls),
-        slope=slope,
-    )  # fmt: skip
     flags = []
     if not best.converged or not known:
         flags.append(Status.NOT_CONVERGED)
-    if _at_bound(likelihood, best.theta, walls, sigma[2]):
+    if _at_bound(likelihood, best.theta, found.walls, sigma[2]):
         flags.append(Status.AT_BOUND)
     if alternatives and alternatives[0].log_likelihood_gap < math.log(AMBIGUITY_ODDS):
         flags.append(Status.AMBIGUOUS_Z)
-    if p_value < POOR_FIT_P:
+    if found.p_value < POOR_FIT_P:
         flags.append(Status.POOR_FIT)
     estimate = best.theta
-    if correct_bias and known and _is_small(bias, sigma, box, slope):
+    if correct_bias and known and _is_small(bias, sigma, box, found.slope):
         estimate = np.minimum(np.maximum(estimate - bias, box.lower), box.upper)
     x, y, z, amplitude = (float(value) for value in estimate[:4])
     if box.free[AMPLITUDE] and model.scale.off_line(estimate[AMPLITUDE], sigma[AMPLITUDE], OUTWARD):
@@ -222,13 +220,13 @@ def fit_particle(
         box=box,
         free=tuple(compress(PARAMETERS, box.free)),
         sigma=sigma,
-        covariance=covariance,
+        covariance=found.covariance,
         contrast=model.amplitude_contrast(z, amplitude, "between" if box.free[2] else "exact"),
         log_likelihood=best.log_likelihood,
         snr=detection_snr(likelihood, best, box),
         iterations=best.passes,
-        chi2_reduced=chi2_reduced,
-        p_value=p_value,
+        chi2_reduced=found.chi2_reduced,
+        p_value=found.p_value,
         status=status,
         flags=noticed,
         alternatives=alternatives,
@@ -327,10 +325,54 @@ def _ranked(optima: list[Optimum]) -> list[Optimum]:
     return sorted(optima, key=lambda o: (not o.converged, -o.log_likelihood))
 
 
-def _judged(likelihood: Likelihood, best: Optimum, box: Box) -> tuple[FloatArray, float, float]:
-    """Give the derivatives of the signal at an optimum, and reduced χ² and p-value there."""
+class _Found(NamedTuple):
+    """An optimum, how it describes the data, and what its curvature says of its errors."""
+
+    best: Optimum
+    chi2_reduced: float
+    p_value: float
+    walls: list[bool]
+    slope: float
+    known: bool
+    sigma: FloatArray
+    covariance: FloatArray
+    bias: FloatArray
+
+
+def _judged(likelihood: Likelihood, best: Optimum, box: Box) -> _Found:
+    """Judge an optimum."""
     derivatives = likelihood.derivatives(best.theta, box.free)
-    return derivatives, *goodness_of_fit(likelihood, best.theta, box.free, derivatives)
+    chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free, derivatives)
+    walls = _walls(best.theta, box)
+    slope = abs(likelihood.model.scale.slope(float(best.theta[AMPLITUDE])))
+    known, sigma, covariance, bias = precision(
+        likelihood, best.theta, best.fisher, box.free, derivatives, walls=np.array(walls),
+        slope=slope,
+    )  # fmt: skip
+    return _Found(best, chi2_reduced, p_value, walls, slope, known, sigma, covariance, bias)
+
+
+def _also_from(
+    likelihood: Likelihood, theta: FloatArray, box: Box, optima: list[Optimum], found: _Found
+) -> tuple[list[Optimum], _Found]:
+    """Follow one more start, and judge where it leads if that is the best."""
+    last = _follow(likelihood, theta, box, found.best.log_likelihood)
+    ranked = _ranked([*optima, last])
+    return ranked, found if ranked[0] is found.best else _judged(likelihood, ranked[0], box)
+
+
+def _far(likelihood: Likelihood, box: Box, found: _Found) -> tuple[_Found, FloatArray | None]:
+    """Widen errors to what the likelihood says far from an optimum; see `reach`."""
+    free = np.flatnonzero(box.free[:4])
+    places = free[free < AMPLITUDE]
+    steps = np.zeros((places.size, 5))
+    steps[:, free] = found.covariance[: places.size] / found.sigma[places, None]
+    steps[:, AMPLITUDE] /= found.slope
+    sigma, higher = reach(likelihood, found.best, box, found.sigma, steps)
+    factor = (sigma / found.sigma)[free]
+    return found._replace(
+        sigma=sigma, covariance=found.covariance * np.outer(factor, factor)
+    ), higher
 
 
 def _is_plain(found: Optimum) -> bool:

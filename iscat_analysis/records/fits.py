@@ -85,9 +85,10 @@ class FitResult:
         Names of the free parameters, a subset of `PARAMETERS` in that order.
     sigma : ndarray, shape (4,)
         Standard deviations from the observed information, in the order of `PARAMETERS`;
-        NaN where not free.
+        NaN where not free.  Those of places at few photons are the likelihood's three errors away,
+        if that is more; see `iscat_analysis.inference.reach`.
     covariance : ndarray, shape (n_free, n_free)
-        Inverse observed information.
+        Inverse observed information, with these standard deviations.
     contrast : float
         Signed peak contrast of the model over the plane, at the estimate.
     log_likelihood : float
