@@ -26,6 +26,7 @@ PEAK_PER_KDA = 3.1e-5
 _AZIMUTHS = 64
 _FARTHEST_NM = 20_000.0
 _NEAREST_NM = 4_000.0
+_FOCUS_PART_NM = 30.0  # between these a picture is cubic in the focus
 _NEGLIGIBLE = 1e-10  # share of a harmonic below which it is left out
 
 
@@ -146,7 +147,7 @@ class Pictures:
         linear, _ = self._terms(near[None, :], near[:, None])
         top = linear.flat[np.argmax(np.abs(linear))]
         self.sign = float(np.sign(top))
-        self._per_kda = PEAK_PER_KDA / abs(top)
+        self.per_kda = PEAK_PER_KDA / abs(top)
 
     def _field(self, dx_nm: FloatArray, dy_nm: FloatArray) -> NDArray[np.complex128]:
         r, phi = np.hypot(dx_nm, dy_nm), np.arctan2(dy_nm, dx_nm)
@@ -166,7 +167,7 @@ class Pictures:
     def contrast(self, dx_nm: FloatArray, dy_nm: FloatArray, mass_kda: float) -> FloatArray:
         """Contrast of a particle at camera minus particle coordinates that broadcast."""
         linear, square = self._terms(dx_nm, dy_nm)
-        amplitude = mass_kda * self._per_kda
+        amplitude = mass_kda * self.per_kda
         return amplitude * linear + amplitude**2 * square
 
     def at_height(self, z_nm: float) -> Pictures:
@@ -256,6 +257,8 @@ class InstrumentMovie:
         Photoelectrons per pixel and frame.
     pixel_nm, gain_e_per_adu : float
         Of the camera.
+    focus_rise_nm : float
+        From the first frame to the last; in the middle the focus is the instrument's.
     """
 
     name = "movie"
@@ -270,25 +273,39 @@ class InstrumentMovie:
         level_e: float = 1e5,
         pixel_nm: float = 84.0,
         gain_e_per_adu: float = 4.0,
+        focus_rise_nm: float = 0.0,
     ) -> None:
         rng = np.random.default_rng(seed)
         frames, rows, columns = shape
         y, x = np.arange(rows) * pixel_nm, np.arange(columns) * pixel_nm
-        pictures = Pictures(instrument, 1.02 * pixel_nm * math.hypot(rows, columns))
+        reach_nm = 1.02 * pixel_nm * math.hypot(rows, columns)
+        parts = 2 * math.ceil(abs(focus_rise_nm) / _FOCUS_PART_NM / 2)
+        foci = instrument.focus_nm + (
+            np.linspace(-0.5, 0.5, parts + 1) * focus_rise_nm if parts else np.zeros(1)
+        )
+        pictures = [Pictures(replace(instrument, focus_nm=focus), reach_nm) for focus in foci]
+        alike = pictures[len(pictures) // 2]
         rough = gaussian_filter(rng.standard_normal((rows, columns)), 3.0, mode="wrap")
         light = level_e * (1 + 0.05 * rough / rough.std())
         order = np.argsort(landings.frame)
         counts = np.empty(shape, dtype=np.uint16)
-        expected = light.copy()
+        landed = np.zeros((len(pictures), rows, columns))  # logarithm of 1 + contrast
+        moving = None
         pending = [int(i) for i in order]
         for t in range(frames):
             while pending and landings.frame[pending[0]] <= t:
                 i = pending.pop(0)
-                expected *= 1 + pictures.contrast(
-                    (x - landings.x_px[i] * pixel_nm)[None, :],
-                    (y - landings.y_px[i] * pixel_nm)[:, None],
-                    float(landings.mass_kda[i]),
-                )
+                for number, picture in enumerate(pictures):
+                    landed[number] += np.log1p(
+                        picture.contrast(
+                            (x - landings.x_px[i] * pixel_nm)[None, :],
+                            (y - landings.y_px[i] * pixel_nm)[:, None],
+                            float(landings.mass_kda[i]) * alike.per_kda / picture.per_kda,
+                        )
+                    )
+                if parts:
+                    moving = CubicSpline(np.linspace(0, frames - 1, parts + 1), landed)
+            expected = light * np.exp(landed[0] if moving is None else moving(t))
             power = 1 + 0.01 * rng.standard_normal()
             noisy = power * expected + np.sqrt(power * expected) * rng.standard_normal(
                 (rows, columns)

@@ -113,6 +113,12 @@ class Optics(Section):
         -300.0,
         description="focus height z_f; sets the oil thickness for a particle at particle.height_nm",
     )
+    focus_drift_nm: Annotated[Finite, length(0.0, LARGEST_NM)] = Field(
+        0.0, description="rise of the focus in 1000 frames of a landing movie"
+    )
+    focus_frame: Annotated[int, Field(ge=0)] = Field(
+        0, description="frame at which the focus is focus_nm"
+    )
     convention: Literal["exact", "dong2021"] = Field(
         "exact", description='"exact" | "dong2021" (the paper\'s numbers, errors included)'
     )

@@ -196,7 +196,7 @@ def learn_sign(
                 sights, others = bright_sights(movie, config, camera, pool, opening)
             if len(sights) < LEAST_TESTED:
                 raise DataError(too_few(movie.name, len(sights)))
-            median = median_p(sights, config, others, pool.map)
+            median, _ = median_p(sights, config, others, pool.map)
             if median >= REJECTED_P:
                 raise DataError("with it the optics describe the particles of the movie")
             found = _found(movie, sights, others, start, wrong, camera, pool)

@@ -320,7 +320,7 @@ def draw_particles(
             middle, half = round(centre), round(LARGEST_IMAGE * scene.roi_px)
             spans.append((max(middle - half, 0), min(middle + half + 1, size)))
         grid = PixelGrid.region(spans[0], spans[1], scene.pixel_nm)
-        image = scene.wide.image(
+        image = scene.wide_at(int(landing)).image(
             grid, x * scene.pixel_nm, y * scene.pixel_nm, scene.config.particle.height_nm, mass
         )
         frame = int(landing)

@@ -18,6 +18,7 @@ from iscat_analysis.calibration.optics import (
     Sight,
     free_groups,
     heights_free,
+    settings_of,
 )
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
@@ -27,13 +28,19 @@ from iscat_analysis.movie.camera import Camera, camera_from_config
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pipeline.crowded import learn_in_field, seen_in_field
 from iscat_analysis.pipeline.fixed_pattern import drift_warning, examine_background
+from iscat_analysis.pipeline.focus_drift import (
+    STEADY,
+    focus_drift,
+    learned_with_drift,
+    with_drift,
+)
 from iscat_analysis.pipeline.microscope import (
     calibrate_sights,
     refuse_uncalibratable,
     with_sign,
 )
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, Opening, judge_counts
-from iscat_analysis.pipeline.ranges import frame_ranges, measured_windows
+from iscat_analysis.pipeline.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.pipeline.run import unheard
 from iscat_analysis.pipeline.sights import bright_sights, kind_of, scan_sights
 from iscat_analysis.pipeline.tested_optics import REJECTED_P, TESTED, median_p, not_alone
@@ -101,11 +108,13 @@ def learn_optics(
         reason
         or config.fit.mode == "track"  # which learns from its tracks
         or optics.calibrate == "never"
-        or (optics.calibrate == "auto" and optics.file is not None)
+        or (optics.calibrate == "auto" and (optics.file is not None or optics.focus_drift_nm))
     ):
         return config, {}
     tested: dict[str, Any] = {}
-    first_tested = optics.calibrate == "auto" and way_of(config) == "sliding"
+    passed, sliding, drift = False, way_of(config) == "sliding", STEADY
+    frames = fitted_frames(movie, config, config.background.recorded)
+    first_tested = optics.calibrate == "auto" and sliding
     with threads(config.compute.workers) as pool:
         sights, others = bright_sights(movie, config, camera, pool, opening, rings=not first_tested)
         alone, source = len(sights), {"movie": movie.name}
@@ -119,10 +128,11 @@ def learn_optics(
             if len(sights) < LEAST_TESTED:
                 by_noise = noise_differs(movie, config, camera)
                 raise DataError(too_few(movie.name, len(sights), by_noise=by_noise))
-            median = median_p(sights, config, others, pool.map)
+            median, fitted = median_p(sights, config, others, pool.map)
             if first_tested and median < REJECTED_P:  # more particles, and whose rings they show
                 sights, others = bright_sights(movie, config, camera, pool, opening)
-                alone, median = len(sights), median_p(sights, config, others, pool.map)
+                alone = len(sights)
+                median, fitted = median_p(sights, config, others, pool.map)
             if optics.calibrate == "auto" and median < REJECTED_P and not heights_free(config):
                 pairs, median = not_alone(sights, config, others, pool.map)
                 sights = [sight for k, sight in enumerate(sights) if k not in pairs]
@@ -130,20 +140,30 @@ def learn_optics(
                 if len(sights) < LEAST_TESTED:
                     raise DataError(too_few(movie.name, len(sights)))
             tested = {"tested": len(sights), "median_p": median}
-            if optics.calibrate == "auto" and median >= REJECTED_P:
+            passed = optics.calibrate == "auto" and median >= REJECTED_P
+            if sliding:
+                drift = focus_drift(fitted, config, settings_of(config), frames, pool.map)
+            if passed and not drift.moves:
                 return config, tested | {"calibrated": False}
             if optics.calibrate == "auto" and noise_differs(movie, config, camera):
                 reason = f"{NOISE}; the analysis goes on as configured"
                 tell(f"the optics cannot be tested on this movie: {reason}")
                 return config, tested | {"calibrated": False, "reason": reason}
             notify("learning the optics from the particles of the movie, which may take minutes…")
-            found = learned_from(
-                sights[:alone], others, movie, config, camera, tuple(FREE), source, pool
+            found = (
+                learned_with_drift(
+                    sights, others, config, settings_of(config), drift, source, pool.map
+                )
+                if passed
+                else learned_from(
+                    sights[:alone], others, movie, config, camera, tuple(FREE), source, pool
+                )
             )
         except DataError as error:
-            tell(f"{_verdict(tested)}: {error}; the analysis goes on as configured")
-            return config, tested | {"calibrated": False, "reason": str(error)}
-    return taken(found, config, tested, _verdict(tested), tell=tell)
+            reason = f"{error}; {drift.said}" if drift.moves else str(error)
+            tell(f"{_verdict(tested)}: {reason}; the analysis goes on as configured")
+            return config, tested | {"calibrated": False, "reason": reason}
+    return taken(found, config, tested, drift.said if passed else _verdict(tested), tell=tell)
 
 
 def why_not(config: Config) -> str:
@@ -389,6 +409,9 @@ def learned_from(
     crowded = way_of(config) == "fixed"
     if not crowded or len(sights) >= LEAST_SIGHTS:
         found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
+        if way_of(config) == "sliding":
+            frames = fitted_frames(movie, config)
+            return with_drift(found, sights, others, config, frames, source, pool.map)
         if found.accepted or not crowded:
             return found
     return learn_in_field(_summed(movie, config, camera), config, groups, source, pool)

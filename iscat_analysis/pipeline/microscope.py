@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from iscat_analysis.calibration.optics import (
+    FOCUS_DRIFT,
     FOCUS_STEP,
     LEAST_SIGHTS,
     OpticsCalibration,
@@ -71,6 +72,7 @@ def calibrate_sights(
     focus_step_nm: float | None = None,
     least: int = LEAST_SIGHTS,
     known: Settings | None = None,
+    drifts: bool = False,
     mapper: Mapper = map,
 ) -> OpticsCalibration:
     """Measure the optics from pictures.
@@ -93,6 +95,8 @@ def calibrate_sights(
         Pictures needed.
     known : mapping, optional
         As for `measure_microscope`.
+    drifts : bool
+        Whether the focus may rise with the frames of a movie, which `Sight.focus_steps` counts.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -118,6 +122,8 @@ def calibrate_sights(
         configured[FOCUS_STEP] = focus_step_nm
         low, high = sorted(factor * focus_step_nm for factor in STEP_FACTORS)
         limits[FOCUS_STEP] = (low, high)
+    if drifts:
+        configured[FOCUS_DRIFT] = 0.0
     build = microscopes(config, max(reach_nm(sight) for sight in sights))
     optics = config.optics
     measured = measure_microscope(

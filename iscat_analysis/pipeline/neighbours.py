@@ -138,7 +138,8 @@ class Neighbours:
             sides.append((max(middle - half, 0), min(middle + half + 1, size)))
         grid = PixelGrid.region(sides[0], sides[1], scene.pixel_nm)
         pixel = scene.pixel_nm
-        image = scene.wide.image(
+        shown = at.frame + sign * self._window // 2
+        image = scene.wide_at(shown).image(
             grid, start.x_px * pixel, start.y_px * pixel, start.z_nm, start.mass_kda
         )
         corner = sides[0][0], sides[1][0]

@@ -13,6 +13,7 @@ from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.stamp import margin_nm
+from iscat_analysis.pipeline.moving_focus import MovingFocus, refuse_moving_focus
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
 from iscat_analysis.search.sliding import CORRELATION
 from iscat_analysis.search.templates import LARGEST_IMAGE, Templates, make_templates
@@ -47,6 +48,8 @@ class Scene:
         Images, or boundaries between windows, that are searched in all of the movie.
     lines : Lines or None
         Rows and columns whose flicker is divided out of the frames.
+    moving : (MovingFocus, MovingFocus) or None
+        `model` and `wide` by frame, where the focus moves.
     """
 
     config: Config
@@ -56,6 +59,15 @@ class Scene:
     mode: str
     searches: int = 1
     lines: Lines | None = None
+    moving: tuple[MovingFocus, MovingFocus] | None = None
+
+    def model_at(self, frame: int) -> ForwardModel:
+        """Give the model for fitted regions at a frame of the movie."""
+        return self.model if self.moving is None else self.moving[0].at(frame)
+
+    def wide_at(self, frame: int) -> ForwardModel:
+        """Give the model for signals far away at a frame of the movie."""
+        return self.wide if self.moving is None else self.moving[1].at(frame)
 
     @property
     def pixel_nm(self) -> float:
@@ -157,6 +169,8 @@ def make_scene(
             'fit.likelihood = "conditional" needs an interferometric scheme and '
             'background.method = "fixed" or "sliding": use "auto"'
         )
+    if not sliding or config.optics.psf == "measured":
+        refuse_moving_focus(config)
     model = square_model(config, pixel, roi_px)
     if sliding:
         reach_nm = math.sqrt(2) * (LARGEST_IMAGE * roi_px + 2) * pixel
@@ -165,10 +179,15 @@ def make_scene(
         reach_nm = min(field_nm, math.sqrt(2) * (SPREAD_NM + 2 * pixel))
     mode = config.fit.mode
     free_z = "z_nm" in FREE_PARAMETERS[mode] and not sliding
+    wide = forward_model(config, reach_nm)
+    moving = None
+    if config.optics.focus_drift_nm:
+        moving = MovingFocus(config, model), MovingFocus(config, wide)
     return Scene(
         config=config,
         model=model,
-        wide=forward_model(config, reach_nm),
+        wide=wide,
+        moving=moving,
         templates=make_templates(
             model,
             search_both(config.detection, searches=searches),

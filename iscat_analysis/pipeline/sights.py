@@ -329,7 +329,7 @@ def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], Sight
             read_variance_after_e2=windows.read_variance_after_e2[cut],
             masked=windows.masked[cut],
         )  # fmt: skip
-        return _centred(likelihood, config, frame=windows.frames_after[0])
+        return _centred(likelihood, config)
 
     return cut_out
 
@@ -408,8 +408,7 @@ def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
                 likelihood = poisson(
                     model, grid, frame, level, level, extra_variance_e2=read[cut], masked=masked
                 )
-            sight = _centred(likelihood, config, frame=first + int(index))
-            seen.append(replace(sight, focus_steps=float(index)))
+            seen.append(replace(_centred(likelihood, config), focus_steps=float(index)))
         weights = [sight.snr**2 for sight in seen]
         x_nm, y_nm = (
             float(np.average([getattr(sight, key) for sight in seen], weights=weights))
@@ -419,7 +418,7 @@ def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
     return _bright(sights)
 
 
-def _centred(likelihood: Likelihood, config: Config, *, frame: int) -> Sight:
+def _centred(likelihood: Likelihood, config: Config) -> Sight:
     """Make a sight of a picture, from the centre of its energy."""
     grid = likelihood.grid
     information = likelihood.signal_information()
@@ -431,7 +430,7 @@ def _centred(likelihood: Likelihood, config: Config, *, frame: int) -> Sight:
     return Sight(
         grid=grid, kind=likelihood.kind, data=likelihood.data,
         x_nm=float(grid.x_nm[0] + x * grid.pixel_nm), y_nm=float(grid.y_nm[0] + y * grid.pixel_nm),
-        z_nm=config.particle.height_nm, frame=frame, snr=snr,
+        z_nm=config.particle.height_nm, snr=snr,
     )  # fmt: skip
 
 
@@ -448,7 +447,8 @@ def _sight_of(step: BrightStep, config: Config, model: ForwardModel) -> Sight:
         read_variance_before_e2=step.n_before * step.read_variance_e2,
         read_variance_after_e2=step.n_after * step.read_variance_e2, masked=~step.usable,
     )  # fmt: skip
-    return _centred(likelihood, config, frame=step.frame)
+    middles = tuple(sum(frames) / 2 for frames in (step.frames_before, step.frames_after))
+    return replace(_centred(likelihood, config), frames=(middles[0], middles[1]))
 
 
 def _pixel_nm(config: Config) -> float:

@@ -153,8 +153,9 @@ class TaskBuilder:
         ranges = (first, second)[:: step.sign]
         grid = PixelGrid.region(region.rows, region.columns, scene.pixel_nm)
         used = chunk.usable[region.slices]
+        shown = second if step.sign > 0 else first
         likelihood = conditional(
-            scene.model, grid, before, after, ratio,
+            scene.model_at(sum(shown) // 2), grid, before, after, ratio,
             read_variance_before_e2=variances[0], read_variance_after_e2=variances[1],
             masked=~used,
         )  # fmt: skip

@@ -39,7 +39,7 @@ _DESCRIBED_SHARE = 0.25  # of the pictures, that must be described where others 
 
 def median_p(
     sights: list[Sight], config: Config, others: Sequence[Sight] = (), mapper: Mapper = map
-) -> float:
+) -> tuple[float, Sequence[Sight]]:
     """Give the median p-value of the brightest particles in the configured microscope.
 
     The rings of neighbours, where any are known, are put into the pictures that fail without.
@@ -57,8 +57,10 @@ def median_p(
 
     Returns
     -------
-    float
+    p_value : float
         Of the best fits of all that were tested.
+    fitted : sequence of Sight
+        Those, where the fits put them.
     """
     settings = settings_of(config)
     build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
@@ -76,10 +78,10 @@ def median_p(
     moved = [sight.placed(sight.x_nm + x, sight.y_nm + y) for sight in shown]
     found, fitted = median(with_masses(moved, build, settings))
     if found >= REJECTED_P or not any(sight.neighbours for sight in fitted):
-        return found
+        return found, fitted
     elsewhere = [other.placed(other.x_nm + x, other.y_nm + y) for other in others]
     near = Neighbours.fitted(elsewhere, build, rings_of(config, sights[0]), settings, mapper)
-    return max(found, median(near.around(fitted, mapper))[0])
+    return max((found, fitted), median(near.around(fitted, mapper)), key=lambda each: each[0])
 
 
 def not_alone(

@@ -24,6 +24,7 @@ _LABELS = {
     "attenuation": ("amplitude that the mask passes", ""),
     "polarization_deg": ("direction of polarisation", "deg"),
     "focus_step_nm": ("rise of the focus per picture", "nm"),
+    "focus_drift_nm": ("rise of the focus in 1000 frames", "nm"),
     "z5": ("Z5 astigmatism, 45°", "nm"),
     "z6": ("Z6 astigmatism, 0°", "nm"),
     "z7": ("Z7 coma, y", "nm"),

@@ -261,6 +261,7 @@ def make_setting(
     changes: dict[str, Mapping[str, Any]] = {
         "bounds": {"pixels": side},
         "fit": {"mode": mode},
+        "optics": {"focus_drift_nm": 0.0},  # one picture, in the middle of the movie
     }
     config = _changed(config, changes)
     if pixel_nm:

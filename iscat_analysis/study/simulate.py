@@ -181,6 +181,11 @@ class Movie:
         self.movers = place_movers(config, self._near_px, lambda i: self._generator("movers", i))
         heights = [p.z_nm for p in self.particles]
         heights += [float(p.points_nm[..., 2].max()) for p in self.movers]
+        if config.optics.focus_drift_nm:
+            raise ConfigError(
+                f"optics.focus_drift_nm = {config.optics.focus_drift_nm:g}: movies are simulated "
+                "with a focus that rests; set it to 0"
+            )
         reach = self._grid.diagonal_nm + self._pixel_nm
         if not all(p.still for p in self.movers):
             reach += (4 * self._near_px + 8) * self._pixel_nm  # also from beyond a corner

@@ -86,7 +86,7 @@ def test_the_scattered_light_is_the_least_that_the_interference_allows() -> None
 def _sights(truth: ForwardModel, masses: np.ndarray[Any, Any], seed: int) -> list[Sight]:
     rng = np.random.default_rng(seed)
     sights = []
-    for number, mass in enumerate(masses):
+    for mass in masses:
         grid = PixelGrid.centred(19, PIXEL)
         x, y = rng.uniform(-50, 50, 2)
         signal = truth.amplitude_image(grid, x, y, truth.height_nm, float(mass))
@@ -96,7 +96,7 @@ def _sights(truth: ForwardModel, masses: np.ndarray[Any, Any], seed: int) -> lis
             Sight(
                 grid=grid, kind=data.kind, data=data.data,
                 x_nm=float(x + rng.normal(0, 20)), y_nm=float(y + rng.normal(0, 20)),
-                z_nm=truth.height_nm, frame=number, snr=20.0,
+                z_nm=truth.height_nm, snr=20.0,
             )
         )  # fmt: skip
     return sights

@@ -8,7 +8,12 @@ before a movie is recorded what it would tell.
 
 from __future__ import annotations
 
-from iscat_analysis.calibration.optics.estimate import Estimate, maximise, optics_limits
+from iscat_analysis.calibration.optics.estimate import (
+    Estimate,
+    first_step,
+    maximise,
+    optics_limits,
+)
 from iscat_analysis.calibration.optics.forecast import OpticsForecast, forecast_optics
 from iscat_analysis.calibration.optics.measure import (
     FAINTEST,
@@ -34,10 +39,17 @@ from iscat_analysis.calibration.optics.settings import (
     settings_of,
     with_settings,
 )
-from iscat_analysis.calibration.optics.sights import FOCUS_STEP, PRIVATE, Settings, Sight
+from iscat_analysis.calibration.optics.sights import (
+    FOCUS_DRIFT,
+    FOCUS_STEP,
+    PRIVATE,
+    Settings,
+    Sight,
+)
 
 __all__ = [
     "FAINTEST",
+    "FOCUS_DRIFT",
     "FOCUS_STEP",
     "FREE",
     "HELD_OUT_P",
@@ -55,6 +67,7 @@ __all__ = [
     "Sight",
     "Twin",
     "build_microscope",
+    "first_step",
     "forecast_optics",
     "free_groups",
     "free_names",

@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.calibration.optics.sights import (
+    FOCUS_DRIFT,
     FOCUS_STEP,
     PRIVATE,
+    RISES,
     ROAM_NM,
     Build,
     Microscope,
@@ -36,7 +38,8 @@ PRIOR_RANGE = {
     "mask_na": 0.3,
     "attenuation": 0.5,
     "polarization_deg": 90.0,
-    "focus_step_nm": 50.0,
+    FOCUS_STEP: 50.0,
+    FOCUS_DRIFT: 1000.0,
 }
 """How far a parameter may plausibly lie from the configured one; what the data leave wider than
 this, they do not tell."""
@@ -51,7 +54,8 @@ _LARGEST_STEP = {
     "mask_na": 0.1,
     "attenuation": 0.1,
     "polarization_deg": 30.0,
-    "focus_step_nm": 2.0,
+    FOCUS_STEP: 2.0,
+    FOCUS_DRIFT: 100.0,
 }
 _TERM_STEP_NM = 25.0
 _PLACE_STEP_NM = 60.0
@@ -200,6 +204,42 @@ def maximise(
         converged=converged,
         passes=used,
     )
+
+
+def first_step(
+    sights: Sequence[Sight],
+    build: Build,
+    settings: Settings,
+    names: Sequence[str],
+    mapper: Mapper = map,
+) -> tuple[FloatArray, FloatArray]:
+    """Say how far pictures ask to change some parameters, to first order.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        The pictures, with their own unknowns fitted.
+    build : callable
+        Makes the microscope.
+    settings : mapping
+        Its parameters.
+    names : sequence of str
+        Those that may change, which every picture tells.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    step : ndarray, shape (n,)
+        In the units of the parameters.
+    covariance : ndarray, shape (n, n)
+        Of it, as `Estimate.covariance`.
+    """
+    private, walls = np.array([sight.private for sight in sights]), _walls(sights)
+    at = _Point.evaluate(sights, build, settings, tuple(names), private, walls, mapper)
+    information, score, _ = at.reduced(0.0)
+    bound = np.linalg.pinv(information, hermitian=True)
+    return bound @ score, bound @ at.scatter([sight.owner for sight in sights]) @ bound
 
 
 def _walls(sights: Sequence[Sight]) -> FloatArray:
@@ -393,13 +433,13 @@ def _scores(
     place = (sight.grid, x, y, z, mass)
     k = len(names)
     if names:
-        wanted = tuple(dict.fromkeys("focus_nm" if n == FOCUS_STEP else n for n in names))
+        wanted = tuple(dict.fromkeys("focus_nm" if n in RISES else n for n in names))
         signal, own, slopes = model.joint_gradient(*place, wanted)
     else:
         signal, own = model.gradient(*place)
     rows = np.empty((k + PRIVATE, signal.size))
     for row, name in zip(rows, names, strict=False):
-        if name == FOCUS_STEP:
+        if name in RISES:
             row[:] = sight.focus_steps * slopes[wanted.index("focus_nm")].ravel()
         else:
             row[:] = slopes[wanted.index(name)].ravel()

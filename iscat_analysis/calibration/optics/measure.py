@@ -25,7 +25,7 @@ from iscat_analysis.calibration.optics.settings import (
     free_names,
     is_term,
 )
-from iscat_analysis.calibration.optics.sights import Build, Settings, Sight
+from iscat_analysis.calibration.optics.sights import RISES, Build, Settings, Sight
 from iscat_analysis.calibration.optics.starts import average_sights, with_masses
 from iscat_analysis.calibration.optics.states import StateSearch, same_state
 from iscat_analysis.records import FloatArray, Mapper
@@ -420,6 +420,7 @@ class _Search:
         mirrored = dict(best.values)
         mirrored["focus_nm"] = 2 * z - best.values["focus_nm"]
         mirrored["reference_phase_deg"] = -best.values["reference_phase_deg"]
+        mirrored |= {name: -best.values[name] for name in RISES if name in best.names}
         for name in best.names:
             if is_term(name) and name not in ("z7", "z8", "z9", "z10"):
                 mirrored[name] = -best.values[name]

@@ -13,7 +13,7 @@ import pandas as pd
 from iscat_analysis.calibration.optics.measure import Judgement, Measured
 from iscat_analysis.calibration.optics.pictures import Pictures
 from iscat_analysis.calibration.optics.settings import exists, is_term, with_settings
-from iscat_analysis.calibration.optics.sights import FOCUS_STEP
+from iscat_analysis.calibration.optics.sights import FOCUS_DRIFT, FOCUS_STEP, RISES
 from iscat_analysis.config import Config, OpticsCovariance
 from iscat_analysis.records import FloatArray
 from iscat_analysis.units import count
@@ -123,6 +123,9 @@ class OpticsCalibration:
             parts.append(
                 with_error("steps of", self.value(FOCUS_STEP), self.sigma(FOCUS_STEP), "nm")
             )
+        if FOCUS_DRIFT in self.names:
+            drift = with_error("rising by", self.value(FOCUS_DRIFT), self.sigma(FOCUS_DRIFT), "nm")
+            parts.append(f"{drift} in 1000 frames")
         terms = [n for n in self.names if is_term(n)]
         if terms:
             rms = float(np.sqrt(sum(self.value(n) ** 2 for n in terms)))
@@ -292,8 +295,8 @@ def make_result(
 def _of_optics(
     names: tuple[str, ...], covariance: FloatArray
 ) -> tuple[tuple[str, ...], FloatArray]:
-    """Leave out what is no key of ``[optics]``."""
-    kept = [k for k, name in enumerate(names) if name != FOCUS_STEP]
+    """Leave out what is no property of the microscope."""
+    kept = [k for k, name in enumerate(names) if name not in RISES]
     return tuple(names[k] for k in kept), covariance[np.ix_(kept, kept)]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from iscat_analysis.calibration.optics.sights import FOCUS_STEP, Settings
+from iscat_analysis.calibration.optics.sights import FOCUS_DRIFT, FOCUS_STEP, Settings
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import ForwardModel, forward_model
@@ -20,7 +20,7 @@ HIGHER = ("z22",)
 """Secondary spherical aberration."""
 
 FREE = {
-    "focus": ("focus_nm", FOCUS_STEP),
+    "focus": ("focus_nm", FOCUS_STEP, FOCUS_DRIFT),
     "na": ("na",),
     "phase": ("reference_phase_deg",),
     "mask": ("mask_na", "attenuation"),
@@ -73,7 +73,7 @@ def exists(name: str, settings: Settings) -> bool:
         One of `FREE`.
     settings : mapping
         The microscope: without a mask it has no edge and no transmission, circular light has no
-        direction, and only a scan has steps.
+        direction, and only a scan has steps, only a movie a drift.
 
     Returns
     -------

@@ -16,6 +16,12 @@ FOCUS_STEP = "focus_step_nm"
 """Rise of the focus from picture to picture of a scan [nm]; the one parameter that is not a key of
 ``[optics]``."""
 
+FOCUS_DRIFT = "focus_drift_nm"
+"""Rise of the focus in 1000 frames of a movie [nm]."""
+
+RISES = (FOCUS_STEP, FOCUS_DRIFT)
+"""What moves the focus from one picture to another, and is no property of the microscope."""
+
 PRIVATE = 5
 """Unknowns of one sight, as `Likelihood` has them: x, y, z [nm], mass [kDa], logarithm of the
 background level."""
@@ -77,10 +83,11 @@ class Sight:
     level : float
         Logarithm of the background level from which the search starts.
     focus_steps : float
-        Steps of the focus since the first picture of a scan; ``focus_step_nm`` of the settings is
-        their size.
-    frame : int
-        First frame of the new state.
+        Steps of the focus since the first picture of a scan, of which ``focus_step_nm`` of the
+        settings is the size; or thousands of frames since ``focus_nm``, in which the focus rises by
+        ``focus_drift_nm``.
+    frames : (float, float)
+        Middle of the frames before a step, and of those after it.
     snr : float
         Signal-to-noise ratio with which it was found.
     neighbours : tuple of (int, float)
@@ -105,7 +112,7 @@ class Sight:
     mass_kda: float = 0.0
     level: float = 0.0
     focus_steps: float = 0.0
-    frame: int = 0
+    frames: tuple[float, float] = (0.0, 0.0)
     snr: float = 0.0
     neighbours: tuple[tuple[int, float], ...] = ()
     rings: FloatArray | float = 1.0
@@ -144,8 +151,8 @@ class Sight:
 
     def seen_with(self, settings: Settings) -> dict[str, Any]:
         """Return the settings with the focus of this picture, as keys of ``[optics]``."""
-        own = {key: value for key, value in settings.items() if key != FOCUS_STEP}
-        own["focus_nm"] += self.focus_steps * settings.get(FOCUS_STEP, 0.0)
+        own = {key: value for key, value in settings.items() if key not in RISES}
+        own["focus_nm"] += self.focus_steps * sum(settings.get(key, 0.0) for key in RISES)
         return own
 
     def moved(self, private: FloatArray) -> Sight:

@@ -1,0 +1,224 @@
+"""Whether the focus moves while a landing movie is recorded, and the optics learned with that.
+
+Pictures of particles that landed at different times tell it: what they ask to change about the
+focus is then a line in their frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from iscat_analysis.calibration.optics import (
+    FOCUS_DRIFT,
+    FREE,
+    OpticsCalibration,
+    Settings,
+    Sight,
+    first_step,
+    maximise,
+)
+from iscat_analysis.calibration.optics.starts import with_masses
+from iscat_analysis.config import Config
+from iscat_analysis.pipeline.microscope import calibrate_sights, microscopes
+from iscat_analysis.pipeline.sights import reach_nm
+from iscat_analysis.records import Mapper
+
+MOVES = 5.0
+"""Standard errors from which a focus is said to move."""
+
+LEAST_RISE_NM = 15.0
+"""Rise over the movie below which pictures and masses hardly change."""
+
+LEAST_PICTURES = 6
+"""From fewer it is not known how well they tell a drift."""
+
+_FOCI = 20  # parts of the movie with a focus of their own, in which pictures are looked at
+_PER = 1000.0  # frames of ``optics.focus_drift_nm``
+_PASSES = 10
+
+
+class FocusDrift(NamedTuple):
+    """How the focus of a movie rises.
+
+    Attributes
+    ----------
+    nm : float
+        In 1000 frames.
+    sigma_nm : float
+        Its standard error.
+    frames : (int, int)
+        Half-open range that is analysed.
+    """
+
+    nm: float
+    sigma_nm: float
+    frames: tuple[int, int]
+
+    @property
+    def moves(self) -> bool:
+        """Whether it does, and enough to matter."""
+        return abs(self.nm) > MOVES * self.sigma_nm and abs(self._rise_nm) > LEAST_RISE_NM
+
+    @property
+    def said(self) -> str:
+        """Say so, to first order."""
+        return f"the focus moves by about {self._rise_nm:+.0f} nm over the movie"
+
+    @property
+    def _rise_nm(self) -> float:
+        return self.nm * (self.frames[1] - self.frames[0]) / _PER
+
+
+STEADY = FocusDrift(0.0, math.inf, (0, 0))
+"""Where nothing is known of a drift."""
+
+
+def focus_drift(
+    sights: Sequence[Sight],
+    config: Config,
+    settings: Settings,
+    frames: tuple[int, int],
+    mapper: Mapper = map,
+) -> FocusDrift:
+    """Measure how the focus rises, to first order.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        Pictures of a landing movie, with their own unknowns fitted.
+    config : Config
+        Resolved.
+    settings : mapping
+        The microscope with which they were fitted, of one focus.
+    frames : (int, int)
+        Half-open range that is analysed.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    FocusDrift
+        `STEADY` from fewer pictures, or times of pictures, than `LEAST_PICTURES`.
+    """
+    seen = dated(sights, frames)
+    if len({sight.focus_steps for sight in seen}) < LEAST_PICTURES:
+        return STEADY
+    build = microscopes(config, max(map(reach_nm, sights)))
+    names = ("focus_nm", FOCUS_DRIFT)
+    step, covariance = first_step(seen, build, {**settings, FOCUS_DRIFT: 0.0}, names, mapper)
+    return FocusDrift(float(step[1]), math.sqrt(covariance[1, 1]), frames)
+
+
+def learned_with_drift(
+    sights: Sequence[Sight],
+    others: Sequence[Sight],
+    config: Config,
+    settings: Settings,
+    drift: FocusDrift,
+    source: Mapping[str, str],
+    mapper: Mapper = map,
+) -> OpticsCalibration:
+    """Learn the optics together with the rise of their focus.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        Pictures of a landing movie.
+    others : sequence of Sight
+        Every particle that `Sight.neighbours` counts.
+    config : Config
+        Resolved.
+    settings : mapping
+        A microscope near the one that made them, as it is in the middle of the movie.
+    drift : FocusDrift
+        Near which the search begins.
+    source : mapping of str to str
+        As for `calibrate_sights`.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    OpticsCalibration
+        With ``optics.focus_drift_nm``, and ``optics.focus_nm`` at the middle frame.
+    """
+    build, frames = microscopes(config, max(map(reach_nm, sights))), drift.frames
+    near: dict[str, object] = {**settings, FOCUS_DRIFT: drift.nm}
+    signed = with_masses(sights, build, settings)  # what leaves is seen before
+    placed = with_masses(dated(signed, frames), build, near)
+    fitted = maximise(placed, build, near, ("focus_nm", FOCUS_DRIFT), passes=_PASSES, mapper=mapper)
+    optics = config.optics.model_copy(update={"focus_frame": _middle(frames)})
+    return calibrate_sights(
+        fitted.sights, dated(others, frames), config.model_copy(update={"optics": optics}),
+        tuple(FREE), source, known=fitted.values, drifts=True, mapper=mapper,
+    )  # fmt: skip
+
+
+def with_drift(
+    found: OpticsCalibration,
+    sights: Sequence[Sight],
+    others: Sequence[Sight],
+    config: Config,
+    frames: tuple[int, int],
+    source: Mapping[str, str],
+    mapper: Mapper = map,
+) -> OpticsCalibration:
+    """Look whether the focus moved in what was learned, and then learn the optics with that.
+
+    Parameters
+    ----------
+    found : OpticsCalibration
+        With one focus.
+    sights, others : sequence of Sight
+        From which it was learned.
+    config : Config
+        Resolved.
+    frames : (int, int)
+        Half-open range that is analysed.
+    source : mapping of str to str
+        As for `calibrate_sights`.
+    mapper : callable
+        `map`, or the one of a pool.
+
+    Returns
+    -------
+    OpticsCalibration
+        `found` itself where its focus rests, or where a moving one explains the pictures no better.
+    """
+    settings = found.measured.settings
+    drift = focus_drift(found.measured.estimate.sights, config, settings, frames, mapper)
+    if not drift.moves:
+        return found
+    moving = learned_with_drift(sights, others, config, settings, drift, source, mapper)
+    return moving if moving.accepted or not found.accepted else found
+
+
+def dated(sights: Sequence[Sight], frames: tuple[int, int]) -> list[Sight]:
+    """Give pictures the time of the frames that show their particle.
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        Pictures of a landing movie.
+    frames : (int, int)
+        Half-open range that is analysed.
+
+    Returns
+    -------
+    list of Sight
+        With `Sight.focus_steps` in thousands of frames since the middle one.
+    """
+    part = max((frames[1] - frames[0]) / _FOCI, 1.0)
+    middle = _middle(frames)
+    return [
+        replace(sight, focus_steps=round((when - middle) / part) * part / _PER)
+        for sight in sights
+        for when in (sight.frames[0] if sight.mass_kda < 0 else sight.frames[1],)
+    ]
+
+
+def _middle(frames: tuple[int, int]) -> int:
+    return (frames[0] + frames[1]) // 2

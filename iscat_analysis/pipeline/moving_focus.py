@@ -1,0 +1,68 @@
+"""Models of a microscope whose focus moves while a movie is recorded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.forward import ForwardModel, forward_model
+from iscat_analysis.optics.kept import kept
+
+STEP_NM = 5.0
+"""Foci of neighbouring models are so far apart: half of it, which is the most that a frame is off,
+changes a picture by a thousandth of its peak."""
+
+_KEPT = 64  # models at hand, of some MB each
+_PER = 1000.0  # frames of ``optics.focus_drift_nm``
+
+
+class MovingFocus:
+    """Models of one movie, by frame.
+
+    Parameters
+    ----------
+    config : Config
+        With ``optics.focus_drift_nm`` and the frame at which the focus is ``optics.focus_nm``.
+    model : ForwardModel
+        At that focus; a mass is the same amplitude at all others.
+    """
+
+    def __init__(self, config: Config, model: ForwardModel) -> None:
+        self._optics = config.optics
+
+        def moved(steps: int) -> ForwardModel:
+            if not steps:
+                return model
+            focus = config.optics.focus_nm + steps * STEP_NM
+            optics = config.optics.model_copy(update={"focus_nm": focus})
+            there = config.model_copy(update={"optics": optics, "calibration": None})
+            return replace(forward_model(there, model.reach_nm, like=model), scale=model.scale)
+
+        self._moved = kept(_KEPT, moved)
+
+    def at(self, frame: int) -> ForwardModel:
+        """Give the model of a frame."""
+        optics = self._optics
+        rise = optics.focus_drift_nm * (frame - optics.focus_frame) / _PER
+        return self._moved(round(rise / STEP_NM))
+
+
+def refuse_moving_focus(config: Config) -> None:
+    """Refuse a focus that moves where pictures are those of one focus.
+
+    Parameters
+    ----------
+    config : Config
+        Of a movie that is not searched for landings, or of a measured picture.
+
+    Raises
+    ------
+    ConfigError
+        It moves.
+    """
+    if config.optics.focus_drift_nm:
+        raise ConfigError(
+            f"optics.focus_drift_nm = {config.optics.focus_drift_nm:g} is known only of landing "
+            'movies (background.method = "sliding") with optics.psf = "model": set it to 0'
+        )
