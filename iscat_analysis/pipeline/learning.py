@@ -133,7 +133,12 @@ def learn_optics(
                 sights, others = bright_sights(movie, config, camera, pool, opening)
                 alone = len(sights)
                 median, fitted = median_p(sights, config, others, pool.map)
-            if optics.calibrate == "auto" and median < REJECTED_P and not heights_free(config):
+            if sliding:
+                drift = focus_drift(fitted, config, settings_of(config), frames, pool.map)
+            if drift.moves:  # which the first particles of a long movie tell badly
+                sights, others = bright_sights(movie, config, camera, pool, opening, whole=True)
+                alone = len(sights)
+            elif optics.calibrate == "auto" and median < REJECTED_P and not heights_free(config):
                 pairs, median = not_alone(sights, config, others, pool.map)
                 sights = [sight for k, sight in enumerate(sights) if k not in pairs]
                 alone -= sum(k < alone for k in pairs)
@@ -141,8 +146,6 @@ def learn_optics(
                     raise DataError(too_few(movie.name, len(sights)))
             tested = {"tested": len(sights), "median_p": median}
             passed = optics.calibrate == "auto" and median >= REJECTED_P
-            if sliding:
-                drift = focus_drift(fitted, config, settings_of(config), frames, pool.map)
             if passed and not drift.moves:
                 return config, tested | {"calibrated": False}
             if optics.calibrate == "auto" and noise_differs(movie, config, camera):

@@ -58,6 +58,7 @@ SAME_NM = 800.0
 """Nearer than this, and at the same time, two steps are one."""
 
 _KNOWN_APART_NM = (APART_NM, 1600.0, 1300.0, 1000.0, 700.0)
+_PARTS = 8  # of a movie, that are searched where all of it is asked for
 _SHIFT_NM = 450.0  # how far a particle may lie from the centre of its picture
 
 
@@ -68,6 +69,7 @@ def bright_sights(
     pool: ThreadPoolExecutor,
     opening: Opening | None = None,
     rings: bool = True,
+    whole: bool = False,
 ) -> tuple[list[Sight], list[Sight]]:
     """Find the bright particles of a movie, in the way in which it is analysed.
 
@@ -88,6 +90,8 @@ def bright_sights(
         Of a landing movie, where it was judged; its reader keeps what is read here.
     rings : bool
         Whether to look for those of a landing movie whose rings may lie in the pictures of others.
+    whole : bool
+        Whether to look in all of a landing movie, and not only until there are enough.
 
     Returns
     -------
@@ -98,10 +102,10 @@ def bright_sights(
     """
     if way_of(config) == "sliding":
         if opening is not None:
-            return landing_sights(opening.reader, opening.window, config, pool, rings)
+            return landing_sights(opening.reader, opening.window, config, pool, rings, whole)
         reader = reader_of(movie, config, camera, fitted_frames(movie, config))
         window = judge_window(reader, config, pool.map)[2]
-        return landing_sights(reader, window, config, pool, rings)
+        return landing_sights(reader, window, config, pool, rings, whole)
     if heights_free(config) and way_of(config) == "fixed":
         return [], []
     windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
@@ -130,6 +134,7 @@ def landing_sights(
     config: Config,
     pool: ThreadPoolExecutor,
     rings: bool,
+    whole: bool,
 ) -> tuple[list[Sight], list[Sight]]:
     """Find bright steps of a landing movie, chunk by chunk until there are enough.
 
@@ -143,7 +148,7 @@ def landing_sights(
         Resolved.
     pool : ThreadPoolExecutor
         Runs the search.
-    rings : bool
+    rings, whole : bool
         As in `bright_sights`.
 
     Returns
@@ -156,7 +161,13 @@ def landing_sights(
     stride = max(1, window // STRIDES)
     found: list[BrightStep] = []
     rest: list[BrightStep] = []
-    for _, span in plan_chunks(reader, config, window, stride):
+    spans = [span for _, span in plan_chunks(reader, config, window, stride)]
+    most = MOST_SIGHTS
+    if whole:
+        chosen = np.linspace(0, len(spans) - 1, min(len(spans), _PARTS)).round().astype(int)
+        spans = [spans[k] for k in chosen]
+        most = math.ceil(MOST_SIGHTS / len(spans))
+    for span in spans:
         chunk = reader.chunk(span, stride, pool)
         alone, every = find_bright_steps(
             chunk,
@@ -164,14 +175,14 @@ def landing_sights(
             pixel_nm=_pixel_nm(config),
             resolution_nm=config.optics.wavelength_nm / config.optics.na,
             roi_px=_roi_px(config),
-            most=MOST_SIGHTS,
+            most=most,
             rings=rings,
             mapper=pool.map,
         )
         found += alone
         rest += every
         bright = [step for step in found if step.snr > FAINTEST]
-        if len(bright) >= MOST_SIGHTS:
+        if len(bright) >= MOST_SIGHTS and not whole:
             break
     bright.sort(key=lambda step: -step.snr)
     unique = _without_repeats(bright)
