@@ -5,6 +5,9 @@ contrast −∇B·(d_a − d_b)/B, beside that of particles.  Counts are never i
 Poisson no longer.  The *expectation* is: the pattern, an average over many frames, is moved to
 where it was in either window, and the ratio of the two is a known factor of the likelihood.
 
+What moves is the sample: the light that falls on it stays where it is.  B is E(x) S(x − d), and E
+is taken for what is left of B where it is smoothed over more than speckle.
+
 The way is followed block by block.  Each is set against the one before it, by least squares
 weighted by shot noise; particles, which cover few pixels, are clipped.  Noise of block k
 enters d_k as a linear functional L of that noise, and every later shift through L as well, so that
@@ -20,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.ndimage import binary_dilation, distance_transform_edt, median_filter
+from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, median_filter
 
 from iscat_analysis._kernels.drift import extend, mismatch, shift_equations
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
@@ -30,6 +33,7 @@ ComplexArray = NDArray[np.complex128]
 REACH_PX = 4
 """From the edges of a field, within which a moved pattern is not to be trusted."""
 
+_STILL_PX = 16.0  # standard deviation of what is smoothed away of the pattern; speckle is finer
 _PASSES = 4
 _CLIP = 4.0  # robust standard deviations beyond which a pixel does not count
 _SETTLED_PX = 1e-5
@@ -106,15 +110,18 @@ def follow_pattern(
     """
     lit = np.flatnonzero(power > 0)
     nearest = filling(usable)
+    still = still_light(blocks_e, usable)
+    # of a count divided by E < 1 the variance is more than that of a count, as by read noise
+    light = blocks_e[lit].sum(axis=0) / (max(power[lit].sum(), 1e-300) * still)
+    noise = light * (1 / still - 1) + read_variance_e2 / still**2
     usable = trusted(usable)
     mover = Mover((usable.shape[0], usable.shape[1]))
 
     def one(place: int) -> tuple[FloatArray, FloatArray, float]:
         here, before = lit[place], lit[place - 1]
         return _register(
-            mover, blocks_e[before][nearest], blocks_e[here], usable,
-            power[before] * read_variance_e2, power[here] * read_variance_e2,
-            float(power[here] / power[before]),
+            mover, (blocks_e[before] / still)[nearest], blocks_e[here] / still, usable,
+            power[before] * noise, power[here] * noise, float(power[here] / power[before]),
         )  # fmt: skip
 
     found = list(mapper(one, range(1, lit.size)))
@@ -285,6 +292,29 @@ def filling(usable: BoolArray) -> tuple[FloatArray, ...]:
     """
     index = distance_transform_edt(~usable, return_distances=False, return_indices=True)
     return tuple(index)
+
+
+def still_light(blocks_e: FloatArray, usable: BoolArray) -> FloatArray:
+    """Give the light that stays where it is while the pattern moves.
+
+    Parameters
+    ----------
+    blocks_e : ndarray, shape (k, y, x)
+        Photoelectrons summed over blocks of frames.
+    usable : ndarray of bool, shape (y, x)
+        Pixels that are neither defective nor saturated.
+
+    Returns
+    -------
+    ndarray, shape (y, x)
+        Smooth, at most 1; 1 everywhere where there is no light.
+    """
+    total = blocks_e.sum(axis=0, dtype=float)[filling(usable)]
+    smooth = gaussian_filter(total, _STILL_PX)
+    least = 1e-3 * smooth.max()
+    if not least > 0:
+        return np.ones(usable.shape)
+    return np.asarray(np.maximum(smooth, least) / smooth.max())
 
 
 def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, float]:

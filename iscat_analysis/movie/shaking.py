@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.records import BoolArray
+from iscat_analysis.records import BoolArray, FloatArray
 
 MOST_EXPLAINED = 0.5
 """Share of the noise beyond the light's that the motion of the pattern must explain to be named."""
@@ -56,27 +56,82 @@ def measure_shaking(
     Shaking or None
         None where there is no noise beyond that of the light, or no pattern.
     """
-    light = np.stack([camera.to_electrons(frame) for frame in counts])
-    used = light.min(axis=0) > 0
-    if masked is not None:
-        used &= ~masked
-    if len(light) < 3 or not used.any():
+    seen = _Pattern.of(counts, camera, masked)
+    if seen is None:
         return None
-    power = light[:, used].mean(axis=1)
-    light *= (power.mean() / power)[:, None, None]
-    mean = light.mean(axis=0)
-    slopes = np.stack([slope[used] for slope in np.gradient(mean)])
-    variance = 2 * (mean + camera.read_variance_e2(mean.shape))[used]
-    information = np.einsum("ip,jp,p->ij", slopes, slopes, 1 / variance)
-    if not np.linalg.cond(information) < 1 / np.finfo(float).eps:
-        return None
+    light, used, information, variance = seen.light, seen.used, seen.information, seen.variance
     steps = np.diff(light, axis=0)[:, used]
-    seen = np.einsum("kp,ip,p->ki", steps, slopes, 1 / variance)
-    moved = np.linalg.solve(information, seen.T).T
-    explained = float(np.einsum("ki,ki->", seen, moved)) - moved.size
+    moved = seen.motion(steps)
+    explained = float(np.einsum("ki,ij,kj->", moved, information, moved)) - moved.size
     beyond = float(np.sum(steps**2 / variance)) - steps.size
     if beyond <= 0:
         return None
     own = float(np.trace(np.linalg.inv(information))) / 2  # of the light's noise alone
     rms = np.sqrt(max(float(np.mean(moved**2)) - own, 0.0) / 2)
     return Shaking(explained / beyond, float(rms))
+
+
+def without_shaking(
+    counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
+) -> NDArray[Any]:
+    """Take the motion of the fixed pattern off frames, to first order.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Successive frames.
+    camera : Camera
+        Counts → photoelectrons.
+    masked : ndarray of bool, shape (y, x), optional
+        Pixels to leave out.
+
+    Returns
+    -------
+    ndarray, shape (t, y, x)
+        Counts with the noise of a pattern that stands still; the same where there is no pattern.
+    """
+    seen = _Pattern.of(counts, camera, masked)
+    if seen is None:
+        return counts
+    moved = seen.motion(seen.light[:, seen.used] - seen.mean[seen.used])
+    change_e = np.einsum("ki,iyx->kyx", moved * seen.power[:, None], seen.slopes)
+    return np.asarray(counts - change_e / camera.gain_e_per_adu)
+
+
+@dataclass(frozen=True)
+class _Pattern:
+    """Frames of equal power, their mean, and how well they tell its motion."""
+
+    light: FloatArray  # (t, y, x) [e]
+    power: FloatArray  # (t,), that was divided out
+    mean: FloatArray
+    slopes: FloatArray  # (2, y, x)
+    used: BoolArray
+    variance: FloatArray  # of the difference of two frames, at the pixels used
+    information: FloatArray  # (2, 2)
+
+    @classmethod
+    def of(cls, counts: NDArray[Any], camera: Camera, masked: BoolArray | None) -> _Pattern | None:
+        light = np.stack([camera.to_electrons(frame) for frame in counts])
+        used = light.min(axis=0) > 0
+        if masked is not None:
+            used &= ~masked
+        if len(light) < 3 or not used.any():
+            return None
+        power = light[:, used].mean(axis=1)
+        power /= power.mean()
+        light /= power[:, None, None]
+        mean = light.mean(axis=0)
+        slopes = np.stack(np.gradient(mean))
+        variance = 2 * (mean + camera.read_variance_e2(mean.shape))[used]
+        there = slopes[:, used]
+        information = np.einsum("ip,jp,p->ij", there, there, 1 / variance)
+        if not np.linalg.cond(information) < 1 / np.finfo(float).eps:
+            return None
+        return cls(light, power, mean, slopes, used, variance, information)
+
+    def motion(self, changes: FloatArray) -> FloatArray:
+        """Fit the slopes to changes (k, p) at the pixels used: how far each is along −y and −x."""
+        there = self.slopes[:, self.used]
+        seen = np.einsum("kp,ip,p->ki", changes, there, 1 / self.variance)
+        return np.asarray(np.linalg.solve(self.information, seen.T).T)

@@ -446,7 +446,9 @@ def noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
     counts = movie.read(first, min(last, first + SPECTRUM_FRAMES, movie.shape[0]))
     light, repeats = measure_frames(counts, camera)
     stuck = way_of(config) != "sliding" and repeats.mean() > _STUCK
-    return bool(stuck or judge_counts(counts[well_lit(light) & ~repeats], camera).differs)
+    follows = config.background.drift_correction if way_of(config) == "sliding" else None
+    noise = judge_counts(counts[well_lit(light) & ~repeats], camera, follows=follows)
+    return bool(stuck or noise.differs)
 
 
 def _verdict(tested: dict[str, Any]) -> str:

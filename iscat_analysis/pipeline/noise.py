@@ -17,6 +17,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.metadata import diagnose_gain
+from iscat_analysis.movie.shaking import measure_shaking, without_shaking
 from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.movie.successive import shared_light
 from iscat_analysis.pipeline.camera_numbers import (
@@ -124,6 +125,7 @@ def judge_counts(
     *,
     masked: BoolArray | None = None,
     additive: bool = False,
+    follows: bool | None = None,
     mapper: Mapper = map,
 ) -> Noise:
     """Compare the noise between neighbouring frames with the camera's.
@@ -139,6 +141,9 @@ def judge_counts(
     additive : bool
         Whether particles add light to a background that says nothing of their masses; its zero is
         then not looked for.
+    follows : bool, optional
+        Whether the motion of the fixed pattern is divided out of the frames before they are fitted,
+        where it can be.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -153,6 +158,12 @@ def judge_counts(
     except DataError:  # too dark to tell
         return Noise(spectrum=spectrum)
     gain = allow_for_correlation(gain, spectrum)
+    if gain.off and gain.noise_ratio > 1 and gain.shaking is None:
+        shaking = measure_shaking(counts[:_GAIN_FRAMES], camera, masked=masked)
+        gain = replace(gain, shaking=shaking)
+    if follows and gain.shakes:
+        still = without_shaking(counts, camera, masked=masked)
+        return judge_counts(still, camera, masked=masked, additive=additive, mapper=mapper)
     shared = shared_light(counts, camera, masked=masked)
     if shared is not None:
         return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
@@ -165,6 +176,8 @@ def judge_counts(
         said = offset_said(wrong, camera)
     else:
         said = ("" if additive else either_said(gain, zero, camera)) or gain.message or ""
+    if gain.shakes and follows is False:
+        said += ", or set background.drift_correction = true, with which it is followed"
     excess = ExcessNoise(gain.noise_ratio, said) if gain.off and gain.noise_ratio > 1 else None
     if wrong is None:
         return Noise((said,) if said else (), gain.off, excess, spectrum)
@@ -322,7 +335,10 @@ def judge_opening(reader: Reader, config: Config) -> Opening:
     additive = config.optics.scheme == "darkfield"
     with threads(config.compute.workers) as pool:
         opening, curve, window = judge_window(reader, config, pool.map)
-        noise = judge_counts(opening, reader.camera, additive=additive, mapper=pool.map)
+        noise = judge_counts(
+            opening, reader.camera, additive=additive,
+            follows=config.background.drift_correction, mapper=pool.map,
+        )  # fmt: skip
     if noise.excess is None:
         ratio = curve.at(window)
         message = (

@@ -1,11 +1,12 @@
 """The fixed pattern of a chunk as it moves: the factor it makes between two windows.
 
-The light of frame t is P_t B(x − d_t), B the pattern in the frame of the sample.  Blocks of frames
-around a step, each moved back by its own shift, add up to B; moved to every shift of a window and
-averaged, B is what that window holds, smear included.  Only blocks within two windows make it, so
-that it may change slowly, the way a movie is cut does not matter, and most particles in it are
-there all the time and move with it.  One that lands or leaves within those blocks is in B with the
-share f of their light, which `Neighbours` takes off again.
+The light of frame t is P_t E(x) B(x − d_t), B the pattern in the frame of the sample and E the
+light that falls on it, which stays.  Blocks of frames around a step, each without E and moved back
+by its own shift, add up to B; moved to every shift of a window and averaged, E B is what that
+window holds, smear included.  Only blocks within two windows make it, so that it may change slowly,
+the way a movie is cut does not matter, and most particles in it are there all the time and move
+with it.  One that lands or leaves within those blocks is in B with the share f of their light,
+which `Neighbours` takes off again.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from iscat_analysis.movie.drift import (
     Trajectory,
     filling,
     follow_pattern,
+    still_light,
     trusted,
 )
 from iscat_analysis.pipeline.regions import Region
@@ -97,11 +99,14 @@ class LocalPattern:
         Of its light per frame of unit power, in the frame of the sample.
     inner : tuple of slice
         The region inside its margin.
+    still : ndarray, shape (y, x)
+        The light that stays, in the region.
     """
 
     mover: Mover
     spectrum: ComplexArray
     inner: tuple[slice, slice]
+    still: FloatArray
 
 
 class MovingPattern:
@@ -140,6 +145,7 @@ class MovingPattern:
             for k in range(len(self._blocks))
         )
         self._nearest = filling(chunk.usable)
+        self._still = still_light(chunk.blocks_e, chunk.usable)
         self._stride = int(edges[1] - edges[0])
         self.chunk = replace(chunk, usable=trusted(chunk.usable, widest))
         self.contrast = self._contrasts(mapper)
@@ -182,18 +188,30 @@ class MovingPattern:
         shape = (here[0].stop - here[0].start, here[1].stop - here[1].start)
         mover = Mover(shape)
         spectrum = sum(
-            mover.spectrum(chunk.blocks_e[k][nearest])
+            mover.spectrum((chunk.blocks_e[k] / self._still)[nearest])
             * mover.transfer(-self._blocks[k : k + 1], np.ones(1))
             for k in range(blocks.start, blocks.stop)
         )
         frames = slice(int(chunk.edges[blocks.start]), int(chunk.edges[blocks.stop]))
-        return LocalPattern(mover, np.asarray(spectrum / self._light(frames)), (inner[0], inner[1]))
+        return LocalPattern(
+            mover, np.asarray(spectrum / self._light(frames)), (inner[0], inner[1]),
+            self._still[region.slices],
+        )  # fmt: skip
 
     def seen(self, pattern: LocalPattern, frames: slice) -> FloatArray:
         """Light that frames, relative to the chunk, hold per unit power without particles."""
         shifts, light = self._pieces(frames)
         transfer = pattern.mover.transfer(shifts, light / light.sum())
-        return pattern.mover.image(pattern.spectrum * transfer)[pattern.inner]
+        moved = pattern.mover.image(pattern.spectrum * transfer)[pattern.inner]
+        return np.asarray(pattern.still * moved)
+
+    def between(
+        self, rows: tuple[int, int], columns: tuple[int, int], before: slice, after: slice
+    ) -> FloatArray:
+        """Light after over light before that the motion makes in a region."""
+        turn = self.chunk.first + (before.stop + after.start) // 2
+        local = self.local(Region(rows, columns), turn)
+        return np.asarray(self.seen(local, after) / self.seen(local, before))
 
     def _around(self, frame: int) -> slice:
         """Blocks that make the pattern around a frame relative to the chunk."""
@@ -226,13 +244,13 @@ class MovingPattern:
 
         def still(k: int) -> NDArray[np.complex64]:
             """Spectrum of a block in the frame of the sample; single precision is 1e-7 of it."""
-            image = mover.spectrum(chunk.blocks_e[k][self._nearest])
+            image = mover.spectrum((chunk.blocks_e[k] / self._still)[self._nearest])
             back = mover.transfer(-self._blocks[k : k + 1], np.ones(1))
             return (image * back).astype(np.complex64)
 
         def seen(spectrum: ComplexArray, blocks: slice) -> FloatArray:
             share = light[blocks] / max(light[blocks].sum(), 1e-300)
-            return mover.image(spectrum * mover.transfer(self._blocks[blocks], share))
+            return self._still * mover.image(spectrum * mover.transfer(self._blocks[blocks], share))
 
         spectra = np.stack(list(mapper(still, range(count))))
         out = np.zeros((count - 1, *chunk.shape), dtype=np.float32)

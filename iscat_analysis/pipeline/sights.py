@@ -31,6 +31,7 @@ from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.pipeline.chunks import Reader, plan_chunks, reader_of
 from iscat_analysis.pipeline.noise import Opening, judge_window
+from iscat_analysis.pipeline.pattern import corrected
 from iscat_analysis.pipeline.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.pipeline.scene import is_counted, variance_of_background
 from iscat_analysis.pipeline.ways import way_of
@@ -169,6 +170,8 @@ def landing_sights(
         most = math.ceil(MOST_SIGHTS / len(spans))
     for span in spans:
         chunk = reader.chunk(span, stride, pool)
+        wanted = config.background.drift_correction
+        chunk, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
         alone, every = find_bright_steps(
             chunk,
             window,
@@ -177,6 +180,7 @@ def landing_sights(
             roi_px=_roi_px(config),
             most=most,
             rings=rings,
+            motion=pattern,
             mapper=pool.map,
         )
         found += alone
@@ -454,7 +458,7 @@ def _sight_of(step: BrightStep, config: Config, model: ForwardModel) -> Sight:
     """Make a sight of a step."""
     grid = PixelGrid.region(step.rows, step.columns, _pixel_nm(config))
     likelihood = conditional(
-        model, grid, step.before_e, step.after_e, step.power_ratio,
+        model, grid, step.before_e, step.after_e, step.power_ratio * step.motion,
         read_variance_before_e2=step.n_before * step.read_variance_e2,
         read_variance_after_e2=step.n_after * step.read_variance_e2, masked=~step.usable,
     )  # fmt: skip

@@ -11,8 +11,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
@@ -63,6 +65,8 @@ class BrightStep:
         Pixels that are neither defective nor saturated.
     read_variance_e2 : ndarray, shape (ny, nx)
         Of one frame [e²].
+    motion : ndarray, shape (ny, nx), or float
+        Light after over light before that the motion of the fixed pattern makes.
     """
 
     frame: int
@@ -80,6 +84,19 @@ class BrightStep:
     power_ratio: float
     usable: BoolArray
     read_variance_e2: FloatArray
+    motion: FloatArray | float = 1.0
+
+
+class Motion(Protocol):
+    """What the motion of the fixed pattern makes of a chunk."""
+
+    contrast: NDArray[np.float32]
+    """Between the windows at every boundary between blocks, shape (k − 1, y, x)."""
+
+    def between(
+        self, rows: tuple[int, int], columns: tuple[int, int], before: slice, after: slice
+    ) -> FloatArray:
+        """Light after over light before in a region, frames relative to the chunk."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +117,7 @@ def find_bright_steps(
     roi_px: int,
     most: int,
     rings: bool = True,
+    motion: Motion | None = None,
     mapper: Mapper = map,
 ) -> tuple[tuple[BrightStep, ...], tuple[BrightStep, ...]]:
     """Bright steps that stand alone, and all of them, brightest first.
@@ -120,6 +138,8 @@ def find_bright_steps(
         Steps that are returned at most.
     rings : bool
         Whether to cut out the others, too, which takes as long again.
+    motion : Motion, optional
+        Of the fixed pattern, where it is divided out.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -131,19 +151,29 @@ def find_bright_steps(
         Every step with nothing else at its own place, in the middle of its region: what the rings
         in the pictures of the first come from.  Empty without `rings`.
     """
-    spots = _spots(chunk, _SPOT * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, mapper)
+    moved = None if motion is None else motion.contrast
+    spots = _spots(chunk, _SPOT * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, moved, mapper)
     # one after the other: between small kernels threads wait for each other at the interpreter
     cut = [
-        _cut(chunk, spot, spots, window, pixel_nm, roi_px, ALONE_NM) for spot in spots[: 4 * most]
+        _cut(chunk, spot, spots, window, pixel_nm, roi_px, ALONE_NM, motion)
+        for spot in spots[: 4 * most]
     ]
     alone = sorted((step for step in cut if step), key=lambda step: -step.snr)[:most]
     small = max(5, round(_OTHERS_NM / pixel_nm))
     around = spots if rings else ()
-    rest = (_cut(chunk, spot, spots, window, pixel_nm, small, _SHADOW_NM) for spot in around)
+    rest = (
+        _cut(chunk, spot, spots, window, pixel_nm, small, _SHADOW_NM, motion) for spot in around
+    )
     return tuple(alone), tuple(step for step in rest if step)
 
 
-def _spots(chunk: Chunk, spot_px: float, shadow_px: float, mapper: Mapper) -> list[_Spot]:
+def _spots(
+    chunk: Chunk,
+    spot_px: float,
+    shadow_px: float,
+    moved: NDArray[np.float32] | None,
+    mapper: Mapper,
+) -> list[_Spot]:
     """Maxima of the energy in time and space, brightest first."""
     count = chunk.edges.size - 2
     power = np.add.reduceat(chunk.power, chunk.edges[:-1])
@@ -159,6 +189,8 @@ def _spots(chunk: Chunk, spot_px: float, shadow_px: float, mapper: Mapper) -> li
         if not 0 < ratio < 1e6:
             return np.zeros(chunk.shape, dtype=np.float32)
         lit = used & (before > 0) & (after > 0)
+        if moved is not None:
+            before = before * (1 + moved[j])
         change = after - ratio * before
         change -= before * (change[lit].sum() / before[lit].sum())
         variance = after + ratio**2 * before
@@ -252,6 +284,7 @@ def _cut(
     pixel_nm: float,
     roi_px: int,
     alone_nm: float,
+    motion: Motion | None,
 ) -> BrightStep | None:
     """Date a step and sum the frames around it in which nothing else happens; None if too few."""
     low, high = max(chunk.first, spot.frame - window), min(chunk.stop, spot.frame + window)
@@ -283,12 +316,16 @@ def _cut(
         after, n_after, power_after = patch.window(frame + (gap or 0), high)
         if min(n_before, n_after) < LEAST_FRAMES:
             return None
+        moved: FloatArray | float = 1.0
+        if motion is not None:
+            cuts = chunk.cut(low, frame - (gap or 0)), chunk.cut(frame + (gap or 0), high)
+            moved = motion.between(rows, columns, *cuts)
         step = BrightStep(
             frame=frame, x_px=column, y_px=row, snr=0.0, rows=rows, columns=columns,
             before_e=before, after_e=after, frames_before=(low, frame - (gap or 0)),
             frames_after=(frame + (gap or 0), high), n_before=n_before, n_after=n_after,
             power_ratio=power_after / power_before, usable=patch.usable,
-            read_variance_e2=np.full(before.shape, np.square(patch.read_noise_e)),
+            read_variance_e2=np.full(before.shape, np.square(patch.read_noise_e)), motion=moved,
         )  # fmt: skip
         y_px, x_px, snr = centre_of_energy(*measured_contrast(step), pixel_nm)
         step = replace(step, y_px=y_px + rows[0], x_px=x_px + columns[0], snr=snr)
@@ -320,8 +357,9 @@ def measured_contrast(step: BrightStep) -> tuple[FloatArray, FloatArray]:
     """
     used = step.usable & (step.before_e > 0) & (step.after_e > 0)
     before, after = np.where(used, step.before_e, 1.0), np.where(used, step.after_e, 1.0)
-    ratio = float(after[used].sum() / before[used].sum())
-    contrast = np.where(used, after / (ratio * before) - 1, 0.0)
+    expected = before * step.motion
+    ratio = float(after[used].sum() / expected[used].sum())
+    contrast = np.where(used, after / (ratio * expected) - 1, 0.0)
     return contrast, np.where(used, 1 / before + 1 / after, 1e6)
 
 
