@@ -17,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, shift
 from scipy.special import jv
 
 FloatArray = NDArray[np.float64]
@@ -259,6 +259,12 @@ class InstrumentMovie:
         Of the camera.
     focus_rise_nm : float
         From the first frame to the last; in the middle the focus is the instrument's.
+    speckle : float
+        Standard deviation of the background.
+    beam : ndarray, shape (rows, columns), or float
+        Light that falls on the sample, which stays where it is.
+    stage_px : ndarray, shape (frames, 2), optional
+        Where the sample is along y and x in every frame.
     """
 
     name = "movie"
@@ -274,6 +280,9 @@ class InstrumentMovie:
         pixel_nm: float = 84.0,
         gain_e_per_adu: float = 4.0,
         focus_rise_nm: float = 0.0,
+        speckle: float = 0.05,
+        beam: FloatArray | float = 1.0,
+        stage_px: FloatArray | None = None,
     ) -> None:
         rng = np.random.default_rng(seed)
         frames, rows, columns = shape
@@ -286,7 +295,7 @@ class InstrumentMovie:
         pictures = [Pictures(replace(instrument, focus_nm=focus), reach_nm) for focus in foci]
         alike = pictures[len(pictures) // 2]
         rough = gaussian_filter(rng.standard_normal((rows, columns)), 3.0, mode="wrap")
-        light = level_e * (1 + 0.05 * rough / rough.std())
+        light = level_e * (1 + speckle * rough / rough.std())
         order = np.argsort(landings.frame)
         counts = np.empty(shape, dtype=np.uint16)
         landed = np.zeros((len(pictures), rows, columns))  # logarithm of 1 + contrast
@@ -306,6 +315,9 @@ class InstrumentMovie:
                 if parts:
                     moving = CubicSpline(np.linspace(0, frames - 1, parts + 1), landed)
             expected = light * np.exp(landed[0] if moving is None else moving(t))
+            if stage_px is not None:
+                expected = shift(expected, stage_px[t], order=3, mode="nearest")
+            expected = expected * beam
             power = 1 + 0.01 * rng.standard_normal()
             noisy = power * expected + np.sqrt(power * expected) * rng.standard_normal(
                 (rows, columns)
