@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.cause import likely_cause
-from iscat_analysis.inference.fit import OUTWARD
+from iscat_analysis.inference.fit import OUTWARD, POOR_FIT_P
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.metadata import diagnose_gain
@@ -39,6 +39,8 @@ _ENOUGH_STEPS = 30
 _NORMAL = (0.4549, 1.3863)  # medians of χ² with one and two degrees of freedom
 _FEWEST_TURNED = 5  # particles of the other sign that make it worth a line,
 _NEARLY_ALL = 0.9  # and their share
+_FEWEST_SLOW = 5  # steps that are none that make it worth a line,
+_MANY_SLOW = 0.1  # and their share of all events
 
 
 def axes_warning(name: str, counts: NDArray[Any]) -> str:
@@ -320,6 +322,35 @@ def sign_warning(config: Config, table: pd.DataFrame) -> str:
         f"{turned} of {count(len(mass), 'particle')} have a negative mass, which is that of "
         f"particles that leave: they {seen} the image, and by {by} those that land {other} it; if "
         "they land, correct that sign, or optics.focus_nm"
+    )
+
+
+def course_warning(table: pd.DataFrame) -> str:
+    """Say that the light of many steps does not change from one frame to the next.
+
+    Their pictures agree with the model, and the goodness of fit is theirs; `Status.POOR_FIT` is
+    then of the course of the light before and after.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Rows of ``fits.csv`` of a landing movie.
+
+    Returns
+    -------
+    str
+        One line; empty where these are few.
+    """
+    poor = table["status"] == Status.POOR_FIT.value
+    slow = int((poor & (table["p_value"] >= POOR_FIT_P)).sum())
+    if slow < _FEWEST_SLOW or slow < _MANY_SLOW * len(table):
+        return ""
+    return (
+        f"{slow} of {int(poor.sum())} events that are poor_fit are described by the model, but "
+        "their light goes on changing before or after the step, not from one frame to the next: "
+        "particles that settle slowly, move on, bleach or blink; their masses are those of the "
+        "mean change (sum frames before the analysis if they settle within a few, or lower "
+        "background.window_frames if they change later)"
     )
 
 

@@ -15,6 +15,7 @@ from iscat_analysis.movie.stack import printable
 from iscat_analysis.pipeline.achieved import spread_verdict
 from iscat_analysis.pipeline.diagnosis import (
     bend_warning,
+    course_warning,
     line_warning,
     plane_warning,
     sign_warning,
@@ -82,6 +83,7 @@ def gather(
         line_warning(config, table),
         bend_warning(scene.model.scale, table),
         sign_warning(config, table),
+        course_warning(table) if ready.way == "sliding" else "",
     ):
         if doubt:
             run.tell(doubt)
