@@ -29,6 +29,7 @@ PAIRS = 12
 _LEAST_PAIRS = 3  # of a range of frames
 _TOGETHER = 8  # frames that are summed there
 _SINGLE_PAIRS = 24  # places where particles are followed
+_NEARER = 0.62  # of half the movie, of every second of these: what comes again must not be missed
 _SAMPLE_BYTES = 96_000_000  # of counts that are read for it
 
 
@@ -205,8 +206,9 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
             continue
         room = stop - gap - together - start
         number = min(places // len(spans), room // together + 1)  # none has another's frames
-        for place in np.linspace(start, start + room, number).astype(int).tolist():
-            places_read.append((place, place + gap))
+        gaps = (gap, math.ceil(_NEARER * gap)) if way == "tracks" else (gap,)
+        for k, place in enumerate(np.linspace(start, start + room, number).astype(int).tolist()):
+            places_read.append((place, place + gaps[k % len(gaps)]))
             parts += [movie.read(k, k + together) for k in places_read[-1]]
     if not parts:
         return [], window

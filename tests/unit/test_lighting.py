@@ -73,6 +73,67 @@ def test_smooth_changes_are_found_with_their_size(factor: Array, degrees: tuple[
     assert found.rms == pytest.approx(spread, rel=0.05)
 
 
+def _fringes(period_px: float, phase: float, bent: float = 0.0) -> Array:
+    way = 0.8 * X * SHAPE[1] / 2 + 0.6 * Y * SHAPE[0] / 2
+    steep = np.exp(-bent * (X**2 + Y**2))
+    return 1 + 1e-2 * steep * np.cos(2 * np.pi * way / period_px + bent * X * Y + phase)
+
+
+@pytest.mark.parametrize(
+    ("period_px", "bent"), [(12.0, 0.0), (25.0, 0.0), (34.0, 0.0), (20.0, 0.7)]
+)
+def test_fringes_are_found_and_measured(period_px: float, bent: float) -> None:
+    """Where they are bent as well as straight, as deep everywhere as in the middle."""
+    phases = np.random.default_rng(8).uniform(0, 2 * np.pi, (PAIRS, 2))
+    light = [
+        (_light() * _fringes(period_px, one, bent), _light() * _fringes(period_px, other, bent))
+        for one, other in phases
+    ]
+    found = find_surface(_pairs(light, 8), Camera(), WINDOW)
+    assert found is not None
+    assert found.fringes.periods_px == pytest.approx([period_px], rel=0.01)
+    assert bool(found.fringes.degree) == bool(bent)
+    factor = _fringes(period_px, 1.0, bent)
+    left = found.factors(found.light_e * factor) / factor
+    assert left.std() < (0.03 if bent else 0.01) * factor.std()
+
+
+@pytest.mark.parametrize("seams", [((40,), ()), ((), (64,)), ((48,), (64,)), ((), (32, 64, 96))])
+def test_parts_of_a_camera_are_told_by_their_seams(
+    seams: tuple[tuple[int, ...], tuple[int, ...]],
+) -> None:
+    rng = np.random.default_rng(9)
+    parts = [
+        np.repeat(np.arange(len(cuts) + 1), np.diff([0, *cuts, n]))
+        for cuts, n in zip(seams, SHAPE, strict=True)
+    ]
+
+    def gains() -> Array:
+        drawn = 1 + 3e-3 * rng.standard_normal([len(cuts) + 1 for cuts in seams])
+        return np.asarray(drawn[np.ix_(*parts)])
+
+    light = [(_light() * gains(), _light() * gains()) for _ in range(2 * PAIRS)]
+    found = find_surface(_pairs(light, 9), Camera(), WINDOW)
+    assert found is not None
+    assert found.seams == seams
+    factor = gains()
+    factor /= np.average(factor, weights=found.light_e)
+    np.testing.assert_allclose(found.factors(found.light_e * factor), factor, atol=1e-9)
+
+
+def test_seams_and_fringes_hide_nothing_from_each_other() -> None:
+    rng = np.random.default_rng(10)
+
+    def light() -> Array:
+        halves = np.repeat(1 + 5e-3 * rng.standard_normal((2, 1)), SHAPE[0] // 2, axis=0)
+        return np.asarray(_light() * halves * _fringes(25.0, rng.uniform(0, 6)))
+
+    found = find_surface(_pairs([(light(), light()) for _ in range(PAIRS)], 10), Camera(), WINDOW)
+    assert found is not None
+    assert found.seams == ((48,), ())
+    assert found.fringes.periods_px == pytest.approx([25.0], rel=0.01)
+
+
 def test_nothing_is_found_in_steady_light() -> None:
     still = [(_light(), _light())] * PAIRS
     assert all(find_surface(_pairs(still, seed), Camera(), WINDOW) is None for seed in range(12))
