@@ -147,12 +147,12 @@ class Lines:
 
         Parameters
         ----------
-        signal : ndarray, shape (y, x)
+        signal : ndarray, shape (…, y, x)
             Contrast.
 
         Returns
         -------
-        ndarray, shape (y, x)
+        ndarray, shape (…, y, x)
             Factor.
         """
         return np.broadcast_to(self.factors(self.light_e * (1 + signal)), signal.shape)
