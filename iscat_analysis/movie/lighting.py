@@ -2,8 +2,9 @@
 
 A beam that wanders, fringes that pass or a lamp that warms up change the light of a pixel, and that
 of its neighbours in the same way.  Over the mean frame such a change is a polynomial in x and y of
-low degree, a few plane waves (`iscat_analysis.movie.fringes`), and a factor of each part of a
-camera that has several amplifiers (`iscat_analysis.movie.seams`), which least squares measure in
+low degree, a few plane waves (`iscat_analysis.movie.fringes`), a factor of each part of a camera
+that has several amplifiers (`iscat_analysis.movie.seams`), and what is added to all pixels alike
+(`iscat_analysis.movie.haze`), which least squares measure in
 every frame with an error far below the noise of one pixel.  A particle is part of what is measured:
 `iscat_analysis.movie.lines.Lines.left` says what that takes of it.
 
@@ -28,6 +29,7 @@ from scipy.linalg import block_diag
 
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.fringes import NO_FRINGES, Fringes, find_fringes
+from iscat_analysis.movie.haze import find_haze, lift
 from iscat_analysis.movie.light_changes import Changes
 from iscat_analysis.movie.seams import Seams, find_seams, parts_of
 from iscat_analysis.records import BoolArray, FloatArray
@@ -41,6 +43,7 @@ _PASSES = 4
 _ROUNDS = 2  # in which seams and fringes are looked for, each beside the other
 _CLIP = 4.0  # robust standard deviations beyond which a cell shows something else
 _SIGNIFICANT = 8.0  # standard errors beyond which a change is one: it repeats in time and place
+_SPREAD = 0.1  # of the cells, over which a change of the light is spread at least
 _SMOOTH = 3.0  # times what a smooth change leaves over in a cell, that it must make there
 _LOWEST_HIGHEST = 3  # degree without which smooth is not told from fine
 _NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
@@ -63,6 +66,9 @@ class Surface:
         Waves that pass over the field.
     seams : tuple of (tuple of int, tuple of int)
         First rows and columns of parts that have factors of their own.
+    haze : float
+        What is added to all pixels alike, and changes: its range, over the mean light; 0 where
+        there is none.
     """
 
     light_e: FloatArray
@@ -70,6 +76,12 @@ class Surface:
     rms: float = math.nan
     fringes: Fringes = NO_FRINGES
     seams: Seams = ((), ())
+    haze: float = 0.0
+
+    @property
+    def measures(self) -> bool:
+        """Whether anything changes."""
+        return bool(self.degree or len(self.fringes.waves) or any(self.seams) or self.haze)
 
     @property
     def messages(self) -> list[str]:
@@ -99,6 +111,14 @@ class Surface:
                 f"parts of the field, which begin at {parts}, change as a whole, as where the "
                 "camera reads them out by amplifiers of their own: each part of each frame was "
                 "divided by its own light"
+            )
+        if self.haze:
+            said.append(
+                "dim pixels change by more of their light than bright ones, as where something is "
+                f"added to all of them that changes by {100 * self.haze:.2g} % of the mean light "
+                "within the movie: light that does not come through the objective, the offset of "
+                "a camera that warms up, or what focus does; each frame was divided by its own, "
+                "but what is added all the time is not known, and masses may be wrong by as much"
             )
         return said
 
@@ -136,6 +156,11 @@ class Surface:
                 (rows * rows[:, i : i + 1]).T @ self.light_e @ (columns * columns[:, j : j + 1])
             )
             gram[k] = overlap[down, along]
+        if self.haze:
+            light, more = self.light_e, lift(self.light_e)
+            beside = (rows.T @ (light * more) @ columns)[down, along]
+            own = np.sum(light * more**2)
+            gram = np.block([[gram, beside[:, None]], [beside, own]])
         return np.asarray(np.linalg.pinv(gram, rcond=_LEAST_SHARE, hermitian=True))
 
     def factors(self, electrons: FloatArray) -> FloatArray:
@@ -157,11 +182,19 @@ class Surface:
         lit = total > 0
         seen *= self.light_e.sum() / np.where(lit, total, 1.0)
         rows, columns = self._axes
-        overlap = rows.T @ np.where(lit, seen - self.light_e, 0.0) @ columns
+        change = np.where(lit, seen - self.light_e, 0.0)
+        overlap = rows.T @ change @ columns
         flat = overlap.reshape(*overlap.shape[:-2], -1)
+        told = flat[..., self._kept]
+        if self.haze:
+            more = lift(self.light_e)
+            told = np.concatenate([told, np.sum(change * more, axis=(-2, -1))[..., None]], axis=-1)
+        found = told @ self._inverse
         terms = np.zeros_like(flat)
-        terms[..., self._kept] = flat[..., self._kept] @ self._inverse
+        terms[..., self._kept] = found[..., : self._kept.size]
         out = 1 + rows @ terms.reshape(overlap.shape) @ columns.T
+        if self.haze:
+            out += found[..., -1:, None] * more
         return np.where(out > 0, out, 1.0)
 
 
@@ -194,9 +227,9 @@ def find_surface(
     found = _patterns(changes, window, highest)
     seamless = _even(changes, replace(found, fringes=NO_FRINGES))
     degree, rms = _smooth(seamless, window, highest, found.fringes)
-    if not (degree or len(found.fringes.waves) or any(found.seams)):
-        return None
-    return replace(found, degree=degree, rms=rms)
+    found = replace(found, degree=degree, rms=rms)
+    found = replace(found, haze=find_haze(_even(changes, found), window))
+    return found if found.measures else None
 
 
 def _patterns(changes: Changes, window: int, highest: int) -> Surface:
@@ -215,8 +248,8 @@ def _patterns(changes: Changes, window: int, highest: int) -> Surface:
 
 
 def _even(changes: Changes, found: Surface) -> Changes:
-    """Divide sums by seams and fringes."""
-    if not (len(found.fringes.waves) or any(found.seams)):
+    """Divide sums by what was found in them."""
+    if not found.measures:
         return changes
     return changes.divided(found.factors(changes.sums_e))
 
@@ -226,6 +259,8 @@ def _smooth(changes: Changes, window: int, highest: int, fringes: Fringes) -> tu
     grid = _Grid.of(changes, highest, fringes)
     squares, left = grid.squares()
     count = len(squares)
+    if not count:
+        return 0, 0.0
     of_degree = [squares[:, grid.degrees == d] for d in range(1, highest + 1)]
     excess = np.array([(s - 1).sum() / count for s in of_degree])
     beyond = np.cumsum(excess[::-1])[::-1]  # what polynomials of lower degree leave
@@ -285,19 +320,30 @@ class _Grid:
 
         Where nothing but noise is left, the mean of that over cells and pairs is 0.
         """
-        out = np.empty((len(self.changes), self.basis.shape[1]))
+        out: list[FloatArray] = []
+        whole = np.eye(self.basis.shape[1])
         left, freedom = 0.0, 0
-        for k, change in enumerate(self.changes):
-            kept = np.ones(change.size, dtype=np.bool_)
+        for change in self.changes:
+            # what landed and is large would bend the first fit so that nothing stands out of it
+            away = np.abs(change - np.median(change))
+            kept = away <= _CLIP * max(1.0, _NORMAL * float(np.median(away)))
+            if kept.sum() <= self.basis.shape[1]:
+                kept[:] = True
             for _ in range(_PASSES):
-                part = self.basis[kept]
-                found = np.linalg.solve(part.T @ part, part.T @ change[kept])
-                rest = np.abs(change - self.basis @ found)
+                part, turned = self.basis, whole
+                if not kept.all():  # beside a hole the noise of terms is known as well
+                    part, turned = np.linalg.qr(self.basis[kept])
+                found = part.T @ change[kept]
+                fitted = self.basis @ np.linalg.solve(turned, found)
+                rest = np.abs(change - fitted)
                 inside = rest <= _CLIP * max(1.0, _NORMAL * float(np.median(rest)))
                 if np.array_equal(inside, kept) or inside.sum() <= found.size:
                     break
                 kept = inside
-            out[k] = np.square(found)
+            squares = np.square(fitted - np.median(fitted))
+            if squares.sum() ** 2 < _SPREAD * squares.size * np.square(squares).sum():
+                continue  # dust that landed, which is nowhere else
+            out.append(np.square(found))
             left += float(np.square(rest[kept]).sum())
             freedom += int(kept.sum()) - found.size
-        return out, left / freedom - 1
+        return np.array(out).reshape(-1, self.basis.shape[1]), left / max(freedom, 1) - 1

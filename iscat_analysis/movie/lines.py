@@ -84,6 +84,7 @@ class Lines:
             "fringe_rms": surface.fringes.rms,
             "seam_rows": list(surface.seams[0]),
             "seam_columns": list(surface.seams[1]),
+            "haze": surface.haze,
         }
 
     def factors(self, electrons: FloatArray) -> FloatArray:

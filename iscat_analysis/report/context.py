@@ -313,6 +313,12 @@ def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
             f"Parts of the field, which begin at {' and '.join(seams)}, changed as a whole; each "
             "part of each frame was divided by its own light."
         )
+    haze = summary.get("lines", {}).get("haze")
+    if haze:
+        yield (
+            f"What is added to all pixels alike changed by {percent(haze)} of the mean light; each "
+            "frame was divided by what that makes of it."
+        )
     background = summary.get("background")
     if background and background["drift_px"] is not None:
         (y, x), (y_se, x_se) = background["drift_px"], background["drift_error_px"]

@@ -170,6 +170,7 @@ class Lines(Closed):
     fringe_rms: NotNegative = key("Relative rms of their changes between frames that are compared")
     seam_rows: list[Count] = key("First rows of parts of the field that had factors of their own")
     seam_columns: list[Count] = key("First columns of such parts")
+    haze: NotNegative = key("Range of what is added to all pixels, over the mean light; 0: none")
 
 
 class Noise(Document):

@@ -152,6 +152,25 @@ def test_particles_and_pixels_that_blink_are_no_light() -> None:
     assert find_surface(_pairs(light, 4), Camera(), WINDOW) is None
 
 
+def test_dust_that_lands_is_no_light() -> None:
+    """Its rim is smooth, and it is nowhere but in one pair."""
+    dust = 1 - 0.3 * np.exp(-((64 * X + 20) ** 2 + (48 * Y - 10) ** 2) / (2 * 6**2))
+    light = [(_light(), _light() * (dust if k == 5 else 1)) for k in range(PAIRS)]
+    assert find_surface(_pairs(light, 11), Camera(), WINDOW) is None
+
+
+def test_what_is_added_to_all_pixels_is_taken_off() -> None:
+    added = 0.02 * LEVEL_E
+    light = [(_light(), _light() + added), (_light() + added, _light())] * (PAIRS // 2)
+    found = find_surface(_pairs(light, 12), Camera(), WINDOW)
+    assert found is not None
+    assert found.degree == 0
+    assert found.haze == pytest.approx(0.02, rel=0.15)
+    frame = found.light_e + added
+    even = frame / found.factors(frame) / found.light_e
+    assert np.std(even) < 1e-9 < np.std(frame / found.light_e)
+
+
 @pytest.mark.parametrize("grain_px", [1.5, 4.0])
 def test_a_pattern_that_moves_is_not_taken_for_light(grain_px: float) -> None:
     still = _light(grain_px)
