@@ -17,6 +17,9 @@ from iscat_analysis.records import FloatArray
 _PARTS = 8  # along each axis
 _SIGNIFICANT = 30.0  # squared standard errors, which follow from the differences of the parts
 _DOUBT = 4.0  # standard errors of what is left over in a part
+_PATTERN = 10.0  # times what the noise of the mean frame tells, that its pattern must
+_ALIKE = 4.0  # times what the median part tells, more than which none should
+_MOST = 0.25  # of the mean light, more than which is not added between windows
 _LEAST_PARTS = 16
 _LEAST_TOLD = 1e-3  # by a part, of what others tell
 
@@ -68,12 +71,15 @@ def find_haze(changes: Changes, window: int) -> float:
     each = sums * (light.sum() / sums.sum(axis=(2, 3), keepdims=True)) - light
     change = each[:, 1] - each[:, 0]
     held, once, twice = summed(light), summed(light * more), summed(light * more**2)
-    lit = held > 0
+    told = np.maximum(twice - np.square(once) / np.where(held > 0, held, 1.0), 0.0)
+    if not (told > 0).any():
+        return 0.0
+    lit = (told > 0) & (told < _ALIKE * np.median(told[told > 0]))  # without dust and particles
     if lit.sum() < _LEAST_PARTS:
         return 0.0
-    mean = once[lit] / held[lit]
-    told = np.maximum(twice[lit] - once[lit] * mean, 0.0)
-    if told.sum() <= 0:
+    mean, told = once[lit] / held[lit], told[lit]
+    pixels = summed((light > 0).astype(np.float64))[lit]
+    if told.sum() < _PATTERN * pixels.sum() * changes.noises.mean() / len(changes.noises):
         return 0.0
     even = summed(change)[:, lit]
     seen = summed(change * more)[:, lit] - even * mean
@@ -82,13 +88,14 @@ def find_haze(changes: Changes, window: int) -> float:
     spread = np.square(rest) / np.maximum(told, told.mean() * _LEAST_TOLD)
     error = spread.sum(axis=1) / (lit.sum() - 1) / told.sum()
     square = float(np.median(np.square(added)))
+    if square > _MOST**2:
+        return 0.0
     if square * told.sum() / light.sum() < changes.least(window) + changes.error:
         return 0.0
     if np.median(np.square(added[:, 0]) / error) < _SIGNIFICANT:
         return 0.0
     # in variances of noise, of the pixels of a part
     noises = changes.noises[:, None]
-    pixels = summed((light > 0).astype(np.float64))[lit]
     squares = summed(np.square(change) / np.where(light > 0, light, 1.0))[:, lit] / noises
     gain = np.square(added) * told / noises
     left = squares - np.square(even) / held[lit] / noises - gain - (pixels - 1)

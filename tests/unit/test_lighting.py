@@ -171,6 +171,16 @@ def test_what_is_added_to_all_pixels_is_taken_off() -> None:
     assert np.std(even) < 1e-9 < np.std(frame / found.light_e)
 
 
+@pytest.mark.parametrize("count", [1, 300])
+def test_particles_on_light_without_a_pattern_are_nothing_that_is_added(count: int) -> None:
+    rng = np.random.default_rng(13)
+    factor = np.ones(SHAPE)
+    for y, x in zip(rng.uniform(0, 96, count), rng.uniform(0, 128, count), strict=True):
+        factor -= 0.02 * np.exp(-(((Y + 1) * 48 - y) ** 2 + ((X + 1) * 64 - x) ** 2) / 4)
+    flat = np.full(SHAPE, LEVEL_E)
+    assert find_surface(_pairs([(flat, flat * factor)] * PAIRS, 13), Camera(), WINDOW) is None
+
+
 @pytest.mark.parametrize("grain_px", [1.5, 4.0])
 def test_a_pattern_that_moves_is_not_taken_for_light(grain_px: float) -> None:
     still = _light(grain_px)
@@ -221,6 +231,33 @@ def test_particles_that_land_in_wandering_light(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("iscat_analysis.pipeline.light.find_surface", lambda *_: None)
     without = ia.fit_movie(counts, config=config)
     assert (without.table["status"] == "ok").sum() < 2
+
+
+def test_fringes_that_change_between_a_background_and_what_follows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As where the laser hops to another mode: within either they stand still."""
+    config = make_config(
+        background={"method": "fixed", "frames": [0, 40]}, fit={"frames": [40, 80]},
+        camera={"gain_e_per_adu": 4.0}, optics={"calibrate": "never"},
+        simulation={
+            "shape": [64, 64], "frames": 80, "photons_per_pixel": 1e5,
+            "events": [{"frame": 40, "x_px": 30.0, "y_px": 34.0, "mass_kda": 500.0}],
+        },
+    )  # fmt: skip
+    y, x = np.indices((64, 64))
+    phase = np.where(np.arange(80) < 40, 0.0, 2.0)[:, None, None]
+    fringes = 1 + 0.01 * np.cos(2 * np.pi * (0.8 * x + 0.6 * y) / 16 + phase)
+    light = np.array(list(Movie(config, 6).expected_frames())) * fringes
+    counts = np.round(np.random.default_rng(6).poisson(light) / 4).astype(np.uint16)
+    result = ia.fit_movie(counts, config=config)
+    assert list(result.table["status"]) == ["ok"]
+    row = result.table.iloc[0]
+    assert abs(row["mass_kda"] - 500) < 4 * row["sigma_mass_kda"]
+    assert result.summary["lines"]["fringe_periods_px"] == pytest.approx([16.0], rel=0.01)
+    monkeypatch.setattr("iscat_analysis.pipeline.light.find_surface", lambda *_: None)
+    without = ia.fit_movie(counts, config=config)
+    assert list(without.table["status"]) != ["ok"]
 
 
 def test_a_particle_that_moves_in_wandering_light() -> None:
