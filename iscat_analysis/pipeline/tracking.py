@@ -48,6 +48,7 @@ from iscat_analysis.records import (
     Windows,
 )
 from iscat_analysis.search.moving import link
+from iscat_analysis.search.sliding import DARK, well_lit
 from iscat_analysis.threads import beside, threads
 
 _STEPS = 100  # of the progress of a block
@@ -330,8 +331,11 @@ def track_frames(
     noise: FrameNoise | None = None
     events: tuple[Event, ...] = ()
     interrupted = False
+    shown = np.ones(last - first, dtype=np.bool_)
+    if not scene.additive:
+        shown = well_lit(windows.power, DARK)[-shown.size :]
     try:
-        for frame in range(first, last):
+        for frame in (first + np.flatnonzero(shown)).tolist():
             here = _one_frame(movie, camera, windows, frame, check, scene)
             starts = [event.candidate for event in events]
             events, here = fit_field(scene, here, starts=starts, pool=pool)

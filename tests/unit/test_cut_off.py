@@ -87,3 +87,13 @@ def test_particles_that_move_lose_a_frame_that_is_cut_off() -> None:
     assert "frame 30 is dark, cut off" in said
     assert list(result.tracks["status"]) == ["ok"]
     assert 30 not in set(result.table["frame"])
+
+
+def test_mode_track_over_a_recorded_background_goes_on_after_such_frames() -> None:
+    config = _config("fixed")
+    counts = _counts(config)
+    counts[60, 24:], counts[65] = 0, OFFSET
+    settings = {"fit.mode": "track", "track.free": "mass", "camera.frame_rate_hz": 100.0}
+    result = ia.fit_movie(counts, config=config, settings=settings)
+    assert any("frames 60, 65 of 80 are dark or cut off" in text for text in result.warnings)
+    assert sorted(set(result.table["frame"])) == sorted(set(range(40, 80)) - {60, 65})

@@ -111,7 +111,7 @@ def test_repeated_and_empty_frames_are_left_out_of_tracks() -> None:
     counts[[57, 58]] = 0
     result = ia.fit_movie(counts, settings=SETTINGS)
     (said,) = [line for line in result.warnings if "left out" in line]
-    assert "frames 10, 15, 20, 25 and 16 more are dark or repeat" in said
+    assert "frames 10, 15, 20, 25 and 16 more are dark, cut off or repeat" in said
     odd = [*stuck.tolist(), 57, 58]
     assert not result.table["frame"].isin(odd).any()
     own = result.table.merge(movie.truth, on="frame", suffixes=("", "_true"))
