@@ -190,6 +190,25 @@ class MovingField:
         """Frames in the movie."""
         return len(self.exposures.counts)
 
+    def renew(self, block: Callable[[int, int], NDArray[Any]]) -> None:
+        """Put other frames in the place of these.
+
+        Parameters
+        ----------
+        block : callable
+            Takes the first of some frames and that after their last, and gives them as they are
+            stored, shape (t, y, x).
+        """
+
+        def put(first: int) -> None:
+            last = min(first + BLOCK, self.frames)
+            self.exposures.counts[first:last] = block(first, last)
+
+        list(self._pool.map(put, range(0, self.frames, BLOCK)))
+        for told in ("total_e", "frame_totals"):
+            self.__dict__.pop(told, None)
+        self.draw_anew()
+
     def set_blurs(self, variances_nm2: FloatArray) -> None:
         """Make the pictures that `Rows.group` numbers.
 

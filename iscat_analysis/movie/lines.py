@@ -57,7 +57,7 @@ class Lines:
         """What the user should know, one line each."""
         said = []
         if self.surface is not None:
-            said.append(self.surface.message)
+            said += self.surface.messages
         if any(self.shares):
             said.append(self._flicker)
         return said
@@ -72,13 +72,19 @@ class Lines:
         )
 
     @property
-    def summary(self) -> dict[str, float]:
+    def summary(self) -> dict[str, Any]:
         """What ``summary.json`` says of it."""
+        surface = self.surface or Surface(self.light_e, 0, 0.0)
         return {
             "row_share": float(self.shares[0]),
             "column_share": float(self.shares[1]),
-            "smooth_degree": 0 if self.surface is None else self.surface.degree,
-            "smooth_rms": 0.0 if self.surface is None else self.surface.rms,
+            "smooth_degree": surface.degree,
+            "smooth_rms": surface.rms,
+            "fringe_periods_px": surface.fringes.periods_px.tolist(),
+            "fringe_rms": surface.fringes.rms,
+            "seam_rows": list(surface.seams[0]),
+            "seam_columns": list(surface.seams[1]),
+            "haze": surface.haze,
         }
 
     def factors(self, electrons: FloatArray) -> FloatArray:
@@ -142,12 +148,12 @@ class Lines:
 
         Parameters
         ----------
-        signal : ndarray, shape (y, x)
+        signal : ndarray, shape (…, y, x)
             Contrast.
 
         Returns
         -------
-        ndarray, shape (y, x)
+        ndarray, shape (…, y, x)
             Factor.
         """
         return np.broadcast_to(self.factors(self.light_e * (1 + signal)), signal.shape)

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from iscat_analysis.movie import Stack
+from iscat_analysis.pipeline.dark_frames import without_cut_off
 from iscat_analysis.pipeline.diagnosis import (
     misfit_warning,
     pixel_warnings,
@@ -73,7 +75,8 @@ def find_bound(ready: Prepared, run: Run) -> Found:
     DataError
         The background leaves no frame to fit, or a frame is impossible.
     """
-    scene, windows, noise, summary = _background(ready, run)
+    ready, windows = _summed(ready, run)
+    scene, noise, summary = _background(ready, run, windows)
     movie, camera = ready.steady, ready.camera
     with threads(scene.config.compute.workers) as pool:
         if scene.mode == "track":
@@ -90,15 +93,33 @@ def find_bound(ready: Prepared, run: Run) -> Found:
     return found
 
 
-def _background(ready: Prepared, run: Run) -> tuple[Scene, Windows, Noise, dict[str, Any]]:
-    """Sum the background and the frames after it, and judge its noise, pixels and drift."""
+def _summed(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
+    """Sum the background and the frames after it, without those that are cut off."""
+    config, camera = ready.config, ready.camera
+    before, after = frame_ranges(ready.steady, config)
+
+    def sums(movie: Stack) -> Windows:
+        return measured_windows(movie, config, camera, before, after, progress=run.progress)
+
+    windows = sums(ready.steady)
+    if config.optics.scheme == "darkfield":
+        return ready, windows
+    movie, message = without_cut_off(ready.steady, camera, windows)
+    if message:
+        run.tell(message)
+    if movie is ready.steady:
+        return ready, windows
+    return replace(ready, steady=movie), sums(movie)
+
+
+def _background(ready: Prepared, run: Run, windows: Windows) -> tuple[Scene, Noise, dict[str, Any]]:
+    """Make the models, and judge the noise, pixels and drift of the background."""
     movie, config, camera = ready.steady, ready.config, ready.camera
-    before, after = frame_ranges(movie, config)
+    after = windows.frames_after
     searches = after[1] - after[0] if config.fit.mode == "track" else 1
     scene = make_scene(config, ready.shape, searches=searches, lines=ready.lines)
     run.warm_up(scene)
     run.clock.lap("model")
-    windows = measured_windows(movie, config, camera, before, after, progress=run.progress)
     still = config.fit.mode != "track"
     noise = judge_background(movie, camera, windows, still=still, additive=scene.additive)
     if noise.spectrum is not None:
@@ -119,7 +140,7 @@ def _background(ready: Prepared, run: Run) -> tuple[Scene, Windows, Noise, dict[
         if moved:
             run.tell(moved)
     run.clock.lap("background")
-    return scene, windows, noise, summary
+    return scene, noise, summary
 
 
 def _judged_beside(ready: Prepared, scene: Scene, windows: Windows, table: pd.DataFrame) -> Noise:

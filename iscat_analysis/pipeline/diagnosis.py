@@ -22,6 +22,7 @@ from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES
 from iscat_analysis.pipeline.systematic import is_bent
 from iscat_analysis.records import FloatArray, Status, Windows
+from iscat_analysis.search.sliding import DARK, well_lit
 from iscat_analysis.units import count, listed
 
 FLAT = 0.05
@@ -129,6 +130,7 @@ def repeats_warning(movie: Stack, windows: Windows) -> str:
     """
     numbers = np.concatenate([np.arange(*windows.frames_before), np.arange(*windows.frames_after)])
     same = (np.diff(windows.power) == 0) & (np.diff(numbers) == 1)
+    same &= well_lit(windows.power, DARK)[1:]  # of dark ones something else is said
     found = [n for n in numbers[1:][same].tolist() if _repeats(movie, n)]
     if not found:
         return ""

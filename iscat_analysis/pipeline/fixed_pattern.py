@@ -12,7 +12,7 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.drift import follow_pattern
 from iscat_analysis.pipeline.noise import first_counts, is_lit
 from iscat_analysis.records import FloatArray, Windows
-from iscat_analysis.search.sliding import measure_noise
+from iscat_analysis.search.sliding import measure_noise, well_lit
 
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""
@@ -48,6 +48,8 @@ def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[s
     if windows.n_before >= 2 and is_lit(windows):
         frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
         some = first_counts(movie, windows, max(2, _NOISE_BYTES // frame_bytes))
+        lit = well_lit(windows.power[: len(some)])
+        some = some if lit.all() or lit.sum() < 2 else some[lit]
         noise = measure_noise(some, camera, min(_LONGEST, len(some) // 2))
         curve, limit = (noise.frames, noise.variance_over_shot), noise.shot_limited
         moved = _pattern_moved(windows)

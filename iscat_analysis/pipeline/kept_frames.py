@@ -127,9 +127,9 @@ def keep_frames(
     missing, share = span[0] + np.flatnonzero(~good), float(np.mean(repeats & ~dark))
     many, is_, same = ("s", "are", "repeat") if len(missing) > 1 else ("", "is", "repeats")
     message = (
-        f"{movie.name}: frame{many} {listed(missing, _NAMED)} {is_} dark or {same} the one "
-        "before (behind a shutter, dropped or stuck in the camera); left out, and steps over them "
-        "count as several frames"
+        f"{movie.name}: frame{many} {listed(missing, _NAMED)} {is_} dark, cut off or {same} the "
+        "one before (behind a shutter, dropped or stuck in the camera); left out, and steps over "
+        "them count as several frames"
     )
     if share > MANY:
         message += (

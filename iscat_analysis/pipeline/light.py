@@ -29,6 +29,8 @@ PAIRS = 12
 _LEAST_PAIRS = 3  # of a range of frames
 _TOGETHER = 8  # frames that are summed there
 _SINGLE_PAIRS = 24  # places where particles are followed
+_NEARER = 0.62  # of half the movie, of every second of these: what comes again must not be missed
+_EVERY = 2  # of the places in a background whose frames are compared with those after it as well
 _SAMPLE_BYTES = 96_000_000  # of counts that are read for it
 
 
@@ -177,8 +179,8 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
     """Read frames that are as far apart as windows that are compared, and how many those have.
 
     Where the background has frames of its own, particles are in the others alone: both are looked
-    at by themselves.  Frames in which particles move are compared one by one, half the movie apart:
-    what they have in common is their background.
+    at by themselves, and then some of one with some of the other.  Frames in which particles move
+    are compared one by one, half the movie apart: what they have in common is their background.
     """
     total, way, places = movie.shape[0], way_of(config), PAIRS
     given = config.background.recorded, config.fit.frames
@@ -205,8 +207,9 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
             continue
         room = stop - gap - together - start
         number = min(places // len(spans), room // together + 1)  # none has another's frames
-        for place in np.linspace(start, start + room, number).astype(int).tolist():
-            places_read.append((place, place + gap))
+        gaps = (gap, math.ceil(_NEARER * gap)) if way == "tracks" else (gap,)
+        for k, place in enumerate(np.linspace(start, start + room, number).astype(int).tolist()):
+            places_read.append((place, place + gaps[k % len(gaps)]))
             parts += [movie.read(k, k + together) for k in places_read[-1]]
     if not parts:
         return [], window
@@ -217,9 +220,15 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
         part[seen & ~repeats]
         for part, seen, (_, repeats) in zip(parts, np.split(lit, cuts), measured, strict=True)
     ]
-    pairs = [
+    read = [
         Pair(place, before, later, after)
         for (place, later), before, after in zip(places_read, good[::2], good[1::2], strict=True)
-        if len(before) and len(after)
     ]
-    return pairs, window
+    if len(spans) == 2:
+        apart = [p for p in read if p.first >= spans[1][0]]
+        firsts = [p for p in read if p.first < spans[1][0]][-len(apart) :][::_EVERY]
+        read += [
+            Pair(one.first, one.before, other.later, other.after)
+            for one, other in zip(firsts, apart[::_EVERY], strict=False)
+        ]
+    return [p for p in read if len(p.before) and len(p.after)], window

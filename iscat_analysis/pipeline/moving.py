@@ -49,6 +49,7 @@ from iscat_analysis.pipeline.linking import (
 )
 from iscat_analysis.pipeline.moving_field import (
     exposure_of,
+    give_back,
     load_field,
     opening_ground,
     search_frames,
@@ -237,6 +238,7 @@ def follow(
             break
     rows = _told_apart(config, trimmed(rows))
     for stage in range(2):
+        give_back(scene, field, movie, camera, span[0], ground, rows)
         if scene.mode == "joint":
             rows = _in_their_fringes(scene, field, ground, rows)
         rows, ground, done = settle(

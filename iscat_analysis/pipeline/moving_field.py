@@ -20,6 +20,7 @@ from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.inference.settling import first_ground
 from iscat_analysis.movie.background import find_defects
 from iscat_analysis.movie.camera import Camera
+from iscat_analysis.movie.lines import Lines
 from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
 from iscat_analysis.search.moving import FrameFilter, Sightings
@@ -60,7 +61,9 @@ def exposure_of(config: Config) -> tuple[float, float]:
     return rate, 1 / rate if exposure is None else exposure / 1e3
 
 
-def track_scene(config: Config, field_px: tuple[int, int], frames: int) -> Scene:
+def track_scene(
+    config: Config, field_px: tuple[int, int], frames: int, lines: Lines | None = None
+) -> Scene:
     """Make models and matched filter for single frames.
 
     Parameters
@@ -71,6 +74,8 @@ def track_scene(config: Config, field_px: tuple[int, int], frames: int) -> Scene
         Rows and columns.
     frames : int
         They share the expected false alarms.
+    lines : Lines, optional
+        What was divided out of the frames.
 
     Returns
     -------
@@ -78,7 +83,8 @@ def track_scene(config: Config, field_px: tuple[int, int], frames: int) -> Scene
         In mode mass or joint, as `track.free` says.
     """
     fit = config.fit.model_copy(update={"mode": config.track.free})
-    return make_scene(config.model_copy(update={"fit": fit}), field_px, searches=frames)
+    tracked = config.model_copy(update={"fit": fit})
+    return make_scene(tracked, field_px, searches=frames, lines=lines)
 
 
 def opening_ground(config: Config, field: MovingField) -> Ground:
@@ -178,6 +184,49 @@ def load_field(
         z_range_nm=scene.config.fit.z_range_nm if free_z else None,
         largest=100 * nominal, pool=pool, saturated=saturated,
     )  # fmt: skip
+
+
+def give_back(
+    scene: Scene,
+    field: MovingField,
+    movie: CountSource,
+    camera: Camera,
+    first: int,
+    ground: Ground,
+    rows: Rows,
+) -> None:
+    """Give frames back what of particles was divided out with the light.
+
+    A particle is part of the light of its lines, and of whatever else each frame was divided by.
+    Where it is known, that light is known without it.
+
+    Parameters
+    ----------
+    scene : Scene
+        From `track_scene`; where nothing was divided out, nothing is done.
+    field : MovingField
+        From `load_field`; its frames are changed.
+    movie : CountSource
+        The movie, as it was divided.
+    camera : Camera
+        Counts → photoelectrons.
+    first : int
+        Number of the field's first frame.
+    ground : Ground
+        The light without particles.
+    rows : Rows
+        Particles.
+    """
+    lines = scene.lines
+    if lines is None or not len(rows.frame):
+        return
+    signal = field.draw(ground, rows, coarse=False)
+
+    def block(start: int, stop: int) -> FloatArray:
+        divided = camera.to_electrons(movie.read(first + start, first + stop))
+        return np.multiply(divided, lines.taken(signal[start:stop].astype(np.float64)))
+
+    field.renew(block)
 
 
 def _room_for(shape: tuple[int, int, int], stored: np.dtype[Any], camera: Camera) -> Exposures:

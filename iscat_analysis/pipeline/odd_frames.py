@@ -58,9 +58,9 @@ def frame_warnings(
         share = missing.size / light.size
         lost = f"; {share:.0%} of the movie, with what lands there, is lost" if share > LOST else ""
         yield (
-            f"{name}: {_frames(missing)} {verb} dark, not finite or the same as the frame "
-            "before (behind a shutter, dropped or stuck in the camera); left out, the other frames "
-            f"are used{lost}"
+            f"{name}: {_frames(missing)} {verb} dark, cut off, not finite or the same as "
+            "the frame before (behind a shutter, dropped or stuck in the camera); left out, the "
+            f"other frames are used{lost}"
         )
     known = np.flatnonzero(np.isfinite(light))
     change = light[known][1:] / light[known][:-1] - 1

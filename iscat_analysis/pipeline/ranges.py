@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
@@ -10,6 +14,7 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.movie.background import Check, measure_windows
 from iscat_analysis.movie.camera import Camera, check_counts
 from iscat_analysis.records import FrameSource, Progress, Windows, silent
+from iscat_analysis.search.sliding import cut_off
 from iscat_analysis.units import count
 
 
@@ -174,12 +179,21 @@ def measured_windows(
     Raises
     ------
     DataError
-        A frame is impossible.
+        A frame is impossible; those that `cut_off` names are not looked at.
     """
-    background = config.background
+    background, refuse = config.background, checked(movie, camera)
+
+    def check(counts: NDArray[Any], first: int) -> None:
+        whole = ~cut_off(counts, camera)
+        if whole.all():
+            refuse(counts, first)
+            return
+        for number in np.flatnonzero(whole).tolist():
+            refuse(counts[number : number + 1], first + number)
+
     return measure_windows(
         movie, camera, before, after,
         median=background.method == "median", level_e=background.level_e,
         power_normalization=background.power_normalization,
-        check=checked(movie, camera), progress=progress,
+        check=refuse if config.optics.scheme == "darkfield" else check, progress=progress,
     )  # fmt: skip

@@ -33,6 +33,7 @@ from iscat_analysis.pipeline.light import judge_light
 from iscat_analysis.pipeline.moving import blurred_rows
 from iscat_analysis.pipeline.moving_field import (
     exposure_of,
+    give_back,
     load_field,
     opening_ground,
     track_scene,
@@ -102,7 +103,7 @@ def redraw(
     seen = steady(movie, lines, camera)
     if way == "tracks":
         blocks = int(summary["blocks"]["number"])
-        return _moving(seen, config, camera, table, tracks, blocks)
+        return _moving(seen, config, camera, lines, table, tracks, blocks)
     return _bound(seen, config, camera, lines, table)
 
 
@@ -220,13 +221,15 @@ def _moving(
     movie: Stack,
     config: Config,
     camera: Camera,
+    lines: Lines | None,
     table: pd.DataFrame,
     tracks: pd.DataFrame | None,
     blocks: int,
 ) -> Redraw:
     """Draw particles in single frames, over the background of their block under all of them."""
     first, last = fitted_frames(movie, config)
-    scene = track_scene(config, (movie.shape[1], movie.shape[2]), max(last - first, 1))
+    shape = movie.shape[1], movie.shape[2]
+    scene = track_scene(config, shape, max(last - first, 1), lines)
     edges = [first + (last - first) * k // blocks for k in range(blocks + 1)]
     known = table["mass_kda"].notna() & table["track"].notna()
     _, exposure_s = exposure_of(config)
@@ -256,6 +259,7 @@ def _moving(
             field.set_blurs(variances)
             follows = config.background.power_normalization
             ground = opening_ground(config, field)
+            give_back(scene, field, movie, camera, start, ground, rows)
             for _ in range(_TURNS):
                 found = field.fit(ground, rows, sweeps=0)[1]
                 level = found.level if config.background.method == "tracks" else ground.level

@@ -315,7 +315,9 @@ def field_repeats(
         count = span[1] - span[0]
         if not count or (side == 0 and not n_before):
             continue
-        edges = np.linspace(0, count, min(PARTS, count) + 1).round().astype(int)
+        lit = np.flatnonzero(power > 0)
+        inner = np.linspace(0, lit.size, min(PARTS, lit.size) + 1).round().astype(int)[1:-1]
+        edges = [0, *lit[inner].tolist(), count]
         sums = windows.after_e if side else windows.before_e
         mean = sums / power.sum()
         known = None
@@ -325,7 +327,7 @@ def field_repeats(
                               if scene.additive else light)  # fmt: skip
         for a, b in pairwise(edges):
             total = np.zeros(shape)
-            for start, stop in _pieces(shape, int(a), int(b)):
+            for start, stop in _pieces(shape, a, b):
                 counts = movie.read(span[0] + start, span[0] + stop)
                 for own in owns:
                     if own is not None:

@@ -38,7 +38,6 @@ from iscat_analysis.pipeline.results import Compared, Followed, Found, lines_of,
 from iscat_analysis.pipeline.resume import GOES_ON, saying
 from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.scene import Scene
-from iscat_analysis.pipeline.taken import taken_warning
 from iscat_analysis.pipeline.tracked_optics import Begun, learn_from_tracks
 from iscat_analysis.records import (
     CountSource,
@@ -49,6 +48,7 @@ from iscat_analysis.records import (
     Windows,
 )
 from iscat_analysis.search.moving import link
+from iscat_analysis.search.sliding import DARK, well_lit
 from iscat_analysis.threads import beside, threads
 
 _STEPS = 100  # of the progress of a block
@@ -105,7 +105,7 @@ def find_moving(ready: Prepared, run: Run) -> Found:
     with _saying_what_is_kept(shelves, plan), threads(config.compute.workers) as pool:
 
         def begin(config: Config, *, cautious: bool = False) -> Begun:
-            scene = track_scene(config, ready.shape, max(last - first, 1))
+            scene = track_scene(config, ready.shape, max(last - first, 1), ready.lines)
             block = _analysed(
                 scene, movie, camera, plan, shelf(config, None if cautious else run.partial), 0,
                 check=check, pool=pool, progress=run.progress, cautious=cautious,
@@ -130,9 +130,6 @@ def find_moving(ready: Prepared, run: Run) -> Found:
         run.tell(text)
     for text in pixel_warnings(*windows.left_out):
         run.tell(text)
-    taken = taken_warning(scene, ready.lines, movie.name) if len(joined.fits) else ""
-    if taken:
-        run.tell(taken)
     if not len(joined.fits) and not interrupted:
         run.tell(f"{movie.name}: {_nothing_found(scene, blocks[0])}")
     run.clock.lap("track")
@@ -334,8 +331,11 @@ def track_frames(
     noise: FrameNoise | None = None
     events: tuple[Event, ...] = ()
     interrupted = False
+    shown = np.ones(last - first, dtype=np.bool_)
+    if not scene.additive:
+        shown = well_lit(windows.power, DARK)[-shown.size :]
     try:
-        for frame in range(first, last):
+        for frame in (first + np.flatnonzero(shown)).tolist():
             here = _one_frame(movie, camera, windows, frame, check, scene)
             starts = [event.candidate for event in events]
             events, here = fit_field(scene, here, starts=starts, pool=pool)

@@ -295,6 +295,30 @@ def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
             "are compared); each frame was divided by a polynomial of degree "
             f"{summary['lines']['smooth_degree']}."
         )
+    fringes = summary.get("lines", {}).get("fringe_periods_px")
+    if fringes:
+        periods = " and ".join(fixed(period, 1) for period in fringes)
+        yield (
+            f"Fringes with a period of {periods} pixels passed over the field "
+            f"({percent(summary['lines']['fringe_rms'])} rms between frames that are compared); "
+            "each frame was divided by its own."
+        )
+    seams = [
+        f"{name} {cut}"
+        for name in ("row", "column")
+        for cut in summary.get("lines", {}).get(f"seam_{name}s", ())
+    ]
+    if seams:
+        yield (
+            f"Parts of the field, which begin at {' and '.join(seams)}, changed as a whole; each "
+            "part of each frame was divided by its own light."
+        )
+    haze = summary.get("lines", {}).get("haze")
+    if haze:
+        yield (
+            f"What is added to all pixels alike changed by {percent(haze)} of the mean light; each "
+            "frame was divided by what that makes of it."
+        )
     background = summary.get("background")
     if background and background["drift_px"] is not None:
         (y, x), (y_se, x_se) = background["drift_px"], background["drift_error_px"]

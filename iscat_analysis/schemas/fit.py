@@ -166,6 +166,11 @@ class Lines(Closed):
     column_share: NotNegative = key("Part of the noise variance that each column had in common")
     smooth_degree: Count = key("Degree of the polynomial in x and y, of smooth changes; 0: none")
     smooth_rms: NotNegative = key("Relative rms of smooth changes between frames that are compared")
+    fringe_periods_px: list[NotNegative] = key("Periods of fringes that passed over the field")
+    fringe_rms: NotNegative = key("Relative rms of their changes between frames that are compared")
+    seam_rows: list[Count] = key("First rows of parts of the field that had factors of their own")
+    seam_columns: list[Count] = key("First columns of such parts")
+    haze: NotNegative = key("Range of what is added to all pixels, over the mean light; 0: none")
 
 
 class Noise(Document):

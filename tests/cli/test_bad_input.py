@@ -147,10 +147,15 @@ def test_a_pixel_without_a_number_in_every_frame(
     assert "frame 0 is NaN or infinite in 1 pixel, the first at y = 20, x = 9" in line
 
 
-def test_zero_frames(refused: Run, tmp_path: Path) -> None:
+def test_zero_frames(refused: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One is left out; a movie of nothing else cannot be analysed."""
     counts = _counts()
     counts[7] = 0
-    assert "frame 7 is zero" in refused(_save(tmp_path / "dropped.tif", counts))
+    path = _save(tmp_path / "dropped.tif", counts)
+    none = ["--out", str(tmp_path / "dropped.iscat")]
+    assert main_fit([str(path), *GOOD, *none]) == 0
+    assert "frame 7 of" in capsys.readouterr().err
+    assert "are all the same" in refused(_save(tmp_path / "nothing.tif", np.zeros_like(counts)))
 
 
 def test_saturated_frames(refused: Run, tmp_path: Path) -> None:

@@ -73,6 +73,67 @@ def test_smooth_changes_are_found_with_their_size(factor: Array, degrees: tuple[
     assert found.rms == pytest.approx(spread, rel=0.05)
 
 
+def _fringes(period_px: float, phase: float, bent: float = 0.0) -> Array:
+    way = 0.8 * X * SHAPE[1] / 2 + 0.6 * Y * SHAPE[0] / 2
+    steep = np.exp(-bent * (X**2 + Y**2))
+    return 1 + 1e-2 * steep * np.cos(2 * np.pi * way / period_px + bent * X * Y + phase)
+
+
+@pytest.mark.parametrize(
+    ("period_px", "bent"), [(12.0, 0.0), (25.0, 0.0), (34.0, 0.0), (20.0, 0.7)]
+)
+def test_fringes_are_found_and_measured(period_px: float, bent: float) -> None:
+    """Where they are bent as well as straight, as deep everywhere as in the middle."""
+    phases = np.random.default_rng(8).uniform(0, 2 * np.pi, (PAIRS, 2))
+    light = [
+        (_light() * _fringes(period_px, one, bent), _light() * _fringes(period_px, other, bent))
+        for one, other in phases
+    ]
+    found = find_surface(_pairs(light, 8), Camera(), WINDOW)
+    assert found is not None
+    assert found.fringes.periods_px == pytest.approx([period_px], rel=0.01)
+    assert bool(found.fringes.degree) == bool(bent)
+    factor = _fringes(period_px, 1.0, bent)
+    left = found.factors(found.light_e * factor) / factor
+    assert left.std() < (0.03 if bent else 0.01) * factor.std()
+
+
+@pytest.mark.parametrize("seams", [((40,), ()), ((), (64,)), ((48,), (64,)), ((), (32, 64, 96))])
+def test_parts_of_a_camera_are_told_by_their_seams(
+    seams: tuple[tuple[int, ...], tuple[int, ...]],
+) -> None:
+    rng = np.random.default_rng(9)
+    parts = [
+        np.repeat(np.arange(len(cuts) + 1), np.diff([0, *cuts, n]))
+        for cuts, n in zip(seams, SHAPE, strict=True)
+    ]
+
+    def gains() -> Array:
+        drawn = 1 + 3e-3 * rng.standard_normal([len(cuts) + 1 for cuts in seams])
+        return np.asarray(drawn[np.ix_(*parts)])
+
+    light = [(_light() * gains(), _light() * gains()) for _ in range(2 * PAIRS)]
+    found = find_surface(_pairs(light, 9), Camera(), WINDOW)
+    assert found is not None
+    assert found.seams == seams
+    factor = gains()
+    factor /= np.average(factor, weights=found.light_e)
+    np.testing.assert_allclose(found.factors(found.light_e * factor), factor, atol=1e-9)
+
+
+def test_seams_and_fringes_hide_nothing_from_each_other() -> None:
+    rng = np.random.default_rng(10)
+
+    def light() -> Array:
+        halves = np.repeat(1 + 5e-3 * rng.standard_normal((2, 1)), SHAPE[0] // 2, axis=0)
+        return np.asarray(_light() * halves * _fringes(25.0, rng.uniform(0, 6)))
+
+    found = find_surface(_pairs([(light(), light()) for _ in range(PAIRS)], 10), Camera(), WINDOW)
+    assert found is not None
+    assert found.seams == ((48,), ())
+    assert found.fringes.periods_px == pytest.approx([25.0], rel=0.01)
+
+
 def test_nothing_is_found_in_steady_light() -> None:
     still = [(_light(), _light())] * PAIRS
     assert all(find_surface(_pairs(still, seed), Camera(), WINDOW) is None for seed in range(12))
@@ -89,6 +150,35 @@ def test_particles_and_pixels_that_blink_are_no_light() -> None:
         factor[rng.integers(0, 96, 10), rng.integers(0, 128, 10)] *= 1.5
         light.append((_light(), _light() * factor))
     assert find_surface(_pairs(light, 4), Camera(), WINDOW) is None
+
+
+def test_dust_that_lands_is_no_light() -> None:
+    """Its rim is smooth, and it is nowhere but in one pair."""
+    dust = 1 - 0.3 * np.exp(-((64 * X + 20) ** 2 + (48 * Y - 10) ** 2) / (2 * 6**2))
+    light = [(_light(), _light() * (dust if k == 5 else 1)) for k in range(PAIRS)]
+    assert find_surface(_pairs(light, 11), Camera(), WINDOW) is None
+
+
+def test_what_is_added_to_all_pixels_is_taken_off() -> None:
+    added = 0.02 * LEVEL_E
+    light = [(_light(), _light() + added), (_light() + added, _light())] * (PAIRS // 2)
+    found = find_surface(_pairs(light, 12), Camera(), WINDOW)
+    assert found is not None
+    assert found.degree == 0
+    assert found.haze == pytest.approx(0.02, rel=0.15)
+    frame = found.light_e + added
+    even = frame / found.factors(frame) / found.light_e
+    assert np.std(even) < 1e-9 < np.std(frame / found.light_e)
+
+
+@pytest.mark.parametrize("count", [1, 300])
+def test_particles_on_light_without_a_pattern_are_nothing_that_is_added(count: int) -> None:
+    rng = np.random.default_rng(13)
+    factor = np.ones(SHAPE)
+    for y, x in zip(rng.uniform(0, 96, count), rng.uniform(0, 128, count), strict=True):
+        factor -= 0.02 * np.exp(-(((Y + 1) * 48 - y) ** 2 + ((X + 1) * 64 - x) ** 2) / 4)
+    flat = np.full(SHAPE, LEVEL_E)
+    assert find_surface(_pairs([(flat, flat * factor)] * PAIRS, 13), Camera(), WINDOW) is None
 
 
 @pytest.mark.parametrize("grain_px", [1.5, 4.0])
@@ -141,6 +231,33 @@ def test_particles_that_land_in_wandering_light(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("iscat_analysis.pipeline.light.find_surface", lambda *_: None)
     without = ia.fit_movie(counts, config=config)
     assert (without.table["status"] == "ok").sum() < 2
+
+
+def test_fringes_that_change_between_a_background_and_what_follows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As where the laser hops to another mode: within either they stand still."""
+    config = make_config(
+        background={"method": "fixed", "frames": [0, 40]}, fit={"frames": [40, 80]},
+        camera={"gain_e_per_adu": 4.0}, optics={"calibrate": "never"},
+        simulation={
+            "shape": [64, 64], "frames": 80, "photons_per_pixel": 1e5,
+            "events": [{"frame": 40, "x_px": 30.0, "y_px": 34.0, "mass_kda": 500.0}],
+        },
+    )  # fmt: skip
+    y, x = np.indices((64, 64))
+    phase = np.where(np.arange(80) < 40, 0.0, 2.0)[:, None, None]
+    fringes = 1 + 0.01 * np.cos(2 * np.pi * (0.8 * x + 0.6 * y) / 16 + phase)
+    light = np.array(list(Movie(config, 6).expected_frames())) * fringes
+    counts = np.round(np.random.default_rng(6).poisson(light) / 4).astype(np.uint16)
+    result = ia.fit_movie(counts, config=config)
+    assert list(result.table["status"]) == ["ok"]
+    row = result.table.iloc[0]
+    assert abs(row["mass_kda"] - 500) < 4 * row["sigma_mass_kda"]
+    assert result.summary["lines"]["fringe_periods_px"] == pytest.approx([16.0], rel=0.01)
+    monkeypatch.setattr("iscat_analysis.pipeline.light.find_surface", lambda *_: None)
+    without = ia.fit_movie(counts, config=config)
+    assert list(without.table["status"]) != ["ok"]
 
 
 def test_a_particle_that_moves_in_wandering_light() -> None:

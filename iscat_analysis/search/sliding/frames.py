@@ -22,6 +22,8 @@ DARK = 0.05
 """Share of the usual light, below which it is closed."""
 
 _CHANGES = 8.0  # times the usual change from one frame to the next, that it takes at least
+_EDGE = 0.1  # of the light of a frame's first and last rows, and of these over the middle one's
+_EDGE_E = 400.0  # photoelectrons of a row, without which it tells nothing
 _USUAL = 0.75  # quantile of the light of frames
 
 
@@ -252,7 +254,8 @@ def measure_frames(
     Returns
     -------
     light_e : ndarray, shape (t,)
-        Mean photoelectrons per pixel; a frame that is zero throughout has −∞.
+        Mean photoelectrons per pixel; a frame that is zero throughout, or that `cut_off` names, has
+        −∞.
     repeats : ndarray of bool, shape (t,)
         Bytes equal to the frame before.
     """
@@ -281,7 +284,34 @@ def measure_frames(
         light = (weighted - float(np.sum(gain * camera.offset_adu))) / pixels
     else:
         light = camera.gain_e_per_adu * (totals / pixels - float(np.mean(camera.offset_adu)))
-    return np.where(totals == 0, -np.inf, light), repeats
+    return np.where((totals == 0) | cut_off(counts, camera), -np.inf, light), repeats
+
+
+def cut_off(counts: NDArray[Any], camera: Camera) -> BoolArray:
+    """Tell which frames lack their first or last row, as where a transfer broke off.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Frames, most of them whole.
+    camera : Camera
+        Counts → photoelectrons.
+
+    Returns
+    -------
+    ndarray of bool, shape (t,)
+        Frames that have next to no light there, where others have at least a part of the field's.
+    """
+    ends = [0, counts.shape[1] // 2, -1]
+    offset, gain = (
+        np.broadcast_to(part, counts.shape[1:])[ends].mean(axis=1)
+        for part in (camera.offset_adu, camera.gain_e_per_adu)
+    )
+    light = gain * (counts[:, ends].mean(axis=2, dtype=np.float64) - offset)
+    usual = np.median(light, axis=0)
+    told = (usual > _EDGE * usual[1]) & (usual * counts.shape[2] > _EDGE_E)
+    found: BoolArray = ((light < _EDGE * usual) & told).any(axis=1)
+    return found
 
 
 def well_lit(light_e: FloatArray, least: float = HALF) -> BoolArray:
