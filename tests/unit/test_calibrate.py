@@ -184,6 +184,16 @@ def test_impossible_counts_are_refused(value: float, message: str) -> None:
         check_counts(counts, 10, "m.tif")
 
 
+def test_of_pixels_that_are_no_number_in_every_frame_it_is_said_what_to_do() -> None:
+    counts = good("f8")
+    counts[:, :, :2] = np.nan
+    with pytest.raises(DataError, match=r"in 40 pixels, .* crop the movie, or set these pixels"):
+        check_counts(counts, 0, "m.tif")
+    counts[1:] = 1000.0
+    with pytest.raises(DataError, match=r"in 40 pixels, .*; leave the frame out"):
+        check_counts(counts, 0, "m.tif")
+
+
 def test_frames_without_information_are_refused() -> None:
     counts = good()
     counts[1] = 0
