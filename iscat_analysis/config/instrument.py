@@ -28,6 +28,9 @@ MOST_WAVES = 0.5
 MOST_PASSES = 3.0
 """Largest attenuation: what passes of the reference against what passes of the scattered light."""
 
+STEEPEST_PER_KDA = 0.01
+"""Largest contrast per kDa, of which 100 kDa would change all light; a protein has some 1e-5."""
+
 ABERRATIONS = tuple(f"z{j}" for j in range(5, 38))
 """Zernike terms on offer, by Noll's index."""
 
@@ -280,4 +283,10 @@ class Calibration(Section):
     def _usable(self) -> Calibration:
         if self.gradient_per_kda == 0:
             raise ValueError("gradient_per_kda = 0 says nothing about mass")
+        if abs(self.gradient_per_kda) > STEEPEST_PER_KDA:
+            raise ValueError(
+                f"gradient_per_kda = {self.gradient_per_kda:g} gives 100 kDa a contrast of "
+                f"{100 * self.gradient_per_kda:g}: give contrast (1 is all light) per kDa, as "
+                "-3.1e-5, not in per cent, in ppm or per MDa"
+            )
         return self
