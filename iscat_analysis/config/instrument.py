@@ -28,8 +28,9 @@ MOST_WAVES = 0.5
 MOST_PASSES = 3.0
 """Largest attenuation: what passes of the reference against what passes of the scattered light."""
 
-STEEPEST_PER_KDA = 0.01
-"""Largest contrast per kDa, of which 100 kDa would change all light; a protein has some 1e-5."""
+PER_KDA = (1e-7, 0.01)
+"""Magnitudes of a contrast per kDa: a protein has some 1e-5, and of the larger one 100 kDa would
+change all light."""
 
 ABERRATIONS = tuple(f"z{j}" for j in range(5, 38))
 """Zernike terms on offer, by Noll's index."""
@@ -283,10 +284,11 @@ class Calibration(Section):
     def _usable(self) -> Calibration:
         if self.gradient_per_kda == 0:
             raise ValueError("gradient_per_kda = 0 says nothing about mass")
-        if abs(self.gradient_per_kda) > STEEPEST_PER_KDA:
+        least, most = PER_KDA
+        if not least <= abs(self.gradient_per_kda) <= most:
             raise ValueError(
-                f"gradient_per_kda = {self.gradient_per_kda:g} gives 100 kDa a contrast of "
-                f"{100 * self.gradient_per_kda:g}: give contrast (1 is all light) per kDa, as "
-                "-3.1e-5, not in per cent, in ppm or per MDa"
+                f"gradient_per_kda = {self.gradient_per_kda:g} has not between {least:g} and "
+                f"{most:g} of all light per kDa: give contrast per kDa, as -3.1e-5, not in per "
+                "cent or ppm, nor per Da or MDa"
             )
         return self
