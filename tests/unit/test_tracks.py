@@ -375,6 +375,17 @@ def test_a_short_movie_is_said_with_what_it_can_tell() -> None:
     assert "track.min_frames = 10" in line
 
 
+def test_tracks_longer_than_the_movie_are_not_looked_for() -> None:
+    """It was said that nothing stands out of the noise."""
+    config = parse_config({"camera": {"pixel_size_nm": 84.0, "frame_rate_hz": 331.0,
+                                      "exposure_ms": 2.0}, "fit": {"mode": "track"},
+                           "background": {"method": "tracks"},
+                           "track": {"min_frames": 60}})  # fmt: skip
+    assert not list(judge_times(config, 60, "movie.tif"))
+    with pytest.raises(ConfigError, match=r"track\.min_frames = 60 is more than the 59 frames of"):
+        list(judge_times(config, 59, "movie.tif"))
+
+
 def test_steps_that_are_not_linked_are_told() -> None:
     """Of steps of 181 nm along each axis 0.4 % exceed 600 nm, and with them 2.2 % of D is lost."""
     told = pd.DataFrame({"status": ["ok"], "d_um2_s": [16.36]})
