@@ -94,6 +94,12 @@ def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
             f"camera.exposure_ms = {exposure:g} is longer than the {1e3 / rate:.4g} ms from frame "
             f"to frame at camera.frame_rate_hz = {rate:g}: correct one of them"
         )
+    elif exposure <= (1 + _ROUNDING) / rate:
+        yield (
+            f"camera.exposure_ms = {exposure:g} is no more than a thousandth of the "
+            f"{1e3 / rate:.4g} ms from frame to frame: if it is in seconds, write "
+            f"{1e3 * exposure:g}, since motion during the exposure blurs pictures and changes D"
+        )
     if way_of(config) == "tracks" and frames < config.track.min_frames:
         raise ConfigError(
             f"track.min_frames = {config.track.min_frames} is more than the {frames} frames of "

@@ -356,6 +356,13 @@ def test_an_exposure_longer_than_the_interval_is_refused() -> None:
         _timed(frame_rate_hz=331.0, exposure_ms=4.0)
 
 
+def test_an_exposure_in_seconds_is_named() -> None:
+    for exposure in (2.5e-3, 1 / 331.0):
+        (line,) = _timed(frame_rate_hz=331.0, exposure_ms=exposure)
+        assert f"in seconds, write {1e3 * exposure:g}," in line
+    assert _timed(frame_rate_hz=331.0, exposure_ms=0.01) == []
+
+
 def test_a_missing_frame_rate_and_exposure_are_said_with_their_keys() -> None:
     assert _timed(frame_rate_hz=331.0, exposure_ms=2.5) == []
     (line,) = _timed(exposure_ms=2.5)
