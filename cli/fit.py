@@ -120,8 +120,9 @@ def fit(
         from iscat_analysis.errors import ConfigError
 
         if len(stacks) > 1:
+            more = ", …" if len(stacks) > 2 else ""
             raise ConfigError(
-                f"{len(stacks)} movies were given ({stacks[0]}, {stacks[1]}, …), but one is "
+                f"{len(stacks)} movies were given ({stacks[0]}, {stacks[1]}{more}), but one is "
                 "analysed at a time: name one, or let the shell repeat the command, as in "
                 'for movie in *.tif; do iscat-fit "$movie" --config setup.toml; done'
             )
@@ -213,11 +214,10 @@ def _is_flagged(row: Mapping[str, Any]) -> bool:
 def _advise(messages: Messages, flagged: Sequence[Mapping[str, Any]]) -> None:
     from iscat_analysis.records import Status
 
-    remarks = Counter(
-        remark
-        for row in flagged
-        for remark in {str(row["status"]), *str(row["flags"] or "").split(";")}
-    )
+    remarks: Counter[str] = Counter()
+    for row in flagged:
+        found = {str(row["status"]), *str(row["flags"] or "").split(";")}
+        remarks.update(found & {"sidelobe"} or found)  # which is no event
     for status in Status:
         if status != Status.OK and remarks[status.value]:
             messages.notify(f"{remarks[status.value]} {status}: {status.advice}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -323,7 +324,7 @@ def _print(found: Distribution) -> None:
             short(row["count"]),
             f"{100 * row['efficiency']:.3g} %",
             short(row["count_corrected"]),
-            f"{100 * row['fraction']:.3g} %",
+            "–" if math.isnan(row["fraction"]) else f"{100 * row['fraction']:.3g} %",
             _interval(100 * row["fraction_low"], 100 * row["fraction_high"], 3),
         )
     print_result(shown)

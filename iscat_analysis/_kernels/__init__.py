@@ -20,6 +20,7 @@ from numba.core.caching import FunctionCache
 from numba.core.runtime import rtsys
 
 from iscat_analysis._kernels.claims import claimed
+from iscat_analysis._kernels.store import KeptFiles
 from iscat_analysis.errors import ConfigError
 
 _INSIDE = range(62, 69)
@@ -57,6 +58,9 @@ def _find_room() -> bool:
 TEMPORARY = _find_room()
 """Whether every process compiles its kernels anew."""
 
+UNKEPT: dict[str, str] = {}
+"""Folders in which this process could not keep what it compiled, and the system's reason."""
+
 
 def environment() -> dict[str, str]:
     """Give the environment of a process that keeps compiled kernels where this one does.
@@ -79,6 +83,13 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba is not typed
     if _compiler is not None:
         _impl_class = _compiler.KernelStore
 
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        impl = self._impl
+        self._cache_file = KeptFiles(
+            self._cache_path, impl.filename_base, impl.locator.get_source_stamp()
+        )
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         with self._guard_against_spurious_io_errors():
             rtsys.initialize(target_context)
@@ -88,8 +99,11 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # Numba is not typed
         return super().load_overload(sig, target_context)
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        with self.claimed():  # its list of signatures is written anew
-            super().save_overload(sig, data)
+        try:
+            with self.claimed():  # its list of signatures is written anew
+                super().save_overload(sig, data)
+        except OSError as error:  # a full disk, say
+            UNKEPT[self.cache_path] = error.strerror or str(error)
 
     def claimed(self, arguments: object = "") -> AbstractContextManager[None]:
         """Claim the function, or what is compiled of it for some arguments."""

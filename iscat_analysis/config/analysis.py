@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from iscat_analysis.config.values import (
     ALL,
     LARGEST_NM,
+    Finite,
     FrameRange,
     FramesOrAll,
     Method,
@@ -18,6 +19,12 @@ from iscat_analysis.config.values import (
     Section,
     length,
 )
+
+THINNEST_MPA_S = 0.1
+"""Half the viscosity of ether, the thinnest liquid near room temperature."""
+
+TEMPERATURES_C = (-100.0, 250.0)
+"""Of liquids in a microscope; the upper end lies below their temperatures in kelvin."""
 
 
 class BackgroundConfig(Section):
@@ -127,6 +134,26 @@ class Fit(Section):
         return max(5, round(self.roi_nm / pixel_nm))
 
 
+def _no_pascal_seconds(viscosity: float) -> float:
+    if viscosity < THINNEST_MPA_S:
+        raise ValueError(
+            f"{viscosity:g} mPa·s is less than any liquid has; if {viscosity:g} is in Pa·s, write "
+            f"{1e3 * viscosity:g}"
+        )
+    return viscosity
+
+
+def _no_kelvins(temperature: float) -> float:
+    low, high = TEMPERATURES_C
+    if not low <= temperature <= high:
+        kelvin = f"; if that is in kelvin, write {temperature - 273.15:g}"
+        raise ValueError(
+            f"{temperature:g} °C is not between {low:g} and {high:g} °C"
+            f"{kelvin if temperature > high else ''}"
+        )
+    return temperature
+
+
 class TrackConfig(Section):
     """Mode track: particles that move."""
 
@@ -146,10 +173,10 @@ class TrackConfig(Section):
         description="frames with a background of their own, at most, tracks going on from block to "
         'block | "auto": as many as fit into the memory and drift of the stage allows',
     )
-    viscosity_mpa_s: Positive = Field(
+    viscosity_mpa_s: Annotated[Positive, AfterValidator(_no_pascal_seconds)] = Field(
         0.89, description="of the medium, for hydrodynamic diameters; water at 25 °C: 0.89"
     )
-    temperature_c: Annotated[float, Field(gt=-273.15, lt=1000.0)] = Field(
+    temperature_c: Annotated[Finite, AfterValidator(_no_kelvins)] = Field(
         25.0, description="of the medium, for hydrodynamic diameters"
     )
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, get_args
 
 from iscat_analysis.config.schema import Config
 from iscat_analysis.config.synthetic import SIMULATED
 from iscat_analysis.config.values import Section
 
+_ALIKE = 0.7  # of two words, as difflib measures it
 _DECIMAL_COMMA = re.compile(r"\s*([-+]?\d+),(\d+)\s*")
 
 
@@ -36,9 +37,9 @@ def complaint(item: Mapping[str, Any], called: Mapping[str, str]) -> str:
     ]
     key = called.get(".".join(location), ".".join(location))
     if unknown:
+        near = _nearest(location[-1], location[:-1])
         known = known_keys(location[:-1])
-        near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
-        hint = f"; did you mean {near[0]}?" if near else f"; known: {', '.join(known)}"
+        hint = f"; did you mean {near}?" if near else f"; known: {', '.join(known)}"
         kind = "section" if len(location) == 1 else "key"
         return f"unknown {kind} {key}{hint}"
     message = str(item["msg"]).removeprefix("Value error, ")
@@ -54,6 +55,46 @@ def complaint(item: Mapping[str, Any], called: Mapping[str, str]) -> str:
     if isinstance(given, (int, float)) and abs(given) < 1e300 and f"{given:g} " in message:
         shown = ""
     return f"{key}: {message[:1].lower()}{message[1:]}{shown}"
+
+
+def complaints(items: Iterable[Mapping[str, Any]], called: Mapping[str, str]) -> Iterator[str]:
+    """Put pydantic's errors into words.
+
+    Parameters
+    ----------
+    items : iterable of mapping
+        From `pydantic.ValidationError.errors()`.
+    called : mapping of str to str
+        As in `complaint`.
+
+    Yields
+    ------
+    str
+        As from `complaint`; that a number is no text, where a number is possible, is left out.
+    """
+    items = tuple(items)
+    for item in items:
+        others = (other for other in items if other is not item)
+        branch = any(other["loc"][:-1] == item["loc"][:-1] for other in others)
+        number = isinstance(item["input"], (int, float))
+        if not (item["type"] == "string_type" and number and branch):
+            yield complaint(item, called)
+
+
+def _nearest(word: str, location: list[str]) -> str:
+    """Give the key that was meant: of this section, else by its full name; empty where none is."""
+    known = {key.lower(): key for key in known_keys(location)}
+    small = word.lower()
+    begun = [key for key in known if key.startswith(small)]
+    if begun:
+        return known[small if small in known else begun[0]]
+    if small in Config.model_fields:
+        return f"section [{small}]"
+    sections = [section for section in Config.model_fields if small in known_keys([section])]
+    if sections and len(location) < 2:
+        return " or ".join(f"{section}.{small}" for section in sections)
+    near = difflib.get_close_matches(small, list(known), n=1, cutoff=_ALIKE)
+    return known[near[0]] if near else ""
 
 
 def known_keys(location: list[str]) -> list[str]:

@@ -17,10 +17,20 @@ from iscat_analysis.config.values import (
     Section,
     length,
     plausible_pixel,
+    refractive_index,
 )
+
+Index = Annotated[Positive, AfterValidator(refractive_index)]
 
 MOST_WAVES = 0.5
 """Largest Zernike term over the wavelength; ten times that of a poor objective."""
+
+MOST_PASSES = 3.0
+"""Largest attenuation: what passes of the reference against what passes of the scattered light."""
+
+PER_KDA = (1e-7, 0.01)
+"""Magnitudes of a contrast per kDa: a protein has some 1e-5, and of the larger one 100 kDa would
+change all light."""
 
 ABERRATIONS = tuple(f"z{j}" for j in range(5, 38))
 """Zernike terms on offer, by Noll's index."""
@@ -83,9 +93,9 @@ class Optics(Section):
         525.0, description="vacuum wavelength"
     )
     na: Positive = Field(1.42, description="numerical aperture")
-    n_immersion: Positive = Field(1.515, description="refractive index of the immersion oil")
-    n_glass: Positive = Field(1.515, description="refractive index of the coverslip")
-    n_sample: Positive = Field(1.33, description="refractive index of the sample")
+    n_immersion: Index = Field(1.515, description="refractive index of the immersion oil")
+    n_glass: Index = Field(1.515, description="refractive index of the coverslip")
+    n_sample: Index = Field(1.33, description="refractive index of the sample")
     scheme: Scheme = Field("iscat", description='"iscat" | "cobri" | "darkfield"')
     attenuation: NonNegative = Field(
         1.0, description="amplitude of the reference that passes; ignored in dark field"
@@ -187,6 +197,11 @@ class Optics(Section):
             raise ValueError(
                 "n_glass equals n_sample: nothing is reflected, so there is no iSCAT reference"
             )
+        if self.attenuation > MOST_PASSES:
+            raise ValueError(
+                f"attenuation = {self.attenuation:g} is more than {MOST_PASSES:g}: it is the part "
+                "of the reference's amplitude that passes, as 0.1 for a tenth"
+            )
         if self.scheme != "darkfield" and self.attenuation == 0:
             raise ValueError('attenuation = 0 leaves no reference: use scheme = "darkfield"')
         return self
@@ -275,4 +290,11 @@ class Calibration(Section):
     def _usable(self) -> Calibration:
         if self.gradient_per_kda == 0:
             raise ValueError("gradient_per_kda = 0 says nothing about mass")
+        least, most = PER_KDA
+        if not least <= abs(self.gradient_per_kda) <= most:
+            raise ValueError(
+                f"gradient_per_kda = {self.gradient_per_kda:g} has not between {least:g} and "
+                f"{most:g} of all light per kDa: give contrast per kDa, as -3.1e-5, not in per "
+                "cent or ppm, nor per Da or MDa"
+            )
         return self

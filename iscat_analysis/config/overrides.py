@@ -15,7 +15,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from iscat_analysis.config.complaints import complaint
+from iscat_analysis.config.complaints import complaints
 from iscat_analysis.config.files import read_optics_file, read_toml
 from iscat_analysis.config.renamed import rename
 from iscat_analysis.config.schema import Config
@@ -151,8 +151,8 @@ def _validated(
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        found = (complaint(item, called) for item in error.errors())
-        raise ConfigError(f"{where}: {'; '.join(dict.fromkeys(found))}") from None
+        found = dict.fromkeys(complaints(error.errors(), called))
+        raise ConfigError(f"{where}: {'; '.join(found)}") from None
 
 
 def _changes(settings: Mapping[str, Any] | Iterable[str] | None) -> list[Change]:

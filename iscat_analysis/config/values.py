@@ -60,6 +60,9 @@ LARGEST_NM = 1e5
 PIXEL_NM = (1.0, 2000.0)
 """Pixel sizes in the sample plane that a microscope can have [nm]; outside, the unit is wrong."""
 
+INDICES = (1.0, 4.5)
+"""Refractive indices of air, oils, glasses and transparent semiconductors."""
+
 _UNITS_NM = {"micrometres": 1e3, "millimetres": 1e6, "metres": 1e9, "ångström": 0.1}
 
 
@@ -136,6 +139,33 @@ def length(low_nm: float, high_nm: float) -> AfterValidator:
     return AfterValidator(check)
 
 
+def refractive_index(index: float) -> float:
+    """Return a refractive index, unless nothing that is transparent has it.
+
+    Parameters
+    ----------
+    index : float
+        Of light.
+
+    Returns
+    -------
+    float
+        The same.
+
+    Raises
+    ------
+    ValueError
+        It lies outside `INDICES`.
+    """
+    low, high = INDICES
+    if not low <= index <= high:
+        raise ValueError(
+            f"a refractive index of {index:g} is not between {low:g} and {high:g}: write water's, "
+            "say, as 1.33"
+        )
+    return index
+
+
 def _kind_of_frames(frames: Any) -> str:
     return "literal" if isinstance(frames, str) and frames == ALL else "tuple"
 
@@ -157,12 +187,11 @@ class _Called(ModelMetaclass):
         try:
             return super().__call__(*args, **kwargs)
         except ValidationError as error:
-            from iscat_analysis.config.complaints import complaint, section_name
+            from iscat_analysis.config.complaints import complaints, section_name
 
             name = section_name(self)
             items = ({**item, "loc": (*name, *item["loc"])} for item in error.errors())
-            complaints = dict.fromkeys(complaint(item, {}) for item in items)
-            raise ConfigError("; ".join(complaints)) from None
+            raise ConfigError("; ".join(dict.fromkeys(complaints(items, {})))) from None
 
 
 class Section(BaseModel, metaclass=_Called):

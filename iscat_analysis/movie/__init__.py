@@ -36,15 +36,16 @@ _READERS: Mapping[bytes, Callable[[Path], Frames]] = {
 """The first bytes of a file and what opens it."""
 
 _LOSSY = "which keeps no counts: its compression leaves out what the eye does not see"
+_EXPORT = "export the movie as TIFF"
 _LAZY = "export it as OME-TIFF, or give the array that a reader makes of it to fit_movie"
 _FOREIGN: Mapping[bytes, str] = {
-    b"\x89PNG": "a PNG picture",
-    b"\xff\xd8\xff": "a JPEG picture",
-    b"PK\x03\x04": "a ZIP archive",
-    b"\x1f\x8b": "a gzip archive",
-    b"RIFF": f"an AVI film, {_LOSSY}",
-    b"\x1aE\xdf\xa3": f"a Matroska film, {_LOSSY}",
-    b"SIMPLE": "a FITS file",
+    b"\x89PNG": f"a PNG picture; {_EXPORT}",
+    b"\xff\xd8\xff": f"a JPEG picture; {_EXPORT}",
+    b"PK\x03\x04": "a ZIP archive; unpack it",
+    b"\x1f\x8b": "a gzip archive; unpack it",
+    b"RIFF": f"an AVI film, {_LOSSY}; {_EXPORT}",
+    b"\x1aE\xdf\xa3": f"a Matroska film, {_LOSSY}; {_EXPORT}",
+    b"SIMPLE": f"a FITS file; {_EXPORT}",
     b"\xda\xce\xbe\x0a": f"a Nikon ND2 file; {_LAZY}",
     b"ZISRAWFI": f"a Zeiss CZI file; {_LAZY}",
 }
@@ -128,7 +129,11 @@ def _open_file(address: Path) -> Stack:
     path, part = split_address(address)
     if path.is_dir():
         if not is_zarr(path):
-            raise DataError(f"{path}: is a folder; give the path of one movie file")
+            raise DataError(
+                f"{path}: is a folder; give the path of one movie file: frames that were saved one "
+                "by one are joined first (in Fiji: File > Import > Image Sequence, then Save As > "
+                "Tiff), and all movies of a folder are analysed by `iscat batch`"
+            )
         return Stack(path, open_zarr(path, part), part=part, files=files_of(path))
     try:
         with path.open("rb") as file:
@@ -158,11 +163,11 @@ def _open_file(address: Path) -> Stack:
 def _refusal(path: Path, signature: bytes) -> str:
     """Say what a file is that is not read, and what to do."""
     known = (what for mark, what in _FOREIGN.items() if signature.startswith(mark))
-    found = f"a film, {_LOSSY}" if signature[4:] == _FILM else next(known, "")
+    found = f"a film, {_LOSSY}; {_EXPORT}" if signature[4:] == _FILM else next(known, "")
     needed = "needs to be a TIFF file, a Refeyn .mp movie, HDF5, Zarr or a NumPy array"
     if found:
-        return f"{needed} but is {found}; export the movie as TIFF"
+        return f"{needed} but is {found}"
     return (
-        f"{needed} but is not one; export the movie as TIFF or, if it is plain numbers, say so, "
+        f"{needed} but is not one; {_EXPORT} or, if it is plain numbers, say so, "
         f'as in "{path}{MARK}1500x128x128,uint16"'
     )

@@ -277,10 +277,13 @@ def check_counts(
         low, high = float(lowest[number]), float(highest[number])
         if not (math.isfinite(low) and math.isfinite(high)):
             bad = ~np.isfinite(frame)
-            raise DataError(
-                f"{where} is NaN or infinite {_first(bad)}; "
-                "leave the frame out or export the movie again"
-            )
+            advice = "; leave the frame out or export the movie again"
+            if len(counts) > 1 and not np.isfinite(counts[:, bad]).any():
+                advice = (
+                    ", as in the frames beside it; crop the movie, or set these pixels to 0, which "
+                    "leaves them out"
+                )
+            raise DataError(f"{where} is NaN or infinite {_first(bad)}{advice}")
         refuse_ratio(frame, where, camera)
         if low == high == 0:
             raise DataError(

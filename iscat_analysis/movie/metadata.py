@@ -7,6 +7,7 @@ noise itself.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,12 +42,14 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
     Config
         With a pixel size, and an exposure and a frame rate where either knows them.
     tuple of str
-        One sentence for each disagreement by more than 1 %.
+        One sentence for each disagreement by more than 1 %, and one where pixels are too large for
+        the optics.
 
     Raises
     ------
     DataError
-        Neither gives the pixel size, or the movie gives one that no microscope has.
+        Neither gives the pixel size, or the movie gives one that no microscope has, or these
+        optics do not.
     """
     notes = []
     found: dict[str, float] = {}
@@ -75,7 +78,25 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
             "set camera.pixel_size_nm, as in camera.pixel_size_nm = 84.4"
         )
     camera = config.camera.model_copy(update=found)
-    return config.model_copy(update={"camera": camera}), tuple(notes)
+    config = config.model_copy(update={"camera": camera})
+    source = f"in the movie's {metadata.source} metadata" if "pixel_size_nm" in found else ""
+    return config, (*notes, *_coarse_pixels(config, source or "in the configuration"))
+
+
+def _coarse_pixels(config: Config, where: str) -> Iterator[str]:
+    """Say that pixels are larger than a particle's spot is wide; refuse twice that."""
+    optics, pixel_nm = config.optics, config.camera.pixel_size_nm
+    spot_nm = optics.wavelength_nm / (2 * optics.na)
+    if pixel_nm is None or pixel_nm <= spot_nm:
+        return
+    said = (
+        f"a pixel of {pixel_nm:g} nm, as {where}, is larger than the spot of a particle is wide: "
+        f"about {spot_nm:.3g} nm, optics.wavelength_nm over twice optics.na"
+    )
+    advice = "give its size in the sample plane, as in camera.pixel_size_nm = 84.4"
+    if pixel_nm > 2 * spot_nm:
+        raise DataError(f"{said}; {advice}")
+    yield f"{said}, so that pictures are not resolved; unless it was binned so far, {advice}"
 
 
 def _refuse_unlikely(pixel_nm: float, source: str) -> None:

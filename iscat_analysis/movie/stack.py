@@ -20,6 +20,7 @@ LeftOut = tuple[BoolArray, NDArray[Any]]
 """Pixels that are left out (y, x), and the counts of each in the dark."""
 
 _MB = 1_000_000
+_FLOAT_BYTES = (4, 8)  # that kernels are compiled for
 _BLOCK_BYTES = 2**22  # that are hashed before another thread is waited for
 
 
@@ -183,6 +184,11 @@ class Stack:
         What the movie is of the file, where it is not all: a dataset, or the shape of numbers.
     files : sequence of Path, optional
         The files that hold it; default `path`, none for an array.
+
+    Raises
+    ------
+    DataError
+        Its pixels are floats of another length than 32 and 64 bits.
     """
 
     def __init__(
@@ -195,6 +201,10 @@ class Stack:
         self._closed = False
         self._own = True
         self._left_out: LeftOut | None = None
+        if self.dtype.kind == "f" and self.dtype.itemsize not in _FLOAT_BYTES:
+            raise DataError(
+                f"{path}: its pixels are {self.dtype}; export it as integers or 32-bit floats"
+            )
 
     def __repr__(self) -> str:
         t, y, x = self.shape

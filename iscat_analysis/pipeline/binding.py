@@ -295,7 +295,8 @@ def check_reaction(
 def _read_samples(path: Path) -> pd.DataFrame:
     try:
         text = path.read_text(encoding="utf-8-sig")
-        return pd.read_csv(io.StringIO("\n".join(without_remarks(text))), sep=separator(text))
+        rows, parts = io.StringIO("\n".join(without_remarks(text))), separator(text)
+        return pd.read_csv(rows, sep=parts, decimal="," if parts == ";" else ".")
     except OSError as error:
         what = "is a folder" if path.is_dir() else f"cannot be read ({error.strerror})"
         raise DataError(f"{path}: {what}; give a CSV file with a row for each table") from None

@@ -208,3 +208,8 @@ def compiling(
             yield listener
     finally:
         listener.close()
+        for folder, reason in _kernels.UNKEPT.items():
+            notify(
+                f"compiled kernels cannot be kept in {folder} ({reason}): the next run compiles "
+                "them anew; make room there, or set NUMBA_CACHE_DIR to another folder"
+            )

@@ -92,7 +92,7 @@ def held_height_warning(
     return (
         f"{movie.name}: the particles seem to stay at one height, as on a membrane: set "
         f'track.free = "mass"; with heights that are free {free.sum()} of {free.size} fits are '
-        f"rejected, and with all held at particle.height_nm = {scene.model.height_nm:g} "
+        f"rejected, and with all held at particle.height_nm = {scene.model.height_nm:g} it is "
         f"{held.sum()} of {held.size} in the same frames"
     )
 

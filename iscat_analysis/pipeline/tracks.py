@@ -75,7 +75,8 @@ def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
     Raises
     ------
     ConfigError
-        The exposure is longer than the time from frame to frame.
+        The exposure is longer than the time from frame to frame, or the shortest track that is
+        kept longer than the movie.
     """
     rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
     if rate is None:
@@ -92,6 +93,17 @@ def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
         raise ConfigError(
             f"camera.exposure_ms = {exposure:g} is longer than the {1e3 / rate:.4g} ms from frame "
             f"to frame at camera.frame_rate_hz = {rate:g}: correct one of them"
+        )
+    elif exposure <= (1 + _ROUNDING) / rate:
+        yield (
+            f"camera.exposure_ms = {exposure:g} is no more than a thousandth of the "
+            f"{1e3 / rate:.4g} ms from frame to frame: if it is in seconds, write "
+            f"{1e3 * exposure:g}, since motion during the exposure blurs pictures and changes D"
+        )
+    if way_of(config) == "tracks" and frames < config.track.min_frames:
+        raise ConfigError(
+            f"track.min_frames = {config.track.min_frames} is more than the {frames} frames of "
+            f"{name} that are tracked, so that no track is long enough: lower it"
         )
     # A movie without any is refused, as is one of few frames whose background is learnt.
     if 0 < frames < SHORT_MOVIE and way_of(config) != "tracks":

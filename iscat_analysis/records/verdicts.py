@@ -32,7 +32,8 @@ _ADVICE = {
     "optics that do not fit), or a mass (below a calibration.offset).",
     Status.AMBIGUOUS_Z: "Another height explains the data almost as well: use more frames, "
     "another focus, or a narrower fit.z_range_nm.",
-    Status.POOR_FIT: "The model does not describe the data: check focus, NA, gain and neighbours.",
+    Status.POOR_FIT: "The model does not describe the data: check focus, NA, pixel size, gain and "
+    "neighbours.",
     Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
     "treat the mass as shared between them.",
     Status.SIDELOBE: "Not larger than what the model leaves over of a brighter particle beside it, "

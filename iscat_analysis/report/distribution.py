@@ -108,7 +108,9 @@ def _rows(species: Sequence[Mapping[str, Any]]) -> list[list[Any]]:
             for p, q in zip(low, high, strict=True)
         ]
         decimals = decimals_for(halves) if bounds else int(factor > 1)
-        columns.append([fixed(factor * s[key], decimals) + unit for s in species])
+        columns.append(
+            ["—" if s[key] is None else fixed(factor * s[key], decimals) + unit for s in species]
+        )
         if bounds:
             columns.append(
                 [

@@ -165,7 +165,7 @@ def to_picasso(fits: pd.DataFrame, *, tracked: bool = False) -> pd.DataFrame:
     if rows["sigma_mass_kda"].notna().any():
         columns |= {"mass_kda": rows["mass_kda"], "sigma_mass_kda": rows["sigma_mass_kda"]}
     table = pd.DataFrame(columns).reset_index(drop=True)
-    floats = table.select_dtypes("float64").columns
+    floats = table.columns.difference(["frame", "group"])  # of no rows they are objects
     return table.astype(dict.fromkeys(floats, np.float32))
 
 

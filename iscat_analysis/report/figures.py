@@ -20,6 +20,7 @@ from iscat_analysis.records import (
     free_parameters,
 )
 from iscat_analysis.report.event_figures import HALO, scale_bar
+from iscat_analysis.report.field import field_axes
 from iscat_analysis.report.headline import as_contrasts, label_of, main_quantity
 from iscat_analysis.report.numbers import UNITS
 from iscat_analysis.report.scales import display_range
@@ -112,31 +113,34 @@ def overview(analysis: Analysis, table: pd.DataFrame) -> Figure:
     """
     image = np.asarray(analysis.ratio_image, float)
     rows, columns = image.shape
-    height = float(np.clip(5.2 * rows / columns, 2.5, 7.5))
-    figure = new_figure(6.2, height + 0.5)
-    axes = figure.add_subplot()
+    figure, axes, per_inch = field_axes((rows, columns))
     low, high = display_range([image], analysis.scheme)
     # Matplotlib leaves the pixels of small images to the browser, and averages those of large ones.
     way = "none" if max(rows, columns) <= LARGEST_FIELD else "antialiased"
-    shown = axes.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation=way)
+    shown = axes.imshow(
+        image, cmap="gray", vmin=low, vmax=high, interpolation=way, aspect=per_inch[0] / per_inch[1]
+    )
     scale_bar(axes, columns, rows, analysis.pixel_size_nm)
     unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
     figure.colorbar(shown, ax=axes, label=unit, fraction=0.05, pad=0.02)
     x, y = table["x_px"].to_numpy(float), table["y_px"].to_numpy(float)
     _points(axes, x, y, np.isfinite(x), "o", mfc="none", mec="#F0E442", ms=11, mew=1)
     first = table.drop_duplicates("event")[["event", "x_px", "y_px"]].dropna()
-    _number(axes, first.to_numpy(float), columns / 5.2, (rows, columns))
+    _number(axes, first.to_numpy(float), per_inch, (rows, columns))
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
     return figure
 
 
-def _number(axes: Axes, events: FloatArray, per_inch: float, shape: tuple[int, int]) -> None:
+def _number(
+    axes: Axes, events: FloatArray, per_inch: tuple[float, float], shape: tuple[int, int]
+) -> None:
     """Write each event's number beside its ring, where it covers no other ring and no number.
 
-    `events` has the rows (number, x, y) [px]; `per_inch` is pixels to an inch of the figure.
+    `events` has the rows (number, x, y) [px]; `per_inch` is pixels to an inch along x and y.
     """
-    ring, tall, wide = 0.08 * per_inch, 0.1 * per_inch, 0.065 * per_inch
-    taken = [(x - ring, y - ring, x + ring, y + ring) for _, x, y in events]
+    ring, high = 0.08 * per_inch[0], 0.08 * per_inch[1]
+    wide, tall = 0.065 * per_inch[0], 0.1 * per_inch[1]
+    taken = [(x - ring, y - high, x + ring, y + high) for _, x, y in events]
     taken.append((0.0, shape[0] * 0.9, shape[1] * 0.35, float(shape[0])))
     for number, x, y in events[:NUMBERED_EVENTS]:
         text = f"{number:.0f}"
@@ -144,8 +148,8 @@ def _number(axes: Axes, events: FloatArray, per_inch: float, shape: tuple[int, i
         for left, top in (
             (x + 1.3 * ring, y - tall / 2),
             (x - 1.3 * ring - width, y - tall / 2),
-            (x - width / 2, y - 1.3 * ring - tall),
-            (x - width / 2, y + 1.3 * ring),
+            (x - width / 2, y - 1.3 * high - tall),
+            (x - width / 2, y + 1.3 * high),
         ):
             box = (left, top, left + width, top + tall)
             inside = left > 0 and top > 0 and box[2] < shape[1] and box[3] < shape[0]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.records import Analysis, BoolArray, FloatArray, TrackStatus, track_numbers
 from iscat_analysis.report.event_figures import scale_bar
+from iscat_analysis.report.field import field_axes
 from iscat_analysis.report.headline import main_quantity
 from iscat_analysis.report.scales import display_range
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, Sketch, new_figure
@@ -159,10 +160,16 @@ def trajectories(analysis: Analysis, fits: pd.DataFrame) -> Figure:
     tracks = tracks_of(analysis)
     image = np.asarray(analysis.ratio_image, float)
     tall, columns = image.shape
-    figure = new_figure(6.2, float(np.clip(5.2 * tall / columns, 2.5, 7.5)) + 0.5)
-    axes = figure.add_subplot()
+    figure, axes, per_inch = field_axes((tall, columns))
     low, high = display_range([image], analysis.scheme)
-    axes.imshow(image, cmap="gray", vmin=2 * low, vmax=2 * high, interpolation="antialiased")
+    axes.imshow(
+        image,
+        cmap="gray",
+        vmin=2 * low,
+        vmax=2 * high,
+        interpolation="antialiased",
+        aspect=per_inch[0] / per_inch[1],
+    )
     scale_bar(axes, columns, tall, analysis.pixel_size_nm)
     norm, colors, _ = _colors(analysis)
     values, _ = masses(analysis)
@@ -202,7 +209,8 @@ def mass_d(analysis: Analysis) -> Figure:
     Returns
     -------
     Figure
-        Shades: the sum of what the tracks' errors make of each; points: the tracks.
+        Shades: the sum of what the tracks' errors make of each that is ok, or of all where none is;
+        points: the tracks.
     """
     tracks = tracks_of(analysis)
     mass, sigma = masses(analysis)

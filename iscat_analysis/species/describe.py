@@ -256,6 +256,9 @@ def _table(
     known = best.weight.size - int(found.background)
     share = best.shares(events)
     seen = share.sum(axis=0)
+    outlier = seen < LEAST_SPECIES - 0.5
+    some = np.arange(best.weight.size) < known
+    some &= ~outlier | outlier[:known].all()
 
     def interval(values: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
         if not values:
@@ -266,7 +269,7 @@ def _table(
 
     mass_low, mass_high = interval([r.mixture.mean for r in repeats])
     width_low, width_high = interval([np.sqrt(r.mixture.variance) for r in repeats])
-    part_low, part_high = interval([_fractions(r.mixture.weight, known) for r in repeats])
+    part_low, part_high = interval([_fractions(r.mixture.weight, some) for r in repeats])
     count_low, count_high = interval([r.count for r in repeats])
     came_low, came_high = interval([r.corrected for r in repeats])
     means = np.array([r.mixture.mean for r in repeats])
@@ -280,7 +283,7 @@ def _table(
             "width_kda": np.sqrt(best.variance),
             "width_low": width_low,
             "width_high": width_high,
-            "fraction": _fractions(best.weight, known),
+            "fraction": _fractions(best.weight, some),
             "fraction_low": part_low,
             "fraction_high": part_high,
             "count": seen,
@@ -293,7 +296,7 @@ def _table(
             "count_corrected": best.weight * best.arrived(events),
             "corrected_low": came_low,
             "corrected_high": came_high,
-            "outlier": seen < LEAST_SPECIES - 0.5,
+            "outlier": outlier,
         },
         columns=list(SPECIES_COLUMNS),
     )
@@ -304,11 +307,9 @@ def _table(
     return table
 
 
-def _fractions(weight: FloatArray, known: int) -> FloatArray:
-    """Shares among the species; a background has none."""
-    parts = np.full(weight.shape, math.nan)
-    parts[:known] = weight[:known] / weight[:known].sum()
-    return parts
+def _fractions(weight: FloatArray, some: BoolArray) -> FloatArray:
+    """Shares among the species; a background and outliers have none."""
+    return np.where(some, weight / weight[some].sum(), math.nan)
 
 
 def _ladder(

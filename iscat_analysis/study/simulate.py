@@ -135,7 +135,8 @@ def write_stack(
             )
             movie.truth.to_csv(partial_truth, index=False, float_format="%.10g")
     except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror or error})") from None
+        reason = error.strerror or f"{error}: is the disk full?"
+        raise DataError(f"{path}: cannot be written ({reason})") from None
     return movie.truth
 
 

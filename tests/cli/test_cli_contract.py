@@ -148,6 +148,16 @@ def test_every_remark_is_explained(library, capsys) -> None:
     assert f"2 saturated: {Status.SATURATED.advice}" in told
 
 
+def test_what_is_remarked_on_side_lobes_is_not_counted_among_the_events(library, capsys) -> None:
+    lobe = _row(1, "sidelobe", "sidelobe;poor_fit")
+    library(_returning(_analysis(_row(0, "poor_fit", "poor_fit"), lobe)))
+    assert main_fit(["movie.tif"]) == 0
+    captured = capsys.readouterr()
+    assert "1 event: 1 poor_fit, 1 sidelobe" in captured.out
+    assert f"1 poor_fit: {Status.POOR_FIT.advice}" in captured.err
+    assert f"1 sidelobe: {Status.SIDELOBE.advice}" in captured.err
+
+
 def test_without_calibration_contrasts_are_printed(library, capsys) -> None:
     """A contrast of −0.0149 for 480.4 kDa: the spread keeps its share, and no kDa is printed."""
     row = _row(0) | {"contrast": -0.0149}

@@ -35,6 +35,16 @@ def test_the_table_and_kd(samples: Path, capsys) -> None:
     assert "of the equilibrium" in last
 
 
+def test_a_table_with_semicolons_and_decimal_commas_is_the_same(samples: Path, capsys) -> None:
+    """As a spreadsheet saves it where numbers are written so."""
+    command = ["kd", str(samples), "--model", "dimer", "--masses", "66", "--quiet"]
+    assert main(command) == 0
+    expected = capsys.readouterr().out
+    pd.read_csv(samples).to_csv(samples, index=False, sep=";", decimal=",")
+    assert main(command) == 0
+    assert capsys.readouterr().out == expected
+
+
 def test_json_follows_the_schema(samples: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
     command = ["kd", str(samples), "--model", "dimer", "--masses", "66", "--inactive"]

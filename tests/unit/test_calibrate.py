@@ -151,6 +151,23 @@ def test_a_pixel_size_that_no_microscope_has_is_refused(size_nm: float) -> None:
         resolve_metadata(parse_config({}), StackMetadata(size_nm, source="ome"))
 
 
+@pytest.mark.parametrize(
+    ("size_nm", "said"), [(84.4, ""), (184.0, ""), (186.0, "not resolved; unless it was binned")]
+)
+def test_pixels_larger_than_a_spot_are_named(size_nm: float, said: str) -> None:
+    config = parse_config({"camera": {"pixel_size_nm": size_nm}})  # 525 nm, NA 1.42
+    _, notes = resolve_metadata(config, StackMetadata())
+    assert [said in note for note in notes] == [True] * bool(said)
+
+
+def test_pixels_twice_as_large_as_a_spot_are_refused_wherever_they_come_from() -> None:
+    """One micrometre, as in files that nobody calibrated: every row was a poor fit."""
+    with pytest.raises(DataError, match=r"1000 nm, as in the movie's ome metadata, .* 185 nm"):
+        resolve_metadata(parse_config({}), StackMetadata(1000.0, source="ome"))
+    with pytest.raises(DataError, match=r"1000 nm, as in the configuration, .*give its size in"):
+        resolve_metadata(parse_config({"camera": {"pixel_size_nm": 1000.0}}), StackMetadata())
+
+
 def test_a_pixel_size_is_needed() -> None:
     with pytest.raises(DataError, match=r"set camera\.pixel_size_nm, as in camera") as error:
         resolve_metadata(parse_config({}), StackMetadata())
@@ -182,6 +199,16 @@ def test_impossible_counts_are_refused(value: float, message: str) -> None:
     counts[2, 3, 5] = value
     with pytest.raises(DataError, match=f"m.tif: {message}"):
         check_counts(counts, 10, "m.tif")
+
+
+def test_of_pixels_that_are_no_number_in_every_frame_it_is_said_what_to_do() -> None:
+    counts = good("f8")
+    counts[:, :, :2] = np.nan
+    with pytest.raises(DataError, match=r"in 40 pixels, .* crop the movie, or set these pixels"):
+        check_counts(counts, 0, "m.tif")
+    counts[1:] = 1000.0
+    with pytest.raises(DataError, match=r"in 40 pixels, .*; leave the frame out"):
+        check_counts(counts, 0, "m.tif")
 
 
 def test_frames_without_information_are_refused() -> None:

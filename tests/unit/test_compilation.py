@@ -248,6 +248,47 @@ def test_a_kept_kernel_is_loaded_without_what_compiling_needs(tmp_path):
     assert said == [["True", "False", "True"], ["True", "False", "False"]]
 
 
+SUPPORT = """
+import numpy as np
+from iscat_analysis._kernels.support import supported
+from iscat_analysis.pipeline.compilation import compiling
+
+with compiling(print, 1):
+    edge = np.array([-100.0, 100.0])
+    places = np.array([[0, 0, 50, 1, 0], [900, 0, 50, 1, 0]], dtype=float)
+    print(*supported(places, edge, edge, 5.0, 500.0, 0.0, 100.0, 1.0))
+    print(sum(supported.stats.cache_hits.values()))
+"""
+
+
+def supported(folder, *, before=""):
+    """Run a kernel that is kept in a folder, and give what is printed."""
+    return subprocess.run(
+        [sys.executable, "-c", before + SUPPORT], env=os.environ | {"NUMBA_CACHE_DIR": str(folder)},
+        capture_output=True, text=True, check=True,
+    ).stdout.splitlines()  # fmt: skip
+
+
+@pytest.mark.parametrize(("suffix", "left"), [("nbi", 0.0), ("nbc", 0.5)])
+def test_kept_kernels_that_are_cut_short_are_compiled_again(tmp_path, suffix, left):
+    assert supported(tmp_path) == ["True False", "0"]
+    for file in tmp_path.glob(f"*/*.{suffix}"):
+        kept = file.read_bytes()
+        file.write_bytes(kept[: int(len(kept) * left)])
+    assert supported(tmp_path) == ["True False", "0"]
+    assert supported(tmp_path) == ["True False", "1"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no sizes of files")
+def test_kernels_that_cannot_be_kept_for_want_of_room_end_no_run(tmp_path):
+    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
+    result, hits, said = supported(tmp_path, before=full)
+    assert (result, hits) == ("True False", "0")
+    assert said.startswith(f"compiled kernels cannot be kept in {tmp_path}")
+    assert "File too large" in said
+    assert supported(tmp_path) == ["True False", "0"]
+
+
 def test_kernels_are_kept_where_nothing_can_be_written(tmp_path):
     package = tmp_path / "iscat_analysis"
     shutil.copytree(

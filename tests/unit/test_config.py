@@ -48,6 +48,13 @@ def _complaint(*overrides: str) -> str:
         ("optic.na=1.4", "unknown section optic; did you mean optics?"),
         ("posterior.walker=32", "did you mean walkers?"),
         ("calibration.gradient=1", "did you mean gradient_per_kda?"),
+        ("optics.NA=1.4", "unknown key optics.NA; did you mean na?"),
+        ("optics.pixel_size_nm=84", "did you mean camera.pixel_size_nm?"),
+        ("camera.wavelength_nm=525", "did you mean optics.wavelength_nm?"),
+        ("camera.offset=100", "did you mean offset_adu?"),  # not calibration.offset
+        ("camera.frames=[0, 9]", "did you mean background.frames or fit.frames or simulation."),
+        ("fit.background=[0, 9]", "did you mean section [background]?"),
+        ("optics.magnification=60", "known: file, wavelength_nm"),  # not attenuation
     ],
 )
 def test_unknown_keys_name_the_nearest(override: str, expected: str) -> None:
@@ -63,6 +70,11 @@ def test_an_unknown_key_of_an_event_is_found() -> None:
         parse_config({"simulation": {"events": [{"frame": 1, "xpx": 1.0, "y_px": 2.0}]}})
 
 
+def test_a_number_that_is_too_small_is_not_told_to_be_a_text() -> None:
+    assert _complaint("camera.gain_e_per_adu=0").count("camera.gain_e_per_adu") == 1
+    assert _complaint("camera.read_noise_e=[1]").count("camera.read_noise_e") == 2
+
+
 def test_every_complaint_is_in_the_one_line() -> None:
     text = _complaint("optics.nna=1", "fit.roi_nm=-3")
     assert "optics.nna" in text
@@ -73,6 +85,10 @@ def test_every_complaint_is_in_the_one_line() -> None:
 
 IMPOSSIBLE = [
     (["optics.na=1.6"], "na = 1.6 must be below n_immersion"),
+    (["calibration.gradient_per_kda=-3.1"], "gradient_per_kda = -3.1 has not between 1e-07 and"),
+    (["calibration.gradient_per_kda=-3.1e-8"], "as -3.1e-5, not in per cent or ppm, nor per Da"),
+    (["optics.n_sample=133"], "n_sample: a refractive index of 133 is not between 1 and 4.5"),
+    (["optics.attenuation=10"], "attenuation = 10 is more than 3: it is the part"),
     (["optics.na=1.45", "optics.n_glass=1.4"], "must be below n_glass"),
     (["optics.na=1.2", "optics.n_sample=1.515"], "no iSCAT reference"),
     (["optics.attenuation=0"], 'use scheme = "darkfield"'),
@@ -107,6 +123,8 @@ IMPOSSIBLE = [
     (["track.min_frames=0"], "track.min_frames"),
     (["track.viscosity_mpa_s=0"], "track.viscosity_mpa_s"),
     (["track.temperature_c=-300"], "track.temperature_c"),
+    (["track.temperature_c=298.15"], "and 250 °C; if that is in kelvin, write 25"),
+    (["track.viscosity_mpa_s=0.00089"], "if 0.00089 is in Pa·s, write 0.89"),
     (["background.frames=200"], "[start, stop)"),
     (["camera.pixel_size_nm=0"], "camera.pixel_size_nm"),
     (["camera.pixel_size_nm=84400"], "84400 nm is not between 1 and 2000 nm"),
@@ -261,9 +279,7 @@ def configurations(draw: st.DrawFn) -> Config:
         "posterior": {"enabled": draw(st.booleans() | st.just("auto"))},
         "calibration": draw(
             st.none()
-            | st.fixed_dictionaries(
-                {"gradient_per_kda": positive.map(lambda v: -v), "offset": finite}
-            )
+            | st.fixed_dictionaries({"gradient_per_kda": st.floats(-0.01, -1e-7), "offset": finite})
         ),
         "simulation": {"shape": [rows, columns], "events": events},
     }

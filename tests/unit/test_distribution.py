@@ -188,6 +188,23 @@ def test_one_event_apart_is_an_outlier() -> None:
     assert found.species["width_kda"].iloc[1] < 5  # and spoils no species
 
 
+def test_an_outlier_takes_no_part_of_the_particles_that_came() -> None:
+    """One event where one in 200 is detected stood for more particles than all others."""
+    mass, sigma = sample()
+    mass = np.abs(mass) + 60
+    seen = Efficiency(30.0, 7.0)
+    alone = describe(mass, sigma, efficiency=seen, seed=1, draws=20).species
+    found = describe(
+        np.append(mass, 12.0), np.append(sigma, 6.0), efficiency=seen, seed=1, draws=20
+    ).species
+    assert found["outlier"].tolist() == [True, *[False] * len(alone)]
+    assert found["count_corrected"].iloc[0] > 50
+    assert np.isnan(found["fraction"].iloc[0])
+    assert found["fraction"].iloc[1:].sum() == pytest.approx(1)
+    for name in ("fraction", "fraction_low", "fraction_high"):
+        np.testing.assert_allclose(found[name].iloc[1:], alone[name], atol=0.05)
+
+
 def test_events_far_below_what_is_detected_stop_nothing() -> None:
     mass, sigma = sample()
     found = describe(

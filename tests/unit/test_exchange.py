@@ -183,6 +183,20 @@ def test_picasso_finds_localisations_and_the_size_of_the_movie(landings: Path) -
         export_result(landings, "picasso")
 
 
+def test_picasso_gets_the_same_columns_of_a_movie_without_particles(landings: Path) -> None:
+    written = export_result(landings, "picasso")
+    with h5py.File(written.path) as file:
+        expected = file["locs"].dtype
+    table = pd.read_csv(landings / "fits.csv")
+    table.iloc[:0].to_csv(landings / "fits.csv", index=False)
+    written = export_result(landings, "picasso", overwrite=True)
+    assert written.text == "0 events"
+    with h5py.File(written.path) as file:
+        assert file["locs"].shape == (0,)
+        assert set(file["locs"].dtype.names) <= set(expected.names)
+        assert file["locs"].dtype["lpx"] == expected["lpx"]
+
+
 def test_heights_and_tracks_reach_picasso() -> None:
     joint = to_picasso(make_analysis(20, "joint").table)
     assert {"z", "lpz", "mass_kda"} <= set(joint.columns)

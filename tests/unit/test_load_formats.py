@@ -61,6 +61,26 @@ def test_refuses_arrays_that_are_no_movie(tmp_path: Path) -> None:
     refused(path, "complex128")
 
 
+@pytest.mark.parametrize("dtype", ["f2", "longdouble"])
+def test_floats_that_no_kernel_takes_are_refused_in_every_format(
+    tmp_path: Path, dtype: str
+) -> None:
+    pixels = COUNTS.astype(dtype)
+    if pixels.dtype == np.float64:
+        pytest.skip("this machine has no longer floats")
+    name = str(pixels.dtype)
+    np.save(tmp_path / "a.npy", pixels)
+    refused(tmp_path / "a.npy", f"pixels are {name}; export it as integers")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["movie"] = pixels
+    refused(tmp_path / "a.h5", name)
+    with pytest.raises(DataError, match=name):
+        open_stack(pixels)
+    if dtype == "f2":
+        tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="minisblack")
+        refused(tmp_path / "a.tif", name)
+
+
 def test_an_array_that_is_cut_short_is_refused_at_every_length(tmp_path: Path) -> None:
     path = tmp_path / "movie.npy"
     np.save(path, COUNTS)
@@ -288,6 +308,14 @@ def test_files_of_microscopes_are_named(tmp_path: Path) -> None:
     refused(tmp_path / "a.nd2", "Nikon ND2", "OME-TIFF", "fit_movie")
     (tmp_path / "a.czi").write_bytes(b"ZISRAWFILE" + bytes(20))
     refused(tmp_path / "a.czi", "Zeiss CZI", "OME-TIFF")
+    for name in ("a.nd2", "a.czi"):
+        with pytest.raises(DataError, match=r"to fit_movie$"):  # one remedy, not two
+            open_stack(tmp_path / name)
+
+
+def test_of_a_folder_of_frames_it_is_said_what_to_do(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "frame_0.tif", COUNTS[0])
+    refused(tmp_path, "is a folder", "Image Sequence", "iscat batch")
 
 
 # ---- TIFF in several files -------------------------------------------------------------------

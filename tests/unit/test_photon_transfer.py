@@ -158,6 +158,8 @@ def test_a_flat_needs_its_offset() -> None:
     found = measure_camera([flat], offset_adu=OFFSET)
     assert abs(pull(found.gain_e_per_adu, GAIN)) < 4
     assert found.offset_from == "given"
+    with pytest.raises(DataError, match=r"counts, no more than `offset_adu` = 60000: give"):
+        measure_camera([flat], offset_adu=6e4)
 
 
 def test_a_dark_alone_gives_counts_only() -> None:

@@ -408,6 +408,31 @@ def test_documents_escape_what_they_are_given() -> None:
     assert page.count("</script>") == page.count("<script")
 
 
+@pytest.mark.parametrize(
+    ("shape", "said"),
+    [
+        ((64, 64), ""),
+        ((128, 512), ""),
+        ((20, 1000), "pixels are drawn 10 times as tall as wide"),
+        ((1000, 20), "pixels are drawn 10 times as wide as tall"),
+    ],
+)
+def test_no_field_is_drawn_as_a_line(shape: tuple[int, int], said: str) -> None:
+    """Of 20 rows of 1000 pixels the picture was a tenth of an inch tall."""
+    analysis = make_analysis(3)
+    analysis = replace(analysis, ratio_image=np.zeros(shape))
+    figure = figures.overview(analysis, event_table(analysis))
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    assert axes.get_title() == said
+    wide, tall = (float(size) for size in axes.get_window_extent().size / figure.dpi)
+    assert min(wide, tall) > 0.8
+    (image,) = axes.images
+    assert image.get_extent() == [-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5]
+    beside = figure.axes[1].get_window_extent().height / figure.dpi
+    assert beside < 2 * tall  # the scale of contrast
+
+
 def test_a_page_without_a_title_is_an_error() -> None:
     import jinja2
 

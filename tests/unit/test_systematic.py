@@ -124,11 +124,11 @@ def test_the_column_is_the_spread_over_draws_of_the_optics() -> None:
 def test_a_line_from_the_same_optics_takes_the_common_factor_away() -> None:
     """Standards and sample through the same wrong microscope: only bright particles differ."""
     standard, light, bright = 10.0, 480.0, 3e5
-    line = Calibration(gradient_per_kda=-1.0)
+    line = Calibration(gradient_per_kda=-0.01)
 
     def masses(config: Config) -> np.ndarray[Any, Any]:
         contrasts = [
-            _fitted(config, _config(), 5.0, a, "mass")["mass_kda"] * -1.0
+            _fitted(config, _config(), 5.0, a, "mass")["mass_kda"] * -0.01
             for a in (standard, light, bright)
         ]
         return np.array(contrasts[1:]) / contrasts[0]

@@ -356,6 +356,13 @@ def test_an_exposure_longer_than_the_interval_is_refused() -> None:
         _timed(frame_rate_hz=331.0, exposure_ms=4.0)
 
 
+def test_an_exposure_in_seconds_is_named() -> None:
+    for exposure in (2.5e-3, 1 / 331.0):
+        (line,) = _timed(frame_rate_hz=331.0, exposure_ms=exposure)
+        assert f"in seconds, write {1e3 * exposure:g}," in line
+    assert _timed(frame_rate_hz=331.0, exposure_ms=0.01) == []
+
+
 def test_a_missing_frame_rate_and_exposure_are_said_with_their_keys() -> None:
     assert _timed(frame_rate_hz=331.0, exposure_ms=2.5) == []
     (line,) = _timed(exposure_ms=2.5)
@@ -373,6 +380,17 @@ def test_a_short_movie_is_said_with_what_it_can_tell() -> None:
     assert line.startswith("movie.tif: 10 frames tell no diffusion coefficient better than to 33 %")
     (line,) = judge_times(config, 5, "movie.tif")
     assert "track.min_frames = 10" in line
+
+
+def test_tracks_longer_than_the_movie_are_not_looked_for() -> None:
+    """It was said that nothing stands out of the noise."""
+    config = parse_config({"camera": {"pixel_size_nm": 84.0, "frame_rate_hz": 331.0,
+                                      "exposure_ms": 2.0}, "fit": {"mode": "track"},
+                           "background": {"method": "tracks"},
+                           "track": {"min_frames": 60}})  # fmt: skip
+    assert not list(judge_times(config, 60, "movie.tif"))
+    with pytest.raises(ConfigError, match=r"track\.min_frames = 60 is more than the 59 frames of"):
+        list(judge_times(config, 59, "movie.tif"))
 
 
 def test_steps_that_are_not_linked_are_told() -> None:

@@ -123,6 +123,11 @@ def measure_camera(
         odd = masked["hot"] | masked["dead"] | saturated(first.max(axis=0), stack.name)
         lit = ~(odd | unlike_neighbours(first.mean(axis=0) - floor))
         measured = moments_of(stack, lit, advance)
+        if dark is None and floor > 0 and np.median(measured.mean) <= floor:
+            raise DataError(
+                f"{stack.name}: has {np.median(measured.mean):.5g} counts, no more than "
+                f"`offset_adu` = {floor:g}: give the counts that the camera has in the dark"
+            )
         full = saturated(measured.highest, stack.name)
         masked["saturated"] |= full
         masked["clipped"] |= clipped(measured.lowest) & (measured.variance > 0)
