@@ -124,7 +124,9 @@ class OpticsCalibration:
                 with_error("steps of", self.value(FOCUS_STEP), self.sigma(FOCUS_STEP), "nm")
             )
         if FOCUS_DRIFT in self.names:
-            drift = with_error("rising by", self.value(FOCUS_DRIFT), self.sigma(FOCUS_DRIFT), "nm")
+            drift = with_error(
+                "focus rising by", self.value(FOCUS_DRIFT), self.sigma(FOCUS_DRIFT), "nm"
+            )
             parts.append(f"{drift} in 1000 frames")
         terms = [n for n in self.names if is_term(n)]
         if terms:
