@@ -73,13 +73,14 @@ def find_bound(ready: Prepared, run: Run) -> Found:
     DataError
         The background leaves no frame to fit, or a frame is impossible.
     """
-    scene, windows, noise, summary = _background(ready, run)
+    scene, windows, noise, summary, doubt = _background(ready, run)
     movie, camera = ready.steady, ready.camera
     with threads(scene.config.compute.workers) as pool:
         if scene.mode == "track":
             found = track_frames(
                 scene, movie, camera, windows, summary,
                 check=checked(movie, camera), pool=pool, progress=run.progress,
+                doubt=doubt, tell=run.tell,
             )  # fmt: skip
             if not windows.n_before:
                 for text in _judged_beside(ready, scene, windows, found.fits).messages:
@@ -90,8 +91,11 @@ def find_bound(ready: Prepared, run: Run) -> Found:
     return found
 
 
-def _background(ready: Prepared, run: Run) -> tuple[Scene, Windows, Noise, dict[str, Any]]:
-    """Sum the background and the frames after it, and judge its noise, pixels and drift."""
+def _background(ready: Prepared, run: Run) -> tuple[Scene, Windows, Noise, dict[str, Any], str]:
+    """Sum the background and the frames after it, and judge its noise, pixels and drift.
+
+    The last is why it may not be the background of these frames; empty where it is.
+    """
     movie, config, camera = ready.steady, ready.config, ready.camera
     before, after = frame_ranges(movie, config)
     searches = after[1] - after[0] if config.fit.mode == "track" else 1
@@ -112,14 +116,15 @@ def _background(ready: Prepared, run: Run) -> tuple[Scene, Windows, Noise, dict[
         if text:
             run.tell(text)
     summary: dict[str, Any] = {}
+    moved = ""
     if not scene.additive:
         summary = examine_background(movie, camera, windows)
         summary["noise_spectrum"] = noise.summary
-        moved = drift_warning(movie.name, summary)
+        moved = drift_warning(movie.name, summary) or ""
         if moved:
             run.tell(moved)
     run.clock.lap("background")
-    return scene, windows, noise, summary
+    return scene, windows, noise, summary, uneven or moved
 
 
 def _judged_beside(ready: Prepared, scene: Scene, windows: Windows, table: pd.DataFrame) -> Noise:
