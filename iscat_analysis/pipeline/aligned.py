@@ -177,7 +177,7 @@ def align(scene: Scene, moving: Moving) -> Aligned:
         return none
     good = moving.converged & ~moving.close & field.holds(rows.theta)
     if field.free[2]:
-        good &= (rows.snr > FAINTEST) & (_smear_nm(moving) < MOST_SMEARED_NM)
+        good &= (rows.snr > FAINTEST) & (moving.smear_nm < MOST_SMEARED_NM)
     else:
         good &= np.isfinite(moving.common.amplitude)[rows.track]
     chosen = np.flatnonzero(_brightest(rows.track, rows.snr, good))
@@ -197,11 +197,6 @@ def _brightest(track: IntArray, snr: FloatArray, good: BoolArray) -> BoolArray:
     enough = np.bincount(track, weights=good) >= LEAST_FRAMES
     best = np.argsort(-np.where(enough, energy, -1.0), kind="stable")[:MOST_TRACKS]
     return np.asarray(good & np.isin(track, best[enough[best]]))
-
-
-def _smear_nm(moving: Moving) -> FloatArray:
-    """Spread of the path of every row about its mean, shape (n,) [nm]."""
-    return np.asarray(np.sqrt(moving.variances_nm2)[moving.rows.group])
 
 
 def _single(scene: Scene, moving: Moving, chosen: IntArray) -> Aligned:
