@@ -7,8 +7,9 @@ that suits it best among the rings of all.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,7 +36,8 @@ _PASSES = 12  # of a fit from one of several heights
 _OPTICS_PASSES = 8
 _LEADERS = 2  # microscopes that are followed beside the configured one,
 _FOLLOWED = 3  # for so many rounds,
-_DESCRIBED_CHI2 = 1.2  # unless one describes the pictures
+_CLEAR = 1.0  # unless one describes the pictures to so many standard errors of one picture's χ²
+_DESCRIBED_CHI2 = 1.2  # of pictures that were not fitted, from which no other is looked for
 
 
 def learn_with_heights(
@@ -140,6 +142,8 @@ def _likeliest(
     build_wide = rings_of(config, sights[0])
     lights = ("linear", "circular") if "polarization" in groups else (known["polarization"],)
     focus_moves = _FOCUS_MOVES_NM if "focus" in groups else (0.0,)
+    # a focus and heights that are one fringe off describe the pictures nearly as well
+    clear = 1 + _CLEAR * math.sqrt(2 / math.prod(sights[0].grid.shape))
 
     def placed(
         settings: Settings, some: Sequence[Sight], around: Sequence[Sight], moved: float = 0.0
@@ -182,7 +186,7 @@ def _likeliest(
         for _ in range(_FOLLOWED):
             begun = better(begun)
             followed.append(begun)
-            if begun.misfit < _DESCRIBED_CHI2:
+            if begun.misfit < clear:
                 return begun
     return min([*tried, *followed], key=lambda begun: begun.misfit)
 
@@ -205,16 +209,10 @@ def _best_heights(
 
     found: list[list[tuple[bool, float, Sight]]] = [[] for _ in sights]
     for shift in shifts_nm:
-        moved = [_raised(sight, shift) for sight in sights]
+        moved = [sight.raised(shift) for sight in sights]
         begun = with_masses(moved, build, settings)
         fits = maximise(begun, build, settings, (), passes=_PASSES, mapper=mapper).sights
         for sight, fit, of_it in zip(sights, fits, found, strict=True):
             turned = sight.mass_kda * fit.mass_kda < 0
             of_it.append((turned, goodness(fit, model)[0], fit))
     return [min(fits, key=lambda fit: fit[:2])[1:] for fits in found]
-
-
-def _raised(sight: Sight, shift_nm: float) -> Sight:
-    """Begin at another height, within those that are possible."""
-    low, high = sight.heights_nm or (sight.z_nm, sight.z_nm)
-    return replace(sight, z_nm=min(max(sight.z_nm + shift_nm, low), high))
