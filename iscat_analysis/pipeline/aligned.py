@@ -10,6 +10,8 @@ microscope changes the blur of a picture by much less than the picture.
 The frames are put where their own noise says.  Of a frame with the covariance Σ of its place the
 model then leaves over −½ ∂²C:Σ on average, C the contrast (what the wrong place blurs, less twice
 that, because noise and place go together): C blurred by Σ less C, which is put back.
+
+Where heights are fitted no two frames show the same: each is a picture of its own.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.calibration.optics import Sight
+from iscat_analysis.calibration.optics import FAINTEST, Sight
 from iscat_analysis.inference.common import variances_left
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import poisson
@@ -39,6 +41,13 @@ LEAST_FRAMES = 20
 
 MOST_TRACKS = 16
 """The brightest are looked at."""
+
+MOST_SINGLE = 36
+"""Frames of their own that are looked at: each has a height that is searched."""
+
+MOST_SMEARED_NM = 25.0
+"""Spread of the path in a frame of its own that is looked at: of a longer one the picture is no
+longer that of a normal distribution about the mean."""
 
 IntArray = NDArray[np.int64]
 
@@ -132,6 +141,7 @@ class Aligned:
         """
         likelihood = self.likelihood(scene, number)
         theta = self.theta[number]
+        fit = scene.config.fit
         x, y, z = (float(v) for v in theta[:3])
         signal = likelihood.signal(theta)
         return Sight(
@@ -139,6 +149,7 @@ class Aligned:
             x_nm=x, y_nm=y, z_nm=z, mass_kda=float(scene.model.scale.mass(theta[3])),
             snr=float(np.sqrt(np.sum(signal**2 * likelihood.signal_information(signal)))),
             owner=int(self.track[number]),
+            heights_nm=fit.z_range_nm if fit.mode == "joint" else None,
         )  # fmt: skip
 
 
@@ -155,22 +166,24 @@ def align(scene: Scene, moving: Moving) -> Aligned:
     Returns
     -------
     Aligned
-        Of frames in which the particle was alone; without any where heights are fitted, which
-        change from frame to frame.
+        Of frames in which the particle was alone.
     """
     side = _side(scene)
     empty = np.zeros((0, side, side))
     nothing = np.zeros(0, dtype=np.int64)
     none = Aligned(nothing, empty, empty, empty, np.zeros((0, 5)), nothing)
     rows, field = moving.rows, moving.field
-    if field.free[2] or not len(rows.frame):
+    if not len(rows.frame):
         return none
     good = moving.converged & ~moving.close & field.holds(rows.theta)
-    good &= np.isfinite(moving.common.amplitude)[rows.track]
-    chosen = _brightest(rows.track, rows.snr, good)
-    if not chosen.any():
+    if field.free[2]:
+        good &= (rows.snr > FAINTEST) & (moving.smear_nm < MOST_SMEARED_NM)
+    else:
+        good &= np.isfinite(moving.common.amplitude)[rows.track]
+    chosen = np.flatnonzero(_brightest(rows.track, rows.snr, good))
+    if not len(chosen):
         return none
-    return _summed(scene, moving, np.flatnonzero(chosen))
+    return _single(scene, moving, chosen) if field.free[2] else _summed(scene, moving, chosen)
 
 
 def _side(scene: Scene) -> int:
@@ -184,6 +197,26 @@ def _brightest(track: IntArray, snr: FloatArray, good: BoolArray) -> BoolArray:
     enough = np.bincount(track, weights=good) >= LEAST_FRAMES
     best = np.argsort(-np.where(enough, energy, -1.0), kind="stable")[:MOST_TRACKS]
     return np.asarray(good & np.isin(track, best[enough[best]]))
+
+
+def _single(scene: Scene, moving: Moving, chosen: IntArray) -> Aligned:
+    """Take frames of their own, from all heights alike."""
+    rows = moving.rows
+    ranked = chosen[np.argsort(rows.theta[chosen, 2], kind="stable")]
+    some = np.linspace(0, len(ranked) - 1, min(MOST_SINGLE, len(ranked))).round().astype(np.int64)
+    chosen = np.sort(ranked[some])
+    side, theta = _side(scene), rows.theta[chosen].copy()
+    corner = np.rint(theta[:, 1::-1] / scene.pixel_nm).astype(np.int64) - side // 2
+    theta[:, :2] -= corner[:, ::-1] * scene.pixel_nm
+    sums, owner = np.zeros((len(chosen), 3, side, side)), np.arange(len(chosen))
+    corner = np.ascontiguousarray(corner)
+    moving.field.add_squares(moving.ground, rows, chosen, corner, owner, sums)
+    left, light, read = np.moveaxis(sums, 1, 0)
+    grid = PixelGrid.region((0, side), (0, side), scene.pixel_nm)
+    counts = left + light
+    for number, (x, y, z, amplitude, _) in enumerate(theta.tolist()):
+        counts[number] += light[number] * scene.model.amplitude_image(grid, x, y, z, amplitude)
+    return Aligned(rows.track[chosen], counts, light, read, theta, np.ones(len(chosen), np.int64))
 
 
 def _summed(scene: Scene, moving: Moving, chosen: IntArray) -> Aligned:

@@ -16,6 +16,7 @@ from iscat_analysis.inference.moving import MovingField
 from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline.aligned import Aligned, align
+from iscat_analysis.pipeline.diagnosis import smear_warning
 from iscat_analysis.pipeline.linking import typical_error
 from iscat_analysis.pipeline.moving import follow
 from iscat_analysis.pipeline.moving_table import common_masses, moving_table
@@ -179,6 +180,9 @@ def analyse_block(
     if not goes_on[0]:
         aligned = pictures.result()
         noise = judged.result().beside(table["chi2_reduced"].to_numpy(float))
+        smeared = smear_warning(scene.config, table, moving.smear_nm)
+        if smeared:  # what is left over of pictures, far around them, is not the camera's
+            noise = Noise(messages=(smeared,))
     return Block(
         span=span,
         rows=replace(rows, frame=rows.frame + first),

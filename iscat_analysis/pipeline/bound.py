@@ -76,13 +76,14 @@ def find_bound(ready: Prepared, run: Run) -> Found:
         The background leaves no frame to fit, or a frame is impossible.
     """
     ready, windows = _summed(ready, run)
-    scene, noise, summary = _background(ready, run, windows)
+    scene, noise, summary, doubt = _background(ready, run, windows)
     movie, camera = ready.steady, ready.camera
     with threads(scene.config.compute.workers) as pool:
         if scene.mode == "track":
             found = track_frames(
                 scene, movie, camera, windows, summary,
                 check=checked(movie, camera), pool=pool, progress=run.progress,
+                doubt=doubt, tell=run.tell,
             )  # fmt: skip
             if not windows.n_before:
                 for text in _judged_beside(ready, scene, windows, found.fits).messages:
@@ -112,8 +113,13 @@ def _summed(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
     return replace(ready, steady=movie), sums(movie)
 
 
-def _background(ready: Prepared, run: Run, windows: Windows) -> tuple[Scene, Noise, dict[str, Any]]:
-    """Make the models, and judge the noise, pixels and drift of the background."""
+def _background(
+    ready: Prepared, run: Run, windows: Windows
+) -> tuple[Scene, Noise, dict[str, Any], str]:
+    """Make the models, and judge the noise, pixels and drift of the background.
+
+    The last is why it may not be the background of these frames; empty where it is.
+    """
     movie, config, camera = ready.steady, ready.config, ready.camera
     after = windows.frames_after
     searches = after[1] - after[0] if config.fit.mode == "track" else 1
@@ -133,14 +139,15 @@ def _background(ready: Prepared, run: Run, windows: Windows) -> tuple[Scene, Noi
         if text:
             run.tell(text)
     summary: dict[str, Any] = {}
+    moved = ""
     if not scene.additive:
         summary = examine_background(movie, camera, windows)
         summary["noise_spectrum"] = noise.summary
-        moved = drift_warning(movie.name, summary)
+        moved = drift_warning(movie.name, summary) or ""
         if moved:
             run.tell(moved)
     run.clock.lap("background")
-    return scene, noise, summary
+    return scene, noise, summary, uneven or moved
 
 
 def _judged_beside(ready: Prepared, scene: Scene, windows: Windows, table: pd.DataFrame) -> Noise:

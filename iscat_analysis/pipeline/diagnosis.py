@@ -37,6 +37,9 @@ _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
 _SWAPPED = 10.0  # times less change along the axis of time than along both of space
 _LOOKED_AT = 96  # frames, rows and columns in which axes are judged
 _ENOUGH_STEPS = 30
+_MOSTLY = 0.5  # of fits that are poor
+_SMEARED_NM = 20.0  # from where most fits of bright particles are,
+_DESCRIBED_NM = 15.0  # and where hardly any is
 _NORMAL = (0.4549, 1.3863)  # medians of χ² with one and two degrees of freedom
 _FEWEST_TURNED = 5  # particles of the other sign that make it worth a line,
 _NEARLY_ALL = 0.9  # and their share
@@ -389,6 +392,46 @@ def plane_warning(config: Config, table: pd.DataFrame) -> str:
         f'by {math.sqrt(along):.2g} nm along z, as on a membrane: set track.free = "mass" and '
         f'particle.height_nm = {good["z_nm"].median():.3g}; with track.free = "joint" pictures '
         "are blurred along z as well, and masses come out too large"
+    )
+
+
+def smear_warning(config: Config, table: pd.DataFrame, smear_nm: FloatArray) -> str:
+    """Say that particles go too far within an exposure for their heights to be fitted.
+
+    A picture is that of a normal distribution about the mean of the path, along z in phase too; of
+    a long path no two are alike.
+
+    Parameters
+    ----------
+    config : Config
+        In mode joint, where heights are fitted, or mass.
+    table : pandas.DataFrame
+        Rows of particles and frames.
+    smear_nm : ndarray, shape (n,)
+        Spread of the path of each about its mean, along each axis [nm].
+
+    Returns
+    -------
+    str
+        One line; empty where most fits are described, or heights are not fitted.
+    """
+    if config.fit.mode != "joint" or len(table) < _ENOUGH_STEPS:
+        return ""
+    poor = table["flags"].fillna("").str.contains(Status.POOR_FIT.value)
+    smear = float(np.median(smear_nm))
+    if poor.mean() < _MOSTLY or smear < _SMEARED_NM:
+        return ""
+    rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
+    if exposure is None and rate is not None:
+        exposure = 1e3 / rate
+    advice = ""
+    if exposure is not None:
+        advice = f" than {exposure:.3g} ms, about {exposure * (_DESCRIBED_NM / smear) ** 2:.1g} ms"
+    return (
+        f"the particles go {smear:.0f} nm (standard deviation) about their mean within an "
+        f"exposure, and {poor.mean():.0%} of the fits are poor: along z that turns the phase by "
+        "too much for one picture, and optics, gain and noise cannot be judged; expose for less"
+        f"{advice}"
     )
 
 

@@ -184,11 +184,10 @@ def why_not(config: Config) -> str:
     """
     optics, mode, way = config.optics, config.fit.mode, way_of(config)
     tracks = mode == "track"
-    followed = way == "tracks" and config.track.free == "mass"
     reasons = (
         (
-            tracks and not followed,
-            'in mode track but with track.free = "mass" and without background frames',
+            tracks and way != "tracks",
+            "in mode track over a background that is not learned with the tracks",
         ),
         (optics.scheme == "darkfield", "from dark field"),
         (optics.convention != "exact", f'with optics.convention = "{optics.convention}"'),

@@ -120,6 +120,11 @@ class Moving:
     shared: FloatArray
     common: CommonAmplitudes
 
+    @property
+    def smear_nm(self) -> FloatArray:
+        """Spread of the path of every row about its mean, along each axis, shape (n,) [nm]."""
+        return np.asarray(np.sqrt(self.variances_nm2)[self.rows.group])
+
 
 def follow(
     scene: Scene,

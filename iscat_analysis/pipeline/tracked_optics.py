@@ -7,6 +7,7 @@ an NA of 1.40 for 1.42, a focus wrong by 20 nm or 15 nm of coma leave over a ten
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,17 +16,29 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from iscat_analysis.calibration.optics import FREE, MOST_SIGHTS, OpticsCalibration, Settings
-from iscat_analysis.calibration.optics.settings import settings_of, with_settings
+from iscat_analysis.calibration.optics import (
+    FREE,
+    MOST_SIGHTS,
+    OpticsCalibration,
+    Settings,
+    heights_free,
+    settings_of,
+    with_settings,
+)
 from iscat_analysis.config import Config
-from iscat_analysis.errors import DataError
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.cause import PIXEL, Cause, likely_cause
+from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.pipeline.aligned import Aligned
 from iscat_analysis.pipeline.block_store import Block
 from iscat_analysis.pipeline.learning import taken, usable
 from iscat_analysis.pipeline.microscope import calibrate_sights, with_sign
+from iscat_analysis.pipeline.run import unheard
 from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.pipeline.settling_optics import Round, Rounds
+from iscat_analysis.pipeline.tested_optics import REJECTED_P
+from iscat_analysis.pipeline.unknown_heights import learn_with_heights
+from iscat_analysis.records import BoolArray
 from iscat_analysis.units import count
 
 REJECTED_SHARE = 0.04
@@ -47,7 +60,6 @@ tracks that were followed with wrong optics is only near the truth, as `settling
 _ROUGH_ROUNDS = 4  # in which optics that describe the tracks at all are found, or never
 _NOISE = "the noise is not what the camera's numbers predict, and may be what is left over"
 _LOOKED_AT = 24  # pictures in which the cause is looked for
-_PLACE_AND_MASS = np.array([True, True, False, True, False])
 
 
 @dataclass(frozen=True)
@@ -58,20 +70,20 @@ class LeftOver:
     ----------
     share : float
         Beyond the noise, of the particle's picture.
-    chi2 : float
-        Reduced χ² over that of single frames.
+    clear : bool
+        Whether that is clearly more than noise.
     tracks : int
         That were looked at.
     """
 
     share: float
-    chi2: float
+    clear: bool
     tracks: int
 
     @property
     def rejected(self) -> bool:
         """Whether the optics are not those of the movie."""
-        return self.share > REJECTED_SHARE and self.chi2 > REJECTED_CHI2
+        return self.share > REJECTED_SHARE and self.clear
 
     @property
     def verdict(self) -> str:
@@ -128,6 +140,7 @@ def learn_from_tracks(
     name: str,
     pool: ThreadPoolExecutor,
     tell: Callable[[str], None],
+    notify: Callable[[str], None] = unheard,
 ) -> tuple[Begun, dict[str, Any]]:
     """Follow the first frames, test the optics on them, and learn better ones where they fail.
 
@@ -146,6 +159,8 @@ def learn_from_tracks(
         Runs the fits.
     tell : callable
         Told in one line what is wrong, or what was learned.
+    notify : callable
+        Told that optics are being learned, which may take minutes.
 
     Returns
     -------
@@ -188,7 +203,10 @@ def learn_from_tracks(
         said = _said(left, cause, learns=learns)
         return as_configured(said, said)
     reason = ""
-    for cautious in (False, True) if trouble is None else (True,):
+    notify("learning the optics from the tracks of the movie, which may take minutes…")
+    # with free heights rings are taken for many particles, each with its own: that takes long
+    apart = trouble is not None or heights_free(config)
+    for cautious in (True,) if apart else (False, True):
         try:
             trial = begin(config, cautious=True) if cautious and trouble is None else begun
             found, near, why = _described(trial, begin, config, cause, name=name, pool=pool)
@@ -202,7 +220,7 @@ def learn_from_tracks(
                 rest = near.left.share if near.left is not None else 0.0
                 told = {"calibrated": True, "reason": why, "left_over_then": rest}
                 return near, tested | told
-        except DataError as error:
+        except (DataError, ConfigError) as error:  # or what was learned asks for too much memory
             why = str(error)
         reason = reason or why
     if left.rejected:
@@ -291,6 +309,9 @@ def _left_over(block: Block, scene: Scene) -> LeftOver | None:
     aligned = block.aligned
     if aligned is None or not len(aligned.track):
         return None
+    tracks = len(np.unique(aligned.track))
+    if scene.mode == "joint":
+        return _left_over_singly(aligned, scene, tracks)
     rest, signal, variance = (np.zeros(aligned.light_e.shape[1:]) for _ in range(3))
     for number, theta in enumerate(aligned.theta):
         likelihood = aligned.likelihood(scene, number)
@@ -302,9 +323,31 @@ def _left_over(block: Block, scene: Scene) -> LeftOver | None:
     usual = max(1.0, float(block.table["chi2_reduced"].median()))
     square = rest[used] ** 2 / variance[used] / usual
     power = float(np.sum(signal[used] ** 2 / variance[used])) / usual
-    excess = max(float(np.sum(square - 1)), 0.0)
-    share = float(np.sqrt(excess / power)) if power > 0 else 0.0
-    return LeftOver(share, float(square.mean()), len(np.unique(aligned.track)))
+    share = _share(float(np.sum(square - 1)), power)
+    return LeftOver(share, float(square.mean()) > REJECTED_CHI2, tracks)
+
+
+def _left_over_singly(aligned: Aligned, scene: Scene, tracks: int) -> LeftOver | None:
+    """Say the same of pictures that no two have in common, as of particles at other heights."""
+    excess, power, p_values = 0.0, 0.0, []
+    for number, theta in enumerate(aligned.theta):
+        likelihood = aligned.likelihood(scene, number)
+        signal = likelihood.signal(theta)
+        chi2, p_value = goodness_of_fit(likelihood, theta, _free(scene))
+        excess += (chi2 - 1) * likelihood.n_pixels
+        power += float(np.sum(signal**2 * likelihood.signal_information(signal)))
+        p_values.append(p_value)
+    return LeftOver(_share(excess, power), float(np.median(p_values)) < REJECTED_P, tracks)
+
+
+def _share(excess: float, power: float) -> float:
+    """Root of the share of a signal's power."""
+    return math.sqrt(max(excess, 0.0) / power) if power > 0 else 0.0
+
+
+def _free(scene: Scene) -> BoolArray:
+    """Tell what is fitted of a picture, as `Likelihood` has it."""
+    return np.array([True, True, scene.mode == "joint", True, False])
 
 
 def _brightest(aligned: Aligned, most: int) -> list[int]:
@@ -320,7 +363,7 @@ def _cause(begun: Begun) -> Cause | None:
     if aligned is None:
         return None
     shown = _brightest(aligned, _LOOKED_AT)
-    fits = [(aligned.likelihood(scene, n), aligned.theta[n], _PLACE_AND_MASS) for n in shown]
+    fits = [(aligned.likelihood(scene, n), aligned.theta[n], _free(scene)) for n in shown]
     return likely_cause(scene.config, fits)
 
 
@@ -362,4 +405,11 @@ def _measured(
     shown = [] if aligned is None else _brightest(aligned, MOST_SIGHTS)
     sights = [aligned.sight(scene, n) for n in shown] if aligned is not None else []
     source: Mapping[str, str] = {"movie": name}
-    return calibrate_sights(sights, (), start, tuple(FREE), source, known=known, mapper=pool.map)
+    if scene.mode != "joint":
+        return calibrate_sights(
+            sights, (), start, tuple(FREE), source, known=known, mapper=pool.map
+        )
+    return learn_with_heights(
+        sights, (), start, tuple(FREE), source,
+        known=known or settings_of(start), around=known is None, mapper=pool.map,
+    )  # fmt: skip

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.config import Config
+from iscat_analysis.errors import DataError
 from iscat_analysis.movie.background import Check, add_frames, start_power
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.optics.forward import PixelGrid
@@ -24,7 +25,12 @@ from iscat_analysis.pieces.regions import lines_from, numbered
 from iscat_analysis.pipeline.blank import FrameNoise
 from iscat_analysis.pipeline.block_store import Block, BlockStore, analyse_block
 from iscat_analysis.pipeline.blocks import Plan, plan_blocks
-from iscat_analysis.pipeline.diagnosis import pixel_warnings, plane_warning, shaking_warning
+from iscat_analysis.pipeline.diagnosis import (
+    misfit_warning,
+    pixel_warnings,
+    plane_warning,
+    shaking_warning,
+)
 from iscat_analysis.pipeline.events import Event
 from iscat_analysis.pipeline.field import fit_field
 from iscat_analysis.pipeline.held_height import held_height_warning
@@ -45,6 +51,7 @@ from iscat_analysis.records import (
     FloatArray,
     FrameSource,
     Progress,
+    Status,
     Windows,
 )
 from iscat_analysis.search.moving import link
@@ -52,6 +59,8 @@ from iscat_analysis.search.sliding import DARK, well_lit
 from iscat_analysis.threads import beside, threads
 
 _STEPS = 100  # of the progress of a block
+_PATTERN = 6  # places in a frame that are taken for the light's unevenness,
+_NEARLY_ALL = 0.8  # where so many of them are no particles
 
 
 def find_moving(ready: Prepared, run: Run) -> Found:
@@ -112,7 +121,9 @@ def find_moving(ready: Prepared, run: Run) -> Found:
             )  # fmt: skip
             return Begun(config, scene, block)
 
-        begun, learned = learn_from_tracks(config, begin, name=movie.name, pool=pool, tell=run.tell)
+        begun, learned = learn_from_tracks(
+            config, begin, name=movie.name, pool=pool, tell=run.tell, notify=run.notify
+        )
         config, scene = begun.config, begun.scene
         blocks, interrupted = track_movie(
             scene, movie, camera, plan, shelf(config, run.partial),
@@ -296,6 +307,8 @@ def track_frames(
     check: Check,
     pool: ThreadPoolExecutor,
     progress: Progress,
+    doubt: str = "",
+    tell: Callable[[str], None],
 ) -> Found:
     """Fit each frame after the background, starting from the frame before, and link.
 
@@ -317,12 +330,21 @@ def track_frames(
         Runs the fits of a frame.
     progress : Progress
         Told the frames.
+    doubt : str
+        Why the background may not be that of the frames, and what to do; empty where it is.
+    tell : callable
+        Told what is probably wrong with the model.
 
     Returns
     -------
     Found
         One row per particle and frame, numbered by track; one view per track.  An interrupt keeps
         the frames that are done.
+
+    Raises
+    ------
+    DataError
+        The background is not that of the frames, and what differs looks like particles.
     """
     first, last = windows.frames_after
     lines: list[dict[str, Any]] = []
@@ -340,6 +362,10 @@ def track_frames(
             starts = [event.candidate for event in events]
             events, here = fit_field(scene, here, starts=starts, pool=pool)
             if events and noise is None:
+                if cause := misfit_warning(scene.config, events):
+                    tell(cause)
+                elif doubt:
+                    _refuse_pattern(doubt, frame, events)
                 read = camera.read_variance_e2((here.after_e.shape[0], here.after_e.shape[1]))
                 noise = FrameNoise(scene, windows, read, [event.fit for event in events])
             if events and noise is not None:
@@ -373,6 +399,16 @@ def track_frames(
         followed=Followed(windows),
         interrupted=interrupted,
     )
+
+
+def _refuse_pattern(doubt: str, frame: int, events: Sequence[Event]) -> None:
+    """Refuse to follow what is fixed, where it is that which is found in a frame."""
+    poor = sum(Status.POOR_FIT in event.flags for event in events)
+    if len(events) >= _PATTERN and poor >= _NEARLY_ALL * len(events):
+        raise DataError(
+            f"of {len(events)} places in frame {frame} that look like particles {poor} do not look "
+            f"like the model's picture, and would be followed through all frames: {doubt}"
+        )
 
 
 def _one_frame(

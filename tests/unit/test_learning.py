@@ -180,9 +180,9 @@ def test_a_phase_that_the_line_of_masses_turns_is_told(
         ({"optics.convention": "dong2021"}, 'with optics.convention = "dong2021"'),
         ({"background.method": "known", "background.level_e": 1e4}, 'background.method = "known"'),
         ({"fit.mode": "joint"}, "in mode joint without background frames"),
-        ({"fit.mode": "track", "track.free": "joint"}, 'but with track.free = "mass"'),
+        ({"fit.mode": "track", "background.frames": [0, 5]}, "not learned with the tracks"),
         (
-            {"fit.mode": "track", "track.free": "mass", "optics.convention": "dong2021"},
+            {"fit.mode": "track", "track.free": "joint", "optics.convention": "dong2021"},
             'with optics.convention = "dong2021"',
         ),
     ],

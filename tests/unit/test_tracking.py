@@ -12,9 +12,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+from instruments import Instrument
 from scenes import PIXEL_NM, make_config
+from wanderers import SETTINGS, wander
 
+import iscat_analysis as ia
 from iscat_analysis.config import Config
+from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import analyse, fit_stack
@@ -157,3 +161,27 @@ def test_nothing_to_track_is_an_empty_table(tmp_path: Path) -> None:
     found = fit_stack(tmp_path / "movie.tif", _config())
     assert found.table.empty
     assert not found.views
+
+
+def test_a_pattern_under_a_known_level_is_not_followed() -> None:
+    """It took 24 s to follow 390 rows of 30 frames, none of which was a particle."""
+    movie = wander((30, 64, 64), seed=1, speckle=0.02, species=((400.0, 0.4, 2),))
+    known = {"background.method": "known", "background.level_e": 4e5}
+    with pytest.raises(DataError, match=r"followed through all frames: .*the light differs"):
+        ia.fit_movie(movie.counts, settings={**SETTINGS, **known})
+
+
+@pytest.mark.parametrize("spherical_nm", [0.0, 20.0])
+def test_what_is_wrong_is_named_over_a_recorded_background(spherical_nm: float) -> None:
+    aberrations = {11: spherical_nm} if spherical_nm else {}
+    instrument = Instrument(emission="reciprocal", aberrations_nm=aberrations)
+    dark, lit = (
+        wander((20, 64, 64), seed=5, instrument=instrument, species=((mass, 0.3, 3),), speckle=0.0)
+        for mass in (1e-6, 600.0)
+    )
+    counts = np.concatenate([dark.counts, lit.counts])
+    fixed = {"background.frames": [0, 20], "fit.z_range_nm": [0.0, 300.0]}
+    result = ia.fit_movie(counts, settings={**SETTINGS, **fixed})
+    said = [line for line in result.warnings if "the model does not describe" in line]
+    assert len(said) == bool(spherical_nm)
+    assert not said or "spherical aberration, off by about +2" in said[0]

@@ -272,7 +272,7 @@ class _Search:
         best, undecided = self._analyzer(best)
         best, twin = self._twin(best)
         best, held_out = self._cleared(best, held_out)
-        best = self._signed(best)
+        best, held_out = self._signed(best, held_out)
         held_out = self._own(held_out, best.values)
         judgement = judge(held_out, best.values, self.judge_one, self.mapper)
         nominal = with_masses(held_out, self.build, self.configured)
@@ -351,8 +351,12 @@ class _Search:
     ) -> tuple[Estimate, tuple[Sight, ...]]:
         """Go on from a microscope that is near."""
         names = free_names(self.free, known, FREE["zernike"])
-        best = self._fit(_fitted(sights), known, names)
-        return best, self._own(_held_out(sights), best.values)
+        fitted = _fitted(sights)
+        best = self._fit(fitted, known, names)
+        # focus and phase move all heights, those of pictures that were not fitted to other fringes
+        rise = np.median([s.z_nm - was.z_nm for s, was in zip(best.sights, fitted, strict=True)])
+        held_out = [s.raised(float(rise)) for s in _held_out(sights)]
+        return best, self._own(held_out, best.values)
 
     def _identified(self, best: Estimate) -> tuple[Estimate, dict[str, str]]:
         """Hold what the pictures do not determine within the plausible range."""
@@ -439,10 +443,12 @@ class _Search:
             best, other, gap = other, best, -gap
         return best, Twin(other.values, gap)
 
-    def _signed(self, best: Estimate) -> Estimate:
+    def _signed(
+        self, best: Estimate, held_out: Sequence[Sight]
+    ) -> tuple[Estimate, tuple[Sight, ...]]:
         """Choose between a phase and its opposite, which a particle that leaves has."""
         if "reference_phase_deg" not in best.names:
-            return best
+            return best, tuple(held_out)
         masses = np.array([s.mass_kda for s in best.sights])
         phase = best.values["reference_phase_deg"]
         if self.landing and abs(np.sign(masses).sum()) > 3 * math.sqrt(masses.size):
@@ -450,10 +456,13 @@ class _Search:
         else:
             flip = math.cos(math.radians(phase - self.configured["reference_phase_deg"])) < 0
         phase = (phase + 180 * flip + 180) % 360 - 180
-        turned = tuple(
-            replace(s, mass_kda=-s.mass_kda if flip else s.mass_kda) for s in best.sights
+        # those that were not fitted too: with its height free a strong one does not turn by itself
+        turned, judged = (
+            tuple(replace(s, mass_kda=-s.mass_kda if flip else s.mass_kda) for s in sights)
+            for sights in (best.sights, held_out)
         )
-        return replace(best, values={**best.values, "reference_phase_deg": phase}, sights=turned)
+        values = {**best.values, "reference_phase_deg": phase}
+        return replace(best, values=values, sights=turned), judged
 
     def _refusals(
         self, final: Estimate, judgement: Judgement, twin: Twin | None

@@ -118,14 +118,15 @@ def heights_free(config: Config) -> bool:
     Parameters
     ----------
     config : Config
-        The configuration; particles that move are learned from at the height of their track.
+        The configuration.
 
     Returns
     -------
     bool
         Whether it asks for that.
     """
-    return config.fit.mode in ("localize", "joint")
+    mode = config.fit.mode
+    return (config.track.free if mode == "track" else mode) in ("localize", "joint")
 
 
 def settings_of(config: Config) -> dict[str, Any]:

@@ -168,3 +168,8 @@ class Sight:
         )
         x, y = min(max(x_nm, left), right), min(max(y_nm, low), high)
         return replace(self, x_nm=x, y_nm=y)
+
+    def raised(self, shift_nm: float) -> Sight:
+        """Return the same picture with another height, or the nearest that is possible."""
+        low, high = self.heights_nm or (self.z_nm, self.z_nm)
+        return replace(self, z_nm=min(max(self.z_nm + shift_nm, low), high))

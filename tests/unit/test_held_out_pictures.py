@@ -1,0 +1,71 @@
+"""Pictures that judge a microscope begin where those lie that it was fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from iscat_analysis._kernels.scoring import POISSON
+from iscat_analysis.calibration.optics.estimate import Estimate
+from iscat_analysis.calibration.optics.measure import _Search
+from iscat_analysis.calibration.optics.sights import Settings, Sight
+from iscat_analysis.optics.grid import PixelGrid
+
+HEIGHTS_NM = (0.0, 1000.0)
+
+
+def _sights(count: int, mass_kda: float) -> tuple[Sight, ...]:
+    grid = PixelGrid.centred(5, 84.0)
+    one = Sight(grid, POISSON, np.ones((4, 5, 5)), 0.0, 0.0, 100.0, heights_nm=HEIGHTS_NM)
+    return tuple(replace(one, mass_kda=mass_kda, z_nm=100.0 + 50 * k) for k in range(count))
+
+
+def _estimate(sights: Sequence[Sight], values: Settings) -> Estimate:
+    return Estimate(
+        ("reference_phase_deg",), values, tuple(sights), np.eye(1), np.eye(1), 0.0, True, 1
+    )
+
+
+class _Moving(_Search):
+    """Every fit of optics moves all heights by a fringe."""
+
+    def _fit(
+        self, sights: Sequence[Sight], start: Settings, names: Sequence[str], passes: int = 40
+    ) -> Estimate:
+        del passes
+        moved = [s.raised(200.0) for s in sights] if names else sights
+        return _estimate(moved, start)
+
+
+def _search(kind: type[_Search] = _Search) -> _Search:
+    values: dict[str, Any] = {"reference_phase_deg": 0.0, "polarization": "linear", "mask_na": 0.0}
+    return kind(values, lambda _: None, lambda *_: (1.0, 0.5), ("phase",), {}, 0, 1)  # type: ignore[arg-type, return-value]
+
+
+@pytest.mark.parametrize(("mass", "phase"), [(-400.0, 173.0), (400.0, -7.0)])
+def test_pictures_that_judge_turn_with_the_phase(mass: float, phase: float) -> None:
+    """A strong particle of free height stays where it is: χ² 1.07 became 2.05."""
+    best = _estimate(_sights(12, mass), {"reference_phase_deg": -7.0})
+    turned, judged = _search()._signed(best, _sights(6, mass))
+    assert turned.values["reference_phase_deg"] == pytest.approx(phase)
+    assert {s.mass_kda for s in (*turned.sights, *judged)} == {400.0}
+
+
+def test_pictures_that_judge_follow_the_heights_of_the_others() -> None:
+    """From where they were they would end in another fringe: χ² 1.05 became 3.9."""
+    sights = _sights(12, 400.0)
+    search = _search(_Moving)
+    best, judged = search._of_known_kind(sights, search.configured)
+    assert len(best.sights) + len(judged) == len(sights)
+    assert [s.z_nm for s in judged] == [s.z_nm + 200.0 for s in sights[1::3]]
+
+
+def test_no_picture_leaves_the_heights_that_are_possible() -> None:
+    (sight,) = _sights(1, 400.0)
+    assert sight.raised(-300.0).z_nm == HEIGHTS_NM[0]
+    assert sight.raised(3000.0).z_nm == HEIGHTS_NM[1]
+    assert replace(sight, heights_nm=None).raised(50.0).z_nm == sight.z_nm
