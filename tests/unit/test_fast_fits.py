@@ -480,7 +480,7 @@ def test_a_place_that_is_held_may_lie_outside_the_bounds(place: float) -> None:
 def test_a_picture_is_exact_on_its_nodes_in_any_unit_of_mass(gradient_per_kda: float) -> None:
     """Neither of its two parts drowns in the rounding of the other, however bright a particle."""
     config = make_config().model_copy(
-        update={"calibration": Calibration(gradient_per_kda=gradient_per_kda)}
+        update={"calibration": Calibration.model_construct(gradient_per_kda=gradient_per_kda)}
     )
     model = forward_model(config, 2200.0)
     lens, table = model.picture_table(PIXEL_NM, max(GRID.shape))
