@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 from numpy.polynomial.legendre import legvander, legvander2d
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.fringes import NO_FRINGES, Fringes, find_fringes
@@ -134,6 +133,8 @@ class Surface:
     @cached_property
     def _functions(self) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Functions of rows and columns, and of which of them there are products (k, k)."""
+        from scipy.linalg import block_diag  # 30 ms to load, for light that changes
+
         shape = (self.light_e.shape[0], self.light_e.shape[1])
         degrees = np.arange(self.degree + 1)
         smooth = np.add.outer(degrees, degrees) <= self.degree
