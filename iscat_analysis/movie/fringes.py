@@ -33,9 +33,7 @@ _ZOOMS = 4  # each to half the step, from half a wave over the field
 _TURNS = 4  # of the fit of wave vectors that follows
 _DEGREES_PER_WAVE = 4  # of a polynomial that follows waves of the field
 _SLOWEST = 2.5  # waves over the field that are left to polynomials
-_BESIDE = (
-    8  # degree of the polynomial beside which waves are looked for: it follows fewer than these
-)
+_BESIDE = 8  # degree of the polynomial beside which waves are looked for: it follows fewer of them
 _STEEPEST = 4  # degree of the heights of waves
 _PIXELS_PER_TERM = 150  # as of the polynomial
 _LEAST_SQUARES = 24  # along an axis

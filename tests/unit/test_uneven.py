@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 import iscat_analysis as ia
+from iscat_analysis.errors import DataError
 
 LEVEL_E = 3e4
 SETUP: dict[str, Any] = {
@@ -70,10 +71,9 @@ def test_what_a_wrong_focus_leaves_over_is_not_called_uneven(tmp_path: Path) -> 
     assert not _said(movie, {**KNOWN, "optics.focus_nm": -380.0})
 
 
-def test_frames_in_which_particles_move_are_judged_before_they_are_followed(
-    tmp_path: Path,
-) -> None:
+def test_an_uneven_field_is_not_followed(tmp_path: Path) -> None:
+    """Of particles that move the light is judged first, and what looks like some is its pattern."""
     movie = _movie(tmp_path / "movie.tif", speckle=0.03)
     track = {"fit.mode": "track", "track.free": "mass", "fit.frames": (60, 62)}
-    (said,) = _said(movie, {**KNOWN, **track})
-    assert 'background.method = "tracks"' in said
+    with pytest.raises(DataError, match=r'light differs by 3 %.*background\.method = "tracks"'):
+        _said(movie, {**KNOWN, **track})
