@@ -8,6 +8,8 @@ the picture, and by the curvature one fit in a thousand is six standard deviatio
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from iscat_analysis.inference.likelihood import Likelihood, Optimum
@@ -75,5 +77,5 @@ def reach(
     places = np.flatnonzero(box.free[:3]).tolist()
     for k, theta, loss in zip([*places, *places], around, fallen.tolist(), strict=True):
         if loss > 0:
-            wider[k] = max(wider[k], abs(theta[k] - best.theta[k]) / np.sqrt(2 * loss))
+            wider[k] = max(wider[k], abs(theta[k] - best.theta[k]) / math.sqrt(2 * loss))
     return wider, higher

@@ -4,8 +4,8 @@ A beam that wanders, fringes that pass or a lamp that warms up change the light 
 of its neighbours in the same way.  Over the mean frame such a change is a polynomial in x and y of
 low degree, a few plane waves (`iscat_analysis.movie.fringes`), a factor of each part of a camera
 that has several amplifiers (`iscat_analysis.movie.seams`), and what is added to all pixels alike
-(`iscat_analysis.movie.haze`), which least squares measure in
-every frame with an error far below the noise of one pixel.  A particle is part of what is measured:
+(`iscat_analysis.movie.haze`), which least squares measure in every frame with an error far below
+the noise of one pixel.  A particle is part of what is measured:
 `iscat_analysis.movie.lines.Lines.left` says what that takes of it.
 
 Whether there is such a change is asked of frames as far apart as the windows that are compared.

@@ -283,9 +283,33 @@ def diagnose_gain(
         n_pixels=int(np.count_nonzero(kept)),
         noise_counts=float(per_count) if whole else math.inf,
     )
-    if not found.off or ratio < 1:
+    return with_shaking(found, counts, camera, masked=~used)
+
+
+def with_shaking(
+    found: GainDiagnosis, counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None
+) -> GainDiagnosis:
+    """Measure what motion of the fixed pattern explains of an excess, where there is one.
+
+    Parameters
+    ----------
+    found : GainDiagnosis
+        Of these frames.
+    counts : ndarray, shape (t, y, x)
+        Successive frames.
+    camera : Camera
+        Counts → photoelectrons.
+    masked : ndarray of bool, shape (y, x), or None
+        Pixels to leave out.
+
+    Returns
+    -------
+    GainDiagnosis
+        The same where nothing is in excess, or it was measured.
+    """
+    if not found.off or found.noise_ratio < 1 or found.shaking is not None:
         return found
-    return replace(found, shaking=measure_shaking(counts, camera, masked=~used))
+    return replace(found, shaking=measure_shaking(counts, camera, masked=masked))
 
 
 def _without_outliers(ratios: FloatArray, n_frames: int) -> BoolArray:

@@ -23,6 +23,7 @@ from iscat_analysis.calibration.optics import (
 from iscat_analysis.calibration.optics.starts import with_masses
 from iscat_analysis.config import Config
 from iscat_analysis.pipeline.microscope import calibrate_sights, microscopes
+from iscat_analysis.pipeline.moving_focus import DRIFT_FRAMES
 from iscat_analysis.pipeline.sights import reach_nm
 from iscat_analysis.records import Mapper
 
@@ -36,7 +37,6 @@ LEAST_PICTURES = 6
 """From fewer it is not known how well they tell a drift."""
 
 _FOCI = 20  # parts of the movie with a focus of their own, in which pictures are looked at
-_PER = 1000.0  # frames of ``optics.focus_drift_nm``
 _PASSES = 10
 
 
@@ -69,7 +69,7 @@ class FocusDrift(NamedTuple):
 
     @property
     def _rise_nm(self) -> float:
-        return self.nm * (self.frames[1] - self.frames[0]) / _PER
+        return self.nm * (self.frames[1] - self.frames[0]) / DRIFT_FRAMES
 
 
 STEADY = FocusDrift(0.0, math.inf, (0, 0))
@@ -153,7 +153,7 @@ def learned_with_drift(
     optics = config.optics.model_copy(update={"focus_frame": _middle(frames)})
     return calibrate_sights(
         fitted.sights, dated(others, frames), config.model_copy(update={"optics": optics}),
-        tuple(FREE), source, known=fitted.values, drifts=True, mapper=mapper,
+        tuple(FREE), source, known=fitted.values, mapper=mapper,
     )  # fmt: skip
 
 
@@ -213,10 +213,14 @@ def dated(sights: Sequence[Sight], frames: tuple[int, int]) -> list[Sight]:
     """
     part = max((frames[1] - frames[0]) / _FOCI, 1.0)
     middle = _middle(frames)
+
+    def shown(sight: Sight) -> float:
+        before, after = sight.frames
+        return before if sight.mass_kda < 0 else after
+
     return [
-        replace(sight, focus_steps=round((when - middle) / part) * part / _PER)
+        replace(sight, focus_steps=round((shown(sight) - middle) / part) * part / DRIFT_FRAMES)
         for sight in sights
-        for when in (sight.frames[0] if sight.mass_kda < 0 else sight.frames[1],)
     ]
 
 

@@ -408,10 +408,11 @@ def learned_from(
     DataError
         There are too few particles.
     """
-    crowded = way_of(config) == "fixed"
+    way = way_of(config)
+    crowded = way == "fixed"
     if not crowded or len(sights) >= LEAST_SIGHTS:
         found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
-        if way_of(config) == "sliding":
+        if way == "sliding":
             frames = fitted_frames(movie, config)
             return with_drift(found, sights, others, config, frames, source, pool.map)
         if found.accepted or not crowded:

@@ -72,7 +72,6 @@ def calibrate_sights(
     focus_step_nm: float | None = None,
     least: int = LEAST_SIGHTS,
     known: Settings | None = None,
-    drifts: bool = False,
     mapper: Mapper = map,
 ) -> OpticsCalibration:
     """Measure the optics from pictures.
@@ -94,9 +93,8 @@ def calibrate_sights(
     least : int
         Pictures needed.
     known : mapping, optional
-        As for `measure_microscope`.
-    drifts : bool
-        Whether the focus may rise with the frames of a movie, which `Sight.focus_steps` counts.
+        As for `measure_microscope`; with `FOCUS_DRIFT`, which is then measured too, of pictures
+        whose `Sight.focus_steps` count frames.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -122,7 +120,7 @@ def calibrate_sights(
         configured[FOCUS_STEP] = focus_step_nm
         low, high = sorted(factor * focus_step_nm for factor in STEP_FACTORS)
         limits[FOCUS_STEP] = (low, high)
-    if drifts:
+    if known is not None and FOCUS_DRIFT in known:
         configured[FOCUS_DRIFT] = 0.0
     build = microscopes(config, max(reach_nm(sight) for sight in sights))
     optics = config.optics

@@ -13,8 +13,10 @@ STEP_NM = 5.0
 """Foci of neighbouring models are so far apart: half of it, which is the most that a frame is off,
 changes a picture by a thousandth of its peak."""
 
+DRIFT_FRAMES = 1000.0
+"""Frames in which the focus rises by ``optics.focus_drift_nm``."""
+
 _KEPT = 64  # models at hand, of some MB each
-_PER = 1000.0  # frames of ``optics.focus_drift_nm``
 
 
 class MovingFocus:
@@ -44,7 +46,7 @@ class MovingFocus:
     def at(self, frame: int) -> ForwardModel:
         """Give the model of a frame."""
         optics = self._optics
-        rise = optics.focus_drift_nm * (frame - optics.focus_frame) / _PER
+        rise = optics.focus_drift_nm * (frame - optics.focus_frame) / DRIFT_FRAMES
         return self._moved(round(rise / STEP_NM))
 
 

@@ -16,8 +16,8 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.movie.metadata import diagnose_gain
-from iscat_analysis.movie.shaking import measure_shaking, without_shaking
+from iscat_analysis.movie.metadata import diagnose_gain, with_shaking
+from iscat_analysis.movie.shaking import without_shaking
 from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.movie.successive import shared_light
 from iscat_analysis.pipeline.camera_numbers import (
@@ -158,9 +158,7 @@ def judge_counts(
     except DataError:  # too dark to tell
         return Noise(spectrum=spectrum)
     gain = allow_for_correlation(gain, spectrum)
-    if gain.off and gain.noise_ratio > 1 and gain.shaking is None:
-        shaking = measure_shaking(counts[:_GAIN_FRAMES], camera, masked=masked)
-        gain = replace(gain, shaking=shaking)
+    gain = with_shaking(gain, counts[:_GAIN_FRAMES], camera, masked=masked)
     if follows and gain.shakes:
         still = without_shaking(counts, camera, masked=masked)
         return judge_counts(still, camera, masked=masked, additive=additive, mapper=mapper)
