@@ -24,13 +24,19 @@ class _Allotment:
 _ALLOTTED: ContextVar[_Allotment | None] = ContextVar("allotted", default=None)
 
 
-class _Inline(ThreadPoolExecutor):
-    """The thread that asks, which does each task at once."""
+def _wanted() -> None:
+    """Do nothing: the work is still wanted."""
 
-    def __init__(self) -> None:
+
+class _Inline(ThreadPoolExecutor):
+    """The thread that asks, which does each task at once, if it is still wanted."""
+
+    def __init__(self, stop: Callable[[], None] = _wanted) -> None:
         super().__init__(1)
+        self._stop = stop
 
     def submit(self, task: Callable[..., Any], /, *args: Any, **options: Any) -> Future[Any]:
+        self._stop()
         done: Future[Any] = Future()
         try:
             done.set_result(task(*args, **options))
@@ -119,7 +125,7 @@ def threads(count: int) -> Iterator[ThreadPoolExecutor]:
     """
     given = _ALLOTTED.get()
     if given is not None:
-        pool: ThreadPoolExecutor = _Watched(given)
+        pool: ThreadPoolExecutor = _Watched(given) if given.count > 1 else _Inline(given.stop)
     else:
         pool = ThreadPoolExecutor(count) if count > 1 else _Inline()
     with one_thread_algebra(), pool:

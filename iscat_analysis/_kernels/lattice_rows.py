@@ -45,19 +45,29 @@ def taps(weights: FloatArray, t: float, value: FloatArray, slope: FloatArray) ->
 
 
 @kernel()
+def _ends(values: FloatArray) -> tuple[float, float]:
+    """Smallest and largest value; those of arrays take Numba 30 ms to load."""
+    low = high = values[0]
+    for value in values:
+        low, high = min(low, value), max(high, value)
+    return low, high
+
+
+@kernel()
 def node_rows(lens: LatticeLens, pixels: Pixels, y_p: float) -> tuple[int, int]:
     """First row of nodes that an image needs, and how many."""
     margin = abs(pixels.offsets[-1])
-    low = (pixels.y.min() - margin - y_p) * lens.inv_step + lens.half
-    high = (pixels.y.max() + margin - y_p) * lens.inv_step + lens.half
-    first = int(low) - BEFORE
-    return first, int(high) - BEFORE + TAPS - first
+    low, high = _ends(pixels.y)
+    first = int((low - margin - y_p) * lens.inv_step + lens.half) - BEFORE
+    last = int((high + margin - y_p) * lens.inv_step + lens.half) - BEFORE
+    return first, last + TAPS - first
 
 
 @kernel()
 def rows_needed(lens: LatticeLens, pixels: Pixels) -> int:
     """Rows of work space that an image needs, wherever the particle is."""
-    span = pixels.y.max() - pixels.y.min() + 2 * abs(pixels.offsets[-1])
+    low, high = _ends(pixels.y)
+    span = high - low + 2 * abs(pixels.offsets[-1])
     rows = int(span * lens.inv_step) + TAPS + 2
     return FIELDS + pixels.offsets.size * 6 * lens.components * rows
 
@@ -319,8 +329,9 @@ def lattice_values(
 def lattice_span(lens: LatticeLens, x: FloatArray, margin: float, x_p: float) -> tuple[int, int]:
     """Range of the flattened lattice that an image needs."""
     side = 2 * lens.half + 1
-    first = int((x.min() - margin - x_p) * lens.inv_step + lens.half) - BEFORE
-    last = int((x.max() + margin - x_p) * lens.inv_step + lens.half) - BEFORE + TAPS
+    low, high = _ends(x)
+    first = int((low - margin - x_p) * lens.inv_step + lens.half) - BEFORE
+    last = int((high + margin - x_p) * lens.inv_step + lens.half) - BEFORE + TAPS
     return max(first, 0) * side, min(last, side) * side
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self, runtime_checkable
@@ -15,13 +16,14 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK, fingerprint, split_address
 from iscat_analysis.records import BoolArray, InPlace, PlacedSource, StackMetadata
+from iscat_analysis.threads import beside
 
 LeftOut = tuple[BoolArray, NDArray[Any]]
 """Pixels that are left out (y, x), and the counts of each in the dark."""
 
 _MB = 1_000_000
 _FLOAT_BYTES = (4, 8)  # that kernels are compiled for
-_BLOCK_BYTES = 2**22  # that are hashed before another thread is waited for
+_BLOCK_BYTES = 2**24  # that are hashed before another thread is waited for
 
 
 class Frames(Protocol):
@@ -201,6 +203,7 @@ class Stack:
         self._closed = False
         self._own = True
         self._left_out: LeftOut | None = None
+        self._hashing: Future[str] | None = None
         if self.dtype.kind == "f" and self.dtype.itemsize not in _FLOAT_BYTES:
             raise DataError(
                 f"{path}: its pixels are {self.dtype}; export it as integers or 32-bit floats"
@@ -217,9 +220,7 @@ class Stack:
         """Let another process open the same file."""
         if not self._files or not self._own:
             raise TypeError(f"{self.name} is no file that another process could open")
-        path = self._path.absolute()
-        address = Path(f"{path}{MARK}{self._part}") if self._part else path
-        return _reopened, (address, self.identity, self._left_out)
+        return _reopened, (self.address.absolute(), self.identity, self._left_out)
 
     def __enter__(self) -> Self:
         return self
@@ -236,6 +237,11 @@ class Stack:
     def path(self) -> Path:
         """The file, or the name of the array."""
         return self._path
+
+    @property
+    def address(self) -> Path:
+        """What opens it again: the file, with the part of it that is the movie."""
+        return Path(f"{self._path}{MARK}{self._part}") if self._part else self._path
 
     @property
     def name(self) -> str:
@@ -280,7 +286,7 @@ class Stack:
         Stack
             Under the same name.
         """
-        seen = Stack(self._path, frames, part=self._part, files=self._files)
+        seen = self._again(frames)
         seen._own = False
         return seen
 
@@ -299,9 +305,15 @@ class Stack:
         Stack
             Under the same name; it reads from the same file.
         """
-        seen = Stack(self._path, self._frames, part=self._part, files=self._files)
+        seen = self._again(self._frames)
         seen._own = self._own
         seen._left_out = pixels, dark
+        return seen
+
+    def _again(self, frames: Frames) -> Stack:
+        """Give another one of the same file, which is hashed once for both."""
+        seen = Stack(self._path, frames, part=self._part, files=self._files)
+        seen._hashing = self._hashing
         return seen
 
     def close(self) -> None:
@@ -429,6 +441,18 @@ class Stack:
                 raise DataError(f"{path}: cannot be read ({error.strerror})") from None
         digest.update(self._part.encode("utf-8", "backslashreplace"))
         return digest.hexdigest()
+
+    def hashed(self) -> Future[str]:
+        """Hash the movie in a thread of its own, once however often it is asked for.
+
+        Returns
+        -------
+        Future of str
+            What `sha256` gives.
+        """
+        if self._hashing is None:
+            self._hashing = beside(self.sha256)
+        return self._hashing
 
     def _require(self, start: int, stop: int) -> None:
         """Refuse to read from a closed stack, or frames that it does not hold."""

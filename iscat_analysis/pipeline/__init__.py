@@ -57,7 +57,7 @@ FEW_FIGURES = 2
 
 
 def fit_stack(
-    stack: str | Path,
+    stack: str | Path | Stack,
     config: Config,
     *,
     out: Path | None = None,
@@ -73,8 +73,8 @@ def fit_stack(
 
     Parameters
     ----------
-    stack : str or Path
-        The movie.
+    stack : str, Path or Stack
+        The movie; one that is open stays open.
     config : Config
         What to do; see `iscat_analysis.config`.
     out : Path, optional
@@ -117,8 +117,9 @@ def fit_stack(
             draughtsman.start()
         progress(stage, done, total)
 
-    stack = path_in("`stack`", stack)
-    folder = beside(stack, ".iscat") if out is None else out
+    opened = stack if isinstance(stack, Stack) else None
+    address = path_in("`stack`", stack) if opened is None else opened.address
+    folder = beside(address, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
     way = way_of(config)
     figures = FEW_FIGURES if way == "sliding" else EVENT_FIGURES
@@ -136,7 +137,7 @@ def fit_stack(
                     (building / "figures").mkdir()
                     draughtsman.begin(known, building / "figures", figures)
 
-            with open_stack(stack) as movie:
+            with open_stack(address) if opened is None else nullcontext(opened) as movie:
                 analysis = analyse(
                     movie,
                     config,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ HALO = 2
 """Windows on either side of a chunk's core: a step, its neighbours, and theirs."""
 
 _LOOKS = 24  # frames all over a movie, that tell how much light there is
+_FIRST_LONGER = 1.15  # than others, of a chunk that is summed before they are begun
 _MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
@@ -189,12 +191,12 @@ class Reader:
         return chunk
 
     def opening(self, mapper: Mapper = map) -> NDArray[Any]:
-        """Good frames among the first, on which the noise is judged; a copy of a file's."""
+        """Good frames among the first, on which the noise is judged."""
         stop = min(self.last, self.first + NOISE_FRAMES)
         counts, good, light = self.counts(self.first, stop, mapper)
         if self._dark_e > 0:  # of frames with a background
             good = good & well_lit(light)
-        used = counts[good] if self._placed or not good.all() else counts
+        used = counts if good.all() else counts[good]
         if len(used) < 2:
             check_counts(counts, self.first, self.name, camera=self.camera)
             raise DataError(f"{self.name}: has no two frames that differ; export it again")
@@ -293,12 +295,12 @@ def plan_chunks(
             f"pixels need compute.memory_limit_mb = {least}; raise it, or lower "
             "background.window_frames"
         )
-    count = 2 * math.ceil((last - first) / core / 2)  # which two processes share evenly
-    core = math.ceil((last - first) / count / stride) * stride  # of equal length
+    count = 2 * math.ceil((last - first) / core / 2)  # which two processes share
+    even = (last - first) / count
+    longer = min(math.ceil(_FIRST_LONGER * even / stride) * stride, core)
+    rest = math.ceil((last - first - longer) / (count - 1) / stride) * stride
+    edges = [first, *range(first + longer, last, rest), last]
     return [
-        (
-            (begin, min(begin + core, last)),
-            (max(begin - halo, first), min(begin + core + halo, last)),
-        )
-        for begin in range(first, last, core)
+        ((begin, end), (max(begin - halo, first), min(end + halo, last)))
+        for begin, end in pairwise(edges)
     ]

@@ -79,10 +79,12 @@ class Pair:
     def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
         """Do something with every item, in both processes; see `iscat_analysis.places.Place`.
 
-        What the second process was at when it was lost is done in the first.  So is what it does
-        not finish: a lock that another thread held when the copy was made is never released there.
+        The first item is done here, where it may have been begun.  What the second process was at
+        when it was lost is done in the first.  So is what it does not finish: a lock that another
+        thread held when the copy was made is never released there.
         """
         waiting = deque(enumerate(items))
+        begun_here = deque([waiting.popleft()] if waiting else ())
         done: queue.SimpleQueue[tuple[int, R] | Exception] = queue.SimpleQueue()
         try:
             other = Copy(lambda number: work(items[number]))
@@ -110,14 +112,14 @@ class Pair:
         longest, idle_since = 0.0, 0.0
         try:
             # whether it lives is asked first: what it leaves behind is there when it does not
-            while driver.is_alive() or waiting or not done.empty():
+            while begun_here or driver.is_alive() or waiting or not done.empty():
                 while not done.empty():
                     found = done.get()
                     if isinstance(found, Exception):
                         raise found
                     yield found
                 try:
-                    number, item = waiting.popleft()
+                    number, item = (begun_here or waiting).popleft()
                 except IndexError:
                     idle_since = idle_since or time.monotonic()
                     driver.join(_LOOK_S)

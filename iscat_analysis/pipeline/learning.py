@@ -42,8 +42,8 @@ from iscat_analysis.pipeline.microscope import (
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES, Opening, judge_counts
 from iscat_analysis.pipeline.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.pipeline.run import unheard
-from iscat_analysis.pipeline.sights import bright_sights, kind_of, scan_sights
-from iscat_analysis.pipeline.tested_optics import REJECTED_P, TESTED, median_p, not_alone
+from iscat_analysis.pipeline.sights import TESTED, bright_sights, kind_of, scan_sights
+from iscat_analysis.pipeline.tested_optics import REJECTED_P, median_p, not_alone
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import Progress, Windows, silent
 from iscat_analysis.search.sliding import measure_frames, well_lit

@@ -143,7 +143,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     with one_thread_algebra():  # in all threads until the light is judged
         # meanwhile, in the light as it is; again if anything of it is unsteady
         if way == "sliding":
-            opening = beside(judge_opening, reader_of(movie, config, camera, span), config)
+            opening = beside(_opening_of, movie, config, camera, span)
         elif tracked:
             looking = beside(look_at_changes, movie, config, camera, span)
         judged = judge_light(movie, config, camera)
@@ -156,11 +156,11 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
             summary["lines"] = lines.summary
             steady = movie.seen_as(SteadyFrames(movie, lines, camera))
         if way == "sliding" and unsteady:
-            opening = beside(judge_opening, reader_of(steady, config, camera, span), config)
+            opening = beside(_opening_of, steady, config, camera, span)
         opened = None if opening is None else opening.result()
     if way == "sliding" or (tracked and unsteady):
         looking = beside(look_at_changes, steady, config, camera, span)
-    digest = beside(movie.sha256)
+    digest = movie.hashed()
     configured = config
     wrong = wrong_sign(config)
     if wrong is not None:
@@ -188,6 +188,10 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     return Prepared(
         movie, steady, config, camera, way, lines, opened, other_kind, digest, summary
     )  # fmt: skip
+
+
+def _opening_of(movie: Stack, config: Config, camera: Camera, span: tuple[int, int]) -> Opening:
+    return judge_opening(reader_of(movie, config, camera, span), config)
 
 
 def _refuse_still(counts: NDArray[Any], name: str) -> None:

@@ -58,6 +58,9 @@ OTHERS_NM = 1700.0
 SAME_NM = 800.0
 """Nearer than this, and at the same time, two steps are one."""
 
+TESTED = 24
+"""Particles on which optics are tested, the brightest."""
+
 _KNOWN_APART_NM = (APART_NM, 1600.0, 1300.0, 1000.0, 700.0)
 _PARTS = 8  # of a movie, that are searched where all of it is asked for
 _SHIFT_NM = 450.0  # how far a particle may lie from the centre of its picture
@@ -90,14 +93,15 @@ def bright_sights(
     opening : Opening, optional
         Of a landing movie, where it was judged; its reader keeps what is read here.
     rings : bool
-        Whether to look for those of a landing movie whose rings may lie in the pictures of others.
+        Whether to look for those of a landing movie whose rings may lie in the pictures of others,
+        as where optics are learned; without, for as many particles as they are tested on.
     whole : bool
         Whether to look in all of a landing movie, and not only until there are enough.
 
     Returns
     -------
     sights : list of Sight
-        At most `MOST_SIGHTS`, the brightest first.
+        At most `MOST_SIGHTS`, or `TESTED` without `rings`, the brightest first.
     others : list of Sight
         Every bright particle, on small regions; of a landing movie with `rings` only.
     """
@@ -155,7 +159,7 @@ def landing_sights(
     Returns
     -------
     sights : list of Sight
-        At most `MOST_SIGHTS`, the brightest first.
+        At most `MOST_SIGHTS`, or `TESTED` without `rings`, the brightest first.
     others : list of Sight
         Every bright step, on small regions; empty without `rings`.
     """
@@ -163,7 +167,7 @@ def landing_sights(
     found: list[BrightStep] = []
     rest: list[BrightStep] = []
     spans = [span for _, span in plan_chunks(reader, config, window, stride)]
-    most = MOST_SIGHTS
+    most = enough = MOST_SIGHTS if rings else TESTED
     if whole:
         chosen = np.linspace(0, len(spans) - 1, min(len(spans), _PARTS)).round().astype(int)
         spans = [spans[k] for k in chosen]
@@ -186,7 +190,7 @@ def landing_sights(
         found += alone
         rest += every
         bright = [step for step in found if step.snr > FAINTEST]
-        if len(bright) >= MOST_SIGHTS and not whole:
+        if len(bright) >= enough and not whole:
             break
     bright.sort(key=lambda step: -step.snr)
     unique = _without_repeats(bright)

@@ -20,15 +20,12 @@ from iscat_analysis.calibration.optics.starts import average_sights, with_masses
 from iscat_analysis.config import Config
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.pipeline.microscope import goodness, microscopes, rings_of
-from iscat_analysis.pipeline.sights import reach_nm
+from iscat_analysis.pipeline.sights import TESTED, reach_nm
 from iscat_analysis.records import Mapper
 
 REJECTED_P = 1e-3
 """Half of the brightest particles must fit worse than this before the optics are doubted: a few
 that are not alone do not suffice."""
-
-TESTED = 24
-"""Particles that are tested, the brightest."""
 
 _STARTS_NM = tuple(range(-400, 401, 100))  # along each axis; rings are some 200 nm apart
 _FITTED = 3  # of these starts

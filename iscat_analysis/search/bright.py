@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ from scipy.ndimage import gaussian_filter
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 from iscat_analysis.search.peaks import maxima
 from iscat_analysis.search.sliding import STRIDES, Chunk, locate_step
+from iscat_analysis.search.smoothing import smoothed, spot_response
 
 THRESHOLD = 7.0
 """Excess of the smoothed energy over its noise; the noise of a movie of 10⁸ pixels stays below."""
@@ -154,11 +156,11 @@ def find_bright_steps(
     moved = None if motion is None else motion.contrast
     spots = _spots(chunk, _SPOT * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, moved, mapper)
     # one after the other: between small kernels threads wait for each other at the interpreter
-    cut = [
+    cut = (
         _cut(chunk, spot, spots, window, pixel_nm, roi_px, ALONE_NM, motion)
         for spot in spots[: 4 * most]
-    ]
-    alone = sorted((step for step in cut if step), key=lambda step: -step.snr)[:most]
+    )
+    alone = sorted(islice((step for step in cut if step), most), key=lambda step: -step.snr)
     small = max(5, round(_OTHERS_NM / pixel_nm))
     around = spots if rings else ()
     rest = (
@@ -224,10 +226,11 @@ def energy_of(
     """
     excess = np.where(used, change**2 / np.where(used, variance, 1.0) - 1, 0.0)
     coverage: FloatArray | float = 1.0
+    spot = spot_response(used.shape, spot_px)
     if not used.all():
-        coverage = np.maximum(gaussian_filter(used.astype(float), spot_px), 1e-3)
+        coverage = np.maximum(smoothed(used.astype(float), spot), 1e-3)
     noise = math.sqrt(2 / (4 * math.pi * spot_px**2))
-    return np.asarray(gaussian_filter(excess, spot_px) / coverage / noise, dtype=np.float32)
+    return np.asarray(smoothed(excess, spot) / coverage / noise, dtype=np.float32)
 
 
 def find_bright_places(

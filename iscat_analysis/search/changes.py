@@ -21,10 +21,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from iscat_analysis.medians import middle
 from iscat_analysis.search.peaks import maxima
+from iscat_analysis.search.smoothing import smoothed, spot_response
 
 CLEAR = 12.0
 """Standard deviations of noise that a change must exceed: the ratios below then have errors of a
@@ -87,10 +87,9 @@ def find_changes(blocks: Sequence[NDArray[np.floating]], spot_px: float) -> Chan
     if len(blocks) < _LEAST_BLOCKS:
         return NO_CHANGES
     smooth = np.empty((len(blocks), *blocks[0].shape), dtype=np.float32)
+    narrow, wide = (spot_response(blocks[0].shape, width * spot_px) for width in (1, 4))
     for image, out in zip(blocks, smooth, strict=True):
-        contrast = image - 1  # whose noise single precision holds
-        out[:] = gaussian_filter(contrast, spot_px)
-        out -= gaussian_filter(contrast, 4 * spot_px)
+        out[:] = smoothed(image - 1, narrow - wide)  # whose noise single precision holds
     lag = np.diff(smooth, axis=0)
     noise = _NORMAL * _median_deviation(lag)
     change = smooth[3:-1] - smooth[1:-3]

@@ -84,6 +84,7 @@ def test_two_processes_find_what_one_finds(movie: Path, monkeypatch) -> None:
     one, two = found
     assert chunks[0] == one.summary["landing"]["chunks"] > 2
     assert 0 < chunks[1] < chunks[0]
+    assert here[0][0] == 0  # whose frames were summed here for the test of the optics
     assert len(one.table) > 8
     pd.testing.assert_frame_equal(one.table, two.table, check_exact=True)
     for mine, other in zip(one.views, two.views, strict=True):

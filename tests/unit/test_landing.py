@@ -6,6 +6,7 @@ import json
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -390,8 +391,8 @@ def test_what_is_shown_of_events_is_made_of_the_first_alone(
 
     monkeypatch.setattr(ChunkFitter, "shown", shown)
     found = _run(counts, _config("compute.workers=1"))[0]
-    # cores begin at 0, 110, 220 and 330; what is a window earlier is known to come before
-    assert made == [(1, 1), (2, 1), (0, -1), (0, -2)]
+    # cores begin at 0, 130, 230 and 330; what is a window earlier is known to come before
+    assert made == [(1, 1), (1, 0), (0, -1), (0, -2)]
     assert [view.event for view in found.views] == [0, 1]
     assert [view.clip is not None for view in found.views] == [True, False]
     for mine, whole in zip(found.views, plain[0].views[:2], strict=True):
@@ -512,6 +513,22 @@ def test_windows_that_do_not_fit_into_memory() -> None:
         analyse_landings(large, config, Camera(), tell=lambda _: None, progress=lambda *_: None)
 
 
+@pytest.mark.parametrize(
+    ("frames", "cores"), [(150, [150]), (301, [60, *[50] * 4, 41]), (600, [75] * 8)]
+)
+def test_chunks_follow_one_another_and_fit_into_memory(frames: int, cores: list[int]) -> None:
+    """The first is longer where there is room, 75 frames beside the windows around them."""
+    config = _config("compute.memory_limit_mb=200", "background.window_frames=20")
+    movie = Memory(np.zeros((frames, 256, 256), dtype="u2"))
+    reader = chunks_module.reader_of(movie, config, Camera(), (0, frames))
+    plan = chunks_module.plan_chunks(reader, config, 20, 5)
+    edges = np.cumsum([0, *cores]).tolist()
+    assert plan == [
+        ((begin, end), (max(begin - 40, 0), min(end + 40, frames)))
+        for begin, end in pairwise(edges)
+    ]
+
+
 @pytest.mark.parametrize("mode", ["localize", "joint"])
 def test_rings_of_neighbours_are_those_of_their_height(mode: str) -> None:
     """Two strong particles land one after the other, 30 nm above the nominal height."""
@@ -575,7 +592,9 @@ def test_an_interrupted_run_resumes_to_the_same_result(
     config = _config("posterior.enabled=false", "background.window_frames=20", "compute.workers=1")
     monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.0031)
     monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
-    fit_stack(movie, config, out=tmp_path / "whole.iscat")
+    with open_stack(movie) as opened:
+        fit_stack(opened, config, out=tmp_path / "whole.iscat")
+        assert opened.read(0, 1).any()  # whoever opened it closes it
     assert not partial_folder(tmp_path / "whole.iscat").exists()
     real: Callable[..., Any] = landing_module.analyse_chunk
     calls: list[int] = []

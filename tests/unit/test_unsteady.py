@@ -136,6 +136,27 @@ def test_another_process_leaves_them_out_too(tmp_path: Path) -> None:
         assert left.sha256() == movie.sha256()
 
 
+def test_a_movie_is_hashed_once_whoever_asks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    np.save(tmp_path / "movie.npy", np.arange(60, dtype=np.uint16).reshape(5, 3, 4))
+    hashed: list[ia.Stack] = []
+    real = ia.Stack.sha256
+
+    def counted(movie: ia.Stack) -> str:
+        hashed.append(movie)
+        return real(movie)
+
+    monkeypatch.setattr(ia.Stack, "sha256", counted)
+    with ia.open_stack(tmp_path / "movie.npy") as movie:
+        begun = movie.hashed()
+        left = movie.without(np.zeros((3, 4), dtype=bool), np.zeros(0, dtype=np.uint16))
+        seen = movie.seen_as(movie)
+        digests = {each.hashed().result() for each in (movie, left, seen)}
+        assert digests == {begun.result()} == {real(movie)}
+        assert len(hashed) == 1
+
+
 def test_a_landing_movie_with_pixels_that_blink(monkeypatch: pytest.MonkeyPatch) -> None:
     """One particle, found among ten such pixels; control: without this."""
     event = {"frame": 80, "x_px": 22.0, "y_px": 25.0, "mass_kda": 800.0}
