@@ -136,31 +136,31 @@ def fit(
         with closing(Draughtsman()) as pen:
             if resolved.background.method != "sliding" or not _is_large(stack):
                 pen.start()  # early, because it has as much to load
-            from iscat_analysis.movie import open_stack
+            from iscat_analysis import threads
             from iscat_analysis.movie.addresses import MARK, beside
 
             if raw is not None:
                 stack = Path(f"{stack}{MARK}{raw}")
+            digest = threads.beside(_hashed, stack)  # another processor is idle while this loads
+
+            from iscat_analysis.pipeline import fit_stack
+            from iscat_analysis.places import open_place
+
             folder = beside(stack, ".iscat") if out is None else out
-            with open_stack(stack) as movie:
-                movie.hashed()  # while libraries are loaded, for which there is one processor
-
-                from iscat_analysis.pipeline import fit_stack
-                from iscat_analysis.places import open_place
-
-                with open_place(scheduler, scheduler_file) as place, messages.progress() as shown:
-                    analysis = fit_stack(
-                        movie,
-                        resolved,
-                        out=folder,
-                        overwrite=overwrite,
-                        progress=shown,
-                        notify=messages.notify,
-                        command=context.obj,
-                        inject=inject or 0,
-                        place=place,
-                        draughtsman=pen,
-                    )
+            with open_place(scheduler, scheduler_file) as place, messages.progress() as progress:
+                analysis = fit_stack(
+                    stack,
+                    resolved,
+                    out=folder,
+                    overwrite=overwrite,
+                    progress=progress,
+                    notify=messages.notify,
+                    command=context.obj,
+                    inject=inject or 0,
+                    place=place,
+                    draughtsman=pen,
+                    digest=digest,
+                )
         rows: list[dict[str, Any]] = analysis.table.to_dict("records")
         if as_json:
             found: dict[str, Any] = {**analysis.summary, "events": rows, "out": str(folder)}
@@ -181,6 +181,13 @@ def fit(
         understated = analysis.summary.get("repeats", {}).get("understated", False)
         if strict and (flagged or understated):
             raise typer.Exit(FLAGGED)
+
+
+def _hashed(stack: Path) -> str:
+    from iscat_analysis.movie import open_stack
+
+    with open_stack(stack) as movie:
+        return movie.sha256()
 
 
 def _is_large(stack: Path) -> bool:

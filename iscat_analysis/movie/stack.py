@@ -220,7 +220,9 @@ class Stack:
         """Let another process open the same file."""
         if not self._files or not self._own:
             raise TypeError(f"{self.name} is no file that another process could open")
-        return _reopened, (self.address.absolute(), self.identity, self._left_out)
+        path = self._path.absolute()
+        address = Path(f"{path}{MARK}{self._part}") if self._part else path
+        return _reopened, (address, self.identity, self._left_out)
 
     def __enter__(self) -> Self:
         return self
@@ -237,11 +239,6 @@ class Stack:
     def path(self) -> Path:
         """The file, or the name of the array."""
         return self._path
-
-    @property
-    def address(self) -> Path:
-        """What opens it again: the file, with the part of it that is the movie."""
-        return Path(f"{self._path}{MARK}{self._part}") if self._part else self._path
 
     @property
     def name(self) -> str:
@@ -442,8 +439,13 @@ class Stack:
         digest.update(self._part.encode("utf-8", "backslashreplace"))
         return digest.hexdigest()
 
-    def hashed(self) -> Future[str]:
+    def hashed(self, begun: Future[str] | None = None) -> Future[str]:
         """Hash the movie in a thread of its own, once however often it is asked for.
+
+        Parameters
+        ----------
+        begun : Future of str, optional
+            The hash of the same file, where somebody has begun it.
 
         Returns
         -------
@@ -451,7 +453,7 @@ class Stack:
             What `sha256` gives.
         """
         if self._hashing is None:
-            self._hashing = beside(self.sha256)
+            self._hashing = begun or beside(self.sha256)
         return self._hashing
 
     def _require(self, start: int, stop: int) -> None:

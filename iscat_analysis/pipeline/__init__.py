@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from contextlib import ExitStack, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
@@ -57,7 +58,7 @@ FEW_FIGURES = 2
 
 
 def fit_stack(
-    stack: str | Path | Stack,
+    stack: str | Path,
     config: Config,
     *,
     out: Path | None = None,
@@ -68,13 +69,14 @@ def fit_stack(
     inject: int = 0,
     place: Place | None = None,
     draughtsman: Draughtsman | None = None,
+    digest: Future[str] | None = None,
 ) -> Analysis:
     """Analyse a movie and write the report.
 
     Parameters
     ----------
-    stack : str, Path or Stack
-        The movie; one that is open stays open.
+    stack : str or Path
+        The movie.
     config : Config
         What to do; see `iscat_analysis.config`.
     out : Path, optional
@@ -95,6 +97,8 @@ def fit_stack(
     draughtsman : Draughtsman, optional
         The process that draws the report, started with it or, by a landing movie, when its chunks
         are done; default this one.
+    digest : Future of str, optional
+        Its `Stack.sha256`, where that was begun before.
 
     Returns
     -------
@@ -117,9 +121,8 @@ def fit_stack(
             draughtsman.start()
         progress(stage, done, total)
 
-    opened = stack if isinstance(stack, Stack) else None
-    address = path_in("`stack`", stack) if opened is None else opened.address
-    folder = beside(address, ".iscat") if out is None else out
+    stack = path_in("`stack`", stack)
+    folder = beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
     way = way_of(config)
     figures = FEW_FIGURES if way == "sliding" else EVENT_FIGURES
@@ -137,7 +140,8 @@ def fit_stack(
                     (building / "figures").mkdir()
                     draughtsman.begin(known, building / "figures", figures)
 
-            with open_stack(address) if opened is None else nullcontext(opened) as movie:
+            with open_stack(stack) as movie:
+                movie.hashed(digest)
                 analysis = analyse(
                     movie,
                     config,
