@@ -195,8 +195,7 @@ def sliding_ratio(frames: int, side: int, peer: Path | None) -> dict[str, float 
             weight = np.ones((side, side), dtype=np.float32)
 
             def one(k: int) -> None:
-                before = chunk.blocks_e[max(k - 4, 0) : k].sum(axis=0)
-                after = chunk.blocks_e[k : k + 4].sum(axis=0)
+                before, after = chunk.blocks_e[max(k - 4, 0) : k], chunk.blocks_e[k : k + 4]
                 contrast_map(before, after, weight, np.empty((side, side), dtype=np.float32))
 
             list(pool.map(one, range(1, len(chunk.blocks_e))))
