@@ -53,9 +53,16 @@ class BackgroundConfig(Section):
         description="divide out the laser power, estimated with the particles excluded, and its "
         "flicker along rows or columns where they show one",
     )
-    drift_correction: bool = Field(
-        False, description="landing movies: divide out the motion of the fixed pattern"
+    drift_correction: Literal["auto"] | bool = Field(
+        "auto",
+        description="landing movies: divide out the motion of the fixed pattern; auto, where it is "
+        "seen to move",
     )
+
+    @property
+    def follows_pattern(self) -> bool:
+        """Whether the motion of the fixed pattern is divided out; "auto" is settled by a movie."""
+        return self.drift_correction is True
 
     @property
     def recorded(self) -> tuple[int, int] | None:

@@ -159,7 +159,7 @@ def analyse_chunk(
     Done
         Everything found.
     """
-    wanted = scene.config.background.drift_correction
+    wanted = scene.config.background.follows_pattern
     still, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
     fitter = ChunkFitter(scene, still, window, pool, pattern, excess_noise=excess_noise)
     seam = max(2, window // STRIDES)

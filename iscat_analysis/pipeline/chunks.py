@@ -281,7 +281,7 @@ def plan_chunks(
     # beside its counts, a block holds its sum and its map (where the pattern's motion is divided
     # out, that and a spectrum as well), and the field some images in doubles
     pixels = math.prod(reader.shape)
-    per_block = 32 if config.background.drift_correction else 20
+    per_block = 32 if config.background.follows_pattern else 20
     beside = per_block * pixels // stride
     if (last - first) * (reader.frame_bytes + beside) <= budget - 40 * pixels:
         return [((first, last), (first, last))]

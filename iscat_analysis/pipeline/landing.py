@@ -209,7 +209,7 @@ def analyse_landings(
         progress("landing", last - first, last - first)
     fits, views, repeats = merged.result()
     light = merged.light()
-    wanted = config.background.drift_correction
+    wanted = config.background.follows_pattern
     for text in frame_warnings(movie.name, merged, light, first, window, corrected=wanted):
         tell(text)
     if merged.cause:

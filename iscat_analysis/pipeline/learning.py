@@ -446,7 +446,7 @@ def noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
     counts = movie.read(first, min(last, first + SPECTRUM_FRAMES, movie.shape[0]))
     light, repeats = measure_frames(counts, camera)
     stuck = way_of(config) != "sliding" and repeats.mean() > _STUCK
-    follows = config.background.drift_correction if way_of(config) == "sliding" else None
+    follows = config.background.follows_pattern if way_of(config) == "sliding" else None
     noise = judge_counts(counts[well_lit(light) & ~repeats], camera, follows=follows)
     return bool(stuck or noise.differs)
 

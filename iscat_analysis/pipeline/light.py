@@ -14,7 +14,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.movie.lighting import find_surface
-from iscat_analysis.movie.lines import Lines, find_lines
+from iscat_analysis.movie.lines import Lines, SteadyFrames, find_lines
 from iscat_analysis.movie.unsteady import find_unsteady, unsteady_said
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES
 from iscat_analysis.pipeline.ways import way_of
@@ -67,11 +67,14 @@ class JudgedLight:
         What of the light may be divided out.
     messages : tuple of str
         What the user should know, one line each.
+    steady : Stack
+        The movie with `lines` divided out.
     """
 
     movie: Stack
     lines: Lines | None
     messages: tuple[str, ...]
+    steady: Stack
 
 
 def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
@@ -92,7 +95,7 @@ def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
         Of dark field the movie itself: its particles are few pixels in the dark.
     """
     if config.optics.scheme == "darkfield":
-        return JudgedLight(movie, None, ())
+        return JudgedLight(movie, None, (), movie)
     pairs, window = _pairs(movie, config, camera)
     said = []
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm
@@ -105,7 +108,10 @@ def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
         movie = movie.without(odd, dark)
         said.append(unsteady_said(odd))
     lines = judge_lines(movie, config, camera, pairs, window)
-    return JudgedLight(movie, lines, (*said, *(lines.messages if lines is not None else ())))
+    if lines is None:
+        return JudgedLight(movie, None, tuple(said), movie)
+    steady = movie.seen_as(SteadyFrames(movie, lines, camera))
+    return JudgedLight(movie, lines, (*said, *lines.messages), steady)
 
 
 def judge_lines(
@@ -140,7 +146,7 @@ def judge_lines(
     if (
         not background.power_normalization
         or background.method == "known"
-        or (background.method == "sliding" and background.drift_correction)
+        or (background.method == "sliding" and background.follows_pattern)
         or (way == "tracks" and config.track.free == "joint")
     ):
         return None

@@ -167,7 +167,7 @@ class LandingSearch:
         stride = stride_of(window)
         frame = min(max(frame, first + stride), last - stride)
         half = STRIDES * stride
-        reach = (SPAN if self._config.background.drift_correction else 1) * STRIDES
+        reach = (SPAN if self._config.background.follows_pattern else 1) * STRIDES
         blocks_before = min(reach, (frame - first) // stride)
         span = frame - blocks_before * stride, min(frame + reach * stride, last)
         scene = self.scene(window)

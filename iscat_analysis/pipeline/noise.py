@@ -67,12 +67,15 @@ class Noise:
         None where the noise is as expected.
     spectrum : NoiseSpectrum or None
         Of the noise between neighbouring frames, where it is not white and of the expected size.
+    shakes : bool
+        Whether the noise beyond the light's is that of a fixed pattern that shakes.
     """
 
     messages: tuple[str, ...] = ()
     differs: bool = False
     excess: ExcessNoise | None = None
     spectrum: NoiseSpectrum | None = None
+    shakes: bool = False
 
     def said(self, name: str) -> Iterator[str]:
         """Give what the user should know.
@@ -178,7 +181,7 @@ def judge_counts(
         said += ", or set background.drift_correction = true, with which it is followed"
     excess = ExcessNoise(gain.noise_ratio, said) if gain.off and gain.noise_ratio > 1 else None
     if wrong is None:
-        return Noise((said,) if said else (), gain.off, excess, spectrum)
+        return Noise((said,) if said else (), gain.off, excess, spectrum, gain.shakes)
     messages = [said]
     moved = replace(camera, offset_adu=camera.offset_adu + wrong.electrons / camera.gain_e_per_adu)
     with contextlib.suppress(DataError):  # too dark to tell
@@ -335,7 +338,7 @@ def judge_opening(reader: Reader, config: Config) -> Opening:
         opening, curve, window = judge_window(reader, config, pool.map)
         noise = judge_counts(
             opening, reader.camera, additive=additive,
-            follows=config.background.drift_correction, mapper=pool.map,
+            follows=config.background.follows_pattern, mapper=pool.map,
         )  # fmt: skip
     if noise.excess is None:
         ratio = curve.at(window)
@@ -391,7 +394,8 @@ def judge_window(
         )
     opening = reader.opening(mapper)
     longest = min(given or longest_window(frames), NOISE_FRAMES // 4)
-    curve = measure_noise(opening, reader.camera, longest, mapper=mapper)
+    follows = config.background.follows_pattern
+    curve = measure_noise(opening, reader.camera, longest, follows=follows, mapper=mapper)
     window = given or choose_window(curve, frames)
     return opening, curve, window
 

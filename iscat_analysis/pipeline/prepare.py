@@ -14,14 +14,14 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_overflow, refuse_ratio
-from iscat_analysis.movie.lines import Lines, SteadyFrames
+from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pieces.setups import darkfield_photons
 from iscat_analysis.pipeline.chunks import reader_of
 from iscat_analysis.pipeline.contrast_sign import learn_sign, wrong_sign
 from iscat_analysis.pipeline.diagnosis import axes_warning
 from iscat_analysis.pipeline.learning import learn_optics
-from iscat_analysis.pipeline.light import judge_light
+from iscat_analysis.pipeline.light import JudgedLight, judge_light
 from iscat_analysis.pipeline.noise import Opening, judge_opening
 from iscat_analysis.pipeline.ranges import fitted_frames, tracked_frames
 from iscat_analysis.pipeline.recognise import (
@@ -31,6 +31,7 @@ from iscat_analysis.pipeline.recognise import (
     look_at_changes,
 )
 from iscat_analysis.pipeline.run import Run
+from iscat_analysis.pipeline.stage import followed, motion_said
 from iscat_analysis.pipeline.tracks import judge_times
 from iscat_analysis.pipeline.ways import Way, way_of, way_said
 from iscat_analysis.search.changes import Changes
@@ -138,26 +139,27 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         run.tell(swapped)
     summary: dict[str, Any] = {}
     looking: Future[Changes] | None = None
-    opening: Future[Opening] | None = None
+    opened: Opening | None = None
 
     with one_thread_algebra():  # in all threads until the light is judged
-        # meanwhile, in the light as it is; again if anything of it is unsteady
         if way == "sliding":
-            opening = beside(_opening_of, movie, config, camera, span)
-        elif tracked:
-            looking = beside(look_at_changes, movie, config, camera, span)
-        judged = judge_light(movie, config, camera)
-        for text in judged.messages:
-            run.tell(f"{movie.name}: {text}")
-        unsteady = judged.movie is not movie or judged.lines is not None
-        movie, lines = judged.movie, judged.lines
-        steady = movie
-        if lines is not None:
-            summary["lines"] = lines.summary
-            steady = movie.seen_as(SteadyFrames(movie, lines, camera))
-        if way == "sliding" and unsteady:
-            opening = beside(_opening_of, steady, config, camera, span)
-        opened = None if opening is None else opening.result()
+            judged, opened = _landing_light(movie, config, camera, span)
+            if config.background.drift_correction == "auto":
+                motion = motion_said(opened)
+                config = followed(config, moves=bool(motion))
+                if motion:
+                    run.notify(f"{movie.name}: {motion}; its motion is followed and divided out")
+                    judged, opened = _landing_light(movie, config, camera, span)
+        else:
+            if tracked:  # in the light as it is; again if anything of it is unsteady
+                looking = beside(look_at_changes, movie, config, camera, span)
+            judged = judge_light(movie, config, camera)
+    for text in judged.messages:
+        run.tell(f"{movie.name}: {text}")
+    unsteady = judged.steady is not movie
+    movie, lines, steady = judged.movie, judged.lines, judged.steady
+    if lines is not None:
+        summary["lines"] = lines.summary
     if way == "sliding" or (tracked and unsteady):
         looking = beside(look_at_changes, steady, config, camera, span)
     digest = movie.hashed()
@@ -190,8 +192,19 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     )  # fmt: skip
 
 
-def _opening_of(movie: Stack, config: Config, camera: Camera, span: tuple[int, int]) -> Opening:
-    return judge_opening(reader_of(movie, config, camera, span), config)
+def _landing_light(
+    movie: Stack, config: Config, camera: Camera, span: tuple[int, int]
+) -> tuple[JudgedLight, Opening]:
+    """Judge the light of a landing movie and, in steady light, the noise of its first frames."""
+
+    def opening_of(seen: Stack) -> Opening:
+        return judge_opening(reader_of(seen, config, camera, span), config)
+
+    opening = beside(opening_of, movie)  # in the light as it is; again if anything is unsteady
+    judged = judge_light(movie, config, camera)
+    if judged.steady is not movie:
+        opening = beside(opening_of, judged.steady)
+    return judged, opening.result()
 
 
 def _refuse_still(counts: NDArray[Any], name: str) -> None:

@@ -127,7 +127,7 @@ def _landings(
         span = max(frame - HALO * window, first), min(frame + HALO * window, last)
         with threads(config.compute.workers) as pool:
             chunk = reader.chunk(span, stride, pool)
-            wanted = config.background.drift_correction
+            wanted = config.background.follows_pattern
             chunk, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
         neighbours = Neighbours(scene, chunk, window, pattern)
         near = (table["frame"] - frame).abs() < 3 * window

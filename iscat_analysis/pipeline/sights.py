@@ -174,7 +174,7 @@ def landing_sights(
         most = math.ceil(MOST_SIGHTS / len(spans))
     for span in spans:
         chunk = reader.chunk(span, stride, pool)
-        wanted = config.background.drift_correction
+        wanted = config.background.follows_pattern
         chunk, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
         alone, every = find_bright_steps(
             chunk,

@@ -32,6 +32,7 @@ from iscat_analysis.search.sliding.noise import (
     NoiseCurve,
     choose_window,
     longest_window,
+    measure_motion,
     measure_noise,
 )
 from iscat_analysis.search.sliding.search import (
@@ -75,6 +76,7 @@ __all__ = [
     "make_chunk",
     "make_filter",
     "measure_frames",
+    "measure_motion",
     "measure_noise",
     "sliding_maps",
     "stride_of",

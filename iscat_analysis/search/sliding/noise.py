@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.movie.camera import Camera
-from iscat_analysis.records import Mapper
+from iscat_analysis.records import FloatArray, Mapper
 
 LONGEST_WINDOW = 100
 """Frames that a window chosen from the noise may have; beyond it events overlap too often."""
@@ -27,8 +28,15 @@ SHOT_LIMITED = 1.2
 """Noise variance over shot noise up to which averaging is called shot-noise limited."""
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
+_APART = (
+    1,
+    2,
+    3,
+    4,
+)  # pixels on either side, whose differences make up the slope of a fine pattern
 _NORMAL_QUARTILE = 0.6744897501960817
 _ROWS = 16  # on which the noise is measured
+_ROWS_TOGETHER = 64  # the same beside what the pattern's motion makes, of which slopes tell
 
 
 @dataclass(frozen=True)
@@ -69,7 +77,12 @@ class NoiseCurve:
 
 
 def measure_noise(
-    counts: NDArray[Any], camera: Camera, longest: int, *, mapper: Mapper = map
+    counts: NDArray[Any],
+    camera: Camera,
+    longest: int,
+    *,
+    follows: bool = False,
+    mapper: Mapper = map,
 ) -> NoiseCurve:
     """Noise of averages over frames, as the Allan deviation has it: neighbours are compared.
 
@@ -81,6 +94,8 @@ def measure_noise(
         Counts → photoelectrons.
     longest : int
         Longest average wanted.
+    follows : bool
+        Whether to leave out what motion of the fixed pattern makes, to first order.
     mapper : callable
         `map`, or the one of a pool.
 
@@ -94,30 +109,92 @@ def measure_noise(
     D. W. Allan, Proc. IEEE 54, 221 (1966).  Variances are from the median deviation, so that
     particles, which cover few pixels at a time, do not count as noise.
     """
-    rows = np.linspace(0, counts.shape[1] - 1, min(_ROWS, counts.shape[1])).astype(int)
-    strip = counts[:, rows]
-    shape = (counts.shape[1], counts.shape[2])
-    gain, offset = (
-        np.broadcast_to(v, shape)[rows] for v in (camera.gain_e_per_adu, camera.offset_adu)
-    )
-    read = camera.read_variance_e2(shape)[rows]
-
-    def ratio(n: int) -> float:
-        blocks = 2 * min(len(strip) // (2 * n), 8)
-        parts = strip[: blocks * n].reshape(blocks, n, *strip.shape[1:])
-        sums = gain * (parts.sum(axis=1, dtype=np.float64) - n * offset)
-        before, after = sums[0::2], sums[1::2]
-        lit = np.all(sums > 0, axis=0)
-        before, after = before[:, lit], after[:, lit]
-        power = after.sum(axis=1, keepdims=True) / before.sum(axis=1, keepdims=True)
-        contrast = after / (power * before) - 1
-        variance = (before + n * read[lit]) / before**2 + (after + n * read[lit]) / after**2
-        deviation = float(np.median(np.abs(contrast) / np.sqrt(variance)))
-        return (deviation / _NORMAL_QUARTILE) ** 2
-
+    strip = _Strip.of(counts, camera, together=follows)
     lengths = sorted({*_LENGTHS[:-1], max(longest, 1)})
-    lengths = [n for n in lengths if n <= longest and 2 * n <= len(strip)]
-    return NoiseCurve(tuple(lengths), tuple(mapper(ratio, lengths)))
+    lengths = [n for n in lengths if n <= longest and 2 * n <= len(counts)]
+    kind = 1 if follows else 0
+    return NoiseCurve(tuple(lengths), tuple(mapper(lambda n: strip.noise(n)[kind], lengths)))
+
+
+def measure_motion(counts: NDArray[Any], camera: Camera, length: int) -> float:
+    """Noise of averages that motion of the fixed pattern makes.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Consecutive good frames.
+    camera : Camera
+        Counts → photoelectrons.
+    length : int
+        Frames that are averaged.
+
+    Returns
+    -------
+    float
+        Its variance over that of the rest.
+    """
+    whole, rest = _Strip.of(counts, camera, together=True).noise(length)
+    return whole / rest - 1
+
+
+@dataclass(frozen=True)
+class _Strip:
+    """Some rows of frames, and their camera."""
+
+    counts: NDArray[Any]
+    gain: FloatArray
+    offset: FloatArray
+    read: FloatArray
+    together: bool
+
+    @classmethod
+    def of(cls, counts: NDArray[Any], camera: Camera, *, together: bool) -> _Strip:
+        """Take rows all over the field, or some that lie together."""
+        height = counts.shape[1]
+        rows: Any = np.linspace(0, height - 1, min(_ROWS, height)).astype(int)
+        if together:
+            first = max(height - _ROWS_TOGETHER, 0) // 2
+            rows = slice(first, first + _ROWS_TOGETHER)
+        shape = (height, counts.shape[2])
+        gain, offset = (
+            np.broadcast_to(v, shape)[rows] for v in (camera.gain_e_per_adu, camera.offset_adu)
+        )
+        return cls(counts[:, rows], gain, offset, camera.read_variance_e2(shape)[rows], together)
+
+    def noise(self, n: int) -> tuple[float, float]:
+        """Variance of neighbouring averages over shot noise: all of it, and that without motion.
+
+        Of rows that do not lie together nothing is known of motion.
+        """
+        blocks = 2 * min(len(self.counts) // (2 * n), 8)
+        parts = self.counts[: blocks * n].reshape(blocks, n, *self.counts.shape[1:])
+        sums = self.gain * (parts.sum(axis=1, dtype=np.float64) - n * self.offset)
+        lit = np.all(sums > 0, axis=0)
+        before, after = np.where(lit, sums[0::2], 1.0), np.where(lit, sums[1::2], 1.0)
+        power, level = (part.sum(axis=(1, 2), keepdims=True, where=lit) for part in (after, before))
+        contrast = after / (power / level * before) - 1
+        read = n * self.read
+        sigma = np.sqrt((before + read) / before**2 + (after + read) / after**2)
+        whole = (contrast / sigma)[:, lit]
+        if not self.together:
+            return _variance(whole), math.nan
+        light = before + after
+        slopes = np.stack([_across(light, n, axis) / light for axis in (1, 2) for n in _APART])
+        seen = np.moveaxis(slopes[:, :, lit] / sigma[:, lit], 0, -1)  # (pair, pixel, axis)
+        turned = np.swapaxes(seen, 1, 2)
+        moved = np.linalg.pinv(turned @ seen, hermitian=True) @ (turned @ whole[..., None])
+        return _variance(whole), _variance(whole - (seen @ moved)[..., 0])
+
+
+def _across(images: FloatArray, reach: int, axis: int) -> FloatArray:
+    """Differences between the pixels on either side of each; beyond the border, of the border."""
+    at = np.arange(images.shape[axis])
+    after, before = (images.take(np.clip(at + step, 0, at[-1]), axis) for step in (reach, -reach))
+    return np.asarray(after - before)
+
+
+def _variance(values: FloatArray) -> float:
+    return (float(np.median(np.abs(values))) / _NORMAL_QUARTILE) ** 2
 
 
 def choose_window(curve: NoiseCurve, frames: int) -> int:

@@ -1,0 +1,53 @@
+"""Whether the stage moves, before anything is searched: what the fixed pattern tells of it."""
+
+from __future__ import annotations
+
+from iscat_analysis.config import Config
+from iscat_analysis.pipeline.noise import Opening
+from iscat_analysis.search.sliding import measure_motion
+
+_MATTERS = 0.03  # of the variance of averages, that motion adds; of noise alone it is 1e-4
+
+
+def followed(config: Config, *, moves: bool) -> Config:
+    """Settle whether the motion of the fixed pattern is divided out.
+
+    Parameters
+    ----------
+    config : Config
+        Resolved, with ``background.drift_correction = "auto"``.
+    moves : bool
+        Whether it moves.
+
+    Returns
+    -------
+    Config
+        With a setting that repeats the analysis.
+    """
+    background = config.background.model_copy(update={"drift_correction": moves})
+    return config.model_copy(update={"background": background})
+
+
+def motion_said(opening: Opening) -> str:
+    """Say that the fixed pattern of a landing movie moves.
+
+    Parameters
+    ----------
+    opening : Opening
+        Of the movie, in steady light.
+
+    Returns
+    -------
+    str
+        Some words; empty where its motion makes no noise that matters, or there is no pattern.
+    """
+    if opening.noise.shakes:
+        return "the fixed pattern shakes"
+    length = opening.curve.frames[-1]
+    share = measure_motion(opening.reader.opening(), opening.reader.camera, length)
+    if not share > _MATTERS:
+        return ""
+    return (
+        f"the fixed pattern moves: averages of {length} frames differ by {1 + share:.3g} times "
+        "what they would otherwise"
+    )
