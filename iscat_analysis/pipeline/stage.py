@@ -6,7 +6,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.pipeline.noise import Opening
 from iscat_analysis.search.sliding import measure_motion
 
-_MATTERS = 0.03  # of the variance of averages, that motion adds; of noise alone it is 1e-4
+_MATTERS = 0.03  # of the variance of averages, that motion adds; of noise alone it is 1e-3
 
 
 def followed(config: Config, *, moves: bool) -> Config:

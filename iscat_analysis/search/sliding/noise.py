@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ _APART = (
     3,
     4,
 )  # pixels on either side, whose differences make up the slope of a fine pattern
+_PARTICLE = 4.0  # standard deviations, from which on a difference is not asked of motion
 _NORMAL_QUARTILE = 0.6744897501960817
 _ROWS = 16  # on which the noise is measured
 _ROWS_TOGETHER = 64  # the same beside what the pattern's motion makes, of which slopes tell
@@ -112,8 +113,8 @@ def measure_noise(
     strip = _Strip.of(counts, camera, together=follows)
     lengths = sorted({*_LENGTHS[:-1], max(longest, 1)})
     lengths = [n for n in lengths if n <= longest and 2 * n <= len(counts)]
-    kind = 1 if follows else 0
-    return NoiseCurve(tuple(lengths), tuple(mapper(lambda n: strip.noise(n)[kind], lengths)))
+    found = mapper(strip.compared, lengths)
+    return NoiseCurve(tuple(lengths), tuple(each.rest if follows else each.noise for each in found))
 
 
 def measure_motion(counts: NDArray[Any], camera: Camera, length: int) -> float:
@@ -131,10 +132,17 @@ def measure_motion(counts: NDArray[Any], camera: Camera, length: int) -> float:
     Returns
     -------
     float
-        Its variance over that of the rest.
+        Its variance over that of the light; about 0 where nothing moves.
     """
-    whole, rest = _Strip.of(counts, camera, together=True).noise(length)
-    return whole / rest - 1
+    return _Strip.of(counts, camera, together=True).compared(length).motion
+
+
+class _Compared(NamedTuple):
+    """Neighbouring averages of a length: variances over that of shot noise."""
+
+    noise: float  # of the contrast
+    rest: float  # the same without motion
+    motion: float  # by least squares, which knows it better than their difference
 
 
 @dataclass(frozen=True)
@@ -161,11 +169,8 @@ class _Strip:
         )
         return cls(counts[:, rows], gain, offset, camera.read_variance_e2(shape)[rows], together)
 
-    def noise(self, n: int) -> tuple[float, float]:
-        """Variance of neighbouring averages over shot noise: all of it, and that without motion.
-
-        Of rows that do not lie together nothing is known of motion.
-        """
+    def compared(self, n: int) -> _Compared:
+        """Compare averages of n frames; of rows that do not lie together nothing tells motion."""
         blocks = 2 * min(len(self.counts) // (2 * n), 8)
         parts = self.counts[: blocks * n].reshape(blocks, n, *self.counts.shape[1:])
         sums = self.gain * (parts.sum(axis=1, dtype=np.float64) - n * self.offset)
@@ -175,15 +180,22 @@ class _Strip:
         contrast = after / (power / level * before) - 1
         read = n * self.read
         sigma = np.sqrt((before + read) / before**2 + (after + read) / after**2)
-        whole = (contrast / sigma)[:, lit]
+        change = (contrast / sigma)[:, lit]
+        noise = _variance(change)
         if not self.together:
-            return _variance(whole), math.nan
+            return _Compared(noise, math.nan, math.nan)
         light = before + after
-        slopes = np.stack([_across(light, n, axis) / light for axis in (1, 2) for n in _APART])
-        seen = np.moveaxis(slopes[:, :, lit] / sigma[:, lit], 0, -1)  # (pair, pixel, axis)
-        turned = np.swapaxes(seen, 1, 2)
-        moved = np.linalg.pinv(turned @ seen, hermitian=True) @ (turned @ whole[..., None])
-        return _variance(whole), _variance(whole - (seen @ moved)[..., 0])
+        slopes = np.stack(
+            [_across(light, reach, axis) / light for axis in (1, 2) for reach in _APART]
+        )
+        seen = np.moveaxis(slopes[:, :, lit] / sigma[:, lit], 0, -1)  # (pair, pixel, slope)
+        usual = np.abs(change) < _PARTICLE * math.sqrt(noise)
+        turned = np.swapaxes(seen * usual[..., None], 1, 2)
+        told = turned @ change[..., None]
+        moved = np.linalg.pinv(turned @ seen, hermitian=True) @ told
+        by_chance = moved.size  # of χ²
+        motion = (float(np.sum(told * moved)) - by_chance) / max(np.count_nonzero(usual), 1)
+        return _Compared(noise, _variance(change - (seen @ moved)[..., 0]), motion)
 
 
 def _across(images: FloatArray, reach: int, axis: int) -> FloatArray:
