@@ -145,7 +145,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         if way == "sliding":
             judged, opened = _landing_light(movie, config, camera, span)
             if config.background.drift_correction == "auto":
-                motion = motion_said(opened)
+                motion = motion_said(judged.steady, opened)
                 config = followed(config, moves=bool(motion))
                 if motion:
                     run.notify(f"{movie.name}: {motion}; its motion is followed and divided out")

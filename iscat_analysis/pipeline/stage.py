@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from iscat_analysis.config import Config
 from iscat_analysis.pipeline.noise import Opening
-from iscat_analysis.search.sliding import measure_motion
+from iscat_analysis.records import FrameSource
+from iscat_analysis.search.sliding import measure_frames, measure_motion, well_lit
 
 _MATTERS = 0.03  # of the variance of averages, that motion adds; of noise alone it is 1e-3
 
@@ -28,13 +29,15 @@ def followed(config: Config, *, moves: bool) -> Config:
     return config.model_copy(update={"background": background})
 
 
-def motion_said(opening: Opening) -> str:
+def motion_said(movie: FrameSource, opening: Opening) -> str:
     """Say that the fixed pattern of a landing movie moves.
 
     Parameters
     ----------
+    movie : FrameSource
+        In steady light.
     opening : Opening
-        Of the movie, in steady light.
+        Of the same movie; its first frames are looked at, and the last that are analysed.
 
     Returns
     -------
@@ -43,8 +46,15 @@ def motion_said(opening: Opening) -> str:
     """
     if opening.noise.shakes:
         return "the fixed pattern shakes"
-    length = opening.curve.frames[-1]
-    share = measure_motion(opening.reader.opening(), opening.reader.camera, length)
+    reader, length = opening.reader, opening.curve.frames[-1]
+    last = movie.read(max(reader.first, reader.last - 2 * length), reader.last)
+    light, repeats = measure_frames(last, reader.camera)
+    last = last[well_lit(light) & ~repeats]
+    share = max(
+        measure_motion(counts, reader.camera, min(length, len(counts) // 2))
+        for counts in (reader.opening(), last)
+        if len(counts) >= 2
+    )
     if not share > _MATTERS:
         return ""
     return (
