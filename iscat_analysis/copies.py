@@ -108,28 +108,19 @@ class Copy:
             raise LostError from None
 
     def end(self) -> None:
-        """End it and its group, whatever they are at; once, as its number may then be another's.
-
-        Nobody waits until the system has taken back its memory.
-        """
+        """End it and its group, whatever they are at; once, as its number may then be another's."""
         if self._ended:
             return
         self._ended = True
         with suppress(OSError):  # somebody else has buried it
             os.killpg(self.pid, signal.SIGKILL)
-            threading.Thread(target=_bury, args=(self.pid,), daemon=True).start()
+            os.waitpid(self.pid, 0)
 
     def close(self) -> None:
         """Close what led to it."""
         for pipe in (self._asking, self._telling):
             with suppress(OSError):
                 pipe.close()
-
-
-def _bury(pid: int) -> None:
-    """Take the status of a process that ends, so that its number becomes free."""
-    with suppress(OSError):
-        os.waitpid(pid, 0)
 
 
 def _send(pipe: IO[bytes], value: Any) -> None:
