@@ -184,10 +184,10 @@ def fit(
 
 
 def _hashed(stack: Path) -> str:
-    from iscat_analysis.movie import open_stack
+    from iscat_analysis.movie.addresses import sha256_of_files, split_address
+    from iscat_analysis.movie.folders import files_of
 
-    with open_stack(stack) as movie:
-        return movie.sha256()
+    return sha256_of_files(files_of(stack), split_address(stack)[1])
 
 
 def _is_large(stack: Path) -> bool:

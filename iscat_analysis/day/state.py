@@ -21,7 +21,7 @@ from typing import Any
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import DataError
 from iscat_analysis.files import whole_file
-from iscat_analysis.movie.addresses import fingerprint, split_address
+from iscat_analysis.movie.addresses import fingerprint, sha256_of_files, split_address
 from iscat_analysis.movie.folders import files_of
 
 STATE = ".batch"
@@ -240,15 +240,10 @@ def sha256_of(path: Path) -> str:
     str
         In hexadecimal; empty where it cannot be read, which whoever opens it will say.
     """
-    digest = hashlib.sha256()
     try:
-        for each in files_of(path):
-            with each.open("rb") as file:
-                hashlib.file_digest(file, lambda: digest)
-    except OSError:
+        return sha256_of_files(files_of(path), split_address(path)[1])
+    except (DataError, OSError):
         return ""
-    digest.update(split_address(path)[1].encode("utf-8", "backslashreplace"))
-    return digest.hexdigest()
 
 
 def saw(record: Mapping[str, Any], path: Path) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.addresses import MARK, fingerprint, split_address
+from iscat_analysis.movie.addresses import MARK, fingerprint, sha256_of_files, split_address
 from iscat_analysis.records import BoolArray, InPlace, PlacedSource, StackMetadata
 from iscat_analysis.threads import beside
 
@@ -23,7 +23,6 @@ LeftOut = tuple[BoolArray, NDArray[Any]]
 
 _MB = 1_000_000
 _FLOAT_BYTES = (4, 8)  # that kernels are compiled for
-_BLOCK_BYTES = 2**24  # that are hashed before another thread is waited for
 
 
 class Frames(Protocol):
@@ -428,16 +427,7 @@ class Stack:
             for _, block in self.chunks():
                 digest.update(block.data)
             return digest.hexdigest()
-        digest, room = hashlib.sha256(), memoryview(bytearray(_BLOCK_BYTES))
-        for path in self._files:
-            try:
-                with path.open("rb", buffering=0) as file:
-                    while length := file.readinto(room):
-                        digest.update(room[:length])
-            except OSError as error:
-                raise DataError(f"{path}: cannot be read ({error.strerror})") from None
-        digest.update(self._part.encode("utf-8", "backslashreplace"))
-        return digest.hexdigest()
+        return sha256_of_files(self._files, self._part)
 
     def hashed(self, begun: Future[str] | None = None) -> Future[str]:
         """Hash the movie in a thread of its own, once however often it is asked for.

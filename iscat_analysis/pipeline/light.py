@@ -18,9 +18,8 @@ from iscat_analysis.movie.lines import Lines, SteadyFrames, find_lines
 from iscat_analysis.movie.unsteady import find_unsteady, unsteady_said
 from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES
 from iscat_analysis.pipeline.ways import way_of
-from iscat_analysis.records import BoolArray
 from iscat_analysis.search.changes import least_beside, spot_of
-from iscat_analysis.search.sliding import longest_window, measure_frames, well_lit
+from iscat_analysis.search.sliding import good_frames, longest_window, measure_frames, well_lit
 from iscat_analysis.threads import threads
 
 PAIRS = 12
@@ -152,7 +151,7 @@ def judge_lines(
         return None
     first, last = background.recorded or config.fit.frames or (0, movie.shape[0])
     counts = movie.read(first, max(first, min(last, movie.shape[0], first + SPECTRUM_FRAMES)))
-    counts = counts[_good(counts, camera)]
+    counts = counts[good_frames(counts, camera)]
     if not len(counts):
         return None
     with threads(config.compute.workers) as pool:
@@ -173,12 +172,6 @@ def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:
             kept.append(counts)
             end = first + len(counts)
     return kept
-
-
-def _good(counts: NDArray[Any], camera: Camera) -> BoolArray:
-    """Leave out frames that are dark beside the others, and those that repeat the one before."""
-    light, repeats = measure_frames(counts, camera)
-    return well_lit(light) & ~repeats
 
 
 def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from iscat_analysis.config import Config
 from iscat_analysis.pipeline.noise import Opening
 from iscat_analysis.records import FrameSource
-from iscat_analysis.search.sliding import measure_frames, measure_motion, well_lit
+from iscat_analysis.search.sliding import good_frames, measure_motion
 
 _MATTERS = 0.03  # of the variance of averages, that motion adds; of noise alone it is 1e-3
 
@@ -48,8 +48,7 @@ def motion_said(movie: FrameSource, opening: Opening) -> str:
         return "the fixed pattern shakes"
     reader, length = opening.reader, opening.curve.frames[-1]
     last = movie.read(max(reader.first, reader.last - 2 * length), reader.last)
-    light, repeats = measure_frames(last, reader.camera)
-    last = last[well_lit(light) & ~repeats]
+    last = last[good_frames(last, reader.camera)]
     share = max(
         measure_motion(counts, reader.camera, min(length, len(counts) // 2))
         for counts in (reader.opening(), last)

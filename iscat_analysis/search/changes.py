@@ -88,8 +88,9 @@ def find_changes(blocks: Sequence[NDArray[np.floating]], spot_px: float) -> Chan
         return NO_CHANGES
     smooth = np.empty((len(blocks), *blocks[0].shape), dtype=np.float32)
     narrow, wide = (spot_response(blocks[0].shape, width * spot_px) for width in (1, 4))
+    between = narrow - wide
     for image, out in zip(blocks, smooth, strict=True):
-        out[:] = smoothed(image - 1, narrow - wide)  # whose noise single precision holds
+        out[:] = smoothed(image - 1, between)  # whose noise single precision holds
     lag = np.diff(smooth, axis=0)
     noise = _NORMAL * _median_deviation(lag)
     change = smooth[3:-1] - smooth[1:-3]

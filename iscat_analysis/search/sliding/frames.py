@@ -339,6 +339,25 @@ def well_lit(light_e: FloatArray, least: float = HALF) -> BoolArray:
     return lit
 
 
+def good_frames(counts: NDArray[Any], camera: Camera) -> BoolArray:
+    """Tell which frames have the light of most, and do not repeat the one before.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        Consecutive frames.
+    camera : Camera
+        Counts → photoelectrons.
+
+    Returns
+    -------
+    ndarray of bool, shape (t,)
+        As `well_lit` and `measure_frames` tell them.
+    """
+    light, repeats = measure_frames(counts, camera)
+    return well_lit(light) & ~repeats
+
+
 def make_chunk(
     first: int,
     counts: NDArray[Any],

@@ -28,12 +28,7 @@ SHOT_LIMITED = 1.2
 """Noise variance over shot noise up to which averaging is called shot-noise limited."""
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
-_APART = (
-    1,
-    2,
-    3,
-    4,
-)  # pixels on either side, whose differences make up the slope of a fine pattern
+_APART = (1, 2, 3, 4)  # pixels, whose differences make up the slope of a fine pattern
 _PARTICLE = 4.0  # standard deviations, from which on a difference is not asked of motion
 _NORMAL_QUARTILE = 0.6744897501960817
 _ROWS = 16  # on which the noise is measured
