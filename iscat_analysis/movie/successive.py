@@ -7,6 +7,7 @@ light or the stage drift, or the laser flickers, differences go on growing.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,8 @@ from iscat_analysis.movie.camera import Camera
 from iscat_analysis.records import BoolArray
 
 _APART, _FAR = 8, 16  # frames: filters are forgotten by then
-_FEWEST = 40  # frames that tell
-_PIXELS = 4096  # that tell, all over the field
+_FEWEST, _FRAMES = 40, 256  # frames that tell, and as many as are asked
+_PIXELS = 4096  # that are asked, all over the field
 _LEAST = 0.1  # by which the variance between neighbours falls short
 _GROWS = 0.15  # of that, by which it may still grow farther on
 
@@ -44,19 +45,18 @@ def shared_light(
     """
     if len(counts) < _FEWEST:
         return None
-    used = camera.to_electrons(counts.mean(axis=0)) > 0
-    if masked is not None:
-        used &= ~masked
-    places = np.flatnonzero(used)
-    if not places.size:
-        return None
-    places = places[:: -(-places.size // _PIXELS)]
+    counts, shape = counts[:_FRAMES], counts.shape[1:]
+    places = np.arange(math.prod(shape)) if masked is None else np.flatnonzero(~masked)
+    places = places[:: max(1, -(-places.size // _PIXELS))]
     offset, gain = (
-        np.broadcast_to(value, used.shape).flat[places]
+        np.broadcast_to(value, shape).flat[places]
         for value in (camera.offset_adu, camera.gain_e_per_adu)
     )
     theirs = Camera(offset_adu=offset, gain_e_per_adu=gain)
     pixels = theirs.to_electrons(counts.reshape(len(counts), -1)[:, places])
+    pixels = pixels[:, pixels.mean(axis=0) > 0]
+    if not pixels.size:
+        return None
     power = pixels.mean(axis=1)
     if power.min() <= 0:
         return None

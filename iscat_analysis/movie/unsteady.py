@@ -117,10 +117,13 @@ def find_unsteady(
         usual = float(np.median(ratio[lit]))
         if scatter is slow and usual > _CHANGING:  # by the light or the stage, and in what pattern
             continue
-        around = np.maximum(median_filter(ratio, _AROUND, mode="nearest"), usual)
-        more = ratio > around * chdtri(number, _CHANCE) / number
+        limit = chdtri(number, _CHANCE) / number
+        more = ratio > usual * limit
         more &= scatter.beside < least_beside * scatter.squares
-        found |= more & (_beside(ratio) - usual < least_beside * (ratio - usual))
+        more &= _beside(ratio) - usual < least_beside * (ratio - usual)
+        if more.any():  # by those around as well, which takes longest
+            more &= ratio > median_filter(ratio, _AROUND, mode="nearest") * limit
+            found |= more
         if scatter is fast:
             found |= _noisy_lines(ratio, lit, usual, least_beside)
     found &= lit

@@ -31,7 +31,7 @@ HALO = 2
 """Windows on either side of a chunk's core: a step, its neighbours, and theirs."""
 
 _LOOKS = 24  # frames all over a movie, that tell how much light there is
-_FIRST_LONGER = 1.15  # than others, of a chunk that is summed before they are begun
+_FIRST_LONGER = 1.27  # than others, of a chunk that is summed before they are begun
 _MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
@@ -297,7 +297,8 @@ def plan_chunks(
         )
     count = 2 * math.ceil((last - first) / core / 2)  # which two processes share
     even = (last - first) / count
-    longer = min(math.ceil(_FIRST_LONGER * even / stride) * stride, core)
+    # two that are held at once have the room of two
+    longer = math.ceil(min(_FIRST_LONGER * even, 2 * core - even) / stride) * stride
     rest = math.ceil((last - first - longer) / (count - 1) / stride) * stride
     edges = [first, *range(first + longer, last, rest), last]
     return [

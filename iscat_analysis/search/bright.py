@@ -183,7 +183,7 @@ def _spots(
     read = chunk.camera.read_variance_e2(chunk.shape)
     used = chunk.usable
 
-    def one(j: int) -> FloatArray:
+    def one(j: int) -> NDArray[np.float32]:
         low, middle, high = max(j + 1 - STRIDES, 0), j + 1, min(j + 1 + STRIDES, count + 1)
         ratio = power[middle:high].sum() / max(power[low:middle].sum(), 1e-300)
         before = chunk.blocks_e[low:middle].sum(axis=0)
@@ -191,10 +191,12 @@ def _spots(
         if not 0 < ratio < 1e6:
             return np.zeros(chunk.shape, dtype=np.float32)
         lit = used & (before > 0) & (after > 0)
+        if not lit.all():
+            before, after = np.where(lit, before, 0.0), np.where(lit, after, 0.0)
         if moved is not None:
-            before = before * (1 + moved[j])
+            before *= 1 + moved[j]
         change = after - ratio * before
-        change -= before * (change[lit].sum() / before[lit].sum())
+        change -= before * (change.sum() / before.sum())
         variance = after + ratio**2 * before
         variance += read * (frames[middle:high].sum() + ratio**2 * frames[low:middle].sum())
         return energy_of(change, variance, lit, spot_px)
@@ -207,7 +209,7 @@ def _spots(
 
 def energy_of(
     change: FloatArray, variance: FloatArray, used: BoolArray, spot_px: float
-) -> FloatArray:
+) -> NDArray[np.float32]:
     """Smoothed energy of a change of the image, in standard deviations of its noise.
 
     Parameters
@@ -224,17 +226,19 @@ def energy_of(
     ndarray of float32, shape (y, x)
         About 0 where there is only noise.
     """
-    excess = np.where(used, change**2 / np.where(used, variance, 1.0) - 1, 0.0)
-    coverage: FloatArray | float = 1.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        excess = (np.square(change) / variance - 1).astype(np.float32)
+    excess[~used] = 0.0
     spot = spot_response(used.shape, spot_px)
-    if not used.all():
-        coverage = np.maximum(smoothed(used.astype(float), spot), 1e-3)
     noise = math.sqrt(2 / (4 * math.pi * spot_px**2))
-    return np.asarray(smoothed(excess, spot) / coverage / noise, dtype=np.float32)
+    energy = smoothed(excess, spot / noise)
+    if not used.all():
+        energy /= np.maximum(smoothed(used.astype(np.float32), spot), 1e-3)
+    return energy
 
 
 def find_bright_places(
-    energy: FloatArray, *, pixel_nm: float, alone_nm: float, roi_px: int
+    energy: NDArray[np.floating], *, pixel_nm: float, alone_nm: float, roi_px: int
 ) -> list[tuple[int, int]]:
     """Places where a single map of the energy has a maximum with no other near.
 
@@ -265,7 +269,7 @@ def find_bright_places(
     ]
 
 
-def _maxima(energy: FloatArray, shadow_px: float) -> list[tuple[int, int, int]]:
+def _maxima(energy: NDArray[np.floating], shadow_px: float) -> list[tuple[int, int, int]]:
     """Maxima of a stack of maps, brightest first, without what belongs to a brighter one."""
     peaks = maxima(energy, THRESHOLD, (1, 2, 2))
     order = np.argsort(-energy[tuple(peaks.T)], kind="stable")

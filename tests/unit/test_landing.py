@@ -514,10 +514,11 @@ def test_windows_that_do_not_fit_into_memory() -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "cores"), [(150, [150]), (301, [60, *[50] * 4, 41]), (600, [75] * 8)]
+    ("frames", "cores"),
+    [(150, [150]), (280, [80, 70, 70, 60]), (301, [65, *[50] * 4, 36]), (600, [75] * 8)],
 )
 def test_chunks_follow_one_another_and_fit_into_memory(frames: int, cores: list[int]) -> None:
-    """The first is longer where there is room, 75 frames beside the windows around them."""
+    """The first is longer where that and the next have room for 2 × 75 frames beside windows."""
     config = _config("compute.memory_limit_mb=200", "background.window_frames=20")
     movie = Memory(np.zeros((frames, 256, 256), dtype="u2"))
     reader = chunks_module.reader_of(movie, config, Camera(), (0, frames))
