@@ -116,7 +116,6 @@ def fit(
     """
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
-        from iscat_analysis.config import load_config
         from iscat_analysis.errors import ConfigError
 
         if len(stacks) > 1:
@@ -127,6 +126,12 @@ def fit(
                 'for movie in *.tif; do iscat-fit "$movie" --config setup.toml; done'
             )
         (stack,) = stacks
+        from iscat_analysis.hashing import begin_hash
+
+        # another processor is idle while this one loads libraries
+        begun_hash = begin_hash(stack) if raw is None and stack.is_file() else None
+
+        from iscat_analysis.config import load_config
 
         changes = _changes(settings, mode, frames, background, posterior, workers)
         resolved = load_config(config, changes)
@@ -136,12 +141,10 @@ def fit(
         with closing(Draughtsman()) as pen:
             if resolved.background.method != "sliding" or not _is_large(stack):
                 pen.start()  # early, because it has as much to load
-            from iscat_analysis import threads
             from iscat_analysis.movie.addresses import MARK, beside
 
             if raw is not None:
                 stack = Path(f"{stack}{MARK}{raw}")
-            digest = threads.beside(_hashed, stack)  # another processor is idle while this loads
 
             from iscat_analysis.pipeline import fit_stack
             from iscat_analysis.places import open_place
@@ -159,7 +162,7 @@ def fit(
                     inject=inject or 0,
                     place=place,
                     draughtsman=pen,
-                    digest=digest,
+                    begun_hash=begun_hash,
                 )
         rows: list[dict[str, Any]] = analysis.table.to_dict("records")
         if as_json:
@@ -181,13 +184,6 @@ def fit(
         understated = analysis.summary.get("repeats", {}).get("understated", False)
         if strict and (flagged or understated):
             raise typer.Exit(FLAGGED)
-
-
-def _hashed(stack: Path) -> str:
-    from iscat_analysis.movie.addresses import sha256_of_files, split_address
-    from iscat_analysis.movie.folders import files_of
-
-    return sha256_of_files(files_of(stack), split_address(stack)[1])
 
 
 def _is_large(stack: Path) -> bool:

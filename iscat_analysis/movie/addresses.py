@@ -17,7 +17,6 @@ from iscat_analysis.errors import DataError
 MARK = "::"
 _END_BYTES = 2**20  # that are read of a file; many files share them
 _LEAST_END_BYTES = 2**8
-_BLOCK_BYTES = 2**24  # that are hashed before another thread is waited for
 _SHAPE = re.compile(r"(?:(\d+)x)?(\d+)x(\d+),\s*(\S+)", flags=re.ASCII)
 
 
@@ -88,38 +87,6 @@ def beside(address: Path, suffix: str) -> Path:
     if not part or layout(part) is not None:
         return path.with_suffix(suffix)
     return path.with_name(".".join([path.stem, *part.strip("/").split("/")]) + suffix)
-
-
-def sha256_of_files(files: Sequence[Path], part: str) -> str:
-    """Hash a movie, without holding it in memory.
-
-    Parameters
-    ----------
-    files : sequence of Path
-        That hold it.
-    part : str
-        What it is of them.
-
-    Returns
-    -------
-    str
-        SHA-256 of the bytes of the files, and of the part, as 64 hexadecimal digits.
-
-    Raises
-    ------
-    DataError
-        A file cannot be read.
-    """
-    digest, room = hashlib.sha256(), memoryview(bytearray(_BLOCK_BYTES))
-    for path in files:
-        try:
-            with path.open("rb", buffering=0) as file:
-                while length := file.readinto(room):
-                    digest.update(room[:length])
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read ({error.strerror})") from None
-    digest.update(part.encode("utf-8", "backslashreplace"))
-    return digest.hexdigest()
 
 
 def fingerprint(files: Sequence[Path], part: str = "") -> str:

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.addresses import MARK, fingerprint, sha256_of_files, split_address
+from iscat_analysis.hashing import BegunHash, sha256_of_files
+from iscat_analysis.movie.addresses import MARK, fingerprint, split_address
 from iscat_analysis.records import BoolArray, InPlace, PlacedSource, StackMetadata
 from iscat_analysis.threads import beside
 
@@ -429,13 +430,13 @@ class Stack:
             return digest.hexdigest()
         return sha256_of_files(self._files, self._part)
 
-    def hashed(self, begun: Future[str] | None = None) -> Future[str]:
+    def hashed(self, begun: BegunHash | None = None) -> Future[str]:
         """Hash the movie in a thread of its own, once however often it is asked for.
 
         Parameters
         ----------
-        begun : Future of str, optional
-            The hash of the same file, where somebody has begun it.
+        begun : BegunHash, optional
+            Of a file, which may be all of this movie.
 
         Returns
         -------
@@ -443,7 +444,10 @@ class Stack:
             What `sha256` gives.
         """
         if self._hashing is None:
-            self._hashing = begun or beside(self.sha256)
+            if begun is not None and (self._files, self._part) == ((begun.path,), ""):
+                self._hashing = begun.digest
+            else:
+                self._hashing = beside(self.sha256)
         return self._hashing
 
     def _require(self, start: int, stop: int) -> None:

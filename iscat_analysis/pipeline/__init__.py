@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
 from contextlib import ExitStack, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.hashing import BegunHash
 from iscat_analysis.inference.checks import path_in
 from iscat_analysis.memory import freed_memory_kept
 from iscat_analysis.movie import Stack, beside, open_stack
@@ -69,7 +69,7 @@ def fit_stack(
     inject: int = 0,
     place: Place | None = None,
     draughtsman: Draughtsman | None = None,
-    digest: Future[str] | None = None,
+    begun_hash: BegunHash | None = None,
 ) -> Analysis:
     """Analyse a movie and write the report.
 
@@ -97,8 +97,8 @@ def fit_stack(
     draughtsman : Draughtsman, optional
         The process that draws the report, started with it or, by a landing movie, when its chunks
         are done; default this one.
-    digest : Future of str, optional
-        Its `Stack.sha256`, where that was begun before.
+    begun_hash : BegunHash, optional
+        Of the movie's file, where that was begun before.
 
     Returns
     -------
@@ -141,7 +141,7 @@ def fit_stack(
                     draughtsman.begin(known, building / "figures", figures)
 
             with open_stack(stack) as movie:
-                movie.hashed(digest)
+                movie.hashed(begun_hash)
                 analysis = analyse(
                     movie,
                     config,

@@ -218,11 +218,10 @@ def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
     edges = np.histogram_bin_edges(values[finite], bins=bins)
     figure = new_figure(6.2, 3.2)
     axes = figure.add_subplot()
-    groups = [values[finite & good], values[finite & ~good]]
-    axes.hist(
-        groups, bins=edges.tolist(), stacked=True, color=[BLUE, PURPLE], label=["ok", "flagged"]
-    )
-    if groups[1].size:
+    ok, every = (np.histogram(values[part], bins=edges)[0] for part in (finite & good, finite))
+    axes.stairs(ok, edges, fill=True, color=BLUE, label="ok")
+    if (every > ok).any():
+        axes.stairs(every, edges, baseline=ok, fill=True, color=PURPLE, label="flagged")
         figure.legend(loc="outside upper right", ncols=2)
     axes.set(xlabel=label, ylabel="events")
     axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
