@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iscat_analysis.pipeline.neighbours import Neighbours
 from iscat_analysis.pipeline.pattern import MovingPattern
@@ -156,26 +157,32 @@ def clip_of(
     )
     # windows begin and end where others do, so that the parts between are summed once
     ends = [turn + k * window // CLIP_STEPS for k in range(-2 * CLIP_STEPS, 2 * CLIP_STEPS + 1)]
-    light, n, power = patch.windows(ends)
-    own = n[CLIP_STEPS : 3 * CLIP_STEPS].reshape(2, -1).sum(axis=1)
-    least = min(window / 2, *own)  # near the ends of a movie, the frames of the fit
-    frames, after_e, expected_e = [], [], []
-    for k in range(CLIP_STEPS, 3 * CLIP_STEPS + 1):
-        before, after = slice(k - CLIP_STEPS, k), slice(k, k + CLIP_STEPS)
-        if min(n[before].sum(), n[after].sum()) < max(least, 1):
-            continue
-        expected = light[before].sum(axis=0) * (power[after].sum() / power[before].sum())
-        if pattern and local:
-            spans = (ends[k - CLIP_STEPS], ends[k]), (ends[k], ends[k + CLIP_STEPS])
+    (before_e, after_e), (n_before, n_after), (power_before, power_after) = map(
+        _on_both_sides, patch.windows(ends)
+    )
+    # near the ends of a movie, the frames of the fit
+    least = min(window / 2, n_before[CLIP_STEPS], n_after[CLIP_STEPS])
+    held = np.flatnonzero(np.minimum(n_before, n_after) >= max(least, 1))
+    if len(held) < 2:
+        return None
+    ratio = power_after[held] / power_before[held]
+    expected_e = before_e[held] * ratio[:, None, None]
+    if pattern and local:
+        for expected, k in zip(expected_e, held, strict=True):
+            first, middle, last = (ends[k + side * CLIP_STEPS] for side in (0, 1, 2))
+            spans = (first, middle), (middle, last)
             seen = [pattern.seen(local, chunk.cut(*span)) for span in spans]
             expected *= seen[1] / seen[0]
-        frames.append(ends[k])
-        after_e.append(light[after].sum(axis=0))
-        expected_e.append(expected)
-    if len(frames) < 2:
-        return None
-    images = _ratio(np.array(after_e), np.array(expected_e), patch.usable, fold)
-    return Clip(tuple(frames), window, images.astype(np.float32))
+    images = _ratio(after_e[held], expected_e, patch.usable, fold)
+    frames = tuple(ends[CLIP_STEPS + k] for k in held)
+    return Clip(frames, window, images.astype(np.float32))
+
+
+def _on_both_sides(parts: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Sum the `CLIP_STEPS` parts before each end, and those after it, where there are as many."""
+    summed = np.cumsum(np.concatenate([0 * parts[:1], parts]), axis=0)
+    middle = summed[CLIP_STEPS:-CLIP_STEPS]
+    return middle - summed[: -2 * CLIP_STEPS], summed[2 * CLIP_STEPS :] - middle
 
 
 def _ratio(after: FloatArray, expected: FloatArray, used: BoolArray, fold: int) -> FloatArray:
