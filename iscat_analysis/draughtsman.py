@@ -87,12 +87,13 @@ class Draughtsman:
         str or None
             The page; None where nothing was begun or the process failed, and another has to draw.
         """
-        if self._answer is None:
+        if self._answer is None or self._other is None:
             return None
         try:
             page: str = self._answer.result()
         except Exception:  # noqa: BLE001  # whoever draws instead finds it again
             return None
+        self._thread.submit(self._other.end)  # while the page is written
         return page
 
     def close(self) -> None:

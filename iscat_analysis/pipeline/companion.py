@@ -93,6 +93,10 @@ class Pair:
             return
 
         def drive() -> None:
+            ask()
+            other.end()
+
+        def ask() -> None:
             while waiting:
                 try:
                     number, item = waiting.popleft()

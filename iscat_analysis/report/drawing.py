@@ -12,6 +12,8 @@ import os
 import pickle
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import closing
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -20,12 +22,13 @@ from typing import Any
 from markupsafe import Markup
 from PIL import Image
 
+from iscat_analysis.copies import Copy
 from iscat_analysis.records import Analysis
 from iscat_analysis.report.event_figures import event_figures
 from iscat_analysis.report.page import page_context, page_of, page_sketches, templates
-from iscat_analysis.report.style import Sketch, drawn, inline_svg, new_figure, publish
+from iscat_analysis.report.style import Sketch, drawn, new_figure, publish
 from iscat_analysis.report.tables import event_table
-from iscat_analysis.threads import processors
+from iscat_analysis.threads import beside, processors
 
 _MOST_SHARED = 256  # figures that two processes take from each other: a number is one byte
 
@@ -53,9 +56,18 @@ class Drawing:
         # the field, which takes longest, comes first, so that both processes end together
         sketches = [*shown, *event_figures(analysis, most)]
         self._names = {name for name, _ in sketches}
-        self._copy, self._left = None, iter(sketches)
+        self._left = iter(sketches)
+        self._others: Future[dict[str, Markup]] | None = None
         if together and sys.platform == "linux" and len(sketches) <= _MOST_SHARED:
-            self._copy, self._left = _copied(sketches, folder)
+            self._left = left = _taken(sketches)
+            copy = Copy(lambda _: publish(drawn(left), folder))
+
+            def answer() -> dict[str, Markup]:
+                with closing(copy):  # which ends it; that takes 20 ms, and nobody waits for it
+                    figures: dict[str, Markup] = copy.do(None)
+                return figures
+
+            self._others = beside(answer)
 
     def page(self, analysis: Analysis) -> str:
         """Draw what is left, and make the page.
@@ -72,53 +84,30 @@ class Drawing:
 
         Raises
         ------
-        RuntimeError
-            The copy could not draw what it had taken.
+        Exception
+            As the copy raises it where it cannot draw what it has taken.
         """
         folder = self._folder
         shown = list(page_sketches(analysis, self._table))
         late = [sketch for sketch in shown if sketch[0] not in self._names]
         about = page_context(analysis, self._table, folder)
         figures = publish(drawn(chain(late, self._left)), folder)
-        if self._copy is not None:
-            _, status = os.waitpid(self._copy, 0)
-            if status:
-                raise RuntimeError(f"a process that drew figures ended with status {status}")
-        return page_of(about, dict(_gathered(shown, figures, folder)))
+        if self._others is not None:
+            figures |= self._others.result()
+        return page_of(about, {name: figures[name] for name, _ in shown if name in figures})
 
 
-def _copied(sketches: Sequence[Sketch], folder: Path) -> tuple[int, Iterator[Sketch]]:
-    """Start a copy of this process that draws; give its number, and the figures that it leaves."""
+def _taken(sketches: Sequence[Sketch]) -> Iterator[Sketch]:
+    """Give what no other process has taken; each is a byte of a pipe that copies share."""
     reader, writer = os.pipe()
     os.write(writer, bytes(range(len(sketches))))
     os.close(writer)
-    copy = os.fork()
-    if copy == 0:
-        status = 1
-        try:
-            publish(drawn(_taken(sketches, reader)), folder)
-            status = 0
-        finally:
-            os._exit(status)
-    return copy, _taken(sketches, reader)
 
+    def taken() -> Iterator[Sketch]:
+        while number := os.read(reader, 1):
+            yield sketches[number[0]]
 
-def _taken(sketches: Sequence[Sketch], reader: int) -> Iterator[Sketch]:
-    """Take one sketch after the other that no other process has taken; each is a byte of a pipe."""
-    while number := os.read(reader, 1):
-        yield sketches[number[0]]
-
-
-def _gathered(
-    sketches: Sequence[Sketch], figures: dict[str, Markup], folder: Path
-) -> Iterator[tuple[str, Markup]]:
-    """Give the figures of the page in their order, those of the other process from its files."""
-    for name, _ in sketches:
-        file = folder / f"{name}.svg"
-        if name in figures:
-            yield name, figures[name]
-        elif file.exists():
-            yield name, inline_svg(file.read_text(encoding="utf-8"), name)
+    return taken()
 
 
 class Desk:

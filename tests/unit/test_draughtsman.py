@@ -221,7 +221,7 @@ def test_what_the_copy_cannot_draw_is_an_error(
         return {}
 
     monkeypatch.setattr("iscat_analysis.report.drawing.publish", fail)
-    with pytest.raises(RuntimeError, match="ended with status"):
+    with pytest.raises(OSError, match="no space left"):
         Drawing(analysis, tmp_path, 12, together=True).page(analysis)
 
 
