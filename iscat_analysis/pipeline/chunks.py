@@ -22,7 +22,15 @@ from iscat_analysis.records import (
     Mapper,
     PlacedSource,
 )
-from iscat_analysis.search.sliding import DARK, Chunk, make_chunk, measure_frames, well_lit
+from iscat_analysis.search.sliding import (
+    DARK,
+    Chunk,
+    make_chunk,
+    measure_frames,
+    stride_of,
+    well_lit,
+)
+from iscat_analysis.threads import threads
 
 NOISE_FRAMES = 800
 """Frames on which the noise is judged, and the windows are chosen."""
@@ -201,6 +209,24 @@ class Reader:
             check_counts(counts, self.first, self.name, camera=self.camera)
             raise DataError(f"{self.name}: has no two frames that differ; export it again")
         return used
+
+
+def sum_first_chunk(reader: Reader, config: Config, window: int) -> None:
+    """Sum what will be the first chunk, so that whoever asks for it has it at once.
+
+    Parameters
+    ----------
+    reader : Reader
+        The frames.
+    config : Config
+        ``compute``, and what else tells chunks apart.
+    window : int
+        Frames before and after a step.
+    """
+    stride = stride_of(window)
+    _, span = plan_chunks(reader, config, window, stride)[0]
+    with threads(config.compute.workers) as pool:
+        reader.chunk(span, stride, pool)
 
 
 def _runs(flags: BoolArray) -> Iterator[slice]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ from iscat_analysis.search.sliding import (
     well_lit,
 )
 from iscat_analysis.search.templates import ExcessNoise
-from iscat_analysis.threads import threads
+from iscat_analysis.threads import beside, threads
 
 SPECTRUM_FRAMES = 128
 """Background frames on which the spectrum of the noise is measured."""
@@ -155,6 +156,7 @@ def judge_counts(
     Noise
         Silent of the camera where it is too dark to tell.
     """
+    looking = None if additive else beside(partial(find_zero, masked=masked), counts, camera)
     spectrum = measure_spectrum(counts, camera, masked=masked, mapper=mapper)
     try:
         gain = diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=masked)
@@ -168,7 +170,7 @@ def judge_counts(
     shared = shared_light(counts, camera, masked=masked)
     if shared is not None:
         return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
-    zero = None if additive else find_zero(counts, camera, masked=masked)
+    zero = None if looking is None else looking.result()
     leaks = spectrum is not None and spectrum.correlated
     if zero is not None and leaks and not zero.flickers:
         zero = None  # the variance of a pixel is then of its neighbours' light as well

@@ -17,7 +17,7 @@ from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_overf
 from iscat_analysis.movie.lines import Lines
 from iscat_analysis.movie.metadata import resolve_metadata
 from iscat_analysis.pieces.setups import darkfield_photons
-from iscat_analysis.pipeline.chunks import reader_of
+from iscat_analysis.pipeline.chunks import reader_of, sum_first_chunk
 from iscat_analysis.pipeline.contrast_sign import learn_sign, wrong_sign
 from iscat_analysis.pipeline.diagnosis import axes_warning
 from iscat_analysis.pipeline.learning import learn_optics
@@ -143,13 +143,12 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
 
     with one_thread_algebra():  # in all threads until the light is judged
         if way == "sliding":
-            judged, opened = _landing_light(movie, config, camera, span)
+            judged, opened, motion = _landing_light(movie, config, camera, span)
             if config.background.drift_correction == "auto":
-                motion = motion_said(judged.steady, opened)
                 config = followed(config, moves=bool(motion))
-                if motion:
-                    run.notify(f"{movie.name}: {motion}; its motion is followed and divided out")
-                    judged, opened = _landing_light(movie, config, camera, span)
+            if motion:
+                run.notify(f"{movie.name}: {motion}; its motion is followed and divided out")
+                judged, opened, _ = _landing_light(movie, config, camera, span)
         else:
             if tracked:  # in the light as it is; again if anything of it is unsteady
                 looking = beside(look_at_changes, movie, config, camera, span)
@@ -194,17 +193,26 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
 
 def _landing_light(
     movie: Stack, config: Config, camera: Camera, span: tuple[int, int]
-) -> tuple[JudgedLight, Opening]:
-    """Judge the light of a landing movie and, in steady light, the noise of its first frames."""
+) -> tuple[JudgedLight, Opening, str]:
+    """Judge the light of a landing movie and, in steady light, noise and motion of some frames.
 
-    def opening_of(seen: Stack) -> Opening:
-        return judge_opening(reader_of(seen, config, camera, span), config)
+    Motion is looked for where that is left open, and told in words.  The first chunk, which is
+    wanted next, is summed while the light is still being judged.
+    """
+
+    def opening_of(seen: Stack) -> tuple[Opening, str]:
+        opened = judge_opening(reader_of(seen, config, camera, span), config)
+        left_open = config.background.drift_correction == "auto"
+        motion = motion_said(seen, opened) if left_open else ""
+        if not motion:
+            sum_first_chunk(opened.reader, config, opened.window)
+        return opened, motion
 
     opening = beside(opening_of, movie)  # in the light as it is; again if anything is unsteady
     judged = judge_light(movie, config, camera)
     if judged.steady is not movie:
         opening = beside(opening_of, judged.steady)
-    return judged, opening.result()
+    return judged, *opening.result()
 
 
 def _refuse_still(counts: NDArray[Any], name: str) -> None:

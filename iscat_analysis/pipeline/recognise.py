@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from iscat_analysis.config import Config
 from iscat_analysis.movie.camera import Camera
 from iscat_analysis.records import FrameSource
 from iscat_analysis.search.changes import NO_CHANGES, Changes, find_changes, spot_of
+from iscat_analysis.search.sliding import summed
 
 MOST_FRAMES = 2000
 """Of a movie that are looked at, from its first."""
@@ -55,21 +55,26 @@ def look_at_changes(
         Of blocks of `BLOCK` frames, whatever light each had.
     """
     last = min(span[1], span[0] + MOST_FRAMES, movie.shape[0])
-    images: list[NDArray[np.float32]] = []  # noise is a thousand times what they round away
+    starts = range(span[0], last - BLOCK + 1, BLOCK)
+    # noise is a thousand times what single precision rounds away
+    images = np.empty((len(starts), *movie.shape[1:]), dtype=np.float32)
+    level, lit = np.zeros(movie.shape[1:]), 0
     saturated = np.zeros(movie.shape[1:], dtype=np.bool_)
-    for first in range(span[0], last - BLOCK + 1, BLOCK):
-        counts = movie.read(first, first + BLOCK)
-        saturated |= camera.saturated(counts.max(axis=0))
-        light = camera.to_electrons(counts.mean(axis=0))
+    for first in starts:
+        counts, highest = summed(movie.read(first, first + BLOCK))
+        saturated |= camera.saturated(highest)
+        light = camera.to_electrons(counts / BLOCK)
         if light.mean() > 0:
-            images.append((light / light.mean()).astype(np.float32))
-    if not images:
+            light /= light.mean()
+            level += light
+            images[lit] = light
+            lit += 1
+    if not lit:
         return NO_CHANGES
-    level = np.mean(images, axis=0, dtype=np.float64)
+    images, level = images[:lit], level / lit
     usable = (level > 0.1 * np.median(level)) & ~saturated
-    for image in images:
-        image /= np.where(usable, level, 1.0)
-        image[~usable] = 1.0
+    images /= np.where(usable, level, 1.0).astype(np.float32)
+    images[:, ~usable] = 1.0
     pixel = config.camera.pixel_size_nm or config.optics.wavelength_nm / config.optics.na
     return find_changes(images, spot_of(config.optics.wavelength_nm, config.optics.na, pixel))
 

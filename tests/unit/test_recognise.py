@@ -232,6 +232,6 @@ def test_pixels_that_blink_are_no_particles_that_move() -> None:
     for y, x in rng.integers(0, SIDE, (20, 2)):
         lit = np.cumsum(rng.random(BLOCKS * BLOCK) < 0.01) % 2
         blocks[:, y, x] += 0.03 * lit.reshape(BLOCKS, BLOCK).mean(axis=1)
-    changes = find_changes(list(_noisy(blocks, rng)), SPOT)
+    changes = find_changes(_noisy(blocks, rng), SPOT)
     assert not as_moving(changes, "movie")
     assert changes.number <= 5  # at the border neighbours are missing

@@ -22,6 +22,7 @@ from iscat_analysis.search.sliding.frames import (
     good_frames,
     make_chunk,
     measure_frames,
+    summed,
     well_lit,
 )
 from iscat_analysis.search.sliding.noise import (
@@ -82,5 +83,6 @@ __all__ = [
     "measure_noise",
     "sliding_maps",
     "stride_of",
+    "summed",
     "well_lit",
 ]

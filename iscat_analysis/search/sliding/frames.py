@@ -358,6 +358,32 @@ def good_frames(counts: NDArray[Any], camera: Camera) -> BoolArray:
     return well_lit(light) & ~repeats
 
 
+def summed(counts: NDArray[Any]) -> tuple[FloatArray, NDArray[Any]]:
+    """Sum frames, and find the highest count of every pixel.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (t, y, x)
+        At least one frame.
+
+    Returns
+    -------
+    sums, highest : ndarray, shape (y, x)
+        The sums are exact where counts are whole numbers.
+    """
+    sums, highest = np.empty(counts.shape[1:]), counts[0].copy()
+    block_sums(counts, np.ones(len(counts), dtype=np.bool_), _scratch(counts), sums, highest)
+    return sums, highest
+
+
+def _scratch(counts: NDArray[Any]) -> NDArray[Any]:
+    """Room for a row of a block's sum."""
+    whole = np.issubdtype(counts.dtype, np.integer)
+    narrow = counts.dtype.itemsize <= 2
+    exact = (np.uint32 if narrow else np.int64) if whole else np.float64
+    return np.empty(counts.shape[2], dtype=exact)
+
+
 def make_chunk(
     first: int,
     counts: NDArray[Any],
@@ -401,9 +427,7 @@ def make_chunk(
     frames, rows, columns = counts.shape
     edges = np.append(np.arange(0, frames, stride), frames).astype(np.int64)
     blocks = np.empty((edges.size - 1, rows, columns))
-    whole = np.issubdtype(counts.dtype, np.integer)
-    narrow = counts.dtype.itemsize <= 2
-    scratch = (np.uint32 if narrow else np.int64) if whole else np.float64
+    offset = np.asarray(camera.offset_adu)
     highest = np.empty((edges.size - 1, rows, columns), dtype=counts.dtype)
 
     def one(k: int) -> None:
@@ -411,21 +435,18 @@ def make_chunk(
         part = slice(edges[k], edges[k + 1])
         start = int(np.argmax(good[part])) + int(edges[k])
         highest[k] = counts[start]
-        block_sums(
-            counts[part], good[part], np.empty(columns, dtype=scratch), blocks[k], highest[k]
-        )
+        block_sums(counts[part], good[part], _scratch(counts), blocks[k], highest[k])
+        blocks[k] -= np.count_nonzero(good[part]) * offset
+        blocks[k] *= camera.gain_e_per_adu
 
     for _ in mapper(one, range(edges.size - 1)):
         pass
     saturated = camera.saturated(highest.max(axis=0))
-    n = np.add.reduceat(good.astype(np.int64), edges[:-1])
-    blocks -= n[:, None, None] * np.asarray(camera.offset_adu)
-    blocks *= camera.gain_e_per_adu
     power = np.where(good, light_e, 0.0)
     power /= power[good].mean()
     total = blocks.sum(axis=0)
     variance = camera.read_variance_e2((rows, columns))
-    usable = ~(saturated | defects(total, n.sum() * variance)) & (total > 0)
+    usable = ~(saturated | defects(total, np.count_nonzero(good) * variance)) & (total > 0)
     return Chunk(
         first, counts, good, power, camera, total / power.sum(), usable, saturated, edges, blocks,
         check,
