@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -115,7 +115,7 @@ def fit(
     coefficient of every particle.
     """
     messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages, debug=debug), ExitStack() as ending:
         from iscat_analysis.errors import ConfigError
 
         if len(stacks) > 1:
@@ -126,10 +126,11 @@ def fit(
                 'for movie in *.tif; do iscat-fit "$movie" --config setup.toml; done'
             )
         (stack,) = stacks
-        from iscat_analysis.hashing import begin_hash
+        from iscat_analysis.hashing import BegunHash
 
-        # another processor is idle while this one loads libraries
-        begun_hash = begin_hash(stack) if raw is None and stack.is_file() else None
+        begun_hash = None
+        if raw is None and stack.is_file():  # another processor is idle while this one loads
+            begun_hash = ending.enter_context(closing(BegunHash(stack)))
 
         from iscat_analysis.config import load_config
 

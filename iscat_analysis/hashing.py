@@ -11,8 +11,7 @@ import hashlib
 import os
 import sys
 from collections.abc import Sequence
-from concurrent.futures import Future
-from dataclasses import dataclass
+from contextlib import suppress
 from pathlib import Path
 
 from iscat_analysis.copies import Copy, LostError
@@ -23,53 +22,50 @@ _BLOCK_BYTES = 2**24  # of a file, that are in memory at a time
 _ASIDE = 5  # on the scale of `nice`: a quarter of a processor that is wanted, and all that is idle
 
 
-@dataclass(frozen=True)
 class BegunHash:
-    """A file that is being hashed.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    digest : Future of str
-        What `sha256_of_files` gives of it alone.
-    """
-
-    path: Path
-    digest: Future[str]
-
-
-def begin_hash(path: Path) -> BegunHash:
-    """Hash a file while something else is done.
+    """A file that is hashed while something else is done.
 
     Parameters
     ----------
     path : Path
         The file.
 
-    Returns
-    -------
-    BegunHash
-        With a digest that raises `DataError` where the file cannot be read.
+    Attributes
+    ----------
+    path : Path
+        The file.
+    digest : Future of str
+        What `sha256_of_files` gives of it alone; raises `DataError` where it cannot be read.
     """
-    if sys.platform != "linux" or processors() < 2:
-        return BegunHash(path, beside(sha256_of_files, (path,)))
-    try:
-        copy = Copy(_hash_aside)
-    except OSError:  # there is no room for another process
-        return BegunHash(path, beside(sha256_of_files, (path,)))
 
-    def answer() -> str:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._closed = False
+        self._copy: Copy | None = None
+        if sys.platform == "linux" and processors() > 1:
+            with suppress(OSError):  # there is no room for another process
+                self._copy = Copy(_hash_aside)
+        self.digest = beside(self._answer)
+
+    def _answer(self) -> str:
+        if self._copy is None:
+            return sha256_of_files((self.path,))
         try:
-            digest: str = copy.do((path,))
+            digest: str = self._copy.do((self.path,))
         except LostError:
-            return sha256_of_files((path,))
+            if self._closed:
+                raise
+            return sha256_of_files((self.path,))
         finally:
-            copy.end()
-            copy.close()
+            self._copy.end()
+            self._copy.close()
         return digest
 
-    return BegunHash(path, beside(answer))
+    def close(self) -> None:
+        """Give up where it is not done yet; its process is gone then, and the file closed."""
+        self._closed = True
+        if self._copy is not None:
+            self._copy.end()
 
 
 def _hash_aside(files: Sequence[Path]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,9 +14,9 @@ import tifffile
 
 import iscat_analysis as ia
 from iscat_analysis import hashing
-from iscat_analysis.copies import Copy
+from iscat_analysis.copies import Copy, LostError
 from iscat_analysis.errors import DataError
-from iscat_analysis.hashing import begin_hash, sha256_of_files
+from iscat_analysis.hashing import BegunHash, sha256_of_files
 
 
 @pytest.fixture
@@ -34,11 +35,20 @@ def test_a_file_is_hashed_as_anybody_would(file: Path, monkeypatch: pytest.Monke
             made.append(self)
 
     monkeypatch.setattr(hashing, "Copy", Noted)
-    begun = begin_hash(file)
+    begun = BegunHash(file)
     assert begun.digest.result() == hashlib.sha256(file.read_bytes()).hexdigest()
     assert len(made) == 1
     with pytest.raises(ProcessLookupError):
         os.kill(made[0].pid, 0)
+
+
+def test_one_that_is_given_up_is_gone(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hashing, "sha256_of_files", lambda _: time.sleep(60))
+    begun = BegunHash(file)
+    begun.close()
+    with pytest.raises(LostError):
+        begun.digest.result()
+    begun.close()
 
 
 def test_several_files_and_a_part_of_them(file: Path, tmp_path: Path) -> None:
@@ -62,18 +72,18 @@ def test_without_another_process(
 ) -> None:
     monkeypatch.setattr(hashing, "Copy", copy)
     expected = hashlib.sha256(file.read_bytes()).hexdigest()
-    assert begin_hash(file).digest.result() == expected
+    assert BegunHash(file).digest.result() == expected
 
 
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="cannot be read"):
-        begin_hash(tmp_path / "gone.tif").digest.result()
+        BegunHash(tmp_path / "gone.tif").digest.result()
 
 
 def test_only_a_movie_that_is_all_of_the_file_has_its_hash(file: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.tif"
     tifffile.imwrite(other, np.ones((5, 16, 32), dtype=np.uint16))
-    begun, wrong = begin_hash(file), begin_hash(other)
+    begun, wrong = BegunHash(file), BegunHash(other)
     with ia.open_stack(file) as movie:
         assert movie.hashed(begun) is begun.digest
         assert movie.hashed().result() == movie.sha256()
