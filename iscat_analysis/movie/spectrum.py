@@ -214,7 +214,7 @@ def measure_spectrum(
     if light < _LIGHT_E:
         return None
 
-    # single precision is a millionth of the noise, and takes a third of the time
+    # rounded to single precision, which is a millionth of the noise and takes half of the time
     expected, read_noise, scale, zero = (
         np.asarray(value, dtype=np.float32)
         for value in (np.where(used, mean, 1.0), read, gain, offset)

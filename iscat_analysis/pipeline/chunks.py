@@ -91,6 +91,11 @@ class Reader:
         self._summed: tuple[tuple[int, int], int, Chunk] | None = None  # span, stride, and that
 
     @property
+    def in_place(self) -> bool:
+        """Whether frames stay where they lie in the file."""
+        return self._placed is not None
+
+    @property
     def held_bytes(self) -> int:
         """What a frame of a chunk counts for: half where it stays in the file.
 
@@ -214,6 +219,9 @@ class Reader:
 def sum_first_chunk(reader: Reader, config: Config, window: int) -> None:
     """Sum what will be the first chunk, so that whoever asks for it has it at once.
 
+    Frames that have to be read into memory are left for then: whoever looks at them divided by the
+    flicker of their light needs as much room again.
+
     Parameters
     ----------
     reader : Reader
@@ -223,6 +231,8 @@ def sum_first_chunk(reader: Reader, config: Config, window: int) -> None:
     window : int
         Frames before and after a step.
     """
+    if not reader.in_place:
+        return
     stride = stride_of(window)
     _, span = plan_chunks(reader, config, window, stride)[0]
     with threads(config.compute.workers) as pool:
