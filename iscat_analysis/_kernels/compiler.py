@@ -259,6 +259,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
     def _whole(self, compiled: Any) -> Any:
         """Make of a body what Python can call."""
+        self.targetctx.refresh()  # a body that was loaded needed nothing of what Numba knows
         flags = Flags()
         self.targetdescr.options.parse_as_flags(flags, self.targetoptions)
         # Ways in keep constants of their own in the environment, which is therefore another one

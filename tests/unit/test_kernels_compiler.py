@@ -158,6 +158,23 @@ def test_what_one_process_compiled_serves_another(tmp_path: Path, first: list[st
     assert last == {name: [values[name], 0] for name in values}
 
 
+def test_a_whole_is_made_of_a_body_where_nothing_was_compiled_before(tmp_path: Path) -> None:
+    """As by the run after one that was stopped between the two."""
+    source = (
+        "from iscat_analysis._kernels import kernel\n\n"
+        "@kernel()\ndef larger(pair):\n    return max(pair[0], pair[1])\n\n"
+        "@kernel()\ndef doubled(x):\n    return 2.0 * larger((x, 1.0))\n"
+    )
+    (tmp_path / "pairs.py").write_text(source, encoding="utf-8")
+    for call, value in (("doubled(3.0)", 6.0), ("larger((3.0, 1.0))", 3.0)):
+        done = subprocess.run(
+            [sys.executable, "-c", f"import pairs; print(pairs.{call})"],
+            cwd=tmp_path, env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kept")},
+            check=False, capture_output=True, text=True,
+        )  # fmt: skip
+        assert float(done.stdout or "nan") == value, done.stderr
+
+
 def test_numba_of_unknown_insides_compiles_everything_as_a_whole(tmp_path: Path) -> None:
     expected = {"more": 13.0, "doubled": [0.0, 2.0, 4.0, 6.0]}
     for compiled in (1, 0):
