@@ -129,7 +129,7 @@ def fit(
         from iscat_analysis.hashing import BegunHash
 
         begun_hash = None
-        if raw is None and stack.is_file():  # another processor is idle while this one loads
+        if raw is None and _bytes_of(stack):  # another processor is idle while this one loads
             begun_hash = ending.enter_context(closing(BegunHash(stack)))
 
         from iscat_analysis.config import load_config
@@ -140,7 +140,8 @@ def fit(
         from iscat_analysis.draughtsman import Draughtsman
 
         with closing(Draughtsman()) as pen:
-            if resolved.background.method != "sliding" or not _is_large(stack):
+            # memory for figures is better taken when that for large chunks is free again
+            if resolved.background.method != "sliding" or _bytes_of(stack) <= _LARGE_BYTES:
                 pen.start()  # early, because it has as much to load
             from iscat_analysis.movie.addresses import MARK, beside
 
@@ -187,9 +188,12 @@ def fit(
             raise typer.Exit(FLAGGED)
 
 
-def _is_large(stack: Path) -> bool:
-    """Whether memory for figures is better taken when that for its chunks is free again."""
-    return stack.is_file() and stack.stat().st_size > _LARGE_BYTES
+def _bytes_of(stack: Path) -> int:
+    """Size of a file; none of what is no file, or what nobody may look at."""
+    try:
+        return stack.stat().st_size if stack.is_file() else 0
+    except OSError:
+        return 0
 
 
 def _changes(

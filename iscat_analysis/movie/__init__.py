@@ -126,8 +126,13 @@ def open_stack(
 
 
 def _open_file(address: Path) -> Stack:
-    path, part = split_address(address)
-    if path.is_dir():
+    try:
+        path, part = split_address(address)
+        is_folder = path.is_dir()
+        is_pipe = path.exists() and not (is_folder or path.is_file())  # or a device
+    except OSError as error:  # nobody may look into the folder that it is in
+        raise DataError(f"{address}: cannot be read ({error.strerror})") from None
+    if is_folder:
         if not is_zarr(path):
             raise DataError(
                 f"{path}: is a folder; give the path of one movie file: frames that were saved one "
@@ -135,6 +140,11 @@ def _open_file(address: Path) -> Stack:
                 "Tiff), and all movies of a folder are analysed by `iscat batch`"
             )
         return Stack(path, open_zarr(path, part), part=part, files=files_of(path))
+    if is_pipe:  # which would keep whoever opens it waiting
+        raise DataError(
+            f"{path}: is a pipe or a device, and a movie is read more than once: save it as a "
+            "file, and give its path"
+        )
     try:
         with path.open("rb") as file:
             signature = file.read(_SIGNATURE_BYTES)

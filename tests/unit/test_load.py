@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import struct
 import sys
 from collections.abc import Callable
@@ -230,6 +231,24 @@ def test_refuses_what_is_not_there(tmp_path: Path) -> None:
         open_stack(tmp_path / "absent.tif")
     with pytest.raises(DataError, match="is a folder"):
         open_stack(tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no such pipes")
+def test_refuses_a_pipe_without_waiting_for_it(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "m.tif")
+    with pytest.raises(DataError, match="is a pipe or a device"):
+        open_stack(tmp_path / "m.tif")
+
+
+def test_says_what_the_system_says_of_a_folder_that_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "stat", denied)
+    with pytest.raises(DataError, match=r"m\.tif: cannot be read \(Permission denied\)"):
+        open_stack(tmp_path / "m.tif")
 
 
 @pytest.mark.parametrize(
