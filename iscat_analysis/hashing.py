@@ -40,6 +40,7 @@ class BegunHash:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._state = _state(path)
         self._closed = False
         self._copy: Copy | None = None
         if sys.platform == "linux" and processors() > 1:
@@ -61,11 +62,35 @@ class BegunHash:
             self._copy.close()
         return digest
 
+    def is_of(self, files: Sequence[Path]) -> bool:
+        """Tell whether a movie is this file, as it was when its hash was begun.
+
+        Parameters
+        ----------
+        files : sequence of Path
+            That hold the movie.
+
+        Returns
+        -------
+        bool
+            False where the file was replaced or written to since then.
+        """
+        return tuple(files) == (self.path,) and _state(self.path) == self._state
+
     def close(self) -> None:
         """Give up where it is not done yet; its process is gone then, and the file closed."""
         self._closed = True
         if self._copy is not None:
             self._copy.end()
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    """Give what of a file changes with its content; nothing where there is no file."""
+    try:
+        found = path.stat()
+    except OSError:
+        return ()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _hash_aside(files: Sequence[Path]) -> str:

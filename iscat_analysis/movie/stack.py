@@ -248,7 +248,10 @@ class Stack:
     @property
     def identity(self) -> str:
         """What tells this movie from others without reading all of it; empty for an array."""
-        return fingerprint(self._files, self._part) if self._files else ""
+        try:
+            return fingerprint(self._files, self._part) if self._files else ""
+        except OSError as error:
+            raise DataError(f"{self._path}: can no longer be read ({error.strerror})") from None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -444,7 +447,7 @@ class Stack:
             What `sha256` gives.
         """
         if self._hashing is None:
-            if begun is not None and (self._files, self._part) == ((begun.path,), ""):
+            if begun is not None and not self._part and begun.is_of(self._files):
                 self._hashing = begun.digest
             else:
                 self._hashing = beside(self.sha256)

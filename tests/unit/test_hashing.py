@@ -89,3 +89,20 @@ def test_only_a_movie_that_is_all_of_the_file_has_its_hash(file: Path, tmp_path:
         assert movie.hashed().result() == movie.sha256()
     with ia.open_stack(file) as movie:
         assert movie.hashed(wrong).result() == movie.sha256() != wrong.digest.result()
+
+
+def test_a_file_that_was_replaced_since_then_is_hashed_again(file: Path, tmp_path: Path) -> None:
+    begun, other = BegunHash(file), tmp_path / "other.tif"
+    tifffile.imwrite(other, np.ones((5, 16, 32), dtype=np.uint16))
+    expected = hashlib.sha256(other.read_bytes()).hexdigest()
+    begun.digest.result()
+    other.replace(file)
+    with ia.open_stack(file) as movie:
+        assert movie.hashed(begun).result() == expected
+
+
+def test_a_movie_that_was_removed_has_no_identity(file: Path) -> None:
+    with ia.open_stack(file) as movie:
+        file.unlink()
+        with pytest.raises(DataError, match=r"movie\.tif: can no longer be read"):
+            _ = movie.identity
