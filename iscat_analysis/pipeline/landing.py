@@ -189,12 +189,12 @@ def analyse_landings(
                     done = analyse_chunk(
                         scene, chunk, core, window, pool, budget, noise.excess, earlier
                     )
+                store.save(number, done)
             merged.note(number, done)
             return done
 
         try:
-            chunks = _finished(finish, len(plan), place, merged, store, posterior=posterior)
-            with closing(chunks) as finished:
+            with closing(_finished(finish, len(plan), place, merged, posterior)) as finished:
                 for frames_done, stopped in finished:
                     if frames_done < last - first:
                         progress("landing", frames_done, last - first)
@@ -233,7 +233,6 @@ def analyse_landings(
         **_way(merged.trajectory()),
         "chunks": len(plan),
     }
-    store.finish()
     return Found(
         scene=scene,
         fits=fits,
@@ -256,15 +255,9 @@ def analyse_landings(
 
 
 def _finished(
-    finish: Callable[[int], Done],
-    count: int,
-    place: Place,
-    merged: Merged,
-    store: Store,
-    *,
-    posterior: bool,
+    finish: Callable[[int], Done], count: int, place: Place, merged: Merged, posterior: bool
 ) -> Generator[tuple[int, bool]]:
-    """Finish chunks, keep them, and merge them in their order, whichever comes first.
+    """Finish chunks and merge them in their order, whichever comes first.
 
     Yields the number of frames that are done, and whether it stopped within a chunk.  Each chunk
     has the posteriors that those before it left to sample: with posteriors, one follows another.
@@ -283,7 +276,6 @@ def _finished(
     for number, done in results():
         waiting[number] = done
         merged.note(number, done)
-        store.begin_save(number, done)
         frames += done.core[1] - done.core[0]
         while ready in waiting:
             merged.add(waiting.pop(ready))

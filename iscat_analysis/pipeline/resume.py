@@ -7,7 +7,6 @@ import json
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -134,8 +133,6 @@ class Shelf:
 class Store(Shelf):
     """Finished chunks of a landing movie on disk."""
 
-    _thread: ThreadPoolExecutor | None = None  # started where something is to be saved
-
     def load(self, number: int) -> Done | None:
         """Give a finished chunk, or None."""
         found = self.read(number)
@@ -161,16 +158,6 @@ class Store(Shelf):
             )
         except (ValueError, KeyError):
             return None
-
-    def begin_save(self, number: int, done: Done) -> None:
-        """Keep a finished chunk while others are analysed, or what was found is put together."""
-        self._thread = self._thread or ThreadPoolExecutor(1)
-        self._thread.submit(self.save, number, done)
-
-    def finish(self) -> None:
-        """Wait until all are kept."""
-        if self._thread is not None:
-            self._thread.shutdown()
 
     def save(self, number: int, done: Done) -> None:
         """Keep a finished chunk."""
