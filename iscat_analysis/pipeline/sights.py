@@ -44,7 +44,7 @@ from iscat_analysis.search.bright import (
     find_bright_places,
     find_bright_steps,
 )
-from iscat_analysis.search.sliding import STRIDES
+from iscat_analysis.search.sliding import stride_of
 
 RINGS_NM = 9000.0
 """Farther than this from a particle its rings are left out."""
@@ -163,7 +163,7 @@ def landing_sights(
     others : list of Sight
         Every bright step, on small regions; empty without `rings`.
     """
-    stride = max(1, window // STRIDES)
+    stride = stride_of(window)
     found: list[BrightStep] = []
     rest: list[BrightStep] = []
     spans = [span for _, span in plan_chunks(reader, config, window, stride)]
