@@ -21,8 +21,8 @@ from typing import Any
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import DataError
 from iscat_analysis.files import whole_file
-from iscat_analysis.hashing import sha256_of_files
-from iscat_analysis.movie.addresses import fingerprint, split_address
+from iscat_analysis.hashing import fingerprint, sha256_of_files
+from iscat_analysis.movie.addresses import split_address
 from iscat_analysis.movie.folders import files_of
 
 STATE = ".batch"

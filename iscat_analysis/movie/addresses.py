@@ -6,17 +6,12 @@ shape and type of the numbers of a file that says nothing of itself: ``movie.bin
 
 from __future__ import annotations
 
-import hashlib
-import os
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 from iscat_analysis.errors import DataError
 
 MARK = "::"
-_END_BYTES = 2**20  # that are read of a file; many files share them
-_LEAST_END_BYTES = 2**8
 _SHAPE = re.compile(r"(?:(\d+)x)?(\d+)x(\d+),\s*(\S+)", flags=re.ASCII)
 
 
@@ -87,30 +82,3 @@ def beside(address: Path, suffix: str) -> Path:
     if not part or layout(part) is not None:
         return path.with_suffix(suffix)
     return path.with_name(".".join([path.stem, *part.strip("/").split("/")]) + suffix)
-
-
-def fingerprint(files: Sequence[Path], part: str = "") -> str:
-    """Tell a movie's content from another's without reading all of it.
-
-    Parameters
-    ----------
-    files : sequence of Path
-        That hold it.
-    part : str
-        What it is of them.
-
-    Returns
-    -------
-    str
-        Hash of the sizes, times of change and ends of the files, and of the part.
-    """
-    end = max(_END_BYTES // max(len(files), 1), _LEAST_END_BYTES)
-    digest = hashlib.sha256(part.encode("utf-8", "backslashreplace"))
-    for path in files:
-        with path.open("rb") as file:
-            state = os.fstat(file.fileno())
-            digest.update(f"{state.st_size} {state.st_mtime_ns}".encode())
-            digest.update(file.read(end))
-            file.seek(max(state.st_size - end, 0))
-            digest.update(file.read(end))
-    return digest.hexdigest()

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.hashing import BegunHash, sha256_of_files
-from iscat_analysis.movie.addresses import MARK, fingerprint, split_address
+from iscat_analysis.hashing import BegunHash, fingerprint, sha256_of_files
+from iscat_analysis.movie.addresses import MARK, split_address
 from iscat_analysis.records import BoolArray, InPlace, PlacedSource, StackMetadata
 from iscat_analysis.threads import beside
 
