@@ -42,6 +42,7 @@ STYLE: Any = {
     "axes.facecolor": "none",
     "axes.titlesize": 10,
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # no axis has numbers above it, and none are looked for
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.edgecolor": GREY,
@@ -135,6 +136,7 @@ def publish(
                 figure.set_layout_engine(None)
             if folder is not None:
                 _write_png(figure, folder / f"{name}.png", PRINT_DPI if printed else DPI)
+                _hold_labels(figure)
             if folder is not None and printed:
                 figure.savefig(folder / f"{name}.pdf", metadata=_NO_PDF_METADATA)
             buffer = io.StringIO()
@@ -152,6 +154,18 @@ def _write_png(figure: Figure, path: Path, dpi: int) -> None:
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     image.save(path, format="png", dpi=(dpi, dpi), compress_level=1)
+
+
+def _hold_labels(figure: Figure) -> None:
+    """Keep the names of axes where they were drawn, so that no file looks for their places again.
+
+    A tenth of drawing is to find how far the numbers beside an axis reach.
+    """
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            name = axis.label
+            place = name.get_transform().transform(name.get_position())
+            axis.set_label_coords(*axes.transAxes.inverted().transform(place))
 
 
 def inline_svg(svg: str, name: str) -> Markup:

@@ -176,6 +176,6 @@ def _curve(levels: FloatArray) -> str:
     runs = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1) if known.size else []
     for run in runs:
         values = levels[run].astype(int)
-        steps = " ".join(f"1{step:+d}" for step in np.diff(values).tolist())
-        text.append(f"M{run[0] + 0.5:g} {values[0]}l{steps}")
-    return "".join(text).replace("+", " ")
+        steps = "".join(f" 1 {step}" for step in np.diff(values).tolist())
+        text.append(f"M{run[0] + 0.5:g} {values[0]}l{steps[1:].replace(' -', '-')}")
+    return "".join(text)
