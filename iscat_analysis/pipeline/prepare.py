@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
+from iscat_analysis.copies import LostError, aside
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_overflow, refuse_ratio
@@ -35,7 +39,7 @@ from iscat_analysis.pipeline.stage import followed, motion_said
 from iscat_analysis.pipeline.tracks import judge_times
 from iscat_analysis.pipeline.ways import Way, way_of, way_said
 from iscat_analysis.search.changes import Changes
-from iscat_analysis.threads import beside, one_thread_algebra
+from iscat_analysis.threads import beside, one_thread_algebra, processors
 
 _OPENING = 64  # frames that are looked at before anything else
 
@@ -151,7 +155,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
                 judged, opened, _ = _landing_light(movie, config, camera, span)
         else:
             if tracked:  # in the light as it is; again if anything of it is unsteady
-                looking = beside(look_at_changes, movie, config, camera, span)
+                looking = _looking(movie, config, camera, span)
             judged = judge_light(movie, config, camera)
     for text in judged.messages:
         run.tell(f"{movie.name}: {text}")
@@ -160,7 +164,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if lines is not None:
         summary["lines"] = lines.summary
     if way == "sliding" or (tracked and unsteady):
-        looking = beside(look_at_changes, steady, config, camera, span)
+        looking = _looking(steady, config, camera, span)
     digest = movie.hashed()
     configured = config
     wrong = wrong_sign(config)
@@ -177,7 +181,10 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     run.clock.lap("optics")
     other_kind = ""
     if looking is not None:
-        changes = looking.result()
+        try:
+            changes = looking.result()
+        except LostError:
+            changes = look_at_changes(steady, configured, camera, span)
         if config.optics.na != configured.optics.na:
             changes = look_at_changes(steady, config, camera, span)
         summary["changes"] = changes_summary(changes)
@@ -189,6 +196,21 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     return Prepared(
         movie, steady, config, camera, way, lines, opened, other_kind, digest, summary
     )  # fmt: skip
+
+
+def _looking(
+    movie: Stack, config: Config, camera: Camera, span: tuple[int, int]
+) -> Future[Changes]:
+    """Begin to look at what changes, beside all else: threads would take turns at Python.
+
+    A second process shares frames that lie in a file as they are; what decodes others it would have
+    to share as well.
+    """
+    placed = sys.platform == "linux" and movie.in_place(*span) is not None
+    if placed and processors() > 1:
+        with suppress(OSError):  # there is no room for another process
+            return aside(partial(look_at_changes, movie, config, camera, span))
+    return beside(look_at_changes, movie, config, camera, span)
 
 
 def _landing_light(

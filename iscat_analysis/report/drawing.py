@@ -13,7 +13,6 @@ import pickle
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import closing
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -22,13 +21,13 @@ from typing import Any
 from markupsafe import Markup
 from PIL import Image
 
-from iscat_analysis.copies import Copy
+from iscat_analysis.copies import aside
 from iscat_analysis.records import Analysis
 from iscat_analysis.report.event_figures import event_figures
 from iscat_analysis.report.page import page_context, page_of, page_sketches, templates
 from iscat_analysis.report.style import Sketch, drawn, new_figure, publish
 from iscat_analysis.report.tables import event_table
-from iscat_analysis.threads import beside, processors
+from iscat_analysis.threads import processors
 
 _MOST_SHARED = 256  # figures that two processes take from each other: a number is one byte
 
@@ -60,14 +59,7 @@ class Drawing:
         self._others: Future[dict[str, Markup]] | None = None
         if together and sys.platform == "linux" and len(sketches) <= _MOST_SHARED:
             self._left = left = _taken(sketches)
-            copy = Copy(lambda _: publish(drawn(left), folder))
-
-            def answer() -> dict[str, Markup]:
-                with closing(copy):  # which ends it; that takes 20 ms, and nobody waits for it
-                    figures: dict[str, Markup] = copy.do(None)
-                return figures
-
-            self._others = beside(answer)
+            self._others = aside(lambda: publish(drawn(left), folder))
 
     def page(self, analysis: Analysis) -> str:
         """Draw what is left, and make the page.
