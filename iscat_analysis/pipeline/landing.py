@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,8 @@ from iscat_analysis.places import Here, Place
 from iscat_analysis.records import CountSource, Progress, Status
 from iscat_analysis.search.sliding import boundaries, stride_of
 from iscat_analysis.threads import one_thread_algebra, threads
+
+_NEEDED_LATER = "scipy.optimize"  # by species, and a tenth of a second to load
 
 POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""
@@ -198,6 +201,7 @@ def analyse_landings(
                 for frames_done, stopped in finished:
                     if frames_done < last - first:
                         progress("landing", frames_done, last - first)
+                        import_module(_NEEDED_LATER)  # the other process may still be at work
                     if stopped:
                         interrupted = True
                         break

@@ -91,20 +91,20 @@ def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
     between = narrow - wide
     for image, out in zip(blocks, smooth, strict=True):
         out[:] = smoothed(image - 1, between)  # whose noise single precision holds
-    lag = np.diff(smooth, axis=0)
-    noise = _NORMAL * _median_deviation(lag)
-    change = smooth[3:-1] - smooth[1:-3]
-    size = np.abs(change)
+    noise = _NORMAL * _median_deviation(smooth[:-1], smooth[1:])
+    size = smooth[3:-1] - smooth[1:-3]
+    np.abs(size, out=size)
     apart = round(2 * _NEAR * spot_px)
     peaks = maxima(size, max(CLEAR * noise, 0.0), (_AROUND, apart, apart))
     peaks = peaks[_of_spots(blocks, peaks, spot_px)]
     if not len(peaks):
         return NO_CHANGES
-    found = tuple(peaks.T)
-    before, after = (part[found] / change[found] for part in (lag[: len(change)], lag[3:]))
-    quiet = np.maximum(_QUIET * noise / size[found], STAYS)
+    block, *place = peaks.T
+    one, two, _, four, five = (smooth[block + n, *place] for n in range(_LEAST_BLOCKS))
+    beside = np.maximum(np.abs(two - one), np.abs(five - four)) / np.abs(four - two)
+    quiet = np.maximum(_QUIET * noise / np.abs(four - two), STAYS)
     pictures = _pictures(smooth, peaks, _NEAR * spot_px, noise)
-    staying = (np.maximum(np.abs(before), np.abs(after)) < quiet) & (pictures == 1)
+    staying = (beside < quiet) & (pictures == 1)
     return Changes(len(peaks), float(staying.mean()), float((pictures > 2).mean()))
 
 
@@ -141,9 +141,10 @@ def _of_spots(
     return real
 
 
-def _median_deviation(values: NDArray[np.floating]) -> float:
-    """Median of the magnitudes of deviations from the median, of some values all over."""
-    some = values.ravel()[:: 1 + values.size // _ASKED]
+def _median_deviation(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
+    """Median deviation from the median of what other has more than one, of some values all over."""
+    every = 1 + one.size // _ASKED
+    some = other.ravel()[::every] - one.ravel()[::every]
     deviation = some - middle(some.copy())
     return float(middle(np.abs(deviation, out=deviation)))
 
