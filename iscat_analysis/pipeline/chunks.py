@@ -39,7 +39,7 @@ HALO = 2
 """Windows on either side of a chunk's core: a step, its neighbours, and theirs."""
 
 _LOOKS = 24  # frames all over a movie, that tell how much light there is
-_FIRST_LONGER = 1.27  # than others, of a chunk that is summed before they are begun
+_FIRST_LONGER = 1.24  # than others, of a chunk that is summed before they are begun
 _MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 

@@ -38,7 +38,7 @@ from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.places import Here, Place
 from iscat_analysis.records import CountSource, Progress, Status
 from iscat_analysis.search.sliding import boundaries, stride_of
-from iscat_analysis.threads import one_thread_algebra, threads
+from iscat_analysis.threads import beside, one_thread_algebra, threads
 
 _NEEDED_LATER = "scipy.optimize"  # by species, and a tenth of a second to load
 
@@ -208,13 +208,14 @@ def analyse_landings(
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
             interrupted = True
-    reader.forget()
+    forgetting = beside(reader.forget)
+    fits, views, repeats = merged.result()
+    light, drift = merged.light(), merged.drift()
+    forgetting.result()
     if not interrupted:  # and their memory is free again
         progress("landing", last - first, last - first)
-    fits, views, repeats = merged.result()
-    light = merged.light()
     wanted = config.background.follows_pattern
-    for text in frame_warnings(movie.name, merged, light, first, window, corrected=wanted):
+    for text in frame_warnings(movie.name, merged, drift, light, first, window, corrected=wanted):
         tell(text)
     if merged.cause:
         tell(f"{movie.name}: {merged.cause}")
@@ -233,7 +234,7 @@ def analyse_landings(
         "noise_variance_over_shot": list(opening.curve.variance_over_shot),
         "noise_spectrum": noise.summary,
         "frames_left_out": merged.left_out(),
-        "drift_px": merged.drift(),
+        "drift_px": drift,
         **_way(merged.trajectory()),
         "chunks": len(plan),
     }

@@ -24,6 +24,7 @@ LOST = 0.05
 def frame_warnings(
     name: str,
     merged: Merged,
+    drift: list[float] | None,
     light: FloatArray,
     first: int,
     window: int,
@@ -38,6 +39,8 @@ def frame_warnings(
         What the lines call the movie.
     merged : Merged
         The chunks.
+    drift : list of float or None
+        Of their pattern, from `Merged.drift`.
     light : ndarray, shape (t,)
         Light of every frame; NaN where it was left out.
     first : int
@@ -74,12 +77,14 @@ def frame_warnings(
                 "it is divided out, but look at the laser and at events in these frames"
             )
     yield from pixel_warnings(*merged.masks())
-    yield from _drift_warnings(name, merged, light.size / window, corrected)
+    yield from _drift_warnings(name, merged, drift, light.size / window, corrected)
 
 
-def _drift_warnings(name: str, merged: Merged, windows: float, corrected: bool) -> Iterator[str]:
+def _drift_warnings(
+    name: str, merged: Merged, drift: list[float] | None, windows: float, corrected: bool
+) -> Iterator[str]:
     """Say how the fixed pattern moved, and what was done about it."""
-    drift, way = merged.drift(), merged.trajectory()
+    way = merged.trajectory()
     if way is not None and drift is not None:
         yield (
             f"{name}: the fixed pattern moved by {drift[1]:+.3f} pixels in x and "

@@ -466,9 +466,8 @@ def test_a_moving_pattern_is_named(shift: int, named: bool) -> None:
             ends_e=np.stack([image, np.roll(image, shift, axis=1)]),
         )
     )
-    told = [
-        text for text in frame_warnings("movie", merged, np.ones(400), 0, 40) if "moved" in text
-    ]
+    said = frame_warnings("movie", merged, merged.drift(), np.ones(400), 0, 40)
+    told = [text for text in said if "moved" in text]
     assert len(told) == named
     if named:
         assert "not corrected" in told[0]

@@ -16,11 +16,11 @@ def test_frames_left_out_are_told_with_what_is_lost(missing: int, lost: str) -> 
     """A pixel that is NaN in two thirds of the frames costs two thirds of the landings."""
     merged: Any = SimpleNamespace(
         repeats=lambda: np.arange(200, 200 + missing), masks=lambda: (0, 0),
-        drift=lambda: None, trajectory=lambda: None, unfollowed=list,
+        trajectory=lambda: None, unfollowed=list,
     )  # fmt: skip
     light = np.full(600, 1e4)
     light[200 : 200 + missing] = np.nan
-    (said,) = frame_warnings("m.tif", merged, light, 0, 50)
+    (said,) = frame_warnings("m.tif", merged, None, light, 0, 50)
     assert said.startswith("m.tif: frames 200, 201, 202")
     assert ("lost" in said) == bool(lost)
     assert lost in said
