@@ -20,7 +20,7 @@ from iscat_analysis.pipeline.noise import SPECTRUM_FRAMES
 from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.search.changes import least_beside, spot_of
 from iscat_analysis.search.sliding import good_frames, longest_window, measure_frames, well_lit
-from iscat_analysis.threads import threads
+from iscat_analysis.threads import over_frames, threads
 
 PAIRS = 12
 """Places in a movie at which the light of some frames is compared with that of later ones."""
@@ -156,7 +156,9 @@ def judge_lines(
         return None
     with threads(config.compute.workers) as pool:
         surface = find_surface([(p.before, p.after) for p in pairs], camera, window)
-        return find_lines(counts, camera, surface, mapper=pool.map)
+        return find_lines(
+            counts, camera, surface, mapper=over_frames(pool, counts.shape[1:])
+        )
 
 
 def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:

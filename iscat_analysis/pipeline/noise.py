@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,7 +39,7 @@ from iscat_analysis.search.sliding import (
     well_lit,
 )
 from iscat_analysis.search.templates import ExcessNoise
-from iscat_analysis.threads import beside, threads
+from iscat_analysis.threads import over_frames, threads
 
 SPECTRUM_FRAMES = 128
 """Background frames on which the spectrum of the noise is measured."""
@@ -156,7 +155,6 @@ def judge_counts(
     Noise
         Silent of the camera where it is too dark to tell.
     """
-    looking = None if additive else beside(partial(find_zero, masked=masked), counts, camera)
     spectrum = measure_spectrum(counts, camera, masked=masked, mapper=mapper)
     try:
         gain = diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=masked)
@@ -170,7 +168,7 @@ def judge_counts(
     shared = shared_light(counts, camera, masked=masked)
     if shared is not None:
         return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
-    zero = None if looking is None else looking.result()
+    zero = None if additive else find_zero(counts, camera, masked=masked)
     leaks = spectrum is not None and spectrum.correlated
     if zero is not None and leaks and not zero.flickers:
         zero = None  # the variance of a pixel is then of its neighbours' light as well
@@ -337,10 +335,11 @@ def judge_opening(reader: Reader, config: Config) -> Opening:
     """
     additive = config.optics.scheme == "darkfield"
     with threads(config.compute.workers) as pool:
-        opening, curve, window = judge_window(reader, config, pool.map)
+        mapper = over_frames(pool, reader.shape)
+        opening, curve, window = judge_window(reader, config, mapper)
         noise = judge_counts(
             opening, reader.camera, additive=additive,
-            follows=config.background.follows_pattern, mapper=pool.map,
+            follows=config.background.follows_pattern, mapper=mapper,
         )  # fmt: skip
     if noise.excess is None:
         ratio = curve.at(window)

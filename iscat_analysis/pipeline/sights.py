@@ -45,6 +45,7 @@ from iscat_analysis.search.bright import (
     find_bright_steps,
 )
 from iscat_analysis.search.sliding import stride_of
+from iscat_analysis.threads import over_frames
 
 RINGS_NM = 9000.0
 """Farther than this from a particle its rings are left out."""
@@ -185,7 +186,7 @@ def landing_sights(
             most=most,
             rings=rings,
             motion=pattern,
-            mapper=pool.map,
+            mapper=over_frames(pool, reader.shape),
         )
         found += alone
         rest += every
