@@ -156,9 +156,7 @@ def judge_lines(
         return None
     with threads(config.compute.workers) as pool:
         surface = find_surface([(p.before, p.after) for p in pairs], camera, window)
-        return find_lines(
-            counts, camera, surface, mapper=over_frames(pool, counts.shape[1:])
-        )
+        return find_lines(counts, camera, surface, mapper=over_frames(pool, counts.shape[1:]))
 
 
 def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:

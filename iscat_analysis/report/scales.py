@@ -111,7 +111,5 @@ def png_of(shades: NDArray[np.uint8], colours: NDArray[np.float64]) -> str:
     picture.putpalette([*palette, 127, 127, 127])
     buffer = io.BytesIO()
     # noise never repeats itself: looking for that takes four times as long, and saves nothing
-    picture.save(
-        buffer, "PNG", transparency=len(colours), compress_type=Image.HUFFMAN_ONLY
-    )
+    picture.save(buffer, "PNG", transparency=len(colours), compress_type=Image.HUFFMAN_ONLY)
     return base64.b64encode(buffer.getvalue()).decode("ascii")
