@@ -67,6 +67,29 @@ def test_a_figure_is_drawn_once_for_each_file(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["line.png", "line.svg"]
 
 
+def test_names_of_axes_are_where_they_would_be_without_an_image_drawn_before(
+    tmp_path: Path,
+) -> None:
+    """In an image letters have whole pixels, which makes numbers beside an axis a little wider."""
+
+    def places(folder: Path | None) -> list[tuple[str, float, float]]:
+        figure = new_figure(6.0, 2.5)
+        left, right = figure.subplots(1, 2)
+        left.plot([0, 1], [0.0, 1e-4])
+        left.set(xlabel="frames", ylabel="narrow")
+        right.semilogy([0, 1e5], [1e-3, 1e7])
+        right.set(xlabel="nothing", ylabel="wide")
+        svg = publish([("axes", figure)], folder)["axes"]
+        found = re.findall(r'x="([-.0-9]+)" y="([-.0-9]+)"[^>]*>([a-z ]+)</text>', svg)
+        return [(name, float(x), float(y)) for x, y, name in found]
+
+    alone, after = places(None), places(tmp_path)
+    assert {name for name, *_ in after} == {"frames", "narrow", "nothing", "wide"}
+    assert [name for name, *_ in after] == [name for name, *_ in alone]
+    moved = np.array([p for _, *p in after]) - np.array([p for _, *p in alone])
+    assert np.abs(moved).max() < 2.0  # points, where a letter has 9
+
+
 class TestFolder:
     def test_holds_exactly_what_is_promised(self, folder: Path) -> None:
         assert {path.name for path in folder.iterdir()} == OUTPUT_NAMES - {
