@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,17 +18,12 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="no copies elsew
 
 
 def _children() -> set[int]:
-    """Processes of this one that have not been buried."""
-    listed = (entry for entry in os.listdir("/proc") if entry.isdecimal())
+    """Give the processes of this one that have not been buried."""
     found = set()
-    for number in listed:
-        try:
-            with open(f"/proc/{number}/stat", encoding="utf-8") as file:  # noqa: PTH123
-                parent = int(file.read().rsplit(")", 1)[1].split()[1])
-        except OSError:
-            continue
-        if parent == os.getpid():
-            found.add(int(number))
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):  # it has ended
+            if int(status.read_text().rsplit(")", 1)[1].split()[1]) == os.getpid():
+                found.add(int(status.parent.name))
     return found
 
 

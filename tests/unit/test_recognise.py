@@ -279,7 +279,7 @@ def test_where_the_other_process_is_lost_changes_are_found_in_this_one(
     expected = fit_stack(tmp_path / "movie.tif", config, out=tmp_path / "one").summary
     lost: Future[Changes] = Future()
     lost.set_exception(LostError())
-    monkeypatch.setattr(prepare, "aside", lambda work: lost)
+    monkeypatch.setattr(prepare, "aside", lambda _work: lost)
     found = fit_stack(tmp_path / "movie.tif", config, out=tmp_path / "two").summary
     assert found["changes"] == expected["changes"]
     assert found["changes"]["number"] > 0
