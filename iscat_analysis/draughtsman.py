@@ -44,6 +44,7 @@ class Draughtsman:
         self._thread = ThreadPoolExecutor(1)  # that asks it one thing after the other
         self._begun = False
         self._answer: Future[Any] | None = None
+        self._ending = False  # all is drawn
 
     def start(self) -> None:
         """Start it, once; not where this process has Matplotlib loaded, or none can be started."""
@@ -93,14 +94,15 @@ class Draughtsman:
             page: str = self._answer.result()
         except Exception:  # noqa: BLE001  # whoever draws instead finds it again
             return None
-        self._thread.submit(self._other.end)  # while the page is written
+        self._ending = True
+        self._thread.submit(self._other.end)  # which takes 20 ms, and nothing waits for it
         return page
 
     def close(self) -> None:
         """End the process, and its copy, whatever they are at."""
-        if self._other is not None:
+        if self._other is not None and not self._ending:
             self._other.end()
-        self._thread.shutdown()
+        self._thread.shutdown(wait=not self._ending)
         if self._other is not None:
             self._other.close()
 
