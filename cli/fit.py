@@ -138,7 +138,9 @@ def fit(
         resolved = load_config(config, changes)
 
         from iscat_analysis.draughtsman import Draughtsman
+        from iscat_cli.lean import load_numpy, without
 
+        load_numpy()
         with closing(Draughtsman()) as pen:
             # memory for figures is better taken when that for large chunks is free again
             if resolved.background.method != "sliding" or _bytes_of(stack) <= _LARGE_BYTES:
@@ -148,7 +150,8 @@ def fit(
             if raw is not None:
                 stack = Path(f"{stack}{MARK}{raw}")
 
-            from iscat_analysis.pipeline import fit_stack
+            with without("coverage"):  # which Numba would tell what of a kernel is run
+                from iscat_analysis.pipeline import fit_stack
             from iscat_analysis.places import open_place
 
             folder = beside(stack, ".iscat") if out is None else out
