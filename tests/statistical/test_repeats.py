@@ -39,7 +39,10 @@ class Layout:
     def settings(self) -> list[str]:
         """Settings of its analysis."""
         if self.landing:
-            return [f"background.window_frames={self.window}"]
+            # what drifts is not followed here: its excess is what is to be reported
+            return [
+                f"background.window_frames={self.window}", "background.drift_correction=false"
+            ]  # fmt: skip
         return [
             f"background.frames=[0,{self.window}]",
             f"fit.frames=[{self.window},{self.frames}]",
