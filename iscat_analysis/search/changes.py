@@ -101,8 +101,9 @@ def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
         return NO_CHANGES
     block, *place = peaks.T
     one, two, _, four, five = (smooth[block + n, *place] for n in range(_LEAST_BLOCKS))
-    beside = np.maximum(np.abs(two - one), np.abs(five - four)) / np.abs(four - two)
-    quiet = np.maximum(_QUIET * noise / np.abs(four - two), STAYS)
+    change = size[block, *place]
+    beside = np.maximum(np.abs(two - one), np.abs(five - four)) / change
+    quiet = np.maximum(_QUIET * noise / change, STAYS)
     pictures = _pictures(smooth, peaks, _NEAR * spot_px, noise)
     staying = (beside < quiet) & (pictures == 1)
     return Changes(len(peaks), float(staying.mean()), float((pictures > 2).mean()))
