@@ -12,6 +12,7 @@ from scipy.stats import poisson
 
 import iscat_analysis as ia
 from iscat_analysis.config import Config, load_config
+from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.lines import Lines
 from iscat_analysis.pipeline.light import judge_lines
@@ -171,7 +172,8 @@ def test_lines_that_are_divided_out_of_a_moving_pattern_make_particles(
 
     monkeypatch.setattr("iscat_analysis.pipeline.light.judge_lines", divided)
     config = _config("drifting", "simulation.count=0", "detection.false_alarms_per_movie=1e-3")
-    assert len(ia.fit_movie(_recorded(config, 0, "both", FLICKER), config=config).table) > 10
+    with pytest.raises(DataError, match="places in frames 0:140 pass the detection threshold"):
+        ia.fit_movie(_recorded(config, 0, "both", FLICKER), config=config)
     assert not len(ia.fit_movie(_recorded(config, 0, "both", 0.0), config=config).table)
 
 
